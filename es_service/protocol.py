@@ -1,0 +1,161 @@
+"""What the driver and the workers say to each other: NumPy only, picklable, every array named by its axes.
+
+A leaf of the import graph: both sides import it and it imports neither. Axes: D policy parameters, P antithetic pairs
+of one chunk, S sign [+, -], E episodes of one evaluation chunk, O observation, B descriptor dimensions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float32]
+SIGNS = (1.0, -1.0)
+"""The two members of a pair, in the order of axis S."""
+EVALUATION_EPISODES_PER_CHUNK = 16
+"""Episodes in one evaluation chunk; a constant, so that its compiled shape is one too."""
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """What the driver must know about a task before any worker starts; plain data."""
+
+    name: str
+    observation_size: int
+    action_size: int
+    episode_steps: int
+    """Default length of an episode in control steps."""
+    descriptor_names: tuple[str, ...]
+    descriptor_bounds: tuple[tuple[float, float], ...]
+    """(low, high) per descriptor dimension, in the units of the task."""
+    final_fitness: bool
+    """Whether `task.fitness: final` (the reward of the last valid step) makes sense here."""
+    options: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Task options a config may set, each with its allowed values; the first is the default."""
+    summary: str = ""
+
+
+@dataclass(frozen=True)
+class WorkerSpec:
+    """Everything a worker must know, sent once when it starts: constants of the run."""
+
+    seed: int
+    environment: str
+    environment_options: dict[str, str]
+    episode_steps: int
+    fitness: Literal["sum", "final"]
+    episodes_per_member: int
+    hidden: tuple[int, ...]
+    observation_clip: float | None
+    action_noise: float
+    common_random_numbers: bool
+    chunk_pairs: int
+    """Pairs in a training chunk: its compiled shape."""
+    rollout_block_pairs: int
+    """Pairs that step together inside a chunk; divides `chunk_pairs`. Small enough for their weights to stay in cache."""
+    gradient_block_pairs: int
+    """Pairs whose weighted noise is summed into one partial gradient."""
+
+
+@dataclass(frozen=True)
+class Centre:
+    """The point all chunks of one phase share: policy parameters, noise width, observation statistics."""
+
+    generation: int
+    parameters_D: FloatArray
+    sigma: float
+    """Standard deviation of the parameter noise, in parameter units."""
+    observation_mean_O: FloatArray
+    observation_std_O: FloatArray
+    """Statistics as they were at the start of the generation; 0 and 1 where normalisation is off."""
+
+
+@dataclass(frozen=True)
+class TrainingChunk:
+    """Roll out pairs `chunk_id * chunk_pairs ...` around the centre, both signs, with action noise."""
+
+    generation: int
+    chunk_id: int
+
+
+@dataclass(frozen=True)
+class EvaluationChunk:
+    """Roll out 16 episodes of the unperturbed centre without action noise; episode ids start at 16 * chunk_id."""
+
+    generation: int
+    chunk_id: int
+
+
+@dataclass(frozen=True)
+class GradientChunk:
+    """Sum weight * noise over one fixed block of pairs, starting at pair `chunk_id * gradient_block_pairs`."""
+
+    generation: int
+    chunk_id: int
+    weights_P: FloatArray
+    """One weight per pair of the block (utility of + minus utility of -); pairs past the end of the population weigh 0."""
+
+
+Chunk = TrainingChunk | EvaluationChunk | GradientChunk
+
+
+class Moments(NamedTuple):
+    """Count, mean and sum of squared deviations of observations, in float64; mergeable."""
+
+    count: float
+    mean_O: NDArray[np.float64]
+    m2_O: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EpisodesResult:
+    """What came of a training chunk (leading axes P, S) or an evaluation chunk (leading axis E)."""
+
+    fitness: FloatArray
+    """Mean over the member's episodes of its return, or of its last reward with `fitness: final`."""
+    descriptor: FloatArray
+    """Leading axes + B: mean over the member's episodes, each copied at the end of its episode."""
+    steps: NDArray[np.int32]
+    """Environment steps taken before or at `done`, summed over the member's episodes."""
+    goal_distance: FloatArray
+    """Leading axes + 2: distance to the goal at the end of the episode and its minimum along the way; NaN without a goal."""
+    moments: Moments
+    """Of every observation acted on before `done`."""
+    seconds: float
+
+
+@dataclass(frozen=True)
+class GradientResult:
+    """One partial sum of the gradient estimate, in units of weight x standard normal noise."""
+
+    sum_D: FloatArray
+    seconds: float
+
+
+ChunkResult = EpisodesResult | GradientResult
+
+
+@dataclass(frozen=True)
+class DispatchCounts:
+    """Faults survived so far by an evaluator, over all generations of this process."""
+
+    retries: int = 0
+    lost_workers: int = 0
+    duplicates: int = 0
+
+
+class Evaluator(Protocol):
+    """Runs chunks somewhere. The driver neither knows nor cares where, in what order, or how often."""
+
+    @property
+    def counts(self) -> DispatchCounts:
+        """Faults so far."""
+        ...
+
+    def evaluate(self, centre: Centre, chunks: Sequence[Chunk]) -> list[ChunkResult]:
+        """Results in the order of `chunks`. Raises EvaluationError, or Interrupted when asked to stop."""
+        ...
