@@ -3,7 +3,7 @@
 A leaf of the import graph. A number is a pure function of its address, so it is made again wherever it is needed and
 never sent, stored or drawn from a stateful stream. An address has two halves:
 
-* the *stream*: (run seed, key domain, generation, ids ...), hashed here in 64-bit NumPy into a key of four uint32 words;
+* the *stream*: (run seed, key domain, generation, ids ...), hashed here in 64-bit NumPy into a key of four words;
 * the *coordinate*: a uint32 counter inside the stream (a policy parameter, a control step x action, ...), hashed with
   the key by `hash_words`, 32-bit integer operations only, which NumPy, XLA and vector units all do exactly.
 

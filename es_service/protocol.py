@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +56,7 @@ class WorkerSpec:
     chunk_pairs: int
     """Pairs in a training chunk: its compiled shape."""
     rollout_block_pairs: int
-    """Pairs that step together inside a chunk; divides `chunk_pairs`. Small enough for their weights to stay in cache."""
+    """Pairs that step together inside a chunk; divides `chunk_pairs`. Few enough for their weights to stay in cache."""
     gradient_block_pairs: int
     """Pairs whose weighted noise is summed into one partial gradient."""
 
@@ -97,13 +97,14 @@ class GradientChunk:
     generation: int
     chunk_id: int
     weights_P: FloatArray
-    """One weight per pair of the block (utility of + minus utility of -); pairs past the end of the population weigh 0."""
+    """Utility of + minus utility of -, per pair of the block; pairs past the end of the population weigh 0."""
 
 
 Chunk = TrainingChunk | EvaluationChunk | GradientChunk
 
 
-class Moments(NamedTuple):
+@dataclass(frozen=True)
+class Moments:
     """Count, mean and sum of squared deviations of observations, in float64; mergeable."""
 
     count: float
@@ -122,7 +123,7 @@ class EpisodesResult:
     steps: NDArray[np.int32]
     """Environment steps taken before or at `done`, summed over the member's episodes."""
     goal_distance: FloatArray
-    """Leading axes + 2: distance to the goal at the end of the episode and its minimum along the way; NaN without a goal."""
+    """Leading axes + 2: distance to the goal at the end of the episode, and its minimum; NaN without a goal."""
     moments: Moments
     """Of every observation acted on before `done`."""
     seconds: float
