@@ -118,6 +118,8 @@ class EpisodesResult:
 
     fitness: FloatArray
     """Mean over the member's episodes of its return, or of its last reward with `fitness: final`."""
+    returns: FloatArray
+    """Mean over the member's episodes of the sum of rewards; equals `fitness` with `fitness: sum`."""
     descriptor: FloatArray
     """Leading axes + B: mean over the member's episodes, each copied at the end of its episode."""
     steps: NDArray[np.int32]

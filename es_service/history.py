@@ -1,0 +1,59 @@
+"""The columns of a run's history: one row per generation. This table is their documentation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of the history. Only deterministic columns enter the digest."""
+
+    name: str
+    type: Literal["INTEGER", "REAL"]
+    deterministic: bool
+    meaning: str
+
+
+_BEFORE_DESCRIPTOR = (
+    Column("generation", "INTEGER", True, "generations completed; 0 is the initial centre's evaluation"),
+    Column("env_steps", "INTEGER", True, "environment steps so far, evaluations counted, none after done"),
+    Column("episodes", "INTEGER", True, "episodes so far, evaluations counted"),
+    Column("centre_fitness_mean", "REAL", True, "mean fitness over the new centre's evaluation episodes"),
+    Column("centre_fitness_std", "REAL", True, "standard deviation of the same episodes (population formula)"),
+    Column("centre_return_mean", "REAL", True, "mean return; equals the fitness with `fitness: sum`"),
+    Column("best_fitness", "REAL", True, "highest centre_fitness_mean so far"),
+    Column("population_fitness_min", "REAL", True, "lowest fitness of a valid member of this generation"),
+    Column("population_fitness_q25", "REAL", True, "first quartile of the members' fitness"),
+    Column("population_fitness_median", "REAL", True, "median of the members' fitness"),
+    Column("population_fitness_q75", "REAL", True, "third quartile of the members' fitness"),
+    Column("population_fitness_max", "REAL", True, "highest fitness of a member: a noisy single value, not the best"),
+)
+_AFTER_DESCRIPTOR = (
+    Column("goal_distance", "REAL", True, "mean distance to the goal at the end of the evaluation episodes"),
+    Column("goal_distance_min", "REAL", True, "least distance to the goal along any evaluation episode"),
+    Column("update_norm", "REAL", True, "Euclidean norm of the step from the old centre to the new one"),
+    Column("parameter_norm", "REAL", True, "Euclidean norm of the new centre"),
+    Column("invalid_members", "INTEGER", True, "members with a non-finite fitness or descriptor"),
+    Column("retries", "INTEGER", False, "chunks run again in this generation"),
+    Column("lost_workers", "INTEGER", False, "workers that died, hung or were replaced in this generation"),
+    Column("workers", "INTEGER", False, "workers the evaluator was asked to keep"),
+    Column("wall_clock_s", "REAL", False, "seconds spent in this run so far, all sessions together"),
+    Column("steps_per_second", "REAL", False, "environment steps of this generation over its seconds"),
+    Column("seconds_rollout", "REAL", False, "waiting for training chunks"),
+    Column("seconds_gradient", "REAL", False, "waiting for gradient chunks and adding them up"),
+    Column("seconds_evaluation", "REAL", False, "waiting for the new centre's evaluation"),
+    Column("seconds_driver", "REAL", False, "everything else on the driver but the store"),
+    Column("seconds_store", "REAL", False, "committing the generation before this one"),
+)
+
+
+def history_columns(descriptor_names: Sequence[str], extra: Sequence[Column] = ()) -> tuple[Column, ...]:
+    """All columns of a run: the trunk's, one `centre_<name>` per descriptor dimension, the algorithm's own."""
+    descriptor = tuple(
+        Column(f"centre_{name}", "REAL", True, f"mean descriptor of the evaluation episodes: {name}")
+        for name in descriptor_names
+    )
+    return (*_BEFORE_DESCRIPTOR, *descriptor, *extra, *_AFTER_DESCRIPTOR)
