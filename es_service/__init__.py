@@ -1,0 +1,21 @@
+"""Evolution strategies for neuro-evolution: `from es_service import load_config, run, open_run`.
+
+Names come from `es_service.api` when they are first used, so that importing a part of the package imports no more.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from es_service.api import fork, load_config, open_run, resume, run
+
+__all__ = ["fork", "load_config", "open_run", "resume", "run"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from es_service import api
+
+    return getattr(api, name)

@@ -6,6 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
+from es_service.protocol import EpisodesResult
+
 
 @dataclass(frozen=True)
 class Column:
@@ -57,3 +61,26 @@ def history_columns(descriptor_names: Sequence[str], extra: Sequence[Column] = (
         for name in descriptor_names
     )
     return (*_BEFORE_DESCRIPTOR, *descriptor, *extra, *_AFTER_DESCRIPTOR)
+
+
+def population_columns(population: EpisodesResult | None) -> dict[str, float | None]:
+    """Quartiles of the valid members' fitness; None for generation 0, which has no population."""
+    names = [f"population_fitness_{name}" for name in ("min", "q25", "median", "q75", "max")]
+    if population is None:
+        return dict.fromkeys(names)
+    fitness = population.fitness[np.isfinite(population.fitness)].astype(np.float64)
+    values = np.quantile(fitness, [0.0, 0.25, 0.5, 0.75, 1.0]) if fitness.size else np.full(5, np.nan)
+    return dict(zip(names, values.tolist(), strict=True))
+
+
+def evaluation_columns(evaluation: EpisodesResult, descriptor_names: Sequence[str]) -> dict[str, float]:
+    """What the new centre's evaluation episodes say: fitness, return, where they end, how near the goal."""
+    descriptor_B = evaluation.descriptor.mean(axis=0, dtype=np.float64).tolist()
+    return {
+        "centre_fitness_mean": float(evaluation.fitness.mean(dtype=np.float64)),
+        "centre_fitness_std": float(evaluation.fitness.std(dtype=np.float64)),
+        "centre_return_mean": float(evaluation.returns.mean(dtype=np.float64)),
+        **{f"centre_{name}": value for name, value in zip(descriptor_names, descriptor_B, strict=True)},
+        "goal_distance": float(evaluation.goal_distance[:, 0].mean(dtype=np.float64)),
+        "goal_distance_min": float(evaluation.goal_distance[:, 1].min()),
+    }

@@ -113,3 +113,12 @@ def normals(key: Keys, count: int) -> NDArray[np.float32]:
     """The first `count` standard normal variates of one stream, in NumPy: coordinates 0 .. count - 1."""
     integers = normal_integers(np, key, np.arange(count, dtype=np.uint32))
     return integers.astype(np.float32) / np.float32(NORMAL_STD)
+
+
+TEST_VECTORS: tuple[tuple[tuple[int, Domain, int, tuple[int, ...]], tuple[int, ...]], ...] = (
+    ((0, Domain.INITIALISATION, 0, (0,)), (-15, 9, 11)),
+    ((0, Domain.PARAMETER_NOISE, 0, (0,)), (-9, 7, -21)),
+    ((1, Domain.PARAMETER_NOISE, 7, (511,)), (31, -23, -65)),
+    ((2**63 - 1, Domain.ACTION_NOISE, 10**6, (4095, 1, 2)), (-13, 1, -1)),
+)
+"""((seed, domain, generation, ids), `normal_integers` at coordinates 0, 1, 2): what any implementation must give."""

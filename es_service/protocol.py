@@ -126,8 +126,8 @@ class EpisodesResult:
     """Environment steps taken before or at `done`, summed over the member's episodes."""
     goal_distance: FloatArray
     """Leading axes + 2: distance to the goal at the end of the episode, and its minimum; NaN without a goal."""
-    moments: Moments
-    """Of every observation acted on before `done`."""
+    moments: Moments | None
+    """Of every observation acted on before `done`; None for evaluations, which feed no statistics."""
     seconds: float
 
 
@@ -149,6 +149,8 @@ class DispatchCounts:
     retries: int = 0
     lost_workers: int = 0
     duplicates: int = 0
+    workers: int = 0
+    """Workers the evaluator was asked to keep."""
 
 
 class Evaluator(Protocol):

@@ -1,0 +1,49 @@
+"""Tasks: what each is (plain data, read by the driver) and how it is made (imported only where rollouts run)."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from es_service.protocol import TaskSpec
+
+TASKS: Mapping[str, TaskSpec] = {
+    "point_maze": TaskSpec(
+        name="point_maze",
+        observation_size=2,
+        action_size=2,
+        episode_steps=200,
+        descriptor_names=("x", "y"),
+        descriptor_bounds=((-1.0, 1.0), (-1.0, 1.0)),
+        final_fitness=True,
+        options={"start": ("default", "corner")},
+        summary="a point crosses a square behind two walls; the straight way to the goal is blocked twice",
+    ),
+}
+"""Every task by name. A test holds each entry against what its module does."""
+
+
+@dataclass(frozen=True)
+class Environment:
+    """A task as pure functions of one environment's state; rollouts vmap and compile them.
+
+    A state is any pytree of arrays. Nothing here knows of episodes, time limits, policies or statistics.
+    """
+
+    reset: Callable[[Any], Any]
+    """Stream key (uint32 [4]) -> state."""
+    observe: Callable[[Any], Any]
+    """State -> observation [O], float32."""
+    step: Callable[[Any, Any], tuple[Any, Any, Any]]
+    """(state, action [A]) -> (next state, reward, done). The action may leave [-1, 1]; the task clips it."""
+    descriptor: Callable[[Any], Any]
+    """State -> descriptor [B] of an episode that ends here."""
+    goal_distance: Callable[[Any], Any]
+    """State -> distance to the goal, NaN where the task has none."""
+
+
+def make_environment(name: str, options: Mapping[str, str]) -> Environment:
+    """The functions of a named task; imports its module, and with it JAX and any physics engine it needs."""
+    return importlib.import_module(f"workers.environments.{name}").make(**options)

@@ -1,0 +1,163 @@
+"""The command line: `es-service run | resume | fork | status | digest | list | doctor`.
+
+Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by SIGINT or SIGTERM.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from es_service import api, digest
+from es_service.config_resolution import config_warnings
+from es_service.errors import ConfigError, Interrupted, ServiceError
+from es_service.report.catalogue import print_catalogue
+from es_service.report.progress import show_progress
+from es_service.report.status import follow_status, print_status, print_summary
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Evolution strategies for neuro-evolution on hard-exploration control tasks.",
+)
+console = Console()
+errors = Console(stderr=True)
+
+ConfigArgument = Annotated[Path, typer.Argument(help="YAML config; see configs/.", show_default=False)]
+RunArgument = Annotated[Path, typer.Argument(help="Folder of a run.", show_default=False)]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one key, e.g. search.sigma=0.05.")
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the new run; default: a name under runs/.")]
+WorkersOption = Annotated[int | None, typer.Option("--workers", help="Worker processes; default: one per core.")]
+EngineOption = Annotated[str | None, typer.Option("--engine", help="What runs the workers: inline.")]
+
+
+@app.command()
+def run(
+    config: ConfigArgument,
+    set_: SetOption = None,
+    out: OutOption = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of all random numbers.")] = None,
+    workers: WorkersOption = None,
+    engine: EngineOption = None,
+) -> None:
+    """Start a run from a config file."""
+    overrides = _overrides(set_, seed=seed, **{"compute.workers": workers, "compute.engine": engine})
+    loaded = api.load_config(config, overrides)
+    for warning in config_warnings(loaded):
+        errors.print(f"note: {warning}", highlight=False, markup=False)
+    folder = out if out is not None else api.default_folder(loaded)
+    _session(folder, lambda show: api.run(loaded, folder, on_generation=show))
+
+
+@app.command()
+def resume(
+    folder: RunArgument, set_: SetOption = None, workers: WorkersOption = None, engine: EngineOption = None
+) -> None:
+    """Go on with a run; only budget, engine, workers and time limits may change."""
+    overrides = _overrides(set_, **{"compute.workers": workers, "compute.engine": engine})
+    _session(folder, lambda show: api.resume(folder, overrides, on_generation=show))
+
+
+@app.command()
+def fork(
+    parent: RunArgument,
+    generation: Annotated[int | None, typer.Option("--generation", help="One of the last two; default: newest.")] = None,
+    set_: SetOption = None,
+    out: OutOption = None,
+    workers: WorkersOption = None,
+    engine: EngineOption = None,
+) -> None:
+    """Start a new run from another run's state, with changed settings."""
+    overrides = _overrides(set_, **{"compute.workers": workers, "compute.engine": engine})
+    folder = out if out is not None else api.default_folder(api.fork_config(parent, overrides))
+    _session(folder, lambda show: api.fork(parent, overrides, generation=generation, out=folder, on_generation=show))
+
+
+@app.command()
+def status(
+    folder: RunArgument,
+    follow: Annotated[bool, typer.Option("--follow", help="Keep watching until the driver ends.")] = False,
+) -> None:
+    """Show where a run stands, also while it is being written."""
+    if follow:
+        follow_status(console, api.open_run(folder))
+    else:
+        print_status(console, api.open_run(folder))
+
+
+@app.command(name="digest")
+def digest_(
+    folder: RunArgument,
+    parts: Annotated[bool, typer.Option("--parts", help="One line per part of the state.")] = False,
+) -> None:
+    """Print the SHA-256 over everything deterministic in a run."""
+    mixed = "  mixed" if digest.is_mixed(folder) else ""
+    if parts:
+        for name, value in digest.digest_parts(folder).items():
+            print(f"{value}  {name}")
+    print(f"{digest.digest(folder)}{mixed}")
+
+
+@app.command(name="list")
+def list_() -> None:
+    """Show tasks, algorithms and presets."""
+    print_catalogue(console)
+
+
+@app.command()
+def doctor() -> None:
+    """Check that this machine can run, and show what results depend on."""
+    from es_service.doctor import examine
+
+    raise typer.Exit(0 if examine(console) else 1)
+
+
+def main() -> None:
+    """Entry point: run the command, turn errors into one readable message and an exit code."""
+    try:
+        app(standalone_mode=False)
+    except typer.Exit as stop:
+        sys.exit(stop.exit_code)
+    except typer.Abort:
+        sys.exit(130)
+    except Interrupted as stop:
+        sys.exit(128 + stop.signal_number)
+    except ConfigError as error:
+        _print_error(str(error))
+        sys.exit(2)
+    except ServiceError as error:
+        _print_error(str(error))
+        sys.exit(1)
+    except BrokenPipeError:  # `es-service status RUN | head`
+        sys.stderr.close()
+        sys.exit(1)
+
+
+def _session(folder: Path, work: Callable[[Callable], api.Outcome]) -> None:
+    """Show a run while it works, and at its end what came of it."""
+    try:
+        with show_progress(console, str(folder)) as show:
+            outcome = work(show)
+    except Interrupted:
+        errors.print(f"interrupted; every finished generation is saved. Go on with: es-service resume {folder}")
+        raise
+    for notice in outcome.notices:
+        errors.print(f"note: {notice}", highlight=False, markup=False)
+    print_summary(console, outcome.run, outcome.reason)
+
+
+def _overrides(set_: list[str] | None, **options: object) -> list[str]:
+    """`--set` values, then options that stand for a key; the later ones win."""
+    return [*(set_ or []), *(f"{key}={value}" for key, value in options.items() if value is not None)]
+
+
+def _print_error(message: str) -> None:
+    errors.print(f"error: {message}", style="red", highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,223 @@
+"""What a run is: the resolved, frozen config, and what of it can never change once the run exists.
+
+A `RunConfig` holds no `auto` that would change results: `config_loading.load_config` fills in presets, defaults and
+shapes and checks the sections against each other, so build one with it and not by hand.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from es_service.config_yaml import dump_yaml, show
+from es_service.protocol import WorkerSpec
+
+# A string beside a type is what error messages say is allowed.
+Count = Annotated[int, Field(ge=1), "a whole number, at least 1"]
+Positive = Annotated[float, Field(gt=0), "a number above 0"]
+NotNegative = Annotated[float, Field(ge=0), "a number, at least 0"]
+Number = Annotated[float, "a number"]
+Fraction = Annotated[float, Field(ge=0, le=1), "a number from 0 to 1"]
+Seed = Annotated[int, Field(ge=0, lt=2**63), "a whole number, at least 0 and below 2**63"]
+Switch = Annotated[bool, "true or false"]
+Text = Annotated[str, Field(min_length=1), "text"]
+Widths = Annotated[
+    tuple[Count, ...],
+    BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value),
+    "a list of whole numbers, each at least 1, such as [64, 64]",
+]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+
+class TaskConfig(_Section):
+    """What is to be learned. Constants of the run."""
+
+    environment: Text = Field(description="Name of the task; `es-service list` shows them.")
+    episode_steps: Count = Field(description="Length of an episode in control steps. null: the task's own length.")
+    fitness: Literal["sum", "final"] = Field(
+        "sum",
+        description="What selection maximises: the sum of an episode's rewards, or the reward of its last valid step "
+        "(only where the task declares that this makes sense).",
+    )
+    episodes_per_member: Count = Field(
+        1, description="Training episodes of each member of the population; its fitness is their mean."
+    )
+    options: dict[Text, Text] = Field(
+        default_factory=dict,
+        description="The task's own settings, such as `start`; `es-service list` shows them.",
+    )
+
+
+class PolicyConfig(_Section):
+    """The controller: a tanh multilayer perceptron with outputs in [-1, 1]. Constants of the run."""
+
+    hidden: Widths = Field((64, 64), description="Widths of the hidden layers; [] is a linear policy under a tanh.")
+    init: Literal["unit_columns", "small_columns"] = Field(
+        description="Initial weights: Gaussian columns scaled to a norm, biases 0. unit_columns: norm 1.0 in hidden "
+        "layers, 0.01 in the output layer. small_columns: 0.01 in every layer. Set by the preset."
+    )
+    observation_normalization: Switch = Field(
+        True, description="Whether observations are shifted and scaled by the running statistics of the training."
+    )
+    observation_clip: Positive | None = Field(
+        description="Bound on each normalised observation, in standard deviations; null for none. Set by the preset; "
+        "a preset sets null where normalisation is off."
+    )
+    action_noise: NotNegative = Field(
+        0.01,
+        description="Standard deviation of the Gaussian noise added to actions in training episodes, in action units.",
+    )
+
+
+class SearchConfig(_Section):
+    """The evolution strategy. Constants of the run."""
+
+    algorithm: Text = Field(description="Name of the search algorithm; `es-service list` shows them.")
+    preset: Literal["literature", "uber"] = Field(
+        "literature", description="Which column of the preset table fills in the keys that the config leaves out."
+    )
+    pairs: Count = Field(
+        description="Antithetic pairs per generation; the population is twice as large. Set by the preset."
+    )
+    sigma: Positive = Field(0.02, description="Standard deviation of the parameter noise, in parameter units.")
+    learning_rate: Positive = Field(0.01, description="Step size of Adam, in parameter units.")
+    l2: NotNegative = Field(
+        0.005, description="Weight decay, added to the gradient before Adam: lambda in -g + lambda x."
+    )
+    evaluation_episodes: Count = Field(
+        30,
+        description="Episodes without noise on which each new centre is judged; counted as environment steps.",
+    )
+    common_random_numbers: Switch = Field(
+        description="Whether the two members of a pair share resets and action noise. Set by the preset."
+    )
+    max_invalid_fraction: Fraction = Field(
+        0.5, description="Share of members with a non-finite fitness or descriptor above which the run stops."
+    )
+    init_from: Text | None = Field(
+        None, description="Folder of another run whose centre this one starts from; null for a random centre."
+    )
+
+
+class BudgetConfig(_Section):
+    """When to stop: whichever comes first. At least one is set. May change on resume."""
+
+    generations: Count | None = Field(None, description="Generations in all, sessions before a resume included.")
+    env_steps: Count | None = Field(None, description="Environment steps in all, evaluations included.")
+    wall_clock_s: Positive | None = Field(None, description="Seconds of running in all, sessions together.")
+    target_fitness: Number | None = Field(None, description="Mean evaluation fitness of a centre that is good enough.")
+
+
+class ComputeConfig(_Section):
+    """How the work is cut and where it runs. Only `rollout` and the three `*_pairs` are constants of the run."""
+
+    engine: Literal["inline"] = Field("inline", description="What runs the workers: child processes of this program.")
+    workers: Literal["auto"] | Count = Field(
+        "auto", description="Worker processes. auto: one per core of the machine at hand. Never changes results."
+    )
+    rollout: Literal["xla"] = Field(description="What computes episodes. auto: xla.")
+    chunk_pairs: Count = Field(
+        description="Pairs in one unit of work; divides search.pairs. auto: the largest divisor of it not above 64, a "
+        "multiple of 8 if there is one."
+    )
+    rollout_block_pairs: Count = Field(
+        description="Pairs that step together, so that their weights stay in cache; divides chunk_pairs. auto: the "
+        "largest divisor of it not above 32."
+    )
+    gradient_block_pairs: Count = Field(
+        description="Pairs summed into one partial gradient; not above search.pairs. auto: as many whole chunks as "
+        "make at most 32 blocks."
+    )
+    chunk_timeout_s: Positive = Field(
+        30.0, description="Least deadline of a chunk in seconds; slow chunks raise it for those that follow."
+    )
+    compile_timeout_s: Positive = Field(600.0, description="Deadline of a worker's start and compilation in seconds.")
+    max_attempts: Count = Field(4, description="Times a chunk is tried before the run stops with its error.")
+    no_worker_timeout_s: Positive = Field(
+        120.0, description="Seconds without any live worker after which the run stops."
+    )
+
+
+COMPUTE_CONSTANTS = ("rollout", "chunk_pairs", "rollout_block_pairs", "gradient_block_pairs")
+"""Keys of `compute` that fix floating-point results, and therefore the run."""
+
+
+class RunConfig(_Section):
+    """A whole run. Equal configs give equal results, wherever and however often they run."""
+
+    task: TaskConfig
+    policy: PolicyConfig
+    search: SearchConfig
+    budget: BudgetConfig
+    compute: ComputeConfig
+    seed: Seed = Field(0, description="Address of all random numbers of the run.")
+
+    def resolved_yaml(self) -> str:
+        """The text of the run folder's `config.yaml`: every value spelled out; loading it gives an equal config."""
+        return dump_yaml(self.model_dump(mode="json"))
+
+    def constants(self) -> dict[str, Any]:
+        """What resume must not change: dotted key -> plain JSON value, in the order of the config."""
+        sections = self.model_dump(mode="json")
+        del sections["budget"]
+        sections["compute"] = {key: sections["compute"][key] for key in COMPUTE_CONSTANTS}
+        return flat(sections)
+
+
+def flat(sections: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one: {"search": {"sigma": 0.02}} -> {"search.sigma": 0.02}."""
+    values: dict[str, Any] = {}
+    for key, value in sections.items():
+        values |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return values
+
+
+ABSENT = "(absent)"
+"""Stands for a constant that only one of two runs has."""
+
+
+def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """Where two results of `constants()` differ: (dotted key, old value, new value), ABSENT where a side lacks it."""
+    return [
+        (name, old.get(name, ABSENT), new.get(name, ABSENT))
+        for name in {**old, **new}
+        if old.get(name, ABSENT) != new.get(name, ABSENT)
+    ]
+
+
+def describe_changes(changes: Sequence[tuple[str, Any, Any]], run: str = "RUN") -> str:
+    """What to tell someone whose resume would change constants of the run: all of them, and the way out."""
+    settings = " ".join(f"--set {shlex.quote(f'{name}={show(new)}')}" for name, _, new in changes if new != ABSENT)
+    return "\n".join(
+        [
+            "a run keeps its task, policy, search, seed and chunk shapes for life; this would change:",
+            *(f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes),
+            f"to go on from its state with other settings: es-service fork {run} {settings}".rstrip(),
+        ]
+    )
+
+
+def worker_spec(config: RunConfig) -> WorkerSpec:
+    """What every worker of the run is told once, when it starts."""
+    task, policy, compute = config.task, config.policy, config.compute
+    return WorkerSpec(
+        seed=config.seed,
+        environment=task.environment,
+        environment_options=dict(task.options),
+        episode_steps=task.episode_steps,
+        fitness=task.fitness,
+        episodes_per_member=task.episodes_per_member,
+        hidden=policy.hidden,
+        observation_clip=policy.observation_clip,
+        action_noise=policy.action_noise,
+        common_random_numbers=config.search.common_random_numbers,
+        chunk_pairs=compute.chunk_pairs,
+        rollout_block_pairs=compute.rollout_block_pairs,
+        gradient_block_pairs=compute.gradient_block_pairs,
+    )

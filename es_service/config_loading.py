@@ -1,0 +1,280 @@
+"""YAML and overrides -> `RunConfig`, or one error that lists everything wrong with them.
+
+The order is: read, sort keys into sections, apply overrides, fill in the preset, check each value alone, check names,
+resolve what is left open, check the sections against each other. A value that fails a step is reported once and taken
+out, so that the later steps still check everything else.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterable, Mapping
+from difflib import get_close_matches
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+
+from es_service.config import RunConfig, changed_constants, describe_changes
+from es_service.config_resolution import (
+    LEFT_OPEN,
+    OPTIONS,
+    did_you_mean,
+    folder_problems,
+    one_of,
+    resolve,
+    shape_problems,
+    task_problems,
+)
+from es_service.config_yaml import config_error, parse_value, read_yaml_file, show
+from es_service.errors import ConfigError
+from es_service.presets import PRESETS, preset_values
+from es_service.protocol import TaskSpec
+
+Source = str | os.PathLike[str] | Mapping[str, Any]
+"""Where a config comes from: the path of a YAML file, or what such a file would contain."""
+
+_SECTIONS = {
+    name: field.annotation
+    for name, field in RunConfig.model_fields.items()
+    if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+}
+_FIELDS = {name: field for name, field in RunConfig.model_fields.items() if name not in _SECTIONS} | {
+    f"{section}.{name}": field
+    for section, model in _SECTIONS.items()
+    for name, field in model.model_fields.items()
+    if f"{section}.{name}." != OPTIONS
+}
+_GROUPS = (*_SECTIONS, OPTIONS.removesuffix("."))
+"""What holds keys and is no value itself."""
+_BUDGET = [name for name in _FIELDS if name.startswith("budget.")]
+
+
+def load_config(
+    source: Source, overrides: Iterable[str] = (), *, tasks: Mapping[str, TaskSpec], algorithms: Collection[str]
+) -> RunConfig:
+    """The config of a new run.
+
+    Args:
+        source: a YAML file, or a nested mapping like one.
+        overrides: "search.sigma=0.05" and the like, values in YAML; a later one wins.
+        tasks: what `task.environment` may name.
+        algorithms: what `search.algorithm` may name.
+
+    Raises:
+        ConfigError: names the file, then lists every problem on a line of its own.
+    """
+    return _load(source, overrides, tasks, algorithms, new=True)
+
+
+def resume_config(
+    source: Source, overrides: Iterable[str] = (), *, tasks: Mapping[str, TaskSpec], algorithms: Collection[str]
+) -> RunConfig:
+    """The config of a run that exists, with what may change on resume changed: budget, engine, workers, time limits.
+
+    Arguments as for `load_config`; `source` is the run's own `config.yaml`. The run it once started from need no longer
+    be there.
+
+    Raises:
+        ConfigError: as for `load_config`, or an override would change a constant of the run.
+    """
+    overrides = tuple(overrides)
+    old = _load(source, (), tasks, algorithms, new=False).constants()
+    wanted = _parse_overrides(overrides)[0]
+    changes = changed_constants(old, old | {name: value for name, value in wanted.items() if name in old})
+    if changes:
+        run = "RUN" if isinstance(source, Mapping) else os.path.dirname(os.fspath(source)) or "."
+        raise ConfigError(describe_changes(changes, run))
+    return _load(source, overrides, tasks, algorithms, new=False)
+
+
+def _load(
+    source: Source, overrides: Iterable[str], tasks: Mapping[str, TaskSpec], algorithms: Collection[str], *, new: bool
+) -> RunConfig:
+    if isinstance(source, Mapping):
+        name, mapping, problems = "config", source, []
+    else:
+        mapping, problems = read_yaml_file(os.fspath(source))
+        name = os.fspath(source)
+    values, unusable, more = _sort_keys(mapping)
+    problems += more
+    wanted, more = _parse_overrides(overrides)
+    problems += more
+    values |= wanted
+
+    left_open = {key for key, ask in LEFT_OPEN.items() if _asks(values.get(key, ask), ask)}
+    values = {key: value for key, value in values.items() if key not in left_open}
+    if "search" not in unusable:
+        values = _preset_values(values) | values
+    bad = _value_problems(values)
+    problems += bad.values()
+    values = {key: value for key, value in values.items() if key not in bad}
+
+    for key, what, known in (("task.environment", "task", tasks), ("search.algorithm", "algorithm", algorithms)):
+        if key in values and values[key] not in known:
+            problems.append(
+                f"{key}: {show(values[key])} is no known {what}; must be {one_of(known)}"
+                f"{did_you_mean(values[key], known)}"
+            )
+        elif key not in values and key not in bad and key.split(".")[0] not in unusable:
+            problems.append(f"{key}: missing; must be {one_of(known)}")
+    task = tasks.get(values.get("task.environment", ""))
+    values = resolve(values, left_open, task)
+    problems += (task_problems(values, task) if task else []) + shape_problems(values)
+    problems += folder_problems(values) if new else []
+    if "budget" not in unusable and not bad.keys() & _BUDGET and all(values.get(key) is None for key in _BUDGET):
+        problems.append(f"budget: nothing ends this run; set at least one of {one_of(_BUDGET)}")
+    if problems:
+        raise config_error(name, problems)
+    return RunConfig.model_validate(_nested(values))
+
+
+def _sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, Any], set[str], list[str]]:
+    """Flat values of the known keys, the groups that are no mapping, and the problems of both other kinds of key."""
+    values: dict[str, Any] = {}
+    unusable: set[str] = set()
+    problems: list[str] = []
+    for key, value in mapping.items():
+        name = f"{group}{key}"
+        if "." in str(key):
+            section, leaf = name.rsplit(".", 1)
+            problems.append(f"{name}: no dots in a file (they are for --set); write {leaf} inside {section}:")
+        elif name in _GROUPS and isinstance(value, Mapping):
+            below = _sort_keys(value, f"{name}.")
+            values |= below[0]
+            unusable |= below[1]
+            problems += below[2]
+        elif name in _GROUPS:
+            unusable.add(name)
+            problems.append(
+                f"{name}: {show(value)} where keys belong; indent them below `{_leaf(name)}:`, "
+                "or delete the line for the defaults"
+            )
+        elif name in _FIELDS or group == OPTIONS:
+            values[name] = value
+        else:
+            problems.append(_unknown_key(name))
+    return values, unusable, problems
+
+
+def _parse_overrides(overrides: Iterable[str]) -> tuple[dict[str, Any], list[str]]:
+    """Values by dotted key, and a problem for each override that has none to give."""
+    values: dict[str, Any] = {}
+    problems: list[str] = []
+    for override in overrides:
+        name, equals, text = (part.strip() for part in override.partition("="))
+        where = f"override {override}"
+        if not equals or not name or not text:
+            hint = "write null for no value" if name and equals else "write a.b=c, such as search.sigma=0.05"
+            problems.append(f"{where}: {hint}")
+        elif name in _GROUPS:
+            keys = [key for key in _FIELDS if key.startswith(f"{name}.")] or [f"{OPTIONS}start"]
+            problems.append(f"{where}: {name} is a section; set its keys one by one, such as {keys[0]}=...")
+        elif name in _FIELDS or (name.startswith(OPTIONS) and name != OPTIONS):
+            try:
+                values[name] = parse_value(text)
+            except ValueError as error:
+                problems.append(f"{where}: {error}")
+        else:
+            problems.append(f"{where}: {_unknown_key(name)}")
+    return values, problems
+
+
+def _unknown_key(name: str) -> str:
+    """The message for a key that is none: the same key elsewhere, else the nearest one, else what there is."""
+    section, _, leaf = name.rpartition(".")
+    everywhere = {_leaf(key): key for key in (*_GROUPS, *_FIELDS)}
+    siblings = {leaf: key for leaf, key in everywhere.items() if key.rpartition(".")[0] == section}
+    for keys in ({leaf: everywhere[leaf]} if leaf in everywhere else {}, siblings, everywhere):
+        if near := get_close_matches(leaf, keys, n=1):
+            return f"{name}: unknown key; did you mean {keys[near[0]]}?"
+    if siblings:
+        return f"{name}: unknown key; {section or 'the top level'} has {', '.join(siblings)}"
+    return f"{name}: unknown key; the sections are {', '.join(_SECTIONS)}"
+
+
+def _leaf(name: str) -> str:
+    return name.rpartition(".")[2]
+
+
+def _asks(value: object, ask: str | None) -> bool:
+    """Whether a value leaves its key open; `==` alone would trip over arrays in a Python mapping."""
+    return value is None if ask is None else isinstance(value, str) and value == ask
+
+
+def _preset_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What the config's preset says; nothing where it names none of ours, which is reported as a bad value."""
+    preset = values.get("search.preset", _FIELDS["search.preset"].default)
+    if not isinstance(preset, str) or preset not in PRESETS:
+        return {}
+    filled = preset_values(preset)
+    if values.get("policy.observation_normalization") is False:
+        filled["policy.observation_clip"] = None  # its bound is in standard deviations, which there are none of
+    return filled
+
+
+def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The inverse of flattening; every section is there, if empty."""
+    nested: dict[str, Any] = {section: {} for section in _SECTIONS}
+    for name, value in values.items():
+        *path, leaf = name.split(".")
+        target = nested
+        for group in path:
+            target = target.setdefault(group, {})
+        target[leaf] = value
+    return nested
+
+
+def _value_problems(values: Mapping[str, Any]) -> dict[str, str]:
+    """Keys whose value is wrong by itself -> message. What is absent is no problem here."""
+    try:
+        RunConfig.model_validate(_nested(values))
+    except ValidationError as error:
+        found = [item["loc"] for item in error.errors(include_url=False) if item["type"] != "missing"]
+    else:
+        return {}
+    # A location goes deeper than our keys where a value has parts: ("policy", "hidden", 1).
+    names = {next(n for k in range(len(loc), 0, -1) if (n := ".".join(map(str, loc[:k]))) in values) for loc in found}
+    return {name: _bad_value(name, value) for name, value in values.items() if name in names}
+
+
+def _bad_value(name: str, value: object) -> str:
+    """Name, value, what is allowed, and how to write what was probably meant."""
+    if name not in _FIELDS:
+        return f"{name}: {show(value)} is not allowed; must be text"
+    field = _FIELDS[name]
+    allowed = _allowed(field.annotation, field.metadata)
+    if name in LEFT_OPEN:
+        allowed = f"{show(LEFT_OPEN[name])} or {allowed}"
+    hint = ""
+    if value is None:
+        hint = "; leave the key out for its default"
+    elif isinstance(value, str) and "number" in allowed and _is_number(value):
+        hint = f"; remove the quotes around {value}"
+    elif isinstance(value, float) and "whole number" in allowed and value.is_integer() and value >= 1:
+        hint = f"; write {int(value)}"
+    elif isinstance(value, str) and get_origin(field.annotation) is Literal:
+        hint = did_you_mean(value, get_args(field.annotation))
+    return f"{name}: {show(value)} is not allowed; must be {allowed}{hint}"
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return type(parse_value(text)) in (int, float)
+    except ValueError:
+        return False
+
+
+def _allowed(annotation: Any, metadata: Iterable[object] = ()) -> str:
+    """What a type allows, in words: those written beside it, else its literal values."""
+    for words in metadata:
+        if isinstance(words, str):
+            return words
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _allowed(parts[0], parts[1:])
+    if origin in (Union, UnionType):
+        return " or ".join(_allowed(part) for part in parts)
+    if annotation is NoneType:
+        return "null"
+    return one_of(parts)

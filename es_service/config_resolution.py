@@ -1,0 +1,173 @@
+"""What a config leaves open, and whether its sections fit together.
+
+Every rule here is a function of the config and the task alone, never of the machine: the shapes it fixes decide which
+floating-point results a run gets. Values travel as one flat mapping, "search.sigma" -> 0.02; a key that is missing from
+it was invalid and has been reported already, so rules that need it keep silent.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Mapping
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from es_service.config import RunConfig
+from es_service.config_yaml import show
+from es_service.protocol import TaskSpec
+
+LEFT_OPEN: dict[str, str | None] = {
+    "task.episode_steps": None,
+    "compute.rollout": "auto",
+    "compute.chunk_pairs": "auto",
+    "compute.rollout_block_pairs": "auto",
+    "compute.gradient_block_pairs": "auto",
+}
+"""Keys that this module resolves -> the value that asks for it, in a file the same as leaving the key out."""
+OPTIONS = "task.options."
+
+MOST_CHUNK_PAIRS = 64
+"""Enough to fill vector units and hide a message's cost; few enough that a lost chunk is cheap."""
+MOST_ROLLOUT_BLOCK_PAIRS = 32
+"""Above this the weights of the pairs that step together fall out of a core's cache."""
+MOST_GRADIENT_BLOCKS = 32
+"""A partial gradient is as large as the policy, so a generation sends few of them."""
+FEW_CHUNK_PAIRS = 8
+"""Below this a chunk is likely to cost more to send and start than to compute."""
+
+
+def default_chunk_pairs(pairs: int) -> int:
+    """The largest divisor of `pairs` not above 64, a multiple of 8 if there is one: 512 -> 64, 5000 -> 40, 7 -> 7."""
+    divisors = [size for size in range(1, MOST_CHUNK_PAIRS + 1) if pairs % size == 0]
+    return max([size for size in divisors if size % 8 == 0] or divisors)
+
+
+def default_rollout_block_pairs(chunk_pairs: int) -> int:
+    """The largest divisor of `chunk_pairs` not above 32: 64 -> 32, 40 -> 20."""
+    return max(size for size in range(1, MOST_ROLLOUT_BLOCK_PAIRS + 1) if chunk_pairs % size == 0)
+
+
+def default_gradient_block_pairs(pairs: int, chunk_pairs: int) -> int:
+    """As few whole chunks as make at most 32 blocks of `pairs`: (512, 64) -> 64, (5000, 40) -> 160."""
+    chunks = -(-pairs // chunk_pairs)
+    return chunk_pairs * max(1, -(-chunks // MOST_GRADIENT_BLOCKS))
+
+
+def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpec | None) -> dict[str, Any]:
+    """Fill in what was left open, as far as the values it follows from are there.
+
+    Args:
+        values: valid values of the config.
+        left_open: keys of LEFT_OPEN that the config leaves to us.
+        task: the task that `task.environment` names, or None where that is invalid.
+    """
+    values = dict(values)
+    if task is not None:
+        if "task.episode_steps" in left_open:
+            values["task.episode_steps"] = task.episode_steps
+        for option, allowed in task.options.items():
+            values.setdefault(f"{OPTIONS}{option}", allowed[0])
+    if "compute.rollout" in left_open:
+        values["compute.rollout"] = "xla"
+    pairs = values.get("search.pairs")
+    if pairs is not None and "compute.chunk_pairs" in left_open:
+        values["compute.chunk_pairs"] = default_chunk_pairs(pairs)
+    chunk_pairs = values.get("compute.chunk_pairs")
+    if chunk_pairs is not None and "compute.rollout_block_pairs" in left_open:
+        values["compute.rollout_block_pairs"] = default_rollout_block_pairs(chunk_pairs)
+    if pairs is not None and chunk_pairs is not None and "compute.gradient_block_pairs" in left_open:
+        values["compute.gradient_block_pairs"] = min(pairs, default_gradient_block_pairs(pairs, chunk_pairs))
+    if isinstance(values.get("search.init_from"), str):
+        # Absolute, so that the record still says which run it was when read from another directory.
+        values["search.init_from"] = os.path.abspath(os.path.expanduser(values["search.init_from"]))
+    return values
+
+
+def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
+    """Where the config asks of the task what it cannot do."""
+    problems = []
+    if values.get("task.fitness") == "final" and not task.final_fitness:
+        problems.append(
+            f"task.fitness: final is not allowed for {task.name}, whose last reward says little about the episode; "
+            "must be sum"
+        )
+    for key in values:
+        option = key.removeprefix(OPTIONS)
+        if not key.startswith(OPTIONS):
+            continue
+        if option not in task.options:
+            known = f"{task.name} has {one_of(task.options)}" if task.options else f"{task.name} has none"
+            problems.append(f"{key}: unknown option; {known}{did_you_mean(option, task.options)}")
+        elif values[key] not in task.options[option]:
+            allowed = task.options[option]
+            problems.append(
+                f"{key}: {show(values[key])} is not allowed; must be {one_of(allowed)}"
+                f"{did_you_mean(values[key], allowed)}"
+            )
+    return problems
+
+
+def shape_problems(values: Mapping[str, Any]) -> list[str]:
+    """Where pairs, chunks and blocks do not divide each other."""
+    problems = []
+    pairs, chunk = values.get("search.pairs"), values.get("compute.chunk_pairs")
+    rollout, gradient = values.get("compute.rollout_block_pairs"), values.get("compute.gradient_block_pairs")
+    if pairs is not None and chunk is not None and pairs % chunk:
+        below = pairs // chunk * chunk
+        fits = f"{below + chunk} (or {below})" if below else f"{chunk}"
+        problems.append(
+            f"search.pairs: {pairs} is not a multiple of compute.chunk_pairs ({chunk}); try pairs = {fits}, "
+            "or compute.chunk_pairs = auto"
+        )
+    if chunk is not None and rollout is not None and chunk % rollout:
+        divisors = [size for size in range(1, MOST_CHUNK_PAIRS + 1) if chunk % size == 0]
+        near = sorted(sorted(divisors, key=lambda size: abs(size - rollout))[:2])
+        problems.append(
+            f"compute.rollout_block_pairs: {rollout} does not divide compute.chunk_pairs ({chunk}); "
+            f"try {' or '.join(map(str, near))}, or auto"
+        )
+    if pairs is not None and gradient is not None and gradient > pairs:
+        problems.append(
+            f"compute.gradient_block_pairs: {gradient} is more than search.pairs ({pairs}); try {pairs}, or auto"
+        )
+    return problems
+
+
+def folder_problems(values: Mapping[str, Any]) -> list[str]:
+    """Where the config names a run that is not there."""
+    folder = values.get("search.init_from")
+    if folder is None or Path(folder).is_dir():
+        return []
+    what = "is a file" if Path(folder).exists() else "does not exist"
+    return [f"search.init_from: {folder} {what}; must be the folder of another run, or null"]
+
+
+def config_warnings(config: RunConfig) -> list[str]:
+    """What is legal and probably not meant; one line each, for the command line to print before the run starts."""
+    warnings = []
+    pairs, chunk = config.search.pairs, config.compute.chunk_pairs
+    if chunk < FEW_CHUNK_PAIRS and pairs > MOST_CHUNK_PAIRS:
+        near = round(pairs / MOST_CHUNK_PAIRS) * MOST_CHUNK_PAIRS
+        auto = default_chunk_pairs(pairs)
+        hint = f"auto would be {auto}" if auto >= FEW_CHUNK_PAIRS else f"search.pairs = {near} has chunks of 64"
+        warnings.append(f"compute.chunk_pairs: {chunk} makes {pairs // chunk} small chunks a generation, slow; {hint}")
+    budget = config.budget
+    if budget.generations is None and budget.env_steps is None and budget.wall_clock_s is None:
+        warnings.append(
+            f"budget: only target_fitness ({budget.target_fitness}) ends this run, which it may never reach; "
+            "consider budget.generations as well"
+        )
+    return warnings
+
+
+def did_you_mean(name: object, candidates: Collection[str]) -> str:
+    """A hint to append to a message: "; did you mean X?", or nothing where no candidate is near."""
+    near = get_close_matches(str(name), candidates, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def one_of(names: Collection[str]) -> str:
+    """Names in a sentence: "a", "a or b", "a, b or c"."""
+    *first, last = map(str, names)
+    return f"{', '.join(first)} or {last}" if first else last

@@ -1,0 +1,81 @@
+"""The digest of a run: SHA-256 over what must repeat bit for bit, and nothing else.
+
+Hashed are values, each with its name, type and shape: not payload bytes as stored, row order on disk, seconds, rates,
+workers, hosts or paths. It is taken from what the tables contain, without looking at the SHA-256 stored beside it
+(`store_reader.verify_run` does that): a flipped bit in a state payload or a deterministic history value gives another
+digest, or a StoreError where the value can no longer be read as one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from es_service.errors import StoreError
+from es_service.store_codec import decode_part, row_bytes
+from es_service.store_reader import read_platforms, reading, state_payload
+from es_service.store_schema import RunMeta, history_select
+
+Connection = sqlite3.Connection
+
+
+def digest(folder: Path) -> str:
+    """Of the run in `folder` as it is now: equal for two runs exactly if all of `digest_parts` are equal."""
+    lines = (f"{name}\0{sha256}\n" for name, sha256 in sorted(digest_parts(folder).items()))
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def digest_parts(folder: Path) -> dict[str, str]:
+    """SHA-256 by name: `state/<part>` of each part's newest value, then one for each of `TABLES`.
+
+    Raises StoreError if the run cannot be read.
+    """
+    with reading(folder) as (connection, meta):
+        try:
+            tables = {name: table(connection, meta) for name, table in TABLES.items()}
+            return {**_state(connection), **tables}
+        except ValueError as error:
+            raise StoreError(f"{folder} holds what cannot be read: {error}; resume it to repair what can be") from error
+
+
+def is_mixed(folder: Path) -> bool:
+    """Whether the stored generations were computed on more than one platform (versions, CPU or GPU kind)."""
+    with reading(folder) as (connection, _):
+        newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
+    in_force = [platform for at, platform in read_platforms(folder) if newest is not None and at <= newest]
+    return len({json.dumps(platform, sort_keys=True) for platform in in_force}) > 1
+
+
+def _state(connection: Connection) -> dict[str, str]:
+    newest = connection.execute("SELECT part, max(generation) FROM state GROUP BY part ORDER BY part").fetchall()
+    return {f"state/{part}": arrays_sha256(decode_part(state_payload(connection, part, at))) for part, at in newest}
+
+
+def arrays_sha256(arrays: dict[str, NDArray[Any]]) -> str:
+    """Of arrays by name: name, type, shape and little-endian values of each, in the order of the names."""
+    total = hashlib.sha256()
+    for name in sorted(arrays):
+        little = arrays[name].astype(arrays[name].dtype.newbyteorder("<"), copy=False)
+        total.update(json.dumps([name, little.dtype.str, list(little.shape)]).encode() + b"\n")
+        total.update(little.tobytes(order="C"))
+    return total.hexdigest()
+
+
+def _history(connection: Connection, meta: RunMeta) -> str:
+    columns = sorted((column for column in meta.columns if column.deterministic), key=lambda column: column.name)
+    total = hashlib.sha256(json.dumps([[column.name, column.type] for column in columns]).encode() + b"\n")
+    for values in connection.execute(history_select(columns) + " ORDER BY history.generation"):
+        total.update(row_bytes(values[:-2]))
+    return total.hexdigest()
+
+
+TABLES: dict[str, Callable[[Connection, RunMeta], str]] = {
+    "history": _history,
+}
+"""What is hashed beside the state, by name. A later table is one more line."""

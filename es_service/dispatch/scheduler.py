@@ -1,0 +1,543 @@
+"""Who runs which task, when to give up on a worker, when to give up altogether: a pure state machine.
+
+Dispatch station, between the driver's tasks and the engines that own the workers. `step(state, event, now)` returns the
+next state and the commands the engine must carry out, in order. No I/O, no clock, no randomness, no threads: the same
+arguments give the same answer, and a published state never changes, so a simulation can try every interleaving.
+
+An engine starts with `initial_state(policy)` and a `Tick`, feeds every message of its workers as an event, and sends a
+`Tick` whenever `next_deadline(state)` has come. It must feed the messages that already wait *before* a late `Tick`:
+otherwise a driver that was busy elsewhere would kill workers whose answers it had not read.
+
+Choices. A result is a pure function of its key, so any result of a known worker for a key that still waits is accepted,
+even of a superseded attempt; a stopped worker is forgotten at once, so what it still says is dropped and counted. Only
+the task a worker was running is charged with its loss; one prefetched behind it goes back with its attempt unused. A
+task that raised waits for another worker rather than go back to the same one, as long as another is up: a broken worker
+that raises at once must not use up the attempts of good tasks. A worker lost while draining is nobody's fault.
+
+Cost: each step makes shallow copies of the containers (C speed, a few microseconds for a thousand entries) and changes
+only the records touched; the records are frozen and shared between states.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import deque
+from collections.abc import Hashable
+from dataclasses import dataclass, field, replace
+
+RECENT_DURATIONS = 31
+"""Durations per kind of task that the running median is taken over."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One piece of work. Two tasks with the same key must have the same result."""
+
+    key: Hashable
+    kind: str
+    """Tasks of one kind compile together and take about equally long."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """How faults are handled: config data. Raises ValueError for a count below 1."""
+
+    workers: int
+    """Workers wanted at the start; `SetWorkers` changes it."""
+    in_flight: int = 2
+    """Tasks assigned to one worker at a time: the one it runs and those prefetched behind it."""
+    max_attempts: int = 4
+    """A task that raised, or lost the worker running it, this often is poison. Keep above `max_failures_in_a_row`, so
+    that a single broken worker is replaced before its task is blamed."""
+    start_deadline_s: float = 120.0
+    first_deadline_s: float = 600.0
+    """For the first task of a kind on a worker, which compiles, and for any task while no duration is known."""
+    min_deadline_s: float = 30.0
+    deadline_factor: float = 5.0
+    """Later tasks may take max(min_deadline_s, deadline_factor x median of recent durations of their kind)."""
+    max_failures_in_a_row: int = 3
+    """A worker that raises this often in a row is killed and replaced."""
+    restart_backoff_s: float = 1.0
+    max_backoff_s: float = 60.0
+    """Wait before replacing the second, third ... loss without a success between: restart_backoff_s, doubling up to
+    max_backoff_s. The first replacement is immediate; losses during a wait share it (a node that died, say)."""
+    max_start_failures: int = 3
+    """This many workers in a row lost before they came up, and none up: the environment is broken."""
+    no_worker_timeout_s: float = 300.0
+    """Longest time with tasks waiting and no worker up; longer than `start_deadline_s` to be of any use."""
+
+    def __post_init__(self) -> None:
+        for name in ("workers", "in_flight", "max_attempts", "max_failures_in_a_row", "max_start_failures"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} ({getattr(self, name)}) must be at least 1")
+
+
+# Events: what an engine reports.
+
+
+@dataclass(frozen=True)
+class Submit:
+    """New tasks, to be assigned in this order. Raises ValueError for a key that still waits."""
+
+    tasks: tuple[Task, ...]
+
+
+@dataclass(frozen=True)
+class WorkerUp:
+    """The worker can take tasks."""
+
+    worker: int
+
+
+@dataclass(frozen=True)
+class WorkerLost:
+    """The worker is gone, whether it ever came up or not."""
+
+    worker: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Result:
+    """The worker answered; the engine holds the result until this step says `Deliver` or says nothing."""
+
+    worker: int
+    key: Hashable
+    attempt: int
+
+
+@dataclass(frozen=True)
+class Failure:
+    """The task raised; the worker lives."""
+
+    worker: int
+    key: Hashable
+    attempt: int
+    message: str
+
+
+@dataclass(frozen=True)
+class Tick:
+    """Time has passed."""
+
+
+@dataclass(frozen=True)
+class Drain:
+    """The worker gets no new task, finishes those it has, and is stopped; it is replaced now, without blame."""
+
+    worker: int
+
+
+@dataclass(frozen=True)
+class SetWorkers:
+    """Change the wanted number of workers; shrinking drains the newest. Raises ValueError below 1."""
+
+    workers: int
+
+
+Event = Submit | WorkerUp | WorkerLost | Result | Failure | Tick | Drain | SetWorkers
+
+
+# Commands: what an engine must do, in the order given.
+
+
+@dataclass(frozen=True)
+class StartWorker:
+    """Start a worker under this id; ids increase and are never used again."""
+
+    worker: int
+
+
+@dataclass(frozen=True)
+class StopWorker:
+    """Kill the worker. Reporting it lost afterwards is allowed and changes nothing."""
+
+    worker: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Assign:
+    """Send the task to the worker, behind those it has. `attempt` is 1 + the faults charged to the task so far."""
+
+    worker: int
+    key: Hashable
+    attempt: int
+
+
+@dataclass(frozen=True)
+class Deliver:
+    """Accept the result just reported; once per submitted task."""
+
+    key: Hashable
+
+
+@dataclass(frozen=True)
+class Fail:
+    """The run stops with this error; only `StopWorker` follows, one for every worker left."""
+
+    message: str
+
+
+Command = StartWorker | StopWorker | Assign | Deliver | Fail
+
+
+# State.
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    """A task that has not been delivered."""
+
+    task: Task
+    faults: int = 0
+    holder: int | None = None
+    """The worker it is assigned to; None while it is in the queue."""
+    last_holder: int | None = None
+    """The worker it came back from; None before that."""
+
+
+@dataclass(frozen=True)
+class _Slot:
+    task: Task
+    attempt: int
+
+
+@dataclass(frozen=True)
+class _Worker:
+    """A worker that came up. `slots` is what it has not answered yet, in the order sent; it runs the first."""
+
+    slots: tuple[_Slot, ...] = ()
+    started_s: float = 0.0
+    """When it began the first slot."""
+    deadline_s: float = math.inf
+    """When it must have answered the first slot."""
+    warm: frozenset[str] = frozenset()
+    """Kinds it has finished a task of, hence compiled."""
+    failures_in_a_row: int = 0
+
+
+@dataclass(frozen=True)
+class SchedulerState:
+    """Everything the scheduler remembers. Treat the containers as read-only; times are in the seconds of `now`."""
+
+    policy: Policy
+    wanted: int
+    starting: dict[int, float] = field(default_factory=dict)
+    """Deadline of each worker that has not come up yet."""
+    up: dict[int, _Worker] = field(default_factory=dict)
+    draining: dict[int, _Worker] = field(default_factory=dict)
+    tasks: dict[Hashable, _Waiting] = field(default_factory=dict)
+    queue: deque[Hashable] = field(default_factory=deque)
+    """Keys to assign, next first."""
+    durations_s: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    """Recent durations per kind, without those that include compiling."""
+    next_worker: int = 0
+    start_at_s: float = -math.inf
+    """No worker is started before this."""
+    losses_in_a_row: int = 0
+    start_failures: int = 0
+    down_since_s: float | None = None
+    """Since when tasks wait and no worker is up."""
+    last_loss: str = "none was ever lost"
+    failed: str | None = None
+    """The message of `Fail`; the state is then terminal."""
+    retries: int = 0
+    """Assignments beyond a task's first."""
+    lost_workers: int = 0
+    """Workers lost, or stopped for a fault."""
+    duplicates: int = 0
+    """Results and failures that were dropped: stale, repeated, or of an unknown worker."""
+
+
+def initial_state(policy: Policy) -> SchedulerState:
+    """No task and no worker yet; the first step, whatever its event, starts the workers."""
+    return SchedulerState(policy, policy.workers)
+
+
+def pending(state: SchedulerState) -> int:
+    """Number of tasks submitted and not delivered."""
+    return len(state.tasks)
+
+
+def next_deadline(state: SchedulerState) -> float:
+    """When the next `Tick` will do something, in the seconds of `now`; infinity if only a message can."""
+    if state.failed is not None:
+        return math.inf
+    times = [worker.deadline_s for group in (state.up, state.draining) for worker in group.values()]
+    times.extend(state.starting.values())
+    if len(state.starting) + len(state.up) < state.wanted:
+        times.append(state.start_at_s)
+    if state.down_since_s is not None:
+        times.append(state.down_since_s + state.policy.no_worker_timeout_s)
+    return min(times, default=math.inf)
+
+
+def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerState, list[Command]]:
+    """The next state and what the engine must do about `event`.
+
+    Args:
+        now: seconds of a clock that never goes back; any origin.
+    Raises:
+        ValueError: for a `Submit` of a key that still waits, or `SetWorkers` below 1.
+    """
+    if state.failed is not None or (isinstance(event, Tick) and now < next_deadline(state)):
+        return state, []
+    # The containers of `s` belong to this step alone until it returns; only they are changed in place.
+    s = replace(
+        state,
+        starting=state.starting.copy(),
+        up=state.up.copy(),
+        draining=state.draining.copy(),
+        tasks=state.tasks.copy(),
+        queue=state.queue.copy(),
+        durations_s=state.durations_s.copy(),
+    )
+    out: list[Command] = []
+    match event:
+        case Submit(tasks):
+            _submit(s, tasks)
+        case WorkerUp(worker):
+            if s.starting.pop(worker, None) is not None:
+                s.up[worker] = _Worker()
+                s = replace(s, start_failures=0)
+        case WorkerLost(worker, reason):
+            s = _lose(s, out, worker, reason, now, fault=worker not in s.draining)
+        case Result(worker, key, attempt):
+            s = _result(s, out, worker, key, attempt, now)
+        case Failure():
+            s = _failure(s, out, event, now)
+        case Tick():
+            s = _expire(s, out, now)
+        case Drain(worker):
+            _drain(s, out, worker)
+        case SetWorkers(wanted):
+            if wanted < 1:
+                raise ValueError(f"SetWorkers({wanted}): at least one worker is needed")
+            s = replace(s, wanted=wanted)
+            for worker in sorted([*s.starting, *s.up])[wanted:]:
+                _drain(s, out, worker)
+    if s.failed is None:
+        s = _start_workers(s, out, now)
+        s = _assign(s, out, now)
+        down = bool(s.tasks) and not s.up and not s.draining
+        if down != (s.down_since_s is not None):
+            s = replace(s, down_since_s=now if down else None)
+    return s, out
+
+
+def _submit(s: SchedulerState, tasks: tuple[Task, ...]) -> None:
+    for task in tasks:
+        if task.key in s.tasks:
+            raise ValueError(f"task {task.key} was submitted twice")
+        s.tasks[task.key] = _Waiting(task)
+        s.queue.append(task.key)
+
+
+def _result(
+    s: SchedulerState, out: list[Command], worker: int, key: Hashable, attempt: int, now: float
+) -> SchedulerState:
+    record = s.up.get(worker) or s.draining.get(worker)
+    if record is None:
+        return replace(s, duplicates=s.duplicates + 1)
+    if key in s.tasks:
+        if s.tasks.pop(key).holder is None:
+            s.queue.remove(key)
+        out.append(Deliver(key))
+        s = replace(s, losses_in_a_row=0)
+    else:
+        s = replace(s, duplicates=s.duplicates + 1)
+    index = _find_slot(record, key, attempt)
+    if index is not None:
+        kind = record.slots[index].task.kind
+        # How long an answer out of order took is not known, nor whether its kind was compiled before.
+        if index == 0 and kind in record.warm:
+            s.durations_s[kind] = (*s.durations_s.get(kind, ()), now - record.started_s)[-RECENT_DURATIONS:]
+        warm = record.warm | {kind} if index == 0 else record.warm
+        record = replace(record, warm=warm, failures_in_a_row=0)
+        _close_slot(s, out, worker, record, index, now)
+    return s
+
+
+def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) -> SchedulerState:
+    worker, key = event.worker, event.key
+    record = s.up.get(worker) or s.draining.get(worker)
+    index = _find_slot(record, key, event.attempt) if record is not None else None
+    if record is None or index is None:
+        return replace(s, duplicates=s.duplicates + 1)
+    record = replace(record, failures_in_a_row=record.failures_in_a_row + 1)
+    _close_slot(s, out, worker, record, index, now)
+    if worker in s.up and record.failures_in_a_row >= s.policy.max_failures_in_a_row:
+        reason = f"{record.failures_in_a_row} tasks in a row raised; the last: {event.message}"
+        out.append(StopWorker(worker, reason))
+        # What it began a moment ago is not to blame.
+        s = _lose(s, out, worker, reason, now, charge=False)
+    waiting = s.tasks.get(key)
+    if waiting is None or waiting.holder != worker:
+        return replace(s, duplicates=s.duplicates + 1)
+    _requeue(s, worker, key)
+    return _charge(s, out, key, f"it raised on worker {worker}: {event.message}")
+
+
+def _find_slot(record: _Worker, key: Hashable, attempt: int) -> int | None:
+    for index, slot in enumerate(record.slots):
+        if slot.attempt == attempt and slot.task.key == key:
+            return index
+    return None
+
+
+def _close_slot(s: SchedulerState, out: list[Command], worker: int, record: _Worker, index: int, now: float) -> None:
+    """Store the worker without that slot, start the clock of the next one; a drained worker is stopped."""
+    record = replace(record, slots=record.slots[:index] + record.slots[index + 1 :])
+    if index == 0:
+        record = _begin_first_slot(s, record, now)
+    if worker in s.up:
+        s.up[worker] = record
+    elif record.slots:
+        s.draining[worker] = record
+    else:
+        del s.draining[worker]
+        out.append(StopWorker(worker, "drained"))
+
+
+def _begin_first_slot(s: SchedulerState, record: _Worker, now: float) -> _Worker:
+    if not record.slots:
+        return replace(record, deadline_s=math.inf)
+    kind = record.slots[0].task.kind
+    durations_s = s.durations_s.get(kind)
+    if kind in record.warm and durations_s:
+        limit_s = max(s.policy.min_deadline_s, s.policy.deadline_factor * statistics.median(durations_s))
+    else:
+        limit_s = s.policy.first_deadline_s
+    return replace(record, started_s=now, deadline_s=now + limit_s)
+
+
+def _lose(
+    s: SchedulerState,
+    out: list[Command],
+    worker: int,
+    reason: str,
+    now: float,
+    *,
+    fault: bool = True,
+    charge: bool = True,
+) -> SchedulerState:
+    """Forget a worker, put its tasks back at the front, plan its replacement; unknown workers change nothing."""
+    starting = s.starting.pop(worker, None) is not None
+    record = s.up.pop(worker, None) or s.draining.pop(worker, None)
+    if not starting and record is None:
+        return s
+    slots = record.slots if record is not None else ()
+    running = slots[0].task.key if slots and _holds(s, worker, slots[0].task.key) else None
+    for slot in reversed(slots):
+        if _holds(s, worker, slot.task.key):
+            _requeue(s, worker, slot.task.key)
+    if not fault:
+        return s
+    s = replace(
+        s,
+        lost_workers=s.lost_workers + 1,
+        start_failures=s.start_failures + starting,
+        last_loss=f"worker {worker}: {reason}",
+    )
+    if now >= s.start_at_s:  # else a replacement already waits, and this one with it
+        doublings = min(s.losses_in_a_row - 1, 30)
+        wait_s = min(s.policy.max_backoff_s, s.policy.restart_backoff_s * 2**doublings) if doublings >= 0 else 0.0
+        s = replace(s, losses_in_a_row=s.losses_in_a_row + 1, start_at_s=now + wait_s)
+    if starting and s.start_failures >= s.policy.max_start_failures and not s.up and not s.draining:
+        return _fail(s, out, f"{s.start_failures} workers in a row did not come up; the last, {s.last_loss}")
+    if running is not None and charge:
+        return _charge(s, out, running, f"it took worker {worker} with it: {reason}")
+    return s
+
+
+def _holds(s: SchedulerState, worker: int, key: Hashable) -> bool:
+    waiting = s.tasks.get(key)
+    return waiting is not None and waiting.holder == worker
+
+
+def _requeue(s: SchedulerState, worker: int, key: Hashable) -> None:
+    s.tasks[key] = replace(s.tasks[key], holder=None, last_holder=worker)
+    s.queue.appendleft(key)
+
+
+def _charge(s: SchedulerState, out: list[Command], key: Hashable, message: str) -> SchedulerState:
+    """One fault more for this task; too many fail the run."""
+    waiting = s.tasks[key] = replace(s.tasks[key], faults=s.tasks[key].faults + 1)
+    if waiting.faults < s.policy.max_attempts:
+        return s
+    return _fail(s, out, f"task {key} failed in {waiting.faults} attempts; the last time {message}")
+
+
+def _fail(s: SchedulerState, out: list[Command], message: str) -> SchedulerState:
+    out.append(Fail(message))
+    out.extend(StopWorker(worker, "the run failed") for worker in sorted([*s.starting, *s.up, *s.draining]))
+    return replace(s, failed=message, starting={}, up={}, draining={}, queue=deque())
+
+
+def _expire(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
+    """Stop every worker whose deadline has passed; fail if no worker was up for too long."""
+    late = {w: f"did not come up in {s.policy.start_deadline_s:g} s" for w, at in s.starting.items() if now >= at}
+    for worker, record in (*s.up.items(), *s.draining.items()):
+        if now >= record.deadline_s:
+            limit_s = record.deadline_s - record.started_s
+            late[worker] = f"no answer to task {record.slots[0].task.key} in {limit_s:.3g} s"
+    for worker, reason in late.items():
+        if s.failed is None:
+            out.append(StopWorker(worker, reason))
+            s = _lose(s, out, worker, reason, now)
+    if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + s.policy.no_worker_timeout_s:
+        for_s = s.policy.no_worker_timeout_s
+        return _fail(
+            s, out, f"{len(s.tasks)} tasks wait and no worker was up for {for_s:g} s; last loss: {s.last_loss}"
+        )
+    return s
+
+
+def _drain(s: SchedulerState, out: list[Command], worker: int) -> None:
+    record = s.up.pop(worker, None)
+    if record is not None and record.slots:
+        s.draining[worker] = record
+    elif record is not None or s.starting.pop(worker, None) is not None:
+        out.append(StopWorker(worker, "drained"))
+
+
+def _start_workers(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
+    missing = s.wanted - len(s.starting) - len(s.up)
+    if missing <= 0 or now < s.start_at_s:
+        return s
+    for worker in range(s.next_worker, s.next_worker + missing):
+        s.starting[worker] = now + s.policy.start_deadline_s
+        out.append(StartWorker(worker))
+    return replace(s, next_worker=s.next_worker + missing)
+
+
+def _assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
+    """Give queued tasks to workers with room, idle ones first."""
+    retries = s.retries
+    for load in range(s.policy.in_flight):
+        if not s.queue:
+            break
+        for worker in [worker for worker, record in s.up.items() if len(record.slots) == load]:
+            index = _next_for(s, worker)
+            if index is None:
+                continue
+            key = s.queue[index]
+            del s.queue[index]
+            waiting, record = s.tasks[key], s.up[worker]
+            s.tasks[key] = replace(waiting, holder=worker)
+            retries += waiting.last_holder is not None
+            slot = _Slot(waiting.task, waiting.faults + 1)
+            record = replace(record, slots=(*record.slots, slot))
+            s.up[worker] = _begin_first_slot(s, record, now) if load == 0 else record
+            out.append(Assign(worker, key, slot.attempt))
+    return s if retries == s.retries else replace(s, retries=retries)
+
+
+def _next_for(s: SchedulerState, worker: int) -> int | None:
+    """Index of the first queued task that this worker may have."""
+    for index, key in enumerate(s.queue):
+        if s.tasks[key].last_holder != worker or len(s.up) == 1:
+            return index
+    return None

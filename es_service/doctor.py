@@ -1,0 +1,115 @@
+"""`es-service doctor`: can this machine run, and what will its results depend on."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from es_service.dispatch.inline_engine import InlineEngine
+from es_service.dispatch.scheduler import Policy
+from es_service.errors import ServiceError
+from es_service.noise import TEST_VECTORS, normal_integers, stream_keys
+from es_service.platform_info import platform_info
+from es_service.protocol import Centre, EpisodesResult, TrainingChunk, WorkerSpec
+from es_service.run_folder import is_network_filesystem
+from workers.environments import TASKS
+from workers.policy import initial_parameters, policy_shape
+
+Finding = tuple[str, str]
+"""("ok" | "note" | "FAIL", text)."""
+MIN_FREE_BYTES = 1 << 30
+MIN_MEMORY_BYTES = 2 << 30
+
+
+def examine(console: Console) -> bool:
+    """Print every finding; whether nothing failed."""
+    healthy = True
+    for check in (_software, _machine, _disk, _noise, _rollout):
+        for level, text in _guarded(check):
+            healthy &= level != "FAIL"
+            colour = {"ok": "green", "note": "yellow", "FAIL": "red"}[level]
+            console.print(f"[{colour}]{level:>4}[/]  ", end="")
+            console.print(text, highlight=False, markup=False, soft_wrap=True)
+    return healthy
+
+
+def _guarded(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    try:
+        yield from check()
+    except (OSError, ServiceError) as error:
+        yield "FAIL", f"{check.__name__.strip('_')}: {error}"
+
+
+def _software() -> Iterator[Finding]:
+    versions = platform_info()
+    cpu = versions.pop("cpu")
+    yield "ok", ", ".join(f"{name} {version}" for name, version in versions.items())
+    yield "ok", f"processor {cpu}: results repeat bit for bit on this kind and these versions"
+    yield "ok", f"SQLite {sqlite3.sqlite_version}, {sys.platform}"
+
+
+def _machine() -> Iterator[Finding]:
+    usable, present = len(os.sched_getaffinity(0)), os.cpu_count() or 1
+    yield "ok", f"{usable} of {present} cores usable: that many workers by default"
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
+    yield ("ok" if memory >= MIN_MEMORY_BYTES else "note"), f"{memory / 2**30:.1f} GiB of memory free"
+
+
+def _disk() -> Iterator[Finding]:
+    here = Path.cwd()
+    free = shutil.disk_usage(here).free
+    yield ("ok" if free >= MIN_FREE_BYTES else "note"), f"{free / 2**30:.1f} GiB free under {here}"
+    if not os.access(here, os.W_OK):
+        yield "FAIL", f"{here} is not writable; run elsewhere or name a folder with --out"
+    if is_network_filesystem(here):
+        yield "note", f"{here} is on a network file system: runs work there, with a slower journal"
+
+
+def _noise() -> Iterator[Finding]:
+    for (seed, domain, generation, ids), expected in TEST_VECTORS:
+        found = normal_integers(np, stream_keys(seed, domain, generation, *ids), np.arange(len(expected), dtype=np.uint32))
+        if found.tolist() != list(expected):
+            yield "FAIL", f"noise of stream {(seed, domain, generation, *ids)} is {found.tolist()}, not {expected}"
+            return
+    yield "ok", f"noise equals its {len(TEST_VECTORS)} test vectors"
+
+
+def _rollout() -> Iterator[Finding]:
+    """Start one worker as a run would, and let it work for a moment."""
+    spec = WorkerSpec(
+        seed=0,
+        environment="point_maze",
+        environment_options={},
+        episode_steps=200,
+        fitness="sum",
+        episodes_per_member=1,
+        hidden=(64, 64),
+        observation_clip=None,
+        action_noise=0.01,
+        common_random_numbers=True,
+        chunk_pairs=64,
+        rollout_block_pairs=32,
+        gradient_block_pairs=64,
+    )
+    task = TASKS["point_maze"]
+    shape = policy_shape(task.observation_size, spec.hidden, task.action_size)
+    size = task.observation_size
+    centre = Centre(
+        0, initial_parameters(shape, "unit_columns", 0), 0.02, np.zeros(size, np.float32), np.ones(size, np.float32)
+    )
+    started = time.perf_counter()
+    with InlineEngine(spec, Policy(workers=1)) as engine:
+        engine.evaluate(centre, [TrainingChunk(0, 0)])
+        ready = time.perf_counter()
+        results = engine.evaluate(centre, [TrainingChunk(1, chunk) for chunk in range(8)])
+        seconds = time.perf_counter() - ready
+    steps = sum(int(result.steps.sum()) for result in results if isinstance(result, EpisodesResult))
+    yield "ok", f"a worker starts and compiles in {ready - started:.1f} s, then makes {steps / seconds:,.0f} steps/s"

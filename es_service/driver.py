@@ -1,0 +1,252 @@
+"""The loop everybody reads: plan, roll out, weigh, step, evaluate, keep.
+
+It knows no Ray, no JAX and no files; its collaborators are arguments. Whatever happens, the store holds the last
+finished generation, and the next one depends only on (config, seed, state).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from es_service.algorithms.base import Algorithm
+from es_service.config import BudgetConfig, RunConfig
+from es_service.generation import estimate_gradient, evaluate_centre, evaluate_population, invalidate
+from es_service.history import evaluation_columns, population_columns
+from es_service.protocol import Centre, DispatchCounts, EpisodesResult, Evaluator, FloatArray, Moments
+from es_service.run_state import Arrays, Best, RunState, state_from_parts, state_parts
+from es_service.statistics import merge_moments, normalisation
+
+HistoryRow = dict[str, int | float | None]
+
+
+class Store(Protocol):
+    """What the loop needs of a run store."""
+
+    generation: int | None
+    """Newest committed generation; None before the first."""
+
+    def load(self) -> Mapping[str, Arrays]: ...
+    def last_history(self) -> Mapping[str, Any] | None: ...
+    def commit(self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow) -> None: ...
+
+
+@dataclass(frozen=True)
+class Search:
+    """What a run is about, apart from where it runs: settings, method, starting point, names for the history."""
+
+    config: RunConfig
+    algorithm: Algorithm
+    initial: Callable[[], tuple[FloatArray, Moments]]
+    """First centre and the observation statistics it comes with (none counted unless it is another run's)."""
+    descriptor_names: tuple[str, ...]
+
+
+def run(
+    search: Search,
+    evaluator: Evaluator,
+    store: Store,
+    report: Callable[[HistoryRow], None],
+) -> tuple[RunState, str]:
+    """Run generations until the budget is spent, from the state in `store` or from the start.
+
+    Args:
+        report: called with each history row after it is safe in the store.
+
+    Returns:
+        The last state and the reason for ending, in words.
+
+    Raises:
+        EvaluationError, StoreError: nothing committed is lost. Interrupted: a signal asked to stop.
+    """
+    budget = search.config.budget
+    clock = _Clock(0.0)
+    if store.generation is None:
+        state = _keep(store, report, clock, None, *_first_generation(search, evaluator, clock))
+    else:
+        last = store.last_history() or {}
+        state = state_from_parts(store.load(), store.generation, float(last.get("wall_clock_s") or 0.0))
+        clock = _Clock(state.wall_clock_s)
+    while (reason := spent(budget, state)) is None:
+        state = _keep(store, report, clock, state, *_next_generation(search, evaluator, clock, state))
+    return state, reason
+
+
+def spent(budget: BudgetConfig, state: RunState) -> str | None:
+    """Why the run is over, or None if it is not. Budgets are checked between generations, so steps may overshoot."""
+    if budget.generations is not None and state.generation >= budget.generations:
+        return f"{state.generation} generations are done"
+    if budget.env_steps is not None and state.env_steps >= budget.env_steps:
+        return f"{state.env_steps:,} environment steps are done"
+    if budget.wall_clock_s is not None and state.wall_clock_s >= budget.wall_clock_s:
+        return f"{state.wall_clock_s:.0f} s are spent"
+    if budget.target_fitness is not None and state.best.fitness >= budget.target_fitness:
+        return f"the target fitness {budget.target_fitness:g} is reached"
+    return None
+
+
+def _first_generation(search: Search, evaluator: Evaluator, clock: _Clock) -> tuple[RunState, HistoryRow]:
+    """Generation 0: the initial centre, evaluated."""
+    centre_D, observations = search.initial()
+    centre = _centre(search, 0, centre_D, observations)
+    evaluation = evaluate_centre(evaluator, centre, search.config.search.evaluation_episodes)
+    clock.lap("seconds_evaluation")
+    worst = Best(0, -math.inf, centre_D, centre.observation_mean_O, centre.observation_std_O)
+    state = RunState(
+        generation=0,
+        search=search.algorithm.start(centre_D),
+        observations=observations,
+        best=_better(worst, centre, evaluation),
+        env_steps=_steps(evaluation),
+        episodes=evaluation.fitness.size,
+        wall_clock_s=clock.total(),
+    )
+    row: HistoryRow = {
+        "update_norm": None,
+        "parameter_norm": _norm(centre_D),
+        "invalid_members": 0,
+        **population_columns(None),
+        **evaluation_columns(evaluation, search.descriptor_names),
+        **_faults(evaluator, DispatchCounts()),
+    }
+    return state, row
+
+
+def _next_generation(
+    search: Search, evaluator: Evaluator, clock: _Clock, state: RunState
+) -> tuple[RunState, HistoryRow]:
+    """One generation: a pure function of (search, state) but for its timings."""
+    settings, sizes, algorithm = search.config.search, search.config.compute, search.algorithm
+    generation = state.generation + 1
+    counts = evaluator.counts
+
+    plan = algorithm.plan(state.search)
+    centre = _centre(search, generation, plan.centre_D, state.observations)
+    clock.lap("seconds_driver")
+    population, observed = evaluate_population(
+        evaluator, centre, pairs=settings.pairs, chunk_pairs=sizes.chunk_pairs
+    )
+    clock.lap("seconds_rollout")
+    population, invalid = invalidate(population, settings.max_invalid_fraction, generation)
+    weights_P = algorithm.weights(state.search, population)
+    clock.lap("seconds_driver")
+    gradient_D = estimate_gradient(evaluator, centre, weights_P, sizes.gradient_block_pairs)
+    clock.lap("seconds_gradient")
+    moved = algorithm.step(state.search, plan, gradient_D)
+    new_centre_D = moved.members[plan.member].centre_D
+    clock.lap("seconds_driver")
+    new_centre = replace(centre, parameters_D=new_centre_D)  # evaluated with the statistics of the generation's start
+    evaluation = evaluate_centre(evaluator, new_centre, settings.evaluation_episodes)
+    clock.lap("seconds_evaluation")
+
+    state = RunState(
+        generation=generation,
+        search=moved,
+        observations=merge_moments(state.observations, observed),
+        best=_better(state.best, new_centre, evaluation),
+        env_steps=state.env_steps + _steps(population) + _steps(evaluation),
+        episodes=state.episodes + population.fitness.size * search.config.task.episodes_per_member
+        + evaluation.fitness.size,
+        wall_clock_s=clock.total(),
+    )
+    row: HistoryRow = {
+        "update_norm": _norm(new_centre_D - plan.centre_D),
+        "parameter_norm": _norm(new_centre_D),
+        "invalid_members": invalid,
+        **population_columns(population),
+        **evaluation_columns(evaluation, search.descriptor_names),
+        **_faults(evaluator, counts),
+    }
+    return state, row
+
+
+def _keep(
+    store: Store,
+    report: Callable[[HistoryRow], None],
+    clock: _Clock,
+    before: RunState | None,
+    state: RunState,
+    row: HistoryRow,
+) -> RunState:
+    """Commit a finished generation, then show it."""
+    clock.lap("seconds_driver")
+    seconds, laps = clock.finish_generation()
+    steps = state.env_steps - (before.env_steps if before else 0)
+    row = {
+        "generation": state.generation,
+        "env_steps": state.env_steps,
+        "episodes": state.episodes,
+        "best_fitness": state.best.fitness,
+        **row,
+        "wall_clock_s": state.wall_clock_s,
+        "steps_per_second": steps / seconds,
+        **laps,
+    }
+    store.commit(state.generation, state_parts(state, before), row)
+    clock.lap("seconds_store")
+    report(row)
+    return state
+
+
+def _centre(search: Search, generation: int, centre_D: FloatArray, observations: Moments) -> Centre:
+    """The point to send out, with the statistics in force."""
+    mean_O, std_O = normalisation(observations, search.config.policy.observation_normalization)
+    return Centre(generation, centre_D, search.config.search.sigma, mean_O, std_O)
+
+
+def _better(best: Best, centre: Centre, evaluation: EpisodesResult) -> Best:
+    """The better of the best so far and a centre just evaluated; an invalid centre (not finite) is no improvement."""
+    fitness = float(np.mean(evaluation.fitness, dtype=np.float64))
+    if not (math.isfinite(fitness) and fitness > best.fitness):
+        return best
+    mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
+    return Best(centre.generation, fitness, centre.parameters_D, mean_O, std_O)
+
+
+def _steps(result: EpisodesResult) -> int:
+    return int(result.steps.sum(dtype=np.int64))
+
+
+def _norm(x_D: FloatArray) -> float:
+    return float(np.sqrt(np.sum(np.square(x_D, dtype=np.float64))))
+
+
+def _faults(evaluator: Evaluator, before: DispatchCounts) -> HistoryRow:
+    now = evaluator.counts
+    return {
+        "retries": now.retries - before.retries,
+        "lost_workers": now.lost_workers - before.lost_workers,
+        "workers": now.workers,
+    }
+
+
+class _Clock:
+    """Where the seconds of a generation go. Time of the commit is shown with the generation after it."""
+
+    def __init__(self, before_s: float) -> None:
+        self._origin = time.perf_counter() - before_s
+        self._last = self._generation_start = time.perf_counter()
+        self._laps: dict[str, float] = {}
+
+    def total(self) -> float:
+        """Seconds spent in this run, earlier sessions included."""
+        return time.perf_counter() - self._origin
+
+    def lap(self, name: str) -> None:
+        """Book the time since the last lap under `name`."""
+        now = time.perf_counter()
+        self._laps[name] = self._laps.get(name, 0.0) + now - self._last
+        self._last = now
+
+    def finish_generation(self) -> tuple[float, dict[str, float]]:
+        """(seconds since the last call, laps since then by name)."""
+        now = time.perf_counter()
+        seconds, laps = now - self._generation_start, self._laps
+        self._generation_start, self._laps = now, {}
+        names = ("seconds_rollout", "seconds_gradient", "seconds_evaluation", "seconds_driver", "seconds_store")
+        return seconds, {name: laps.get(name, 0.0) for name in names}

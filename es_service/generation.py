@@ -1,0 +1,110 @@
+"""The pieces of one generation: what to ask the workers for, and how their answers become one.
+
+Order never comes from arrival: results are taken by chunk id, and partial gradients are added in one fixed binary tree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.errors import EvaluationError
+from es_service.protocol import (
+    EVALUATION_EPISODES_PER_CHUNK,
+    Centre,
+    EpisodesResult,
+    EvaluationChunk,
+    Evaluator,
+    FloatArray,
+    GradientChunk,
+    GradientResult,
+    Moments,
+    TrainingChunk,
+)
+
+
+def evaluate_population(
+    evaluator: Evaluator, centre: Centre, *, pairs: int, chunk_pairs: int
+) -> tuple[EpisodesResult, list[Moments]]:
+    """Roll out all pairs around the centre: results with axes [P, S], and each chunk's observations in chunk order."""
+    chunks = [TrainingChunk(centre.generation, chunk_id) for chunk_id in range(pairs // chunk_pairs)]
+    results = _episodes(evaluator.evaluate(centre, chunks))
+    return _concatenate(results, pairs), [result.moments for result in results if result.moments is not None]
+
+
+def evaluate_centre(evaluator: Evaluator, centre: Centre, episodes: int) -> EpisodesResult:
+    """Roll out the unperturbed centre: results with axis [E]. Episodes past the wanted number are discarded."""
+    chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
+    results = evaluator.evaluate(centre, [EvaluationChunk(centre.generation, chunk_id) for chunk_id in range(chunks)])
+    return _concatenate(_episodes(results), episodes)
+
+
+def estimate_gradient(evaluator: Evaluator, centre: Centre, weights_P: FloatArray, block_pairs: int) -> FloatArray:
+    """(1 / pairs) * sum over pairs of weight * noise, in standard normal units; workers sum blocks of pairs."""
+    chunks = []
+    for chunk_id, first in enumerate(range(0, weights_P.size, block_pairs)):
+        block_P = weights_P[first : first + block_pairs]
+        padded_P = np.pad(block_P, (0, block_pairs - block_P.size))
+        chunks.append(GradientChunk(centre.generation, chunk_id, padded_P))
+    results = evaluator.evaluate(centre, chunks)
+    sums = [result.sum_D for result in results if isinstance(result, GradientResult)]
+    return tree_sum(sums) * np.float32(1.0 / weights_P.size)
+
+
+def tree_sum(blocks: Sequence[FloatArray]) -> FloatArray:
+    """Sum by adding neighbours level by level: ((0 + 1) + (2 + 3)) + ...; an odd one out moves up unchanged.
+
+    The tree is fixed by the number of blocks alone, so any node of it may be computed anywhere.
+    """
+    level = list(blocks)
+    while len(level) > 1:
+        pairs = [level[i] + level[i + 1] for i in range(0, len(level) - 1, 2)]
+        level = pairs + level[len(pairs) * 2 :]
+    return level[0]
+
+
+def valid_members(result: EpisodesResult) -> NDArray[np.bool_]:
+    """Which members (or episodes) have a finite fitness and descriptor; leading axes only."""
+    return np.isfinite(result.fitness) & np.isfinite(result.descriptor).all(axis=-1)
+
+
+def invalidate(population: EpisodesResult, max_invalid_fraction: float, generation: int) -> tuple[EpisodesResult, int]:
+    """Give every invalid member the fitness NaN, which ranks last: (population, number of invalid members).
+
+    Raises:
+        EvaluationError: more than `max_invalid_fraction` of the members are invalid.
+    """
+    valid_P_S = valid_members(population)
+    invalid = int(np.count_nonzero(~valid_P_S))
+    if invalid > max_invalid_fraction * valid_P_S.size:
+        raise EvaluationError(
+            f"generation {generation}: {invalid} of {valid_P_S.size} members returned a fitness or descriptor that is "
+            f"not finite, more than search.max_invalid_fraction ({max_invalid_fraction}) allows. Everything up to "
+            f"generation {generation - 1} is saved; a smaller search.sigma or search.learning_rate may help (fork)."
+        )
+    fitness_P_S = np.where(valid_P_S, population.fitness, np.float32(np.nan))
+    return replace(population, fitness=fitness_P_S), invalid
+
+
+def _episodes(results: Sequence[object]) -> list[EpisodesResult]:
+    return [result for result in results if isinstance(result, EpisodesResult)]
+
+
+def _concatenate(results: Sequence[EpisodesResult], count: int) -> EpisodesResult:
+    """Join along the first axis and keep the first `count`; observation moments are left to the caller."""
+
+    def join(name: str) -> np.ndarray:
+        return np.concatenate([getattr(result, name) for result in results])[:count]
+
+    return EpisodesResult(
+        fitness=join("fitness"),
+        returns=join("returns"),
+        descriptor=join("descriptor"),
+        steps=join("steps"),
+        goal_distance=join("goal_distance"),
+        moments=None,
+        seconds=sum(result.seconds for result in results),
+    )

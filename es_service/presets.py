@@ -1,0 +1,82 @@
+"""The keys on which the presets differ, in one table; the README prints it, the config loader reads it.
+
+A preset fills in what a config leaves out. A key written in the config wins, and the run's own `config.yaml` records
+every value, so a later change of this table changes no existing run.
+
+Sources named below: ES-starter is OpenAI's evolution-strategies-starter (Salimans et al. 2017, arXiv:1703.03864); DNE
+is Uber's deep-neuroevolution (Conti et al. 2018, arXiv:1712.06560); ME-ES is Uber's Map-Elites-Evolutionary (Colas et
+al. 2020, arXiv:2003.01825). All of them were read as code, not as papers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import MappingProxyType
+
+PRESETS = MappingProxyType(
+    {
+        "literature": "what papers and independent implementations agree on; ours where they say nothing",
+        "uber": "what the authors' released ME-ES code does",
+    }
+)
+"""Preset name -> what it stands for. Each name is also a column of the table."""
+
+
+@dataclass(frozen=True)
+class PresetRow:
+    """One config key on which the presets differ."""
+
+    key: str
+    """Dotted name in the config, such as `search.pairs`."""
+    literature: object
+    uber: object
+    source: str
+    """Where both values come from, and what is our own choice."""
+
+
+_ROWS = (
+    PresetRow(
+        "search.pairs",
+        512,
+        5000,
+        "uber: ME-ES, 10,000 episodes a generation as + and - pairs. literature: ours, sized for one machine; the "
+        "papers used 5,000 to 10,000 episodes a generation, so compare results at equal environment steps.",
+    ),
+    PresetRow(
+        "policy.init",
+        "unit_columns",
+        "small_columns",
+        "literature: ES-starter and DNE (column norm 1.0 in hidden layers, 0.01 in the output layer). uber: ME-ES "
+        "(0.01 in every layer).",
+    ),
+    PresetRow(
+        "policy.observation_clip",
+        5.0,
+        None,
+        "literature: ES-starter and DNE clip normalised observations to [-5, 5]; where normalisation is off this is "
+        "null. uber: ME-ES does not clip.",
+    ),
+    PresetRow(
+        "search.common_random_numbers",
+        True,
+        False,
+        "uber: ME-ES, where the two members of a pair start from different resets. literature: ours; sharing reset and "
+        "action noise inside a pair takes their luck out of its difference.",
+    ),
+)
+
+
+def preset_table() -> list[PresetRow]:
+    """Every key on which the presets differ; for documentation."""
+    return list(_ROWS)
+
+
+def preset_values(preset: str) -> dict[str, object]:
+    """What one preset says: dotted key -> value.
+
+    Raises:
+        KeyError: `preset` is not a key of PRESETS.
+    """
+    if preset not in PRESETS:
+        raise KeyError(preset)
+    return {row.key: getattr(row, preset) for row in _ROWS}

@@ -1,0 +1,47 @@
+"""What there is to choose from: tasks, algorithms, presets."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Table
+
+from es_service.algorithms import ALGORITHMS
+from es_service.presets import PRESETS, preset_table
+from workers.environments import TASKS
+
+
+def print_catalogue(console: Console) -> None:
+    """Tables of tasks, algorithms, and of the keys on which presets differ."""
+    tasks = Table(title="tasks (task.environment)", title_justify="left")
+    for name in ("name", "observation", "action", "steps", "descriptor", "options"):
+        tasks.add_column(name)
+    for task in TASKS.values():
+        bounds = zip(task.descriptor_names, task.descriptor_bounds, strict=True)
+        tasks.add_row(
+            task.name,
+            str(task.observation_size),
+            str(task.action_size),
+            str(task.episode_steps),
+            ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in bounds),
+            "; ".join(f"{name}: {' | '.join(values)}" for name, values in task.options.items()),
+        )
+    console.print(tasks)
+
+    algorithms = Table(title="algorithms (search.algorithm)", title_justify="left")
+    algorithms.add_column("name")
+    algorithms.add_column("what it is")
+    for name, factory in ALGORITHMS.items():
+        algorithms.add_row(name, (factory.__doc__ or "").strip().splitlines()[0])
+    console.print(algorithms)
+
+    presets = Table(title="presets (search.preset): the keys on which they differ", title_justify="left")
+    presets.add_column("key")
+    for name in PRESETS:
+        presets.add_column(name)
+    for row in preset_table():
+        presets.add_row(row.key, *(_value(getattr(row, name)) for name in PRESETS))
+    console.print(presets)
+
+
+def _value(value: object) -> str:
+    return {None: "null", True: "true", False: "false"}.get(value, str(value)) if not isinstance(value, float) else f"{value:g}"

@@ -1,0 +1,103 @@
+"""All that a run carries from one generation to the next, and how it is kept in the store."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from es_service.algorithms.base import SearchState, member_from_arrays, member_part, member_to_arrays
+from es_service.protocol import FloatArray, Moments
+
+Arrays = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Best:
+    """The centre with the highest mean fitness so far, with the statistics it was evaluated with."""
+
+    generation: int
+    fitness: float
+    centre_D: FloatArray
+    observation_mean_O: FloatArray
+    observation_std_O: FloatArray
+
+
+@dataclass(frozen=True)
+class RunState:
+    """State of a run after `generation` generations."""
+
+    generation: int
+    search: SearchState
+    observations: Moments
+    best: Best
+    env_steps: int
+    """Environment steps so far, evaluations counted; a Python int, it outgrows 32 bits."""
+    episodes: int
+    wall_clock_s: float
+    """Seconds spent so far, all sessions together. Kept in the history, not in the state: it is not deterministic."""
+
+
+def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
+    """The parts of `state` that differ from `before` (all of them for None), as the store keeps them."""
+    parts = {
+        "observations": _moments_to_arrays(state.observations),
+        "counters": {
+            "env_steps": np.asarray(state.env_steps, np.int64),
+            "episodes": np.asarray(state.episodes, np.int64),
+        },
+    }
+    for index, member in enumerate(state.search.members):
+        if before is None or member is not before.search.members[index]:
+            parts[member_part(index)] = member_to_arrays(member)
+    if before is None or state.best is not before.best:
+        parts["best"] = _best_to_arrays(state.best)
+    return parts
+
+
+def state_from_parts(parts: Mapping[str, Mapping[str, np.ndarray]], generation: int, wall_clock_s: float) -> RunState:
+    """Inverse of `state_parts(state, None)`."""
+    members = []
+    while member_part(len(members)) in parts:
+        members.append(member_from_arrays(parts[member_part(len(members))]))
+    counters = parts["counters"]
+    return RunState(
+        generation=generation,
+        search=SearchState(tuple(members)),
+        observations=moments_from_arrays(parts["observations"]),
+        best=best_from_arrays(parts["best"]),
+        env_steps=int(counters["env_steps"]),
+        episodes=int(counters["episodes"]),
+        wall_clock_s=wall_clock_s,
+    )
+
+
+def _moments_to_arrays(moments: Moments) -> Arrays:
+    return {"count": np.asarray(moments.count, np.float64), "mean_O": moments.mean_O, "m2_O": moments.m2_O}
+
+
+def moments_from_arrays(arrays: Mapping[str, np.ndarray]) -> Moments:
+    """Observation statistics from the store's part `observations`."""
+    return Moments(float(arrays["count"]), arrays["mean_O"], arrays["m2_O"])
+
+
+def _best_to_arrays(best: Best) -> Arrays:
+    return {
+        "generation": np.asarray(best.generation, np.int64),
+        "fitness": np.asarray(best.fitness, np.float64),
+        "centre_D": best.centre_D,
+        "observation_mean_O": best.observation_mean_O,
+        "observation_std_O": best.observation_std_O,
+    }
+
+
+def best_from_arrays(arrays: Mapping[str, np.ndarray]) -> Best:
+    """The best centre from the store's part `best`."""
+    return Best(
+        generation=int(arrays["generation"]),
+        fitness=float(arrays["fitness"]),
+        centre_D=arrays["centre_D"],
+        observation_mean_O=arrays["observation_mean_O"],
+        observation_std_O=arrays["observation_std_O"],
+    )

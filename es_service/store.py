@@ -1,0 +1,260 @@
+"""The run store's writer: one transaction per generation, so that `kill -9` loses the generation in flight only.
+
+A run is a folder: `config.yaml`, `run.db` (SQLite), `run.lock`, and after a while `run.db.copy`. On a local disk
+`run.db` is in WAL mode: a killed process loses nothing that was committed, a power cut at most what was committed since
+the last checkpoint. On network file systems there is no WAL: the journal is rolled back, every commit is synchronous,
+and readers read the copy. A clean end leaves `run.db` as a single file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sqlite3
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from numpy.typing import NDArray
+
+from es_service.errors import StoreError
+from es_service.run_folder import DATABASE, explained, is_network_filesystem, require_run_folder
+from es_service.run_lock import RunLock, acquire_lock, lock_holder
+from es_service.store_codec import (
+    Part,
+    column_bytes,
+    decode_part,
+    encode_part,
+    part_sha256,
+    row_dict,
+    row_sha256,
+    row_values,
+    text_sha256,
+)
+from es_service.store_create import create_run_folder
+from es_service.store_repair import open_sound
+from es_service.store_schema import PAGE_BYTES, RunMeta, history_insert, history_select, meta_text
+from es_service.store_upkeep import Upkeep
+from es_service.store_verify import rows_in_force, state_in_force
+
+__all__ = ["Part", "RunMeta", "RunStore", "Values", "is_network_filesystem", "lock_holder", "no_hook"]
+
+Values = Mapping[str, int | float | None]
+"""One history row by column name; NaN or None for no value."""
+
+
+def no_hook(name: str) -> None:
+    """What happens at the store's named instants, unless a test wants otherwise: nothing."""
+
+
+class RunStore:
+    """The one writer of a run, from `create` or `open` until `close`; a context manager. Not for several threads."""
+
+    meta: RunMeta
+    notices: list[str]
+    """What opening had to repair, and what later went wrong without ending the run; for the user to read."""
+    generation: int | None
+    """Newest committed generation; None before the first."""
+
+    def __init__(self, folder: Path, lock: RunLock, hook: Callable[[str], None]) -> None:
+        """Open the run in `folder`, whose lock is held; `create` and `open` are the ways in."""
+        self.folder = folder
+        self.notices = []
+        self._lock = lock
+        self._hook = hook
+        self._closed = False
+        self._connection, verdict = open_sound(folder, self.notices)
+        self.meta = verdict.meta
+        self.generation = verdict.good
+        self._kept = verdict.kept
+        self._columns = column_bytes(self.meta.columns)
+        self._insert_history = history_insert(self.meta.columns)
+        try:
+            with self._explaining(f"opening {DATABASE}"):
+                self.upkeep = Upkeep(self._connection, folder, is_network_filesystem(folder), hook, self.notices)
+            hook("opened")
+        except BaseException:
+            self._connection.close()
+            raise
+
+    @classmethod
+    def create(
+        cls, folder: Path, config_yaml: str, meta: RunMeta, *, hook: Callable[[str], None] = no_hook
+    ) -> RunStore:
+        """Start a run in `folder`, which must not exist or be empty; its parent must exist.
+
+        Raises StoreError if the folder is taken, cannot be written, or the columns of `meta` cannot be stored.
+        """
+        folder = Path(folder)
+        lock = create_run_folder(folder, config_yaml, meta_text(meta))
+        return cls._holding(lock, folder, hook)
+
+    @classmethod
+    def open(cls, folder: Path, *, hook: Callable[[str], None] = no_hook) -> RunStore:
+        """Continue the run in `folder`: take its lock, verify everything, repair what must be and say so in `notices`.
+
+        Raises RunLockedError if another process writes to it; StoreError if it is no run, was written by a newer
+        version, or holds nothing that can be trusted.
+        """
+        folder = Path(folder)
+        try:
+            require_run_folder(folder)
+        except OSError as error:
+            raise explained(error, folder, "looking for a run") from error
+        return cls._holding(acquire_lock(folder), folder, hook)
+
+    @classmethod
+    def _holding(cls, lock: RunLock, folder: Path, hook: Callable[[str], None]) -> RunStore:
+        try:
+            return cls(folder, lock, hook)
+        except BaseException:
+            lock.release()
+            raise
+
+    def load(self) -> dict[str, dict[str, NDArray[Any]]]:
+        """Every state part as of the newest generation, checked once more; empty before the first commit."""
+        parts: dict[str, dict[str, NDArray[Any]]] = {}
+        if self.generation is None:
+            return parts
+        with self._explaining("loading the state"):
+            for part, (at, sha256) in sorted(rows_in_force(self._kept, self.generation).items()):
+                row = self._connection.execute(
+                    "SELECT payload FROM state WHERE part = ? AND generation = ?", (part, at)
+                ).fetchone()
+                if row is None or part_sha256(part, at, row[0]) != sha256:
+                    raise StoreError(
+                        f"{self.folder / DATABASE}: state of {part!r} at generation {at} was damaged since it was "
+                        f"opened; `es-service resume {self.folder}` falls back to what is sound"
+                    )
+                parts[part] = decode_part(row[0])
+        return parts
+
+    def commit(self, generation: int, parts: Mapping[str, Part], history: Values) -> None:
+        """Store a generation: all of it or, if this raises, nothing of it.
+
+        Args:
+            generation: the one after `self.generation`, 0 if that is None.
+            parts: those that changed; the others keep their value.
+            history: a value for every column of the run but perhaps `generation`; NaN or None for no value.
+
+        Raises StoreError for another generation, a row that does not fit the columns, a full disk. After it the store
+        is as before and may still be used.
+        """
+        self._store(generation, [history], parts)
+
+    def adopt(self, history: Sequence[Values], parts: Mapping[str, Part]) -> None:
+        """Start a run where another one stands: its rows of generations 0, 1, ..., and its state after the last one.
+
+        One transaction, so that a fork that is killed has begun or has not. Raises StoreError as `commit` does.
+        """
+        self._store(0, history, parts)
+
+    def _store(self, first: int, history: Sequence[Values], parts: Mapping[str, Part]) -> None:
+        """Store the rows of generations `first`, `first` + 1, ... and the parts that the last of them changed."""
+        expected = 0 if self.generation is None else self.generation + 1
+        if first != expected or not history:
+            raise StoreError(f"{self.folder}: generation {first} cannot be stored, the next one is {expected}")
+        newest = first + len(history) - 1
+        payloads = {part: encode_part(arrays) for part, arrays in parts.items()}
+        kept = {part: dict(rows) for part, rows in self._kept.items()}
+        for part, payload in payloads.items():
+            kept.setdefault(part, {})[newest] = part_sha256(part, newest, payload)
+        rows = [self._history_row(at, row, state_in_force(kept, at)) for at, row in enumerate(history, first)]
+        # Enough stays to put together the newest generation and the one before it.
+        fallback = rows_in_force(kept, newest - 1)
+        outdated = [(part, at) for part, (oldest, _) in fallback.items() for at in kept[part] if at < oldest]
+        for part, at in outdated:
+            del kept[part][at]
+        self._hook("before_begin")
+        with self._transaction(f"storing generation {newest}") as execute:
+            # First, so that the new rows take the pages of the old ones.
+            for part, at in outdated:
+                execute("DELETE FROM state WHERE part = ? AND generation = ?", (part, at))
+            for part, payload in payloads.items():
+                row = (part, newest, kept[part][newest], payload)
+                execute("INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)", row)
+            self._hook("mid_transaction")
+            for row in rows:
+                execute(self._insert_history, row)
+            self._hook("before_commit")
+        self.generation, self._kept = newest, kept
+        self._hook("after_commit")
+        self.upkeep.after_commit(sum(map(len, payloads.values())) + (len(rows) + 3) * PAGE_BYTES)
+
+    def _history_row(self, generation: int, history: Values, state: str) -> tuple[int | float | str | None, ...]:
+        values = row_values(self.meta.columns, generation, history)
+        return (*values, state, row_sha256(self._columns, values, state))
+
+    def last_history(self) -> dict[str, int | float] | None:
+        """The newest generation's history row, NaN where it has no value; None before the first commit."""
+        if self.generation is None:
+            return None
+        with self._explaining("reading the history"):
+            query = history_select(self.meta.columns) + " WHERE history.generation = ?"
+            row = self._connection.execute(query, (self.generation,)).fetchone()
+        return row_dict(self.meta.columns, row[:-2])
+
+    def record_platform(self, generation: int, platform: dict[str, Any]) -> bool:
+        """Record what the run runs on (versions, CPU kind; JSON-able), in force from `generation` on.
+
+        Replaces what was recorded for `generation` and later, of which nothing is stored. Returns whether it differs
+        from the one in force before; if not, nothing is recorded.
+        """
+        if self.generation is not None and generation <= self.generation:
+            raise StoreError(
+                f"{self.folder}: generation {generation} is stored already, its platform cannot be changed"
+            )
+        text = json.dumps(platform, sort_keys=True)
+        with self._transaction("recording the platform") as execute:
+            execute("DELETE FROM platform WHERE generation >= ?", (generation,))
+            latest = execute("SELECT platform FROM platform ORDER BY generation DESC LIMIT 1").fetchone()
+            differs = latest is None or latest[0] != text
+            if differs:
+                row = (generation, text, text_sha256(f"platform {generation}", text))
+                execute("INSERT INTO platform (generation, platform, sha256) VALUES (?, ?, ?)", row)
+        return differs
+
+    def close(self) -> None:
+        """Leave `run.db` as a single file and let go of the run. Harmless if done already; raises nothing of its own.
+
+        A reader that holds on to the database, or a full disk, leaves a WAL beside it, which loses nothing.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self.upkeep.finish()
+        finally:
+            self._connection.close()
+            self._lock.release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @contextlib.contextmanager
+    def _explaining(self, doing: str) -> Iterator[None]:
+        if self._closed:
+            raise StoreError(f"{self.folder}: the store was closed before {doing}")
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise explained(error, self.folder, doing) from error
+
+    @contextlib.contextmanager
+    def _transaction(self, doing: str) -> Iterator[Callable[..., sqlite3.Cursor]]:
+        with self._explaining(doing):
+            try:
+                self._connection.execute("BEGIN IMMEDIATE")
+                yield self._connection.execute
+                self._connection.execute("COMMIT")
+            except BaseException:
+                # SQLite has rolled back by itself after some errors.
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+                raise

@@ -1,0 +1,154 @@
+"""Bytes of the run store: what a state part and a history row are, byte for byte, and their SHA-256.
+
+Everything here is deterministic: equal values give equal bytes on every machine. No pickle.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import operator
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.errors import StoreError
+from es_service.history import Column
+
+Part = Mapping[str, NDArray[Any]]
+"""One piece of the search state that changes as a whole: arrays by name, e.g. {"centre_D": ..., "step": int64[]}."""
+Row = tuple[int | float | None, ...]
+"""Values of one history row in the order of the run's columns; None for what has no value."""
+
+_MAGIC = b"ESP1"
+_HEADER_LENGTH = struct.Struct("<I")
+_INTEGER = struct.Struct("<cq")
+_REAL = struct.Struct("<cd")
+_NUMERIC_KINDS = "biufc"
+
+
+def encode_part(part: Part) -> bytes:
+    """Magic, header length, JSON header [[name, dtype, shape], ...] sorted by name, then the raw little-endian arrays.
+
+    Raises StoreError for an array that is not of booleans or numbers.
+    """
+    header: list[tuple[str, str, list[int]]] = []
+    raw: list[bytes] = []
+    for name in sorted(part):
+        array = np.asarray(part[name])
+        if array.dtype.kind not in _NUMERIC_KINDS:
+            raise StoreError(f"state array {name!r} has dtype {array.dtype}; only booleans and numbers can be stored")
+        little = array.astype(array.dtype.newbyteorder("<"), copy=False)
+        header.append((name, little.dtype.str, list(array.shape)))
+        raw.append(little.tobytes(order="C"))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    return b"".join((_MAGIC, _HEADER_LENGTH.pack(len(text)), text, *raw))
+
+
+def decode_part(payload: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays of `encode_part`, writable. Raises ValueError if `payload` is not exactly one encoded part."""
+    if payload[:4] != _MAGIC or len(payload) < 8:
+        raise ValueError("a state payload does not start as one")
+    position = 8 + _HEADER_LENGTH.unpack_from(payload, 4)[0]
+    try:
+        entries = [(str(name), np.dtype(kind), tuple(shape)) for name, kind, shape in json.loads(payload[8:position])]
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"a state payload has an unreadable header: {error}") from error
+    part: dict[str, NDArray[Any]] = {}
+    for name, dtype, shape in entries:
+        count = math.prod(shape)
+        if dtype.kind not in _NUMERIC_KINDS or count < 0 or position + count * dtype.itemsize > len(payload):
+            raise ValueError(f"a state payload is too short for its array {name!r}")
+        flat = np.frombuffer(payload, dtype, count, position)
+        part[name] = flat.reshape(shape).astype(dtype.newbyteorder("="), copy=True)
+        position += flat.nbytes
+    if position != len(payload):
+        raise ValueError("a state payload is longer than its header says")
+    return part
+
+
+def part_sha256(part: str, generation: int, payload: bytes) -> str:
+    """Of a state row. Name and generation are in it, so that a row cannot pass for another one."""
+    digest = hashlib.sha256(f"state\0{part}\0{generation}\0".encode())
+    digest.update(payload)
+    return digest.hexdigest()
+
+
+def state_sha256(rows: Mapping[str, tuple[int, str]]) -> str:
+    """Of the whole state of one generation, from (generation, sha256) of each part's row in force.
+
+    Stored with the history row, so that a state row that has vanished is noticed and not replaced by an older one.
+    """
+    lines = (f"{part}\0{generation}\0{sha256}\n" for part, (generation, sha256) in sorted(rows.items()))
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def text_sha256(key: str, text: str) -> str:
+    """Of a row that is a key and a JSON text."""
+    return hashlib.sha256(f"{key}\0{text}".encode()).hexdigest()
+
+
+def row_values(columns: Sequence[Column], generation: int, history: Mapping[str, int | float | None]) -> Row:
+    """The row to store: every column once, NaN as None, -0.0 as 0.0 (SQLite does not keep the sign).
+
+    `generation` may be left out of `history`. Raises StoreError for a column too many or too few, a value of the
+    wrong type, or another generation.
+    """
+    given = {"generation": generation, **history}
+    names = {column.name for column in columns}
+    if given.keys() != names:
+        raise StoreError(
+            f"history row of generation {generation}: unknown columns {sorted(given.keys() - names)}, "
+            f"missing columns {sorted(names - given.keys())}; give exactly the run's columns, NaN for no value"
+        )
+    if given["generation"] != generation:
+        raise StoreError(f"history row of generation {generation} says it is of generation {given['generation']}")
+    return tuple(_value(column, given[column.name]) for column in columns)
+
+
+def _value(column: Column, value: Any) -> int | float | None:
+    if value is None or value != value:
+        return None
+    try:
+        if column.type == "REAL":
+            return float(value) + 0.0
+        integer = operator.index(value)
+    except TypeError as error:
+        raise StoreError(f"history column {column.name} is {column.type} and cannot hold {value!r}") from error
+    if not -(2**63) <= integer < 2**63:
+        raise StoreError(f"history column {column.name} cannot hold {value!r}: it does not fit 64 bits")
+    return integer
+
+
+def row_bytes(row: Row) -> bytes:
+    """Canonical bytes of values as read from the database. Raises ValueError for a value no column can hold."""
+    parts: list[bytes] = []
+    for value in row:
+        if value is None:
+            parts.append(b"N")
+        elif type(value) is int:
+            parts.append(_INTEGER.pack(b"I", value))
+        elif type(value) is float:
+            parts.append(_REAL.pack(b"R", value))
+        else:
+            raise ValueError(f"a history row holds {value!r}, which is not a number")
+    return b"".join(parts)
+
+
+def column_bytes(columns: Sequence[Column]) -> bytes:
+    """Names and types of the columns, to be hashed before their values."""
+    return json.dumps([[column.name, column.type] for column in columns], separators=(",", ":")).encode()
+
+
+def row_sha256(columns: bytes, row: Row, state: str) -> str:
+    """Of a history row: its columns (`column_bytes`), values, and the `state_sha256` stored with it."""
+    return hashlib.sha256(b"".join((columns, row_bytes(row), state.encode()))).hexdigest()
+
+
+def row_dict(columns: Sequence[Column], row: Row) -> dict[str, int | float]:
+    """A stored row for its readers: NaN where there is no value."""
+    return {column.name: math.nan if value is None else value for column, value in zip(columns, row, strict=True)}

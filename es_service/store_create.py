@@ -1,0 +1,111 @@
+"""Creating a run folder so that it appears whole or not at all, whenever the process is killed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+from es_service.errors import StoreError
+from es_service.run_folder import CONFIG, COPY, DATABASE, LOCK, explained, remove_database, sync_file, sync_folder
+from es_service.run_lock import RunLock, acquire_lock
+from es_service.store_repair import connect
+from es_service.store_schema import create_tables
+
+_NEW_DATABASE = "run.db.new"
+_LEFT_BEHIND = {LOCK, CONFIG, _NEW_DATABASE, f"{_NEW_DATABASE}-journal"}
+"""What a creation in place may leave when it is killed, and the next one may overwrite."""
+
+
+def create_run_folder(folder: Path, config_yaml: str, meta_text: str) -> RunLock:
+    """Make `folder` that of a run without a generation, and hold its lock.
+
+    It is built beside its final place and renamed; in an existing empty folder, `run.db` is renamed into place last.
+    Raises StoreError if the folder is taken or cannot be written.
+    """
+    try:
+        return _create(folder, config_yaml, meta_text)
+    except (sqlite3.Error, OSError) as error:
+        raise explained(error, folder, "creating the run", "give the same command again") from error
+
+
+def _create(folder: Path, config_yaml: str, meta_text: str) -> RunLock:
+    _refuse_taken(folder)
+    parent = folder.absolute().parent
+    if not parent.is_dir():
+        raise StoreError(f"cannot create {folder}: its parent folder {parent} does not exist; create it first")
+    # A folder that exists may be a mount point or somebody's working directory, which cannot be renamed over.
+    beside = not folder.is_dir()
+    place = parent / f".{folder.name}.creating" if beside else folder
+    try:
+        place.mkdir(exist_ok=True)
+    except OSError as error:
+        raise StoreError(
+            f"cannot create {folder}: {error.strerror} in {parent}; make that folder writable or choose another --out"
+        ) from error
+    lock = acquire_lock(place)
+    try:
+        if not beside:
+            # Another creation may have been at work until the lock was ours.
+            _refuse_taken(folder)
+        _build(place, config_yaml, meta_text)
+        if beside:
+            _move(place, folder)
+    except BaseException:
+        _clear(place, beside)
+        lock.release()
+        raise
+    return lock
+
+
+def _build(place: Path, config_yaml: str, meta_text: str) -> None:
+    new = place / _NEW_DATABASE
+    remove_database(new)
+    remove_database(place / DATABASE)
+    (place / CONFIG).write_text(config_yaml, encoding="utf-8")
+    sync_file(place / CONFIG)
+    with closing(connect(new)) as connection:
+        create_tables(connection, meta_text)
+    os.replace(new, place / DATABASE)
+    sync_folder(place)
+
+
+def _move(place: Path, folder: Path) -> None:
+    try:
+        # Replaces an empty folder, fails on any other.
+        os.rename(place, folder)
+    except OSError as error:
+        if folder.exists():
+            raise StoreError(f"{folder} appeared while this run was being created; choose another --out") from error
+        raise
+    sync_folder(folder.absolute().parent)
+
+
+def _clear(place: Path, beside: bool) -> None:
+    """Take away what a failed creation wrote, so that the same command can be given again; a whole run stays."""
+    with contextlib.suppress(OSError):
+        remove_database(place / _NEW_DATABASE)
+        if beside:
+            remove_database(place / DATABASE)
+        elif (place / DATABASE).exists():
+            return
+        for name in (CONFIG, LOCK):
+            (place / name).unlink(missing_ok=True)
+        if beside:
+            place.rmdir()
+
+
+def _refuse_taken(folder: Path) -> None:
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise StoreError(f"cannot create a run in {folder}: it is a file; choose another --out")
+    names = {path.name for path in folder.iterdir()}
+    if names & {DATABASE, COPY}:
+        raise StoreError(f"{folder} already holds a run; continue it with `es-service resume {folder}`")
+    others = sorted(names - _LEFT_BEHIND)
+    if others:
+        shown = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
+        raise StoreError(f"{folder} is not empty and holds no run ({shown}); choose another --out")

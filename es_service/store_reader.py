@@ -1,0 +1,157 @@
+"""Reading a run: short transactions that work while a writer writes, after it was killed, and after a clean end.
+
+Readers never create, change or repair a run; what they return was checked against its SHA-256.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from es_service.errors import StoreError
+from es_service.run_folder import COPY, DATABASE, is_network_filesystem, require_run_folder
+from es_service.run_lock import lock_holder
+from es_service.store_codec import column_bytes, decode_part, part_sha256, row_dict, row_sha256, text_sha256
+from es_service.store_schema import Damaged, RunMeta, history_select, load_meta
+from es_service.store_verify import KeptRows, rows_in_force, state_in_force, verify
+
+_BUSY_S = 5.0
+
+
+@contextlib.contextmanager
+def reading(folder: Path) -> Iterator[tuple[sqlite3.Connection, RunMeta]]:
+    """One consistent view of the run in `folder`: a read-only connection inside a transaction, and what the run is.
+
+    Keep it short: a writer cannot end its log while it lasts. Raises StoreError if the folder is no run, if it was
+    written by a newer version, or if it cannot be read.
+    """
+    folder = Path(folder)
+    try:
+        require_run_folder(folder)
+        file = folder / DATABASE
+        if not file.exists():
+            raise StoreError(f"{file} is missing; `es-service resume {folder}` restores it from {COPY}")
+        if is_network_filesystem(folder) and lock_holder(folder) and (folder / COPY).exists():
+            file = folder / COPY
+        connection = sqlite3.connect(
+            f"{file.absolute().as_uri()}?mode=ro", uri=True, timeout=_BUSY_S, isolation_level=None
+        )
+    except (OSError, sqlite3.Error) as error:
+        raise StoreError(f"{folder} cannot be read: {error}") from error
+    try:
+        with contextlib.closing(connection):
+            connection.execute("BEGIN")
+            yield connection, load_meta(connection, file)
+    except (sqlite3.Error, Damaged) as error:
+        what = "is not a run folder" if _is_no_database(error) else "cannot be read"
+        raise StoreError(
+            f"{folder} {what}: {file.name}: {error}. If it is a run, `es-service resume {folder}` repairs what can be."
+        ) from error
+
+
+def _is_no_database(error: Exception) -> bool:
+    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+    return code == sqlite3.SQLITE_NOTADB or "no such table: meta" in str(error)
+
+
+def read_meta(folder: Path) -> RunMeta:
+    """What the run is."""
+    with reading(folder) as (_, meta):
+        return meta
+
+
+def read_generation(folder: Path) -> int | None:
+    """Newest committed generation; None before the first."""
+    with reading(folder) as (connection, _):
+        return connection.execute("SELECT max(generation) FROM history").fetchone()[0]
+
+
+def read_history(folder: Path, since_generation: int | None = None) -> list[dict[str, int | float]]:
+    """History rows in order, from `since_generation` on (itself included; all if None); NaN where there is no value.
+
+    Raises StoreError for a row that is missing or does not match its SHA-256.
+    """
+    with reading(folder) as (connection, meta):
+        first = max(since_generation or 0, 0)
+        query = history_select(meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation"
+        columns = column_bytes(meta.columns)
+        rows: list[dict[str, int | float]] = []
+        for *values, state, sha256 in connection.execute(query, (first,)):
+            row = tuple(values)
+            named = row_dict(meta.columns, row)
+            try:
+                sound = row_sha256(columns, row, str(state)) == sha256
+            except ValueError:
+                sound = False
+            if not sound or named["generation"] != first + len(rows):
+                raise Damaged(f"the history row of generation {first + len(rows)} is damaged or missing")
+            rows.append(named)
+        return rows
+
+
+def read_parts(folder: Path, generation: int | None = None) -> tuple[int, dict[str, dict[str, NDArray[Any]]]]:
+    """A generation (the newest if None) and every state part as of it.
+
+    Raises StoreError if its state is not kept, naming those that are, or does not match its SHA-256.
+    """
+    with reading(folder) as (connection, _):
+        kept: KeptRows = {}
+        for part, at, sha256 in connection.execute("SELECT part, generation, sha256 FROM state"):
+            kept.setdefault(part, {})[at] = sha256
+        states = dict(
+            connection.execute("SELECT generation, state_sha256 FROM history ORDER BY generation DESC LIMIT 2")
+        )
+        if not states:
+            raise StoreError(f"{folder} has no generation yet; `es-service resume {folder}` continues it")
+        wanted = max(states) if generation is None else generation
+        whole = sorted(
+            at for at, state in states.items() if rows_in_force(kept, at) and state_in_force(kept, at) == state
+        )
+        if wanted not in whole:
+            if wanted in states and wanted == max(states):
+                raise Damaged(f"the state of generation {wanted} is damaged")
+            raise StoreError(
+                f"{folder} does not keep the state of generation {wanted}; it keeps that of {whole}, "
+                f"the history reaches generation {max(states)}"
+            )
+        parts: dict[str, dict[str, NDArray[Any]]] = {}
+        for part, (at, sha256) in sorted(rows_in_force(kept, wanted).items()):
+            payload = state_payload(connection, part, at)
+            if part_sha256(part, at, payload) != sha256:
+                raise Damaged(f"the state of {part!r} at generation {at} does not match its SHA-256")
+            parts[part] = decode_part(payload)
+        return wanted, parts
+
+
+def state_payload(connection: sqlite3.Connection, part: str, generation: int) -> bytes:
+    """The payload of an existing state row."""
+    query = "SELECT payload FROM state WHERE part = ? AND generation = ?"
+    return connection.execute(query, (part, generation)).fetchone()[0]
+
+
+def read_platforms(folder: Path) -> list[tuple[int, dict[str, Any]]]:
+    """(first generation, platform) in order; each holds until the next."""
+    with reading(folder) as (connection, _):
+        platforms: list[tuple[int, dict[str, Any]]] = []
+        for at, text, sha256 in connection.execute(
+            "SELECT generation, platform, sha256 FROM platform ORDER BY generation"
+        ):
+            if text_sha256(f"platform {at}", text) != sha256:
+                raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
+            platforms.append((at, json.loads(text)))
+        return platforms
+
+
+def verify_run(folder: Path) -> list[str]:
+    """Check everything stored, as opening for writing does, and return what is wrong; costs one read of the file."""
+    with reading(folder) as (connection, _):
+        try:
+            return list(verify(connection, Path(folder) / DATABASE).problems)
+        except Damaged as damage:
+            return [str(damage)]

@@ -1,0 +1,110 @@
+"""What a run's database needs now and then while it is written: checkpoints of its log and verified copies."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from es_service.run_folder import COPY, DATABASE, is_disk_full
+from es_service.store_repair import make_copy
+from es_service.store_schema import Damaged
+
+LOCAL_COPY_INTERVAL_S = 180.0
+NETWORK_COPY_INTERVAL_S = 10.0
+COPY_TIME_FRACTION = 0.02
+"""Copying waits longer than its interval rather than take more than this part of the time."""
+CHECKPOINT_BYTES = 8 * 1024 * 1024
+"""A checkpoint follows the commit with which the log has grown by about this much."""
+CHECKPOINT_INTERVAL_S = 5.0
+"""Or the commit that ends this many seconds after the last one: what a power cut can take."""
+_CLOSE_PATIENCE_MS = 1000
+
+
+class Upkeep:
+    """Looks after the database of `connection` in `folder`; what fails here becomes a notice and not an error."""
+
+    def __init__(
+        self,
+        connection: sqlite3.Connection,
+        folder: Path,
+        network: bool,
+        hook: Callable[[str], None],
+        notices: list[str],
+    ) -> None:
+        """Set the journal: WAL on a local disk, a synchronous rollback journal on a network file system."""
+        self._connection = connection
+        self._folder = folder
+        self._network = network
+        self._hook = hook
+        self._notices = notices
+        self.copy_interval_s = NETWORK_COPY_INTERVAL_S if network else LOCAL_COPY_INTERVAL_S
+        self._copied_at = time.monotonic() - _age_s(folder / COPY, self.copy_interval_s)
+        self._copy_seconds = 0.0
+        self._is_copied = False
+        self._pending_bytes = 0
+        self._checkpointed_at = time.monotonic()
+        connection.execute(f"PRAGMA journal_mode = {'DELETE' if network else 'WAL'}")
+        connection.execute(f"PRAGMA synchronous = {'FULL' if network else 'NORMAL'}")
+        # Checkpoints are ours to make, so that a commit's cost is known and tests can be killed around them.
+        connection.execute("PRAGMA wal_autocheckpoint = 0")
+        # Old states need not be overwritten with zeros before their pages are used again.
+        connection.execute("PRAGMA secure_delete = OFF")
+        if network and not (folder / COPY).exists():
+            self._copy()
+
+    def after_commit(self, log_bytes: int) -> None:
+        """Checkpoint and copy if it is time to; the commit added about `log_bytes` to the log."""
+        self._is_copied = False
+        self._pending_bytes += log_bytes
+        now = time.monotonic()
+        due = self._pending_bytes >= CHECKPOINT_BYTES or now - self._checkpointed_at >= CHECKPOINT_INTERVAL_S
+        if due and not self._network:
+            try:
+                self._checkpoint("PASSIVE")
+            except sqlite3.Error as error:
+                self._notice(f"could not move the newest generations from the log into {DATABASE}", error)
+        if now - self._copied_at >= max(self.copy_interval_s, self._copy_seconds / COPY_TIME_FRACTION):
+            self._copy()
+
+    def finish(self) -> None:
+        """Make the database a single file; a reader that holds on to it, or a full disk, leaves a log beside it."""
+        if self._network and not self._is_copied:
+            self._copy()
+        with contextlib.suppress(sqlite3.Error):
+            self._connection.execute(f"PRAGMA busy_timeout = {_CLOSE_PATIENCE_MS}")
+            self._checkpoint("TRUNCATE")
+            self._connection.execute("PRAGMA journal_mode = DELETE")
+
+    def _checkpoint(self, mode: str) -> None:
+        self._hook("before_checkpoint")
+        # Also when it fails: the next commit need not try again at once.
+        self._checkpointed_at, self._pending_bytes = time.monotonic(), 0
+        self._connection.execute(f"PRAGMA wal_checkpoint({mode})").fetchall()
+        self._hook("after_checkpoint")
+
+    def _copy(self) -> None:
+        start = time.monotonic()
+        try:
+            make_copy(self._connection, self._folder)
+            self._is_copied = True
+        except (sqlite3.Error, OSError, Damaged) as error:
+            self._notice(f"could not refresh {COPY}; the former one, if any, stays", error)
+        self._copied_at = time.monotonic()
+        self._copy_seconds = self._copied_at - start
+
+    def _notice(self, what: str, error: Exception) -> None:
+        full = not isinstance(error, Damaged) and is_disk_full(error, self._folder)
+        notice = f"{self._folder}: {'disk full: ' if full else ''}{what} ({error})"
+        if notice not in self._notices:
+            self._notices.append(notice)
+
+
+def _age_s(file: Path, limit: float) -> float:
+    """Seconds since `file` was written, between 0 and `limit`; 0 if there is none, whatever the clock says."""
+    try:
+        return min(max(time.time() - file.stat().st_mtime, 0.0), limit)
+    except OSError:
+        return 0.0

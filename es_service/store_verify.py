@@ -1,0 +1,168 @@
+"""What can be trusted in a run's database: SQLite's own check, the tables, and every SHA-256."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from es_service.store_codec import (
+    column_bytes,
+    decode_part,
+    part_sha256,
+    row_sha256,
+    state_sha256,
+    text_sha256,
+)
+from es_service.store_schema import Damaged, RunMeta, history_select, load_meta, table_statements
+
+_NOT_DAMAGE = {
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_NOMEM,
+    sqlite3.SQLITE_PERM,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_INTERRUPT,
+}
+"""Errors that say nothing about the file's content, so that nothing is moved aside because of them."""
+KeptRows = dict[str, dict[int, str]]
+"""SHA-256 of the state rows at hand, by part and generation."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a database that can be read holds, and how much of it is sound."""
+
+    meta: RunMeta
+    newest: int | None
+    """Newest generation with a history row; None if none was ever committed."""
+    good: int | None
+    """Newest generation of which the whole state and the history up to it are sound."""
+    kept: KeptRows
+    """Sound state rows."""
+    bad_rows: tuple[tuple[str, int], ...] = ()
+    """State rows (part, generation) that must go."""
+    problems: tuple[str, ...] = field(default=())
+    """Everything that is wrong, for a user to read."""
+
+
+def check_header(file: Path) -> None:
+    """Look at the first bytes of a database that no connection of this process has open. Raises Damaged."""
+    with file.open("rb") as stream:
+        header = stream.read(100)
+    if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
+        raise Damaged("it is not an SQLite database")
+    # Write and read version: 1 is a rollback journal, 2 is WAL. SQLite would take others for a read-only file.
+    if header[18] != header[19] or header[18] not in (1, 2):
+        raise Damaged("its header names an unknown file format")
+
+
+def verify(connection: sqlite3.Connection, file: Path) -> Verdict:
+    """Check everything in the database `file`; costs one read of it.
+
+    Raises Damaged where no part of the file can be relied upon, sqlite3.Error where the check itself could not be
+    made (locked, no permission), StoreError for a newer schema version.
+    """
+    try:
+        return _verify(connection, file)
+    except sqlite3.Error as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NOT_DAMAGE:
+            raise
+        raise Damaged(f"SQLite says: {error}") from error
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
+        raise Damaged(f"it holds what was never written to it: {error}") from error
+
+
+def _verify(connection: sqlite3.Connection, file: Path) -> Verdict:
+    # Before all else: of a newer schema version nothing more is known than this table.
+    meta = load_meta(connection, file)
+    complaints = [row[0] for row in connection.execute("PRAGMA quick_check(3)")]
+    if complaints != ["ok"]:
+        raise Damaged(f"SQLite's quick_check says: {'; '.join(complaints)}")
+    tables = dict(connection.execute("SELECT name, sql FROM sqlite_schema"))
+    if tables != table_statements(meta.columns):
+        raise Damaged("its tables are not those of a run")
+    for generation, platform, sha256 in connection.execute("SELECT generation, platform, sha256 FROM platform"):
+        if text_sha256(f"platform {generation}", platform) != sha256:
+            raise Damaged(f"the platform recorded at generation {generation} does not match its SHA-256")
+
+    problems: list[str] = []
+    states = _history(connection, meta, problems)
+    kept, bad_rows = _state(connection, problems)
+    sound_history = next((index for index, state in enumerate(states) if state is None), len(states))
+    newest = len(states) - 1 if states else None
+    unfinished = sorted((part, at) for part, rows in kept.items() for at in rows if at >= len(states))
+    problems += [f"state of {part!r} at generation {at} has no history row" for part, at in unfinished]
+    good = None
+    if newest is not None:
+        # Of older generations the state is not kept.
+        for generation in (newest, newest - 1):
+            in_force = rows_in_force(kept, generation) if 0 <= generation < sound_history else {}
+            # Before a fork's first generation there is history without a state.
+            if in_force and states[generation] == state_sha256(in_force):
+                good = generation
+                break
+        else:
+            problems.append(f"neither generation {newest} nor the one before it can be put together")
+        if good == newest - 1:
+            problems.append(f"generation {newest} cannot be put together")
+    return Verdict(meta, newest, good, kept, tuple(bad_rows), tuple(problems))
+
+
+def _history(connection: sqlite3.Connection, meta: RunMeta, problems: list[str]) -> list[str | None]:
+    """The `state_sha256` of each generation from 0 on, None where the history row is not sound."""
+    columns = column_bytes(meta.columns)
+    at = [column.name for column in meta.columns].index("generation")
+    states: list[str | None] = []
+    for *values, state, sha256 in connection.execute(history_select(meta.columns) + " ORDER BY history.generation"):
+        row = tuple(values)
+        generation = len(states)
+        if row[at] != generation:
+            problems.append(f"history row of generation {generation} is missing")
+            states.append(None)
+            break
+        sound = _row_is_sound(columns, row, state, sha256)
+        if not sound:
+            problems.append(f"history row of generation {generation} does not match its SHA-256")
+        states.append(state if sound else None)
+    return states
+
+
+def _row_is_sound(columns: bytes, row: tuple, state: object, sha256: object) -> bool:
+    try:
+        return row_sha256(columns, row, str(state)) == sha256
+    except ValueError:
+        return False
+
+
+def _state(connection: sqlite3.Connection, problems: list[str]) -> tuple[KeptRows, list[tuple[str, int]]]:
+    """Sound state rows, and (part, generation) of the others."""
+    kept: KeptRows = {}
+    bad_rows: list[tuple[str, int]] = []
+    for part, generation, sha256, payload in connection.execute("SELECT part, generation, sha256, payload FROM state"):
+        try:
+            sound = part_sha256(part, generation, payload) == sha256
+            if sound:
+                decode_part(payload)
+        except (ValueError, TypeError):
+            sound = False
+        if sound:
+            kept.setdefault(part, {})[generation] = sha256
+        else:
+            problems.append(f"state of {part!r} at generation {generation} does not match its SHA-256")
+            bad_rows.append((part, generation))
+    return kept, bad_rows
+
+
+def rows_in_force(kept: Mapping[str, Mapping[int, str]], generation: int) -> dict[str, tuple[int, str]]:
+    """Per part its newest row up to `generation`, as (generation of the row, sha256)."""
+    newest = {part: max((at for at in rows if at <= generation), default=None) for part, rows in kept.items()}
+    return {part: (at, kept[part][at]) for part, at in newest.items() if at is not None}
+
+
+def state_in_force(kept: Mapping[str, Mapping[int, str]], generation: int) -> str:
+    """`state_sha256` of the state at `generation`, put together from the rows at hand."""
+    return state_sha256(rows_in_force(kept, generation))

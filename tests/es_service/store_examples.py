@@ -1,0 +1,129 @@
+"""A small run whose every generation is known: what the tests of the run store write and expect to read back."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from es_service import store_upkeep
+from es_service.history import Column
+from es_service.store import RunMeta, RunStore, no_hook
+
+CONFIG_YAML = "seed: 0\n"
+COLUMNS = (
+    Column("generation", "INTEGER", True, ""),
+    Column("env_steps", "INTEGER", True, ""),
+    Column("centre_fitness_mean", "REAL", True, ""),
+    Column("goal_distance", "REAL", True, ""),
+    Column("seconds_rollout", "REAL", False, ""),
+)
+MEMBERS = 3
+
+
+def meta(**changes):
+    fields = {
+        "run_id": "run-1",
+        "created": "2025-01-01T00:00:00+00:00",
+        "config": {"seed": 0, "search": {"pairs": 8}},
+        "constants": {"search.pairs": 8},
+        "columns": COLUMNS,
+        "parent": None,
+    }
+    return RunMeta(**{**fields, **changes})
+
+
+def parts_of(generation, seed=0):
+    """The parts that this generation changes: the statistics, and one member of three (all of them at first)."""
+    members = range(MEMBERS) if generation == 0 else [generation * 7 % 5 % MEMBERS]
+    parts = {f"member_{member}": _member(seed, generation, member) for member in members}
+    parts["observations"] = {
+        "count": np.asarray(100.0 * generation),
+        "mean_O": np.random.default_rng([seed, generation, 99]).standard_normal(5),
+        "steps": np.asarray(generation, np.int64),
+    }
+    return parts
+
+
+def _member(seed, generation, member):
+    rng = np.random.default_rng([seed, generation, member])
+    return {
+        "centre_D": rng.standard_normal(150).astype(np.float32),
+        "adam_m_D": rng.standard_normal(150).astype(np.float32),
+        "step": np.asarray(generation, np.int64),
+    }
+
+
+def state_at(generation, seed=0):
+    """Every part as of `generation`."""
+    state = {}
+    for at in range(generation + 1):
+        state.update(parts_of(at, seed))
+    return state
+
+
+def history_row(generation):
+    return {
+        "generation": generation,
+        "env_steps": generation * 3_000_000_000,
+        "centre_fitness_mean": -math.inf if generation == 1 else 1.0 / (generation + 3),
+        "goal_distance": math.nan if generation % 2 else float(generation),
+        "seconds_rollout": 0.25 + generation,
+    }
+
+
+def create(folder, *, seed=0, generations=0, hook=no_hook, run_meta=None):
+    store = RunStore.create(Path(folder), CONFIG_YAML, run_meta or meta(), hook=hook)
+    advance(store, generations - 1, seed=seed)
+    return store
+
+
+def advance(store, last, *, seed=0):
+    """Commit generations up to and including `last`."""
+    first = 0 if store.generation is None else store.generation + 1
+    for generation in range(first, last + 1):
+        store.commit(generation, parts_of(generation, seed), history_row(generation))
+
+
+def finished(folder, generations, seed=0):
+    """A run that ended cleanly."""
+    create(folder, seed=seed, generations=generations).close()
+    return Path(folder)
+
+
+def copy_at_every_commit(monkeypatch):
+    """Refresh the verified copy with every generation, as a run of many minutes would now and then."""
+    monkeypatch.setattr(store_upkeep, "LOCAL_COPY_INTERVAL_S", 0.0)
+    monkeypatch.setattr(store_upkeep, "COPY_TIME_FRACTION", math.inf)
+
+
+def assert_same_state(found, expected):
+    assert found.keys() == expected.keys()
+    for part in expected:
+        assert found[part].keys() == expected[part].keys()
+        for name, array in expected[part].items():
+            assert found[part][name].dtype == array.dtype
+            assert found[part][name].shape == array.shape
+            assert found[part][name].tobytes() == array.tobytes(), (part, name)
+
+
+def assert_same_history(found, generations):
+    assert len(found) == generations
+    for generation, row in enumerate(found):
+        expected = history_row(generation)
+        assert row.keys() == expected.keys()
+        for name, value in expected.items():
+            assert type(row[name]) is type(value)
+            assert row[name] == value or (math.isnan(value) and math.isnan(row[name]))
+
+
+def flip_bit(file, position, bit=0):
+    content = bytearray(Path(file).read_bytes())
+    content[position] ^= 1 << bit
+    Path(file).write_bytes(content)
+
+
+def position_of(file, content):
+    """Where `content` stands in the file; it must stand there once."""
+    data = Path(file).read_bytes()
+    assert data.count(content) == 1
+    return data.index(content)

@@ -1,0 +1,300 @@
+"""Configs load, resolve to one value per key, and survive the way through the run folder."""
+
+from __future__ import annotations
+
+import pickle
+import string
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from es_service.config import RunConfig, changed_constants, describe_changes, worker_spec
+from es_service.config_loading import load_config, resume_config
+from es_service.config_resolution import (
+    config_warnings,
+    default_chunk_pairs,
+    default_gradient_block_pairs,
+    default_rollout_block_pairs,
+)
+from es_service.config_yaml import dump_yaml, parse_value
+from es_service.errors import ConfigError
+from es_service.presets import PRESETS, preset_table, preset_values
+from es_service.protocol import TaskSpec
+
+POINT_MAZE = TaskSpec(
+    name="point_maze",
+    observation_size=2,
+    action_size=2,
+    episode_steps=200,
+    descriptor_names=("x", "y"),
+    descriptor_bounds=((-1.0, 1.0), (-1.0, 1.0)),
+    final_fitness=True,
+    options={"start": ("default", "corner")},
+)
+TASKS = {"point_maze": POINT_MAZE}
+CONFIGS = Path(__file__).parents[2] / "configs"
+MINIMAL = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 3}}
+MINIMAL_TEXT = "task: {environment: point_maze}\nsearch: {algorithm: es}\nbudget: {generations: 3}\n"
+
+
+def load(source=MINIMAL, *overrides: str) -> RunConfig:
+    return load_config(source, overrides, tasks=TASKS, algorithms=("es",))
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(text: str | bytes) -> Path:
+        path = tmp_path / "my.yaml"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return write
+
+
+# What a config resolves to
+
+
+def test_minimal_config_resolves_every_value():
+    config = load()
+    assert config.task.episode_steps == 200
+    assert config.task.options == {"start": "default"}
+    assert config.policy.hidden == (64, 64)
+    assert (config.policy.init, config.policy.observation_clip) == ("unit_columns", 5.0)
+    assert (config.search.pairs, config.search.common_random_numbers) == (512, True)
+    assert (config.search.sigma, config.search.learning_rate, config.search.l2) == (0.02, 0.01, 0.005)
+    assert (config.compute.rollout, config.compute.workers, config.compute.engine) == ("xla", "auto", "inline")
+    assert (config.compute.chunk_pairs, config.compute.rollout_block_pairs) == (64, 32)
+    assert config.compute.gradient_block_pairs == 64
+    assert config.seed == 0
+
+
+def test_uber_preset_and_explicit_keys_over_it():
+    config = load(MINIMAL, "search.preset=uber")
+    assert (config.search.pairs, config.search.common_random_numbers) == (5000, False)
+    assert (config.policy.init, config.policy.observation_clip) == ("small_columns", None)
+    assert (config.compute.chunk_pairs, config.compute.gradient_block_pairs) == (40, 160)
+    config = load(MINIMAL, "search.preset=uber", "search.pairs=64", "policy.observation_clip=10")
+    assert (config.search.pairs, config.policy.observation_clip) == (64, 10.0)
+    assert load(MINIMAL, "policy.observation_clip=null").policy.observation_clip is None
+
+
+def test_preset_clips_only_normalised_observations():
+    assert load(MINIMAL, "policy.observation_normalization=false").policy.observation_clip is None
+    both = load(MINIMAL, "policy.observation_normalization=false", "policy.observation_clip=2")
+    assert both.policy.observation_clip == 2.0
+
+
+def test_preset_table_has_a_source_for_every_row_and_differs_in_each():
+    for row in preset_table():
+        assert row.literature != row.uber
+        assert "literature:" in row.source
+        assert "uber:" in row.source
+    assert {row.key for row in preset_table()} == set(preset_values("uber")) == set(preset_values("literature"))
+    for preset in PRESETS:
+        assert load(MINIMAL, f"search.preset={preset}").search.preset == preset
+
+
+@pytest.mark.parametrize(
+    ("pairs", "chunk"), [(5000, 40), (512, 64), (7, 7), (127, 1), (1, 1), (64, 64), (62, 62), (496, 16), (130, 26)]
+)
+def test_default_chunk_pairs(pairs, chunk):
+    assert default_chunk_pairs(pairs) == chunk
+
+
+@given(st.integers(1, 100_000))
+def test_default_shapes_fit_together(pairs):
+    chunk = default_chunk_pairs(pairs)
+    rollout, gradient = default_rollout_block_pairs(chunk), default_gradient_block_pairs(pairs, chunk)
+    assert pairs % chunk == 0
+    assert chunk % rollout == 0
+    assert chunk <= 64
+    assert rollout <= 32
+    assert gradient % chunk == 0
+    assert gradient <= pairs
+    assert -(-pairs // gradient) <= 32
+
+
+def test_awkward_populations_load_with_a_warning():
+    assert config_warnings(load()) == []
+    (warning,) = config_warnings(load(MINIMAL, "search.pairs=127"))
+    assert warning.startswith("compute.chunk_pairs: 1 makes 127 small chunks")
+    assert "search.pairs = 128" in warning
+    (warning,) = config_warnings(load(MINIMAL, "compute.chunk_pairs=4"))
+    assert "auto would be 64" in warning
+    (warning,) = config_warnings(load(MINIMAL, "budget.generations=null", "budget.target_fitness=-25"))
+    assert "target_fitness (-25.0)" in warning
+
+
+def test_overrides_win_over_the_file_and_later_ones_over_earlier(file):
+    path = file(MINIMAL_TEXT + "seed: 1\n")
+    config = load(path, "seed=2", "seed=3", "policy.hidden=[8]", "task.options.start=corner", "search.sigma=1e-3")
+    assert config.seed == 3
+    assert config.policy.hidden == (8,)
+    assert config.task.options == {"start": "corner"}
+    assert config.search.sigma == 0.001
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1e-3", 0.001), ("1E+2", 100.0), (".5", 0.5), ("-1.5e3", -1500.0), ("1", 1.0), ("1_000.5", 1000.5)],
+)
+def test_numbers_as_people_write_them_are_floats(file, text, value):
+    config = load(file(MINIMAL_TEXT.replace("generations: 3", f"target_fitness: {text}")))
+    assert type(config.budget.target_fitness) is float
+    assert config.budget.target_fitness == value
+
+
+def test_whole_numbers_may_have_underscores_and_leading_zeros(file):
+    assert load(file(MINIMAL_TEXT.replace("generations: 3", "env_steps: 1_000_000"))).budget.env_steps == 1_000_000
+    assert load(file(MINIMAL_TEXT + "seed: 012\n")).seed == 12
+
+
+def test_init_from_is_made_absolute(tmp_path, monkeypatch):
+    (tmp_path / "old").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert load(MINIMAL, "search.init_from=old").search.init_from == str(tmp_path / "old")
+
+
+def test_config_is_frozen():
+    with pytest.raises(ValidationError):
+        load().search.sigma = 0.1  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
+def test_shipped_configs_load_and_are_named_after_task_and_algorithm(path):
+    config = load(path)
+    assert path.stem == f"{config.task.environment}_{config.search.algorithm}"
+    assert config_warnings(config) == []
+
+
+def test_shipped_config_hides_no_preset_key():
+    """Its commented "by preset" keys stay commented, or `--set search.preset=uber` would do nothing."""
+    path = CONFIGS / "point_maze_es.yaml"
+    assert load(path, "search.preset=uber").constants().items() >= preset_values("uber").items()
+
+
+# Round trip and constants
+
+
+WORDS = st.text(string.ascii_letters + string.digits + " .:#'\"-_+~/&*!%[]{}", max_size=12)
+POSITIVE = st.floats(min_value=1e-9, max_value=1e9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.fixed_dictionaries(
+        {},
+        optional={
+            "search.pairs": st.integers(1, 20_000),
+            "search.preset": st.sampled_from(["literature", "uber"]),
+            "search.sigma": POSITIVE,
+            "search.l2": st.floats(min_value=0, max_value=1),
+            "search.common_random_numbers": st.booleans(),
+            "policy.hidden": st.lists(st.integers(1, 512), max_size=4),
+            "policy.observation_clip": st.none() | POSITIVE,
+            "policy.observation_normalization": st.booleans(),
+            "task.options.start": st.sampled_from(["default", "corner"]),
+            "task.episode_steps": st.none() | st.integers(1, 5000),
+            "budget.target_fitness": st.none() | st.floats(allow_nan=False, allow_infinity=False),
+            "compute.workers": st.just("auto") | st.integers(1, 64),
+            "seed": st.integers(0, 2**63 - 1),
+        },
+    )
+)
+def test_resolved_yaml_loads_to_an_equal_config(values):
+    config = load(MINIMAL, *(f"{name}={dump_yaml([value]).strip()[1:-1]}" for name, value in values.items()))
+    again = load(parse_value(config.resolved_yaml()))
+    assert again == config
+    assert again.resolved_yaml() == config.resolved_yaml()
+    assert changed_constants(config.constants(), again.constants()) == []
+
+
+@given(WORDS | st.floats(allow_nan=False) | st.integers() | st.booleans() | st.none() | st.lists(WORDS, max_size=3))
+def test_dumped_values_read_back(value):
+    assert parse_value(dump_yaml({"key": value})) == {"key": value}
+
+
+def test_resolved_yaml_is_plain_yaml_for_other_readers():
+    assert yaml.safe_load(load().resolved_yaml())["search"]["sigma"] == 0.02
+
+
+def test_constants_name_what_fixes_the_results():
+    constants = load().constants()
+    assert constants["search.sigma"] == 0.02
+    assert constants["task.options.start"] == "default"
+    assert constants["policy.hidden"] == [64, 64]
+    assert constants["seed"] == 0
+    assert {name for name in constants if name.startswith("compute.")} == {
+        "compute.rollout",
+        "compute.chunk_pairs",
+        "compute.rollout_block_pairs",
+        "compute.gradient_block_pairs",
+    }
+    assert not [name for name in constants if name.startswith("budget.")]
+
+
+def test_changed_constants_lists_both_values_and_absent_ones():
+    old, new = {"a": 1, "b": 2, "c": 3}, {"a": 1, "b": 5, "d": 4}
+    assert changed_constants(old, new) == [("b", 2, 5), ("c", 3, "(absent)"), ("d", "(absent)", 4)]
+
+
+def test_describe_changes_shows_all_and_the_fork_that_makes_them():
+    message = describe_changes([("search.sigma", 0.02, 0.05), ("policy.hidden", [64, 64], [8, 8])], run="runs/a")
+    assert "  search.sigma: 0.02 -> 0.05" in message.splitlines()
+    assert "  policy.hidden: [64, 64] -> [8, 8]" in message.splitlines()
+    assert "es-service fork runs/a --set search.sigma=0.05 --set 'policy.hidden=[8, 8]'" in message
+
+
+def resume(*overrides: str) -> RunConfig:
+    stored = parse_value(load().resolved_yaml())
+    assert isinstance(stored, dict)
+    return resume_config(stored, overrides, tasks=TASKS, algorithms=("es",))
+
+
+def test_resume_may_change_budget_workers_and_limits():
+    config = resume("budget.generations=9", "compute.workers=2", "compute.chunk_timeout_s=5", "compute.max_attempts=1")
+    assert (config.budget.generations, config.compute.workers, config.compute.max_attempts) == (9, 2, 1)
+    assert config.constants() == load().constants()
+    assert resume("search.sigma=2e-2") == resume()  # saying what is so changes nothing
+
+
+def test_resume_refuses_constants_and_points_to_fork():
+    with pytest.raises(ConfigError) as caught:
+        resume("search.sigma=0.05", "seed=7", "budget.generations=9", "compute.chunk_pairs=32")
+    message = str(caught.value)
+    for line in ("search.sigma: 0.02 -> 0.05", "seed: 0 -> 7", "compute.chunk_pairs: 64 -> 32"):
+        assert f"  {line}" in message.splitlines()
+    assert "fork RUN --set search.sigma=0.05 --set compute.chunk_pairs=32 --set seed=7" in message
+    with pytest.raises(ConfigError, match=r"did you mean budget\.generations"):
+        resume("budget.generation=9")
+
+
+def test_a_run_outlives_the_run_it_started_from(tmp_path):
+    (tmp_path / "old").mkdir()
+    stored = parse_value(load(MINIMAL, f"search.init_from={tmp_path / 'old'}").resolved_yaml())
+    (tmp_path / "old").rmdir()
+    assert resume_config(stored, tasks=TASKS, algorithms=("es",)).search.init_from == str(tmp_path / "old")
+    with pytest.raises(ConfigError, match="old does not exist; must be the folder of another run, or null"):
+        load(stored)
+
+
+def test_worker_spec_says_what_the_config_says():
+    config = load(MINIMAL, "policy.hidden=[8, 4]", "task.options.start=corner", "task.fitness=final", "seed=5")
+    spec = worker_spec(config)
+    assert pickle.loads(pickle.dumps(spec)) == spec
+    assert (spec.seed, spec.environment, spec.environment_options) == (5, "point_maze", {"start": "corner"})
+    assert (spec.episode_steps, spec.fitness, spec.episodes_per_member) == (200, "final", 1)
+    assert (spec.hidden, spec.observation_clip, spec.action_noise) == ((8, 4), 5.0, 0.01)
+    assert (spec.chunk_pairs, spec.rollout_block_pairs, spec.gradient_block_pairs) == (64, 32, 64)
+    assert spec.common_random_numbers is True
+
+
+def test_every_field_says_what_it_means():
+    for section in ("task", "policy", "search", "budget", "compute"):
+        fields = RunConfig.model_fields[section].annotation.model_fields  # pyright: ignore
+        for name, field in fields.items():
+            assert field.description, f"{section}.{name}"

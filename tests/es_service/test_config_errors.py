@@ -1,0 +1,250 @@
+"""Everything wrong with a config is said at once, each with the field, the value, what is allowed and the way out."""
+
+from __future__ import annotations
+
+import pickle
+import string
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from es_service.config import RunConfig
+from es_service.config_loading import load_config
+from es_service.errors import ConfigError
+from es_service.protocol import TaskSpec
+
+POINT_MAZE = TaskSpec(
+    name="point_maze",
+    observation_size=2,
+    action_size=2,
+    episode_steps=200,
+    descriptor_names=("x", "y"),
+    descriptor_bounds=((-1.0, 1.0), (-1.0, 1.0)),
+    final_fitness=True,
+    options={"start": ("default", "corner")},
+)
+NO_FINAL = TaskSpec("no_final", 2, 2, 50, ("x",), ((0.0, 1.0),), final_fitness=False)
+TASKS = {"point_maze": POINT_MAZE, "no_final": NO_FINAL}
+MINIMAL = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 3}}
+MINIMAL_TEXT = "task: {environment: point_maze}\nsearch: {algorithm: es}\nbudget: {generations: 3}\n"
+WORDS = st.text(string.ascii_letters + string.digits + " .:#'\"-_+~/&*!%[]{}", max_size=12)
+
+
+def load(source=MINIMAL, *overrides: str) -> RunConfig:
+    return load_config(source, overrides, tasks=TASKS, algorithms=("es",))
+
+
+def problems(source=MINIMAL, *overrides: str) -> list[str]:
+    """The lines of the error, without its heading and indentation."""
+    with pytest.raises(ConfigError) as caught:
+        load(source, *overrides)
+    heading, *lines = str(caught.value).splitlines()
+    assert heading.endswith(f": {len(lines)} problem" + "s" * (len(lines) > 1))
+    return [line.strip() for line in lines]
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(text: str | bytes) -> Path:
+        path = tmp_path / "my.yaml"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("search.pairs='512'", "'512' ... must be a whole number, at least 1; remove the quotes"),
+        ("search.pairs=512.5", "512.5 ... must be a whole number, at least 1"),
+        ("search.pairs=0", "0 ... must be a whole number, at least 1"),
+        ("search.pairs=true", "true ... must be a whole number"),
+        ("search.pairs=null", "null ... must be a whole number, at least 1; leave the key out"),
+        ("budget.env_steps=1e6", "1000000.0 ... must be a whole number, at least 1 or null; write 1000000"),
+        ("seed=true", "true ... must be a whole number, at least 0 and below 2**63"),
+        ("seed=-1", "-1 ... must be a whole number, at least 0 and below 2**63"),
+        ("seed=9223372036854775808", "9223372036854775808 ... must be"),
+        ("search.sigma=0", "0 ... must be a number above 0"),
+        ("search.sigma=.nan", ".nan ... must be a number above 0"),
+        ("search.sigma=1e999", ".inf is not allowed"),
+        ("search.sigma=true", "true is not allowed"),
+        ("search.sigma='1e-3'", "'1e-3' ... must be a number above 0; remove the quotes around 1e-3"),
+        ("search.init_from=''","'' ... must be text"),
+        ("search.l2=-1", "-1 ... must be a number, at least 0"),
+        ("search.max_invalid_fraction=1.5", "1.5 ... must be a number from 0 to 1"),
+        ("search.preset=litrature", "litrature ... must be literature or uber; did you mean literature?"),
+        ("search.algorithm=ess", "ess is no known algorithm; must be es; did you mean es?"),
+        ("task.environment=pointmaze", "pointmaze is no known task; must be point_maze or no_final; did you mean"),
+        ("task.episode_steps=auto", "auto ... must be null or a whole number, at least 1"),
+        ("task.fitness=finl", "finl ... must be sum or final; did you mean final?"),
+        ("task.options.start=cornr", "cornr ... must be default or corner; did you mean corner?"),
+        ("task.options.start=3", "3 ... must be text"),
+        ("task.options.strat=corner", "unknown option; point_maze has start; did you mean start?"),
+        ("policy.hidden=64", "64 ... must be a list of whole numbers, each at least 1, such as [64, 64]"),
+        ("policy.hidden=[64, 0]", "[64, 0] is not allowed"),
+        ("policy.observation_normalization=1", "1 ... must be true or false"),
+        ("policy.observation_clip=0", "0 ... must be a number above 0 or null"),
+        ("compute.engine=ray", "ray ... must be inline"),
+        ("compute.rollout=simd", "simd ... must be auto or xla"),
+        ("compute.workers=0", "0 ... must be auto or a whole number, at least 1"),
+        ("compute.chunk_pairs=half", "half ... must be auto or a whole number"),
+        ("search.init_from=/no/such/run", "/no/such/run does not exist; must be the folder of another run"),
+        ("compute.rollout_block_pairs=24", "24 does not divide compute.chunk_pairs (64); try 16 or 32"),
+        ("compute.gradient_block_pairs=513", "513 is more than search.pairs (512); try 512"),
+    ],
+)  # fmt: skip
+def test_a_bad_value_is_one_line_with_field_value_and_what_is_allowed(override, message):
+    """`...` in the table stands for "is not allowed;"."""
+    (line,) = problems(MINIMAL, override)
+    assert line.startswith(f"{override.split('=')[0]}: {message.replace('...', 'is not allowed;')}")
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("search.sgima=1", "override search.sgima=1: search.sgima: unknown key; did you mean search.sigma?"),
+        ("serach.sigma=1", "did you mean search.sigma?"),
+        ("sigma=1", "override sigma=1: sigma: unknown key; did you mean search.sigma?"),
+        ("search.hidden=[4]", "did you mean policy.hidden?"),
+        ("seeed=3", "did you mean seed?"),
+        ("qqq.zzz=3", "unknown key; the sections are task, policy, search, budget, compute"),
+        ("budget.qqq=3", "unknown key; budget has generations, env_steps, wall_clock_s, target_fitness"),
+        ("search.sigma", "override search.sigma: write a.b=c, such as search.sigma=0.05"),
+        ("=3", "override =3: write a.b=c"),
+        ("search.init_from=", "override search.init_from=: write null for no value"),
+        ("search=3", "override search=3: search is a section; set its keys one by one, such as search.algorithm=..."),
+        ("task.options=3", "task.options is a section; set its keys one by one, such as task.options.start=..."),
+        ("policy.hidden=[64,", "override policy.hidden=[64,: line 1, column 5: not YAML"),
+        ("compute.chunk_pairs=48", "512 is not a multiple of compute.chunk_pairs (48); try pairs = 528 (or 480)"),
+        ("compute.chunk_pairs=600", "512 is not a multiple of compute.chunk_pairs (600); try pairs = 600, or"),
+        ("budget.generations=null", "budget: nothing ends this run; set at least one of budget.generations, bud"),
+    ],
+)  # fmt: skip
+def test_a_problem_elsewhere_is_one_line_with_a_hint(override, message):
+    (line,) = problems(MINIMAL, override)
+    assert message in line
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (MINIMAL_TEXT + "novelty: {neighbours: 10}\n", "novelty: unknown key; the top level has task, policy, search"),
+        (MINIMAL_TEXT + "policy:\n", "policy: null where keys belong; indent them below `policy:`, or delete"),
+        (MINIMAL_TEXT + "compute: 3\n", "compute: 3 where keys belong"),
+        (MINIMAL_TEXT + "seed: 1\nseed: 2\n", "seed: written twice, on lines 4 and 5; keep one"),
+        (MINIMAL_TEXT + "policy.hidden: [3]\n", "policy.hidden: no dots in a file (they are for --set); write hidden"),
+        (MINIMAL_TEXT.replace("algorithm: es", "preset: uber"), "search.algorithm: missing; must be es"),
+        (MINIMAL_TEXT.replace("es}", "es, sigma: 1, sigma: 2}"), "search.sigma: written twice, on lines 2 and 2"),
+        (MINIMAL_TEXT.replace("maze}", "maze, options: }"), "task.options: null where keys belong"),
+        ("- 1\n", "the top level is [1]; write sections such as `task:`"),
+        ("", "the file is empty"),
+        ("# nothing\n", "the file is empty"),
+        ("task: a: b\n", "line 1, column 8: not YAML: mapping values are not allowed here: task: a: b"),
+        ("task:\n\tx: 1\n", "line 2, column 1: not YAML: while scanning for the next token found character '\\t'"),
+        ("task: [1,\nsearch: 2\n", "not YAML: while parsing a flow sequence"),
+        ("task: !!python/name:os.system\n", "line 1, column 7: not YAML: could not determine a constructor"),
+        ("task: 1\n---\ntask: 2\n", "expected a single document"),
+        ("task: \x01\n", "line 1: not YAML: character code 1 is not allowed"),
+        ("[" * 500, "nested too deeply"),
+        (b"task: \xff\n", "not a text file: byte 6 is not UTF-8"),
+    ],
+)  # fmt: skip
+def test_file_problems_say_where_and_what(file, text, message):
+    path = file(text)
+    (line,) = problems(path)
+    assert message in line
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    assert str(caught.value).startswith(f"{path}: 1 problem\n")
+
+
+def test_missing_file_and_directory(tmp_path):
+    assert problems(tmp_path / "none.yaml") == ["no such file"]
+    assert problems(tmp_path) == ["this is a directory; name a YAML file"]
+
+
+def test_a_list_that_contains_itself_is_refused_and_a_merge_key_is_no_repetition(file):
+    (line,) = problems(file(MINIMAL_TEXT + "policy: {hidden: &a [*a]}\n"))
+    assert line.startswith("policy.hidden: [[...]] is not")
+    merged = "task: {environment: point_maze}\nsearch: &s {algorithm: es}\nbudget: {generations: 3}\n"
+    (line,) = problems(file(merged + "policy: {<<: *s, hidden: [3]}\n"))
+    assert line == "policy.algorithm: unknown key; did you mean search.algorithm?"
+
+
+def test_final_fitness_only_where_the_task_declares_it():
+    (line,) = problems(MINIMAL, "task.environment=no_final", "task.fitness=final")
+    assert line.startswith("task.fitness: final is not allowed for no_final")
+    (line,) = problems(MINIMAL, "task.environment=no_final", "task.options.start=corner")
+    assert line == "task.options.start: unknown option; no_final has none"
+
+
+def test_everything_at_once_and_no_echoes(file):
+    """Sections are checked against each other where they can be, and a bad value is reported once, as itself."""
+    text = """\
+task: {environment: nowhere, options: {start: 3}}
+policy: {hidden: big}
+search: {algorithm: es, sgima: 0.1, preset: nobody}
+compute: {chunk_pairs: 64, rollout_block_pairs: 24, gradient_block_pairs: lots}
+seed: true
+"""
+    lines = problems(file(text), "search.pairs=500", "budgt.generations=3")
+    fields = [line.split(":")[0] for line in lines]
+    assert sorted(fields) == sorted(
+        [
+            "search.sgima",
+            "override budgt.generations=3",
+            "task.options.start",
+            "policy.hidden",
+            "search.preset",
+            "compute.gradient_block_pairs",
+            "seed",
+            "task.environment",
+            "search.pairs",
+            "compute.rollout_block_pairs",
+            "budget",
+        ]
+    )
+    assert next(line for line in lines if line.startswith("search.pairs")) == (
+        "search.pairs: 500 is not a multiple of compute.chunk_pairs (64); try pairs = 512 (or 448), "
+        "or compute.chunk_pairs = auto"
+    )
+
+
+@pytest.mark.parametrize("section", ["task", "search", "budget", "compute", "policy"])
+def test_an_unusable_section_is_one_problem(section):
+    (line,) = problems({**MINIMAL, "compute": {"chunk_pairs": 64}, section: None})
+    assert line.startswith(f"{section}: null where keys belong")
+
+
+@settings(deadline=None, max_examples=150)
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | WORDS,
+        lambda inner: st.lists(inner, max_size=2) | st.dictionaries(WORDS, inner, max_size=2),
+        max_leaves=4,
+    ),
+    st.sampled_from(sorted({*load().constants(), "budget.generations", "compute.workers", "task.options", "search"})),
+)
+def test_any_value_anywhere_loads_or_is_a_config_error_that_names_the_field(value, name):
+    source: dict = {section: dict(MINIMAL.get(section, {})) for section in ("task", "search", "budget")}
+    *path, leaf = name.split(".")
+    target = source
+    for group in path:
+        target = target.setdefault(group, {})
+    target[leaf] = value
+    message = ""
+    try:
+        load(source)
+    except ConfigError as error:
+        message = str(error)
+    assert all(len(line) < 400 for line in message.splitlines())
+    assert not message or name in message
+
+
+def test_config_errors_survive_pickling():
+    with pytest.raises(ConfigError) as caught:
+        load(MINIMAL, "search.sgima=1")
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)

@@ -1,0 +1,723 @@
+"""The scheduler against a simulated world that breaks in every way we know, and against cases worked by hand."""
+
+from __future__ import annotations
+
+import copy
+import heapq
+import itertools
+import math
+import time
+from collections import Counter, deque
+from dataclasses import replace
+from random import Random
+
+import pytest
+
+from es_service.dispatch.scheduler import (
+    Assign,
+    Command,
+    Deliver,
+    Drain,
+    Event,
+    Fail,
+    Failure,
+    Policy,
+    Result,
+    SchedulerState,
+    SetWorkers,
+    StartWorker,
+    StopWorker,
+    Submit,
+    Task,
+    Tick,
+    WorkerLost,
+    WorkerUp,
+    initial_state,
+    next_deadline,
+    pending,
+    step,
+)
+
+START_FATES = ("start_dies", "start_hangs")
+TASK_FATES = ("task_dies", "task_hangs", "task_slow", "task_raises", "contradicts")
+FAULTS = (
+    *START_FATES,
+    *TASK_FATES,
+    "dies_idle",
+    "duplicates",
+    "reports_stopped",
+    "speaks_after_stop",
+    "drain",
+    "resize",
+)
+SEEDS, BLOCKS = 3000, 10
+
+
+class World:
+    """Workers as an engine would see them, faults drawn from one seed, and its own books to check the scheduler by."""
+
+    def __init__(self, seed: int) -> None:
+        r = self.random = Random(seed)
+        self.policy = Policy(
+            workers=r.randint(1, 4),
+            in_flight=r.randint(1, 2),
+            max_attempts=r.randint(2, 5),
+            start_deadline_s=3.0,
+            first_deadline_s=8.0,
+            min_deadline_s=2.0,
+            deadline_factor=4.0,
+            max_failures_in_a_row=r.randint(1, 3),
+            restart_backoff_s=0.5,
+            max_backoff_s=r.choice((4.0, 20.0)),
+            max_start_failures=r.randint(2, 5),
+            no_worker_timeout_s=r.choice((4.0, 12.0)),
+        )
+        harshness = r.choice((0.0, 0.05, 0.2, 0.5))
+        self.faultless = harshness == 0.0
+        self.rate = {fault: harshness * r.random() ** 2 for fault in FAULTS}
+        if harshness and r.random() < 0.1:
+            self.rate[r.choice(("start_dies", "start_hangs", "task_raises", "task_dies"))] = 1.0
+        self.poison_rate = harshness * r.choice((0.0, 0.0, 0.1))
+        self.check_purity = seed % 31 == 0
+        self.state, self.now = initial_state(self.policy), 0.0
+        self.heap: list[tuple[float, int, object, tuple]] = []
+        self.serial = itertools.count()
+        self.seen: Counter[str] = Counter()
+        # What the processes do.
+        self.alive: set[int] = set()
+        self.inbox: dict[int, deque[tuple[tuple, int]]] = {}
+        self.busy: set[int] = set()
+        self.last_word: dict[int, float] = {}
+        self.poison: dict[tuple, str] = {}
+        # What a correct scheduler must know.
+        self.wanted = self.policy.workers
+        self.known: set[int] = set()
+        self.up: set[int] = set()
+        self.draining: set[int] = set()
+        self.open: dict[int, list[tuple[tuple, int]]] = {}
+        self.fresh: deque[tuple] = deque()
+        self.waiting: set[tuple] = set()
+        self.delivered: set[tuple] = set()
+        self.faults: Counter[tuple] = Counter()
+        self.last_holder: dict[tuple, int] = {}
+        self.assigned = self.lost = self.dropped = self.start_failures = self.newest = 0
+        self.down_since: float | None = None
+        self.failed: str | None = None
+
+    # The processes.
+
+    def at(self, delay: float, function: object, *args: object) -> None:
+        heapq.heappush(self.heap, (self.now + delay, next(self.serial), function, args))
+
+    def happens(self, fault: str) -> bool:
+        return self.random.random() < self.rate[fault]
+
+    def say(self, worker: int, event: Event) -> None:
+        """A message that arrives late, in order per worker only."""
+        arrival = max(self.now, self.last_word.get(worker, 0.0)) + self.random.expovariate(20.0)
+        self.last_word[worker] = arrival
+        self.at(arrival - self.now, self.feed, event)
+
+    def start_process(self, worker: int) -> None:
+        self.alive.add(worker)
+        self.inbox[worker], self.open[worker] = deque(), []
+        if self.happens("start_dies"):
+            self.at(self.random.random(), self.die, worker)
+        elif not self.happens("start_hangs"):
+            self.at(self.random.random(), self.come_up, worker)
+
+    def come_up(self, worker: int) -> None:
+        if worker in self.alive or self.happens("speaks_after_stop"):
+            self.say(worker, WorkerUp(worker))
+            if self.happens("dies_idle"):
+                self.at(self.random.expovariate(0.5), self.die, worker)
+
+    def die(self, worker: int) -> None:
+        if worker in self.alive:
+            self.alive.discard(worker)
+            self.say(worker, WorkerLost(worker, "killed"))
+
+    def begin(self, worker: int) -> None:
+        if worker not in self.alive or worker in self.busy or not self.inbox[worker]:
+            return
+        self.busy.add(worker)
+        key, attempt = self.inbox[worker].popleft()
+        fate = self.poison.get(key) or next((fate for fate in TASK_FATES if self.happens(fate)), "ok")
+        if fate != "task_hangs":
+            self.at(self.random.random() + 10.0 * (fate == "task_slow"), self.end, worker, key, attempt, fate)
+
+    def end(self, worker: int, key: tuple, attempt: int, fate: str) -> None:
+        if worker not in self.alive and not self.happens("speaks_after_stop"):
+            return
+        if fate == "task_dies":
+            self.die(worker)
+            return
+        if fate in ("task_raises", "contradicts"):
+            self.say(worker, Failure(worker, key, attempt, "ValueError: no"))
+        if fate != "task_raises":
+            self.say(worker, Result(worker, key, attempt))
+        if self.happens("duplicates"):
+            self.say(worker, Result(worker, key, attempt) if fate == "ok" else Failure(worker, key, attempt, "again"))
+        self.busy.discard(worker)
+        self.begin(worker)
+
+    # The books.
+
+    def forget(self, worker: int, *, fault: bool, charge: bool) -> None:
+        """The scheduler has stopped the worker or learned that it is gone."""
+        self.known.discard(worker)
+        if fault:
+            self.lost += 1
+            self.start_failures += worker not in self.up
+            running = self.open[worker][0][0] if self.open[worker] else None
+            if charge and running in self.waiting:
+                self.faults[running] += 1
+        self.up.discard(worker)
+        self.draining.discard(worker)
+        self.open[worker] = []
+
+    def note(self, event: Event) -> None:
+        """What the event means, before the scheduler is asked."""
+        match event:
+            case Submit(tasks):
+                self.fresh.extend(task.key for task in tasks)
+                self.waiting.update(task.key for task in tasks)
+            case WorkerUp(worker) if worker in self.known and worker not in self.up:
+                self.up.add(worker)
+                self.start_failures = 0
+            case WorkerLost(worker) if worker in self.known:
+                expected = worker in self.draining
+                self.seen["lost while draining"] += expected
+                self.forget(worker, fault=not expected, charge=not expected)
+            case Result(worker, key, attempt):
+                if worker in self.known and (key, attempt) in self.open[worker]:
+                    self.open[worker].remove((key, attempt))
+                elif worker in self.known and key in self.waiting:
+                    self.seen["superseded result"] += 1
+            case Failure(worker, key, attempt):
+                valid = worker in self.known and (key, attempt) in self.open[worker]
+                if valid:
+                    self.open[worker].remove((key, attempt))
+                if valid and key in self.waiting:
+                    self.faults[key] += 1
+                else:
+                    self.dropped += 1
+            case Drain(worker) if worker in self.known:
+                self.draining.add(worker)
+            case SetWorkers(wanted):
+                self.wanted = wanted
+                self.draining.update(sorted(self.known - self.draining)[wanted:])
+
+    def feed(self, event: Event) -> None:
+        before = self.state
+        speaker_known = isinstance(event, Result) and event.worker in self.known
+        if self.failed is None:
+            self.note(event)
+        copied = copy.deepcopy(before) if self.check_purity else None
+        self.state, commands = step(before, event, self.now)
+        if copied is not None:
+            assert step(before, event, self.now) == (self.state, commands)
+            assert before == copied
+        if self.failed is not None:
+            assert self.state is before
+            assert commands == []
+            return
+        accepted = 0
+        for command in commands:
+            assert self.failed is None or isinstance(command, StopWorker)
+            match command:
+                case StartWorker(worker):
+                    assert worker >= self.newest
+                    self.newest = worker + 1
+                    self.known.add(worker)
+                    self.start_process(worker)
+                case StopWorker(worker, reason):
+                    self.stop(worker, reason, event)
+                case Assign(worker, key, attempt):
+                    self.check_assign(worker, key, attempt)
+                case Deliver(key):
+                    assert isinstance(event, Result)
+                    assert event.key == key
+                    assert speaker_known
+                    assert key in self.waiting
+                    self.waiting.remove(key)
+                    self.delivered.add(key)
+                    accepted += 1
+                case Fail(message):
+                    self.failed = message
+                    self.check_fail(message)
+        if isinstance(event, Result) and not accepted:
+            assert not (speaker_known and event.key in self.waiting)
+            self.dropped += 1
+        self.check_books()
+        if isinstance(event, Tick):
+            assert next_deadline(self.state) > self.now
+
+    def stop(self, worker: int, reason: str, event: Event) -> None:
+        assert worker in self.known, "stopped twice, or never started"
+        if self.failed is None and reason == "drained":
+            assert worker in self.draining
+            assert not self.open[worker]
+            self.forget(worker, fault=False, charge=False)
+        elif self.failed is None:
+            assert isinstance(event, Tick | Failure)
+            self.seen["quarantine" if isinstance(event, Failure) else "deadline"] += 1
+            self.forget(worker, fault=True, charge=isinstance(event, Tick))
+        self.known.discard(worker)
+        self.up.discard(worker)
+        self.alive.discard(worker)
+        if self.happens("reports_stopped"):
+            self.say(worker, WorkerLost(worker, "stopped"))
+
+    def check_assign(self, worker: int, key: tuple, attempt: int) -> None:
+        assert worker in self.up - self.draining
+        assert key in self.waiting
+        assert all(key != held for slots in self.open.values() for held, _ in slots)
+        assert attempt == self.faults[key] + 1 <= self.policy.max_attempts
+        if key not in self.last_holder:
+            assert key == self.fresh.popleft(), "out of submission order"
+        assert self.last_holder.get(key) != worker or len(self.up - self.draining) == 1
+        self.last_holder[key] = worker
+        self.assigned += 1
+        self.open[worker].append((key, attempt))
+        assert len(self.open[worker]) <= self.policy.in_flight
+        self.inbox[worker].append((key, attempt))
+        self.at(0.0, self.begin, worker)
+
+    def check_fail(self, message: str) -> None:
+        worn_out = [key for key in self.waiting if self.faults[key] >= self.policy.max_attempts]
+        if message.startswith("task"):
+            self.seen["poison"] += 1
+            assert any(str(key) in message for key in worn_out)
+        elif "workers in a row" in message:
+            self.seen["start failures"] += 1
+            assert self.start_failures >= self.policy.max_start_failures
+            assert not self.up
+        else:
+            self.seen["no worker"] += 1
+            assert self.waiting
+            assert not self.up
+            assert self.down_since is not None
+            assert self.now - self.down_since >= self.policy.no_worker_timeout_s - 1e-9
+
+    def check_books(self) -> None:
+        state = self.state
+        assert (state.lost_workers, state.duplicates) == (self.lost, self.dropped)
+        assert state.retries == self.assigned - len(self.last_holder)
+        assert pending(state) == len(self.waiting)
+        if self.failed is not None:
+            assert state.failed == self.failed
+            assert not self.known, "a worker was left running"
+            return
+        assert all(self.faults[key] < self.policy.max_attempts for key in self.waiting), "poison went unnoticed"
+        if not self.waiting or self.up:
+            self.down_since = None
+        elif self.down_since is None:
+            self.down_since = self.now
+        usable = self.up - self.draining
+        queued = self.waiting - {key for slots in self.open.values() for key, _ in slots}
+        for worker in usable if queued else ():
+            if len(self.open[worker]) < self.policy.in_flight:
+                assert len(usable) > 1
+                assert {self.last_holder.get(key) for key in queued} == {worker}, "work waits beside a free worker"
+
+    # The run.
+
+    def submit(self, generation: int) -> None:
+        tasks = tuple(
+            Task((kind, generation, index), kind)
+            for kind in ("TrainingChunk", "EvaluationChunk")
+            for index in range(self.random.randint(0, 7))
+        )
+        for task in tasks:
+            if self.random.random() < self.poison_rate:
+                self.poison[task.key] = self.random.choice(("task_raises", "task_dies", "task_hangs"))
+        self.feed(Submit(tasks))
+
+    def operate(self) -> None:
+        """An operator, or a cloud, at work."""
+        if self.happens("drain") and self.newest:
+            worker = self.random.randrange(self.newest)
+            self.feed(Drain(worker))
+            if self.random.random() < 0.5:
+                self.at(self.random.random(), self.die, worker)
+        if self.happens("resize"):
+            self.feed(SetWorkers(self.random.randint(1, 5)))
+        if self.random.random() < 0.3:
+            self.feed(Tick())
+
+    def run_until_quiet(self) -> None:
+        for _ in range(20_000):
+            due = next_deadline(self.state)
+            if self.heap and self.heap[0][0] <= due:
+                self.now, _, function, args = heapq.heappop(self.heap)
+                function(*args)  # type: ignore[operator]
+            elif due < math.inf:
+                self.now = max(self.now, due)
+                before = self.state
+                self.feed(Tick())
+                assert self.state is not before, "next_deadline announced nothing"
+            else:
+                return
+        raise AssertionError("does not come to rest")
+
+
+def simulate(seed: int) -> World:
+    world = World(seed)
+    world.feed(Tick())
+    for generation in range(3):
+        world.submit(generation)
+        for _ in range(8):
+            world.at(world.random.random() * 4.0, world.operate)
+        if world.random.random() < 0.2:
+            continue  # the next generation is submitted on top
+        world.run_until_quiet()
+        assert world.failed is not None or not world.waiting, "deadlock"
+    # The storm is over: one more generation must go through without a scratch, on as many workers as are wanted.
+    world.rate, world.poison_rate = dict.fromkeys(FAULTS, 0.0), 0.0
+    world.run_until_quiet()
+    if world.failed is not None:
+        return world
+    scratches = world.lost, world.dropped, world.state.retries
+    world.submit(3)
+    world.run_until_quiet()
+    assert world.failed is None
+    assert not world.waiting
+    assert (world.lost, world.dropped, world.state.retries) == scratches
+    assert world.alive == world.known == world.up == set(world.state.up)
+    assert len(world.alive) == world.wanted
+    assert not world.draining
+    if world.faultless:
+        assert scratches == (0, 0, 0)
+    return world
+
+
+@pytest.fixture(scope="module")
+def seen() -> Counter[str]:
+    """Which rare things happened over all simulations."""
+    return Counter()
+
+
+@pytest.mark.parametrize("block", range(BLOCKS))
+def test_every_task_is_delivered_once_or_the_run_fails_for_a_reason(block, seen):
+    for seed in range(block, SEEDS, BLOCKS):
+        try:
+            world = simulate(seed)
+        except Exception as error:
+            error.add_note(f"seed {seed}")
+            raise
+        seen.update(world.seen)
+        seen["failed" if world.failed else "survived faults" if world.lost else "untouched"] += 1
+
+
+def test_the_simulation_reached_every_rare_case(seen):
+    if seen["failed"] + seen["survived faults"] + seen["untouched"] < SEEDS:
+        pytest.skip("not all simulations ran")
+    rare = ("poison", "start failures", "no worker", "quarantine", "deadline", "superseded result")
+    too_rare = {case: seen[case] for case in (*rare, "lost while draining", "survived faults") if seen[case] < 20}
+    assert not too_rare
+    assert seen["failed"] < SEEDS / 2
+
+
+# Cases worked by hand.
+
+POLICY = Policy(
+    workers=2,
+    in_flight=2,
+    max_attempts=3,
+    start_deadline_s=50.0,
+    first_deadline_s=100.0,
+    min_deadline_s=10.0,
+    deadline_factor=5.0,
+    max_failures_in_a_row=2,
+    restart_backoff_s=1.0,
+    max_backoff_s=3.0,
+    max_start_failures=3,
+    no_worker_timeout_s=30.0,
+)
+
+
+def play(state: SchedulerState, *events: tuple[float, Event]) -> tuple[SchedulerState, list[Command]]:
+    """The state after all events, and the commands of the last."""
+    commands: list[Command] = []
+    for now, event in events:
+        state, commands = step(state, event, now)
+    return state, commands
+
+
+def tasks(keys: str) -> Submit:
+    """One task per letter; capitals are of another kind."""
+    return Submit(tuple(Task(key, "train" if key.islower() else "evaluate") for key in keys))
+
+
+def ready(workers: int = 2, **changes: object) -> SchedulerState:
+    """All workers up at time 0."""
+    state, commands = step(initial_state(replace(POLICY, workers=workers, **changes)), Tick(), 0.0)  # type: ignore[arg-type]
+    assert commands == [StartWorker(worker) for worker in range(workers)]
+    return play(state, *((0.0, WorkerUp(worker)) for worker in range(workers)))[0]
+
+
+def test_tasks_go_out_in_order_to_idle_workers_first():
+    state, commands = step(ready(), tasks("abcde"), 1.0)
+    assert commands == [Assign(0, "a", 1), Assign(1, "b", 1), Assign(0, "c", 1), Assign(1, "d", 1)]
+    state, commands = step(state, Result(1, "b", 1), 2.0)
+    assert commands == [Deliver("b"), Assign(1, "e", 1)]
+    assert pending(state) == 4
+
+
+def test_tasks_submitted_before_any_worker_is_up_wait_for_it():
+    state, commands = step(initial_state(POLICY), tasks("ab"), 0.0)
+    assert commands == [StartWorker(0), StartWorker(1)]
+    assert step(state, WorkerUp(1), 1.0)[1] == [Assign(1, "a", 1), Assign(1, "b", 1)]
+
+
+def test_a_lost_worker_is_replaced_and_only_its_running_task_is_charged():
+    state, commands = play(ready(), (1.0, tasks("abcdef")), (2.0, WorkerLost(0, "killed")))
+    assert commands == [StartWorker(2)]
+    assert list(state.queue) == ["a", "c", "e", "f"]
+    state, commands = step(state, WorkerUp(2), 3.0)
+    assert commands == [Assign(2, "a", 2), Assign(2, "c", 1)]
+    assert (state.lost_workers, state.retries) == (1, 2)
+
+
+def test_a_task_that_raised_waits_for_another_worker():
+    state, commands = play(ready(in_flight=1), (1.0, tasks("abcd")), (2.0, Failure(0, "a", 1, "no")))
+    assert commands == [Assign(0, "c", 1)]
+    assert step(state, Result(1, "b", 1), 3.0)[1] == [Deliver("b"), Assign(1, "a", 2)]
+    state, commands = play(ready(in_flight=1), (1.0, tasks("ab")), (2.0, Failure(0, "a", 1, "no")))
+    assert commands == []
+    # With nobody else left it may go back.
+    assert Assign(0, "b", 2) in play(state, (3.0, WorkerLost(1, "killed")))[1]
+    assert step(step(ready(1), tasks("a"), 1.0)[0], Failure(0, "a", 1, "no"), 2.0)[1] == [Assign(0, "a", 2)]
+
+
+def test_a_poison_task_fails_the_run_with_its_name_and_nothing_happens_after():
+    state, commands = play(
+        ready(in_flight=1, max_failures_in_a_row=3),
+        (1.0, tasks("ab")),
+        (2.0, Failure(0, "a", 1, "no")),
+        (3.0, Result(1, "b", 1)),
+        (4.0, WorkerLost(1, "out of memory")),
+        (5.0, Failure(0, "a", 3, "ValueError: never")),
+    )
+    message = "task a failed in 3 attempts; the last time it raised on worker 0: ValueError: never"
+    assert commands == [Fail(message), StopWorker(0, "the run failed"), StopWorker(2, "the run failed")]
+    assert state.failed == message
+    for event in (WorkerUp(2), Result(0, "a", 3), tasks("z"), SetWorkers(5), Tick(), WorkerLost(0, "stopped")):
+        assert step(state, event, 1e9) == (state, [])
+    assert next_deadline(state) == math.inf
+
+
+def test_a_task_that_kills_its_workers_is_poison_too():
+    state = ready(1)
+    state, _ = play(state, (1.0, tasks("abc")), (2.0, WorkerLost(0, "died")), (2.0, WorkerUp(1)))
+    state, _ = play(state, (3.0, WorkerLost(1, "died")), (5.0, Tick()), (5.0, WorkerUp(2)))
+    state, commands = step(state, WorkerLost(2, "signal 11"), 6.0)
+    assert commands == [Fail("task a failed in 3 attempts; the last time it took worker 2 with it: signal 11")]
+
+
+def test_deadlines_exempt_compiling_and_follow_the_median_of_their_kind():
+    state, _ = play(ready(1, in_flight=1), (0.0, tasks("abcdefE")))
+    assert next_deadline(state) == 100.0
+    state, _ = step(state, Result(0, "a", 1), 40.0)
+    assert state.durations_s == {}
+    assert next_deadline(state) == 40.0 + 100.0, "no duration is known yet"
+    state, _ = step(state, Result(0, "b", 1), 44.0)
+    assert next_deadline(state) == 44.0 + 5.0 * 4.0
+    state, _ = step(state, Result(0, "c", 1), 46.0)
+    assert next_deadline(state) == 46.0 + 5.0 * 3.0
+    state, _ = step(state, Result(0, "d", 1), 47.0)
+    assert next_deadline(state) == 47.0 + 5.0 * 2.0
+    state, _ = step(state, Result(0, "e", 1), 48.0)
+    assert next_deadline(state) == 48.0 + 10.0, "never below min_deadline_s"
+    state, _ = step(state, Result(0, "f", 1), 49.0)
+    assert next_deadline(state) == 49.0 + 100.0, "the first task of another kind compiles"
+    assert state.durations_s == {"train": (4.0, 2.0, 1.0, 1.0, 1.0)}
+    state, _ = play(ready(1), *((float(n), event) for n in range(40) for event in (tasks("a"), Result(0, "a", 1))))
+    assert len(state.durations_s["train"]) == 31, "a bounded window"
+
+
+def test_the_clock_of_a_prefetched_task_starts_when_the_one_ahead_is_done():
+    state, _ = play(ready(1), (0.0, tasks("abcd")), (10.0, Result(0, "a", 1)), (12.0, Result(0, "b", 1)))
+    assert state.durations_s == {"train": (2.0,)}
+    assert next_deadline(state) == 22.0
+    state, _ = step(state, Result(0, "c", 1), 15.0)
+    assert next_deadline(state) == 15.0 + 12.5
+    assert step(state, Tick(), 27.4) == (state, [])
+    state, commands = step(state, Tick(), 27.5)
+    assert commands == [StopWorker(0, "no answer to task d in 12.5 s"), StartWorker(1)]
+    assert step(state, WorkerUp(1), 28.0)[1] == [Assign(1, "d", 2)]
+
+
+def test_a_result_out_of_order_leaves_the_clock_of_the_running_task_alone():
+    state, _ = play(ready(1, in_flight=3), (0.0, tasks("abc")), (9.0, Result(0, "b", 1)))
+    assert next_deadline(state) == 100.0
+    state, _ = play(state, (10.0, Result(0, "a", 1)), (12.0, tasks("de")), (15.0, Result(0, "d", 1)))
+    assert state.durations_s == {}, "how long an answer out of order took is not known"
+    assert play(state, (16.0, Result(0, "c", 1)))[0].durations_s == {"train": (6.0,)}
+
+
+def test_a_worker_that_keeps_raising_is_quarantined_without_blaming_its_next_task():
+    state, _ = play(ready(), (1.0, tasks("abcdefg")), (2.0, Failure(0, "a", 1, "no")), (3.0, Failure(0, "c", 1, "bad")))
+    assert sorted(state.up) == [1]
+    assert list(state.queue) == ["c", "e", "a", "f", "g"]
+    assert state.lost_workers == 1
+    assert step(state, WorkerUp(2), 4.0)[1] == [Assign(2, "c", 2), Assign(2, "e", 1)]
+    assert state.tasks["e"].faults == 0
+    state, _ = play(
+        ready(1), (1.0, tasks("abc")), (2.0, Failure(0, "a", 1, "no")), (3.0, Result(0, "b", 1)),
+        (4.0, Failure(0, "a", 2, "no")),
+    )  # fmt: skip
+    assert sorted(state.up) == [0], "a success in between"
+
+
+def test_replacements_back_off_until_a_success():
+    state, commands = step(ready(1, max_attempts=99), tasks("a"), 0.0)
+    now, waits = 0.0, []
+    for worker in range(6):
+        state, commands = step(state, WorkerLost(worker, "killed"), now)
+        if not commands:
+            waits.append(next_deadline(state) - now)
+            now += waits[-1]
+            state, commands = step(state, Tick(), now)
+        assert commands == [StartWorker(worker + 1)]
+        state, _ = step(state, WorkerUp(worker + 1), now)
+    assert waits == [1.0, 2.0, 3.0, 3.0, 3.0]
+    state, commands = play(state, (now, Result(6, "a", 7)), (now + 1.0, WorkerLost(6, "killed")))
+    assert commands == [StartWorker(7)]
+
+
+def test_losses_during_a_wait_share_it():
+    state, _ = play(ready(9), *((0.0, WorkerLost(worker, "node died")) for worker in range(8)))
+    assert (sorted(state.starting), next_deadline(state)) == ([9], 1.0)
+    assert step(state, Tick(), 1.0)[1] == [StartWorker(worker) for worker in range(10, 17)]
+
+
+def test_a_broken_environment_is_reported_at_once():
+    state, _ = play(initial_state(POLICY), (0.0, Tick()), (0.1, WorkerLost(0, "no module")))
+    state, _ = play(state, (0.2, WorkerLost(1, "no module")))
+    state, commands = step(state, WorkerLost(2, "ImportError: brax"), 0.3)
+    message = "3 workers in a row did not come up; the last, worker 2: ImportError: brax"
+    assert commands == [Fail(message)]
+    assert (state.failed, state.lost_workers) == (message, 3)
+
+
+def test_start_failures_are_forgiven_while_a_worker_is_up():
+    state = ready(2)
+    state, _ = play(state, (0.0, WorkerLost(0, "killed")), *((0.1 + w, WorkerLost(w, "no memory")) for w in (2, 3, 4)))
+    state, _ = play(state, (50.0, Tick()), (50.0, WorkerLost(3, "no memory")), (99.0, Tick()))
+    state, _ = play(state, (99.0, WorkerLost(4, "no memory")))
+    assert (state.failed, state.start_failures) == (None, 3)
+    state, _ = play(state, (200.0, Tick()), (200.0, WorkerUp(5)))
+    assert state.start_failures == 0
+
+
+def test_a_worker_that_never_comes_up_is_killed_and_replaced():
+    state, _ = play(initial_state(POLICY), (0.0, Tick()), (1.0, WorkerUp(1)))
+    assert next_deadline(state) == 50.0
+    state, commands = step(state, Tick(), 50.0)
+    assert commands == [StopWorker(0, "did not come up in 50 s"), StartWorker(2)]
+    assert step(state, WorkerUp(0), 51.0) == (state, [])
+    assert step(state, WorkerLost(0, "stopped"), 51.0) == (state, [])
+
+
+def test_no_worker_for_too_long_fails_the_run():
+    state, _ = play(initial_state(POLICY), (0.0, Tick()), (25.0, tasks("ab")))
+    assert next_deadline(state) == 50.0
+    assert next_deadline(play(initial_state(POLICY), (0.0, Tick()), (5.0, tasks("a")))[0]) == 35.0
+    state, commands = play(state, (50.0, Tick()), (55.0, Tick()))
+    assert commands[0] == Fail(
+        "2 tasks wait and no worker was up for 30 s; last loss: worker 1: did not come up in 50 s"
+    )
+    assert play(initial_state(POLICY), (0.0, Tick()), (40.0, Tick()))[0].failed is None, "nothing waits"
+
+
+def test_a_drained_worker_finishes_what_it_has_and_is_replaced_without_blame():
+    state, commands = play(ready(), (1.0, tasks("abcdef")), (2.0, Drain(0)))
+    assert commands == [StartWorker(2)]
+    assert step(state, Result(0, "a", 1), 3.0)[1] == [Deliver("a")]
+    done, commands = play(state, (3.0, Result(0, "a", 1)), (4.0, Result(0, "c", 1)))
+    assert commands == [Deliver("c"), StopWorker(0, "drained")]
+    lost, commands = play(state, (3.0, WorkerLost(0, "preempted")), (4.0, WorkerUp(2)))
+    assert commands == [Assign(2, "a", 1), Assign(2, "c", 1)]
+    assert (done.lost_workers, lost.lost_workers) == (0, 0)
+    assert step(ready(), Drain(0), 1.0)[1] == [StopWorker(0, "drained"), StartWorker(2)]
+    assert play(initial_state(POLICY), (0.0, Tick()), (1.0, Drain(0)))[1] == [StopWorker(0, "drained"), StartWorker(2)]
+    # One that hangs while draining is killed all the same.
+    state, commands = play(state, (3.0, WorkerUp(2)), (101.0, Tick()))
+    assert StopWorker(0, "no answer to task a in 100 s") in commands
+
+
+def test_the_number_of_workers_follows_the_wish():
+    state, commands = play(ready(3, in_flight=1), (1.0, tasks("abc")), (2.0, SetWorkers(5)))
+    assert commands == [StartWorker(3), StartWorker(4)]
+    state, commands = step(state, SetWorkers(2), 3.0)
+    assert commands == [StopWorker(3, "drained"), StopWorker(4, "drained")]
+    assert (sorted(state.up), sorted(state.draining)) == ([0, 1], [2])
+    assert step(state, Result(2, "c", 1), 4.0)[1] == [Deliver("c"), StopWorker(2, "drained")]
+    with pytest.raises(ValueError, match=r"SetWorkers\(0\)"):
+        step(state, SetWorkers(0), 4.0)
+
+
+def test_stale_answers_are_dropped_and_counted():
+    state, _ = play(ready(1), (1.0, tasks("abc")), (2.0, Result(0, "a", 1)))
+    for now, event in enumerate(
+        (Result(0, "a", 1), Failure(0, "a", 1, "no"), Result(7, "b", 1), Failure(7, "b", 1, "no"))
+    ):
+        before = state
+        state, commands = step(state, event, 3.0 + now)
+        assert (commands, state) == ([], replace(before, duplicates=now + 1))
+
+
+def test_a_late_result_of_a_superseded_attempt_is_accepted():
+    base, _ = play(ready(in_flight=1), (1.0, tasks("ab")), (2.0, Failure(0, "a", 1, "lost contact")))
+    queued, commands = step(base, Result(0, "a", 1), 3.0)
+    assert commands == [Deliver("a")]
+    assert not queued.queue
+    held, commands = play(base, (3.0, Result(1, "b", 1)), (4.0, Result(0, "a", 1)))
+    assert commands == [Deliver("a")]
+    # Worker 1 is still busy with its copy, whatever becomes of it.
+    state, commands = step(held, tasks("cd"), 5.0)
+    assert commands == [Assign(0, "c", 1)]
+    state, commands = step(state, Result(1, "a", 2), 6.0)
+    assert (commands, state.duplicates) == ([Assign(1, "d", 1)], 1)
+    assert step(held, WorkerLost(1, "killed"), 6.0)[1] == [StartWorker(2)]
+    assert not step(held, WorkerLost(1, "killed"), 6.0)[0].tasks
+
+
+def test_a_key_may_be_submitted_again_only_after_it_was_delivered():
+    state, _ = play(ready(), (1.0, tasks("ab")))
+    with pytest.raises(ValueError, match="submitted twice"):
+        step(state, tasks("b"), 2.0)
+    assert pending(play(state, (2.0, Result(1, "b", 1)), (3.0, tasks("b")))[0]) == 2
+
+
+def test_a_worker_busy_with_an_old_copy_does_not_answer_for_the_new_one():
+    held, _ = play(ready(in_flight=1), (1.0, tasks("ab")), (2.0, Failure(0, "a", 1, "no")), (3.0, Result(1, "b", 1)))
+    held, _ = play(held, (4.0, Result(0, "a", 1)), (5.0, tasks("a")))
+    assert held.tasks["a"].holder == 0
+    for event in (WorkerLost(1, "killed"), Failure(1, "a", 2, "no")):
+        state, _ = step(held, event, 6.0)
+        assert (list(state.queue), state.tasks["a"]) == ([], held.tasks["a"])
+    assert step(held, Result(1, "a", 2), 6.0)[1] == [Deliver("a")]
+
+
+def test_a_policy_without_workers_or_attempts_is_refused():
+    for name in ("workers", "in_flight", "max_attempts", "max_failures_in_a_row", "max_start_failures"):
+        with pytest.raises(ValueError, match=rf"{name} \(0\) must be at least 1"):
+            replace(POLICY, **{name: 0})  # type: ignore[arg-type]
+
+
+def test_an_event_costs_little():
+    """About 25 microseconds on one core; the bound leaves room for a slow and busy machine."""
+    state, commands = step(ready(), Submit(tuple(Task(index, "train") for index in range(640))), 1.0)
+    started, events = time.process_time(), 0
+    while commands:
+        assigned = [command for command in commands if isinstance(command, Assign)]
+        commands = []
+        for command in assigned:
+            state, more = step(state, Result(command.worker, command.key, command.attempt), 2.0)
+            commands += more
+            events += 1
+    assert pending(state) == 0
+    assert (time.process_time() - started) / events < 500e-6

@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+
+from es_service.errors import StoreError
+from es_service.store_codec import decode_part, encode_part, part_sha256, row_bytes, row_values, state_sha256
+from tests.es_service.store_examples import COLUMNS, assert_same_state, history_row
+
+ARRAYS = {
+    "float32": np.linspace(-1, 1, 12, dtype=np.float32).reshape(3, 4),
+    "float64": np.array([np.nan, np.inf, -0.0, 5e-324]),
+    "int64": np.asarray(-(2**62), np.int64),
+    "uint8": np.arange(7, dtype=np.uint8),
+    "bool": np.array([[True], [False]]),
+    "empty": np.zeros((0, 3), np.float32),
+    "float16": np.ones(1, np.float16),
+}
+
+
+def test_a_part_comes_back_bit_for_bit_with_types_and_shapes():
+    assert_same_state({"part": decode_part(encode_part(ARRAYS))}, {"part": ARRAYS})
+
+
+def test_decoded_arrays_can_be_written_to():
+    decoded = decode_part(encode_part(ARRAYS))
+    decoded["float32"][0, 0] = 7
+    assert decoded["float32"][0, 0] == 7
+
+
+def test_equal_values_have_equal_bytes_whatever_their_order_strides_and_endianness():
+    other = {name: array.astype(array.dtype.newbyteorder(">")) for name, array in reversed(ARRAYS.items())}
+    other["float32"] = np.asfortranarray(ARRAYS["float32"])
+    assert encode_part(other) == encode_part(ARRAYS)
+    assert encode_part({"a": ARRAYS["float32"]}) != encode_part({"b": ARRAYS["float32"]})
+    assert encode_part({"a": ARRAYS["float32"]}) != encode_part({"a": ARRAYS["float32"].reshape(4, 3)})
+
+
+@pytest.mark.parametrize("array", [np.array(["text"]), np.array([object()]), np.zeros(1, "M8[s]")])
+def test_what_is_no_number_is_refused(array):
+    with pytest.raises(StoreError, match="'a' has dtype"):
+        encode_part({"a": array})
+
+
+def test_a_payload_cut_or_extended_anywhere_is_refused():
+    payload = encode_part({"a": np.arange(4, dtype=np.float32), "b": np.zeros(2)})
+    for length in range(len(payload)):
+        with pytest.raises(ValueError, match="payload"):
+            decode_part(payload[:length])
+    with pytest.raises(ValueError, match="longer"):
+        decode_part(payload + b"\0")
+
+
+def test_a_state_row_cannot_pass_for_another():
+    payload = encode_part({"a": np.zeros(2)})
+    hashes = {part_sha256("a", 1, payload), part_sha256("b", 1, payload), part_sha256("a", 2, payload)}
+    assert len(hashes) == 3
+    assert state_sha256({"a": (1, "x"), "b": (2, "y")}) == state_sha256({"b": (2, "y"), "a": (1, "x")})
+    assert state_sha256({"a": (1, "x")}) != state_sha256({"a": (2, "x")})
+
+
+def test_history_values_become_what_the_database_gives_back():
+    row = {**history_row(1), "env_steps": np.int32(5), "centre_fitness_mean": np.float32(0.1), "goal_distance": -0.0}
+    values = row_values(COLUMNS, 1, row)
+    assert values == (1, 5, float(np.float32(0.1)), 0.0, 1.25)
+    assert [type(value) for value in values] == [int, int, float, float, float]
+    assert str(values[3]) == "0.0"
+    assert row_values(COLUMNS, 1, {**row, "env_steps": np.nan, "goal_distance": None})[1:4:2] == (None, None)
+
+
+def test_history_rows_that_do_not_fit_are_refused_by_name():
+    row = history_row(3)
+    with pytest.raises(StoreError, match=r"unknown columns \['speed'\], missing columns \['env_steps'\]"):
+        row_values(COLUMNS, 3, {name: 1 for name in [*row, "speed"] if name != "env_steps"})
+    with pytest.raises(StoreError, match="generation 4 says it is of generation 3"):
+        row_values(COLUMNS, 4, row)
+    with pytest.raises(StoreError, match=r"env_steps is INTEGER and cannot hold 1\.5"):
+        row_values(COLUMNS, 3, {**row, "env_steps": 1.5})
+    with pytest.raises(StoreError, match="does not fit 64 bits"):
+        row_values(COLUMNS, 3, {**row, "env_steps": 2**63})
+
+
+def test_row_bytes_tell_types_and_positions_apart():
+    rows = [(1, 2.0), (1.0, 2), (None, 1), (1, None), (2.0, 1), (1, 2), (0, None), (None, 0)]
+    assert len({row_bytes(row) for row in rows}) == len(rows)
+    with pytest.raises(ValueError, match="not a number"):
+        row_bytes(("1",))

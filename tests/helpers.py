@@ -1,0 +1,76 @@
+"""Small things several tests need: a tiny spec, an evaluator without processes, recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts, WorkerSpec
+from workers.worker import make_worker
+
+SPEC = WorkerSpec(
+    seed=3,
+    environment="point_maze",
+    environment_options={},
+    episode_steps=200,
+    fitness="sum",
+    episodes_per_member=1,
+    hidden=(8, 8),
+    observation_clip=5.0,
+    action_noise=0.01,
+    common_random_numbers=True,
+    chunk_pairs=8,
+    rollout_block_pairs=4,
+    gradient_block_pairs=8,
+)
+PARAMETERS = 2 * 8 + 8 + 8 * 8 + 8 + 8 * 2 + 2
+
+
+def spec(**changes: object) -> WorkerSpec:
+    return replace(SPEC, **changes)  # pyright: ignore[reportArgumentType]
+
+
+def centre(parameters_D: np.ndarray, generation: int = 1, sigma: float = 0.1) -> Centre:
+    return Centre(
+        generation, parameters_D.astype(np.float32), sigma, np.zeros(2, np.float32), np.ones(2, np.float32)
+    )
+
+
+def random_parameters(seed: int = 0, size: int = PARAMETERS, scale: float = 0.7) -> np.ndarray:
+    return (np.random.default_rng(seed).normal(size=size) * scale).astype(np.float32)
+
+
+class DirectEvaluator:
+    """An Evaluator in this process: one worker function, chunks in the order given. Records all it returned."""
+
+    def __init__(self, worker_spec: WorkerSpec) -> None:
+        self._run_chunk = make_worker(worker_spec)
+        self.counts = DispatchCounts(workers=1)
+        self.recorded: list[tuple[Centre, Chunk, ChunkResult]] = []
+
+    def evaluate(self, centre: Centre, chunks: Sequence[Chunk]) -> list[ChunkResult]:
+        results = [self._run_chunk(centre, chunk) for chunk in chunks]
+        self.recorded += [(centre, chunk, result) for chunk, result in zip(chunks, results, strict=True)]
+        return results
+
+
+class MemoryStore:
+    """A run store in memory, for driver tests that are not about the store."""
+
+    def __init__(self) -> None:
+        self.generation: int | None = None
+        self.parts: dict[str, dict[str, np.ndarray]] = {}
+        self.rows: list[dict] = []
+
+    def load(self) -> dict[str, dict[str, np.ndarray]]:
+        return self.parts
+
+    def last_history(self) -> dict | None:
+        return self.rows[-1] if self.rows else None
+
+    def commit(self, generation, parts, history) -> None:
+        self.generation = generation
+        self.parts |= parts
+        self.rows.append(dict(history))

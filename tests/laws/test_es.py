@@ -1,0 +1,268 @@
+"""ES against its twin, and the laws any rank-based antithetic ES obeys."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from es_service import driver
+from es_service.algorithms import ALGORITHMS
+from es_service.api import load_config
+from es_service.config import worker_spec
+from es_service.errors import EvaluationError
+from es_service.generation import estimate_gradient, tree_sum
+from es_service.noise import Domain, normals, stream_keys
+from es_service.optimizer import adam_ascent, fresh_adam
+from es_service.protocol import EpisodesResult, TrainingChunk
+from es_service.shaping import centred_ranks, pair_weights
+from es_service.statistics import no_observations
+from tests.helpers import DirectEvaluator, MemoryStore, centre
+from tests.twins import es as twin
+from workers.policy import initial_parameters, policy_shape
+
+SHAPE = policy_shape(2, (8, 8), 2)
+fitness_arrays = hnp.arrays(
+    np.float64, st.tuples(st.integers(1, 12), st.just(2)), elements=st.integers(-5, 5).map(float) | st.floats(-1e6, 1e6)
+)
+
+
+def small_config(**changes):
+    mapping = {
+        "task": {"environment": "point_maze"},
+        "policy": {"hidden": [8, 8]},
+        "search": {"algorithm": "es", "pairs": 48, "sigma": 0.1, "evaluation_episodes": 20, **changes},
+        "budget": {"generations": 20},
+        "compute": {"chunk_pairs": 16, "gradient_block_pairs": 20},
+    }
+    return load_config(mapping)
+
+
+def run_in_memory(config, evaluator=None):
+    evaluator = evaluator or DirectEvaluator(worker_spec(config))
+    first = initial_parameters(SHAPE, config.policy.init, config.seed)
+    search = driver.Search(
+        config,
+        ALGORITHMS["es"](config.search),
+        lambda: (first, no_observations(2)),
+        ("x", "y"),
+    )
+    store = MemoryStore()
+    state, reason = driver.run(search, evaluator, store, lambda row: None)
+    return state, store, evaluator, reason
+
+
+@pytest.fixture(scope="module")
+def finished():
+    config = small_config()
+    return config, *run_in_memory(config)
+
+
+def test_twenty_generations_equal_the_twin(finished):
+    config, state, _, evaluator, _ = finished
+    es = twin.ES(initial_parameters(SHAPE, config.policy.init, 0), config.search.learning_rate, config.search.l2)
+    for generation in range(1, 21):
+        results = [
+            (chunk.chunk_id, result.fitness)
+            for _, chunk, result in evaluator.recorded
+            if isinstance(chunk, TrainingChunk) and chunk.generation == generation
+        ]
+        fitness_P_S = np.concatenate([fitness for _, fitness in sorted(results, key=lambda item: item[0])])
+        keys = stream_keys(0, Domain.PARAMETER_NOISE, generation, np.arange(48))
+        es.generation([normals(key, SHAPE.parameters) for key in keys], fitness_P_S)
+    difference = np.linalg.norm(state.search.members[0].centre_D - es.centre) / np.linalg.norm(es.centre)
+    assert difference < 1e-6
+
+
+def test_history_counts_what_the_workers_did(finished):
+    config, state, store, evaluator, reason = finished
+    assert reason == "20 generations are done"
+    assert [row["generation"] for row in store.rows] == list(range(21))
+    trained = [r for _, chunk, r in evaluator.recorded if isinstance(chunk, TrainingChunk)]
+    evaluated = [r for _, chunk, r in evaluator.recorded if type(chunk).__name__ == "EvaluationChunk"]
+    used = [r.steps if i % 2 == 0 else r.steps[:4] for i, r in enumerate(evaluated)]  # 20 of 32 episodes
+    steps = sum(int(r.steps.sum()) for r in trained) + sum(int(s.sum()) for s in used)
+    assert state.env_steps == store.rows[-1]["env_steps"] == steps
+    assert state.episodes == 20 * 96 + 21 * 20
+    last_two = np.concatenate([evaluated[-2].fitness, evaluated[-1].fitness[:4]]).astype(float)
+    assert store.rows[-1]["centre_fitness_mean"] == pytest.approx(last_two.mean())
+    assert store.rows[-1]["centre_fitness_std"] == pytest.approx(last_two.std())
+    best = max(row["centre_fitness_mean"] for row in store.rows)
+    assert store.rows[-1]["best_fitness"] == state.best.fitness == best
+    assert store.rows[state.best.generation]["centre_fitness_mean"] == best
+
+
+def test_observation_statistics_are_those_of_the_generation_s_start(finished):
+    """All chunks of a generation see the same statistics, gathered from the training steps of earlier ones only."""
+    _, state, _, evaluator, _ = finished
+    by_generation = {}
+    for point, chunk, result in evaluator.recorded:
+        by_generation.setdefault(chunk.generation, []).append((point, chunk, result))
+    total = 0.0
+    for generation in range(21):
+        seen = {(p.observation_mean_O.tobytes(), p.observation_std_O.tobytes()) for p, _, _ in by_generation[generation]}
+        assert len(seen) == 1
+        if generation in (0, 1):
+            assert by_generation[generation][0][0].observation_std_O.tolist() == [1.0, 1.0]
+        trained = [r for _, chunk, r in by_generation[generation] if isinstance(chunk, TrainingChunk)]
+        total += sum(r.moments.count for r in trained)
+    assert state.observations.count == total == sum(int(r.steps.sum()) for _, c, r in evaluator.recorded
+                                                    if isinstance(c, TrainingChunk))
+
+
+def test_normalisation_off_means_raw_observations():
+    config = load_config(
+        {
+            "task": {"environment": "point_maze"},
+            "policy": {"hidden": [8, 8], "observation_normalization": False},
+            "search": {"algorithm": "es", "pairs": 8, "evaluation_episodes": 2},
+            "budget": {"generations": 2},
+        }
+    )
+    _, _, evaluator, _ = run_in_memory(config)
+    for point, _, _ in evaluator.recorded:
+        assert point.observation_mean_O.tolist() == [0.0, 0.0]
+        assert point.observation_std_O.tolist() == [1.0, 1.0]
+
+
+def test_same_config_same_bits_other_seed_other_bits(finished):
+    config, state, _, _, _ = finished
+    again, *_ = run_in_memory(config)
+    np.testing.assert_array_equal(again.search.members[0].centre_D, state.search.members[0].centre_D)
+    other, *_ = run_in_memory(config.model_copy(update={"seed": 1}))
+    assert not np.array_equal(other.search.members[0].centre_D, state.search.members[0].centre_D)
+
+
+@pytest.mark.parametrize(
+    ("budget", "generations", "reason"),
+    [
+        ({"generations": 2}, 2, "2 generations are done"),
+        ({"env_steps": 30_000}, 2, "environment steps are done"),
+        ({"target_fitness": -1e9}, 0, "the target fitness -1e+09 is reached"),
+        ({"wall_clock_s": 1e-6, "generations": 50}, 0, "s are spent"),
+    ],
+)
+def test_the_first_spent_budget_ends_the_run(budget, generations, reason):
+    mapping = small_config().model_dump(mode="json") | {"budget": budget}
+    state, _, _, why = run_in_memory(load_config(mapping))
+    assert state.generation == generations
+    assert reason in why
+
+
+class Tampering(DirectEvaluator):
+    """Makes some members' results not finite."""
+
+    def __init__(self, worker_spec, spoil):
+        super().__init__(worker_spec)
+        self.spoil = spoil
+
+    def evaluate(self, centre, chunks):
+        results = super().evaluate(centre, chunks)
+        return [self.spoil(c, r) if isinstance(r, EpisodesResult) else r for c, r in zip(chunks, results, strict=True)]
+
+
+def test_invalid_members_rank_last_are_counted_and_do_not_stop_the_run():
+    def spoil(chunk, result):
+        if isinstance(chunk, TrainingChunk) and chunk.chunk_id == 1:
+            result.fitness[0, 0] = np.nan
+            result.descriptor[1, 1] = np.inf
+        return result
+
+    config = small_config()
+    state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config), spoil))
+    assert [row.get("invalid_members") for row in store.rows[1:]] == [2] * 20
+    assert np.isfinite(state.search.members[0].centre_D).all()
+    assert all(np.isfinite(row["population_fitness_min"]) for row in store.rows[1:])
+
+
+def test_too_many_invalid_members_stop_the_run_with_a_named_error():
+    def spoil(chunk, result):
+        if isinstance(chunk, TrainingChunk) and chunk.generation == 3:
+            result.fitness[:9] = np.nan
+        return result
+
+    config = small_config(max_invalid_fraction=0.25)
+    with pytest.raises(EvaluationError, match=r"generation 3: 54 of 96 members .* search.max_invalid_fraction \(0.25\)"):
+        run_in_memory(config, Tampering(worker_spec(config), spoil))
+
+
+def test_an_invalid_centre_is_never_the_best():
+    def spoil(chunk, result):
+        if type(chunk).__name__ == "EvaluationChunk" and chunk.generation != 4:
+            return dataclasses.replace(result, fitness=result.fitness * np.nan)
+        return result
+
+    config = small_config()
+    state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config), spoil))
+    assert state.best.generation == 4
+    assert store.rows[3]["best_fitness"] == -np.inf
+
+
+# Ranks
+
+
+def test_ranks_by_hand():
+    # three pairs; 2.0 occurs twice (ranks 2 and 3), NaN and -inf share the lowest two ranks
+    fitness = [[1e9, 2.0], [np.nan, 2.0], [-np.inf, 5.0]]
+    np.testing.assert_allclose(centred_ranks(fitness), [[0.5, 0.0], [-0.4, 0.0], [-0.4, 0.3]])
+    np.testing.assert_allclose(pair_weights(centred_ranks(fitness)), [0.5, -0.4, -0.7], rtol=1e-6)
+
+
+@given(fitness_arrays)
+def test_ranks_equal_the_twin_and_sum_to_zero(fitness):
+    ranks = centred_ranks(fitness)
+    np.testing.assert_allclose(ranks.ravel(), twin.averaged_centred_ranks(fitness.ravel()), atol=1e-12)
+    assert abs(ranks.sum()) < 1e-9
+
+
+@given(hnp.arrays(np.float64, (6, 2), elements=st.integers(-50, 50).map(float)))
+def test_an_increasing_map_of_the_fitness_changes_nothing(fitness):
+    for mapped in (fitness * 3.0 - 7.0, np.exp(fitness / 10.0), fitness**3):
+        np.testing.assert_array_equal(centred_ranks(mapped), centred_ranks(fitness))
+
+
+def test_swapping_signs_negates_the_gradient_estimate_exactly():
+    config = small_config()
+    evaluator = DirectEvaluator(worker_spec(config))
+    fitness = np.random.default_rng(0).normal(size=(48, 2))
+    point = centre(np.zeros(SHAPE.parameters))
+    estimates = [
+        estimate_gradient(evaluator, point, pair_weights(centred_ranks(values)), 20)
+        for values in (fitness, fitness[:, ::-1])
+    ]
+    assert np.abs(estimates[0]).max() > 0
+    np.testing.assert_array_equal(estimates[0], -estimates[1])
+
+
+def test_gradient_by_hand_three_pairs():
+    """Worked through: weights of three pairs times their noise, over three; blocks of two leave one padded pair."""
+    config = load_config(
+        small_config().model_dump(mode="json")
+        | {"search": {"algorithm": "es", "pairs": 3}, "compute": {"gradient_block_pairs": 2}}
+    )
+    weights = np.float32([1.0, -0.5, 0.25])
+    found = estimate_gradient(DirectEvaluator(worker_spec(config)), centre(np.zeros(SHAPE.parameters)), weights, 2)
+    noise = [normals(key, SHAPE.parameters) for key in stream_keys(0, Domain.PARAMETER_NOISE, 1, np.arange(3))]
+    np.testing.assert_allclose(found, (noise[0] - 0.5 * noise[1] + 0.25 * noise[2]) / 3, rtol=1e-5, atol=1e-6)
+
+
+def test_tree_sum_adds_neighbours_level_by_level():
+    a, b, c, d, e = (np.float32([x]) for x in (1e8, 1.0, -1e8, 1.0, 3.0))
+    assert tree_sum([a, b, c, d, e])[0] == ((a + b) + (c + d) + e)[0] == 3.0
+    assert tree_sum([a])[0] == a[0]
+
+
+def test_adam_by_hand():
+    """First step: m = 0.1 g, v = 0.001 g^2, so the step is lr * sqrt(0.001)/0.1 * 0.1 g / (sqrt(0.001)|g| + 1e-8)."""
+    gradient, start = np.float32([2.0, -0.5, 0.0]), np.float32([1.0, 1.0, 1.0])
+    adam, moved = adam_ascent(fresh_adam(3), start, gradient, learning_rate=0.01, l2=0.0)
+    np.testing.assert_allclose(moved, [1.01, 0.99, 1.0], rtol=1e-6)
+    assert adam.step == 1
+    _, pulled = adam_ascent(fresh_adam(3), start, np.zeros(3, np.float32), learning_rate=0.01, l2=0.005)
+    np.testing.assert_allclose(pulled, start - 0.01, rtol=1e-4)  # the penalty alone, through Adam
+    tiny = np.float32([1e-7, 0.0, 0.0])  # epsilon sits inside the bias correction: visible for tiny gradients only
+    _, crept = adam_ascent(fresh_adam(3), np.zeros(3, np.float32), tiny, learning_rate=0.01, l2=0.0)
+    expected = 0.01 * np.sqrt(0.001) / 0.1 * 0.1 * 1e-7 / (np.sqrt(0.001) * 1e-7 + 1e-8)
+    assert crept[0] == pytest.approx(expected, rel=1e-4)

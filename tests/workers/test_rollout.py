@@ -1,0 +1,248 @@
+"""Compiled episodes against a step-by-step NumPy episode, and the ways episodes have silently gone wrong elsewhere."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import workers.worker
+from es_service.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys
+from es_service.protocol import EpisodesResult, EvaluationChunk, GradientChunk, GradientResult, TrainingChunk
+from es_service.run_view import Policy
+from es_service.statistics import merge_moments, no_observations
+from tests.helpers import PARAMETERS, centre, random_parameters, spec
+from tests.twins import noise as noise_twin
+from tests.twins import point_maze as maze_twin
+from workers.environments import Environment
+from workers.policy import initial_parameters, policy_shape
+from workers.worker import make_worker
+
+SHAPE = policy_shape(2, (8, 8), 2)
+MEAN, STD = np.float32([0.1, -0.4]), np.float32([0.3, 0.6])
+
+
+def numpy_episode(parameters_D, reset_key, action_key, action_noise, steps=200):
+    """One PointMaze episode with the scalar twin and the NumPy policy: returns, steps, end, observations."""
+    policy = Policy(SHAPE, parameters_D, MEAN, STD, 5.0)
+    x = -0.1 + 0.2 * noise_twin.uniform(reset_key, 0)
+    y = -1.0 + 0.3 * noise_twin.uniform(reset_key, 1)
+    total, seen, distances = 0.0, [], []
+    for t in range(steps):
+        seen.append((x, y))
+        noise = np.array([noise_twin.normal_integer(action_key, 2 * t + i) for i in range(2)]) / NORMAL_STD
+        action = policy(np.float32([x, y])) + action_noise * noise
+        x, y, reward, done = maze_twin.step(x, y, (float(action[0]), float(action[1])))
+        total += reward
+        distances.append(-reward)
+        if done:
+            break
+    return total, len(seen), (x, y), np.array(seen), (distances[-1], min(distances))
+
+
+def run(chunk, worker_spec, parameters_D, sigma=0.1):
+    point = centre(parameters_D, sigma=sigma)
+    point = type(point)(point.generation, point.parameters_D, sigma, MEAN, STD)
+    return make_worker(worker_spec)(point, chunk)
+
+
+def test_training_chunk_equals_numpy_episodes():
+    worker_spec, parameters_D = spec(), random_parameters(1)
+    result = run(TrainingChunk(1, 2), worker_spec, parameters_D)
+    assert isinstance(result, EpisodesResult)
+    observed = []
+    for p, pair in enumerate(range(16, 24)):
+        direction = normals(stream_keys(3, Domain.PARAMETER_NOISE, 1, pair), PARAMETERS)
+        reset = noise_twin.stream_key(3, Domain.TRAINING_RESET, 1, pair, 0, 0)
+        action = noise_twin.stream_key(3, Domain.ACTION_NOISE, 1, pair, 0, 0)
+        for s, sign in enumerate((1.0, -1.0)):
+            member = (parameters_D + sign * 0.1 * direction).astype(np.float32)
+            total, steps, end, seen, distances = numpy_episode(member, reset, action, 0.01)
+            assert result.fitness[p, s] == result.returns[p, s] == pytest.approx(total, abs=2e-2)
+            assert result.steps[p, s] == steps
+            np.testing.assert_allclose(result.descriptor[p, s], end, atol=1e-3)
+            np.testing.assert_allclose(result.goal_distance[p, s], distances, atol=1e-3)
+            observed.append(seen)
+    seen = np.concatenate(observed)
+    assert result.moments is not None
+    assert result.moments.count == len(seen)
+    np.testing.assert_allclose(result.moments.mean_O, seen.mean(0), atol=1e-4)
+    np.testing.assert_allclose(result.moments.m2_O / len(seen), seen.var(0), rtol=1e-3)
+
+
+def test_evaluation_chunk_equals_numpy_episodes_and_has_no_noise():
+    parameters_D = random_parameters(2)
+    result = run(EvaluationChunk(4, 1), spec(action_noise=0.5), parameters_D)
+    assert isinstance(result, EpisodesResult)
+    assert result.moments is None
+    for e, episode in enumerate(range(16, 32)):
+        reset = noise_twin.stream_key(3, Domain.EVALUATION_RESET, 4, episode)
+        total, steps, end, _, _ = numpy_episode(parameters_D, reset, [0, 0, 0, 0], 0.0)
+        assert result.fitness[e] == pytest.approx(total, abs=2e-2)
+        assert result.steps[e] == steps
+        np.testing.assert_allclose(result.descriptor[e], end, atol=1e-3)
+
+
+def test_gradient_chunk_is_the_weighted_sum_of_the_rollout_s_noise():
+    weights = np.random.default_rng(0).normal(size=8).astype(np.float32)
+    result = run(GradientChunk(1, 3, weights), spec(), random_parameters())
+    assert isinstance(result, GradientResult)
+    keys = stream_keys(3, Domain.PARAMETER_NOISE, 1, np.arange(24, 32))
+    integers = np.stack([normal_integers(np, key, np.arange(PARAMETERS, dtype=np.uint32)) for key in keys])
+    np.testing.assert_allclose(result.sum_D, weights.astype(float) @ integers / NORMAL_STD, rtol=1e-5, atol=1e-5)
+
+
+def test_common_random_numbers_share_starts_within_a_pair_only():
+    """With sigma 0 and a common start both signs are the same episode; without, they differ; pairs always differ."""
+    for common in (True, False):
+        result = run(TrainingChunk(1, 0), spec(common_random_numbers=common), random_parameters(1), sigma=0.0)
+        assert isinstance(result, EpisodesResult)
+        assert np.array_equal(result.fitness[:, 0], result.fitness[:, 1]) is common
+        assert len(np.unique(result.fitness[:, 0])) == 8
+
+
+def test_episodes_per_member_average():
+    """Fitness and descriptor are means over the member's episodes, steps their sum, episodes start differently."""
+    parameters_D = random_parameters(1)
+    three = run(TrainingChunk(1, 0), spec(episodes_per_member=3), parameters_D)
+    assert isinstance(three, EpisodesResult)
+    singles = []
+    for e in range(3):
+        pairs = [
+            numpy_episode(
+                (parameters_D + 0.1 * normals(stream_keys(3, Domain.PARAMETER_NOISE, 1, p), PARAMETERS)),
+                noise_twin.stream_key(3, Domain.TRAINING_RESET, 1, p, 0, e),
+                noise_twin.stream_key(3, Domain.ACTION_NOISE, 1, p, 0, e),
+                0.01,
+            )
+            for p in range(2)
+        ]
+        singles.append(pairs)
+    for p in range(2):
+        assert three.fitness[p, 0] == pytest.approx(np.mean([singles[e][p][0] for e in range(3)]), abs=2e-2)
+        np.testing.assert_allclose(three.descriptor[p, 0], np.mean([singles[e][p][2] for e in range(3)], 0), atol=1e-3)
+        assert three.steps[p, 0] == sum(singles[e][p][1] for e in range(3))
+
+
+def test_results_do_not_alias_each_other():
+    """The fault this guards: descriptors that are views of memory which the next rollout overwrites."""
+    worker = make_worker(spec())
+    first = worker(centre(random_parameters(1)), TrainingChunk(1, 0))
+    assert isinstance(first, EpisodesResult)
+    kept = first.descriptor.copy()
+    worker(centre(random_parameters(2)), TrainingChunk(2, 1))
+    np.testing.assert_array_equal(first.descriptor, kept)
+    assert first.descriptor.flags.owndata
+
+
+def test_running_a_chunk_again_gives_the_same_bits():
+    worker, point = make_worker(spec()), centre(random_parameters(1))
+    for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
+        first, second = worker(point, chunk), worker(point, chunk)
+        assert isinstance(first, EpisodesResult)
+        assert isinstance(second, EpisodesResult)
+        for name in ("fitness", "descriptor", "steps", "goal_distance"):
+            np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def counting_environment(lifetimes, poison_after_done: bool) -> Environment:
+    """State = (own lifetime, steps so far): reward is the step's number, done at the lifetime, NaN afterwards."""
+
+    def reset(key):
+        return jnp.stack([jnp.asarray(lifetimes, jnp.float32)[key[0] % len(lifetimes)], jnp.float32(0)])
+
+    def step(state, action):
+        lifetime, t = state[0], state[1] + 1
+        value = jnp.where((t > lifetime) & poison_after_done, jnp.nan, t)
+        return jnp.stack([lifetime, t]), value, t >= lifetime
+
+    return Environment(
+        reset=reset,
+        observe=lambda state: jnp.where((state[1] >= state[0]) & poison_after_done, jnp.nan, state),
+        step=step,
+        descriptor=lambda state: jnp.where((state[1] > state[0]) & poison_after_done, jnp.nan, state),
+        goal_distance=lambda state: 100.0 - state[1],
+    )
+
+
+@pytest.mark.parametrize("fitness", ["sum", "final"])
+def test_steps_after_done_never_count(monkeypatch, fitness):
+    """Nothing after `done` reaches return, descriptor, distances or statistics, even if it is NaN."""
+    environment = counting_environment([1, 5, 17, 1000], poison_after_done=True)
+    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: environment)
+    result = make_worker(spec(episode_steps=30, fitness=fitness))(centre(random_parameters()), TrainingChunk(1, 0))
+    assert isinstance(result, EpisodesResult)
+    n = result.steps.astype(float)
+    assert set(n.ravel()) <= {1, 5, 17, 30}
+    assert len(set(n.ravel())) >= 3
+    np.testing.assert_array_equal(result.returns, n * (n + 1) / 2)
+    np.testing.assert_array_equal(result.fitness, n * (n + 1) / 2 if fitness == "sum" else n)
+    np.testing.assert_array_equal(result.descriptor[..., 1], n)
+    np.testing.assert_array_equal(result.goal_distance, np.stack([100 - n, 100 - n], -1))
+    assert result.moments is not None
+    assert result.moments.count == n.sum()
+    counted = np.concatenate([np.arange(k) for k in n.ravel()])  # the step number, observed before each step
+    assert result.moments.mean_O[1] == pytest.approx(counted.mean())
+    assert result.moments.m2_O[1] == pytest.approx(counted.var() * counted.size, rel=1e-5)
+
+
+def test_a_member_that_returns_nan_is_seen_and_does_not_poison_the_statistics(monkeypatch):
+    environment = counting_environment([1, 5, 17, 1000], poison_after_done=False)
+    broken = Environment(
+        reset=environment.reset,
+        observe=lambda state: jnp.where(state[0] == 5.0, jnp.nan, state),
+        step=lambda state, action: (state + jnp.array([0.0, 1.0]), jnp.sum(action), state[1] + 1 >= state[0]),
+        descriptor=environment.descriptor,
+        goal_distance=environment.goal_distance,
+    )
+    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: broken)
+    result = make_worker(spec(episode_steps=30))(centre(random_parameters()), TrainingChunk(1, 0))
+    assert isinstance(result, EpisodesResult)
+    assert result.moments is not None
+    invalid = ~np.isfinite(result.fitness)
+    assert 0 < invalid.sum() < invalid.size
+    assert np.isfinite(result.moments.mean_O).all()
+    assert result.moments.count == result.steps[~invalid].sum()
+
+
+def test_numpy_policy_equals_the_rollout_s(monkeypatch):
+    """One step of an environment whose reward is its first action: the exported policy says the same."""
+    one_step = Environment(
+        reset=lambda key: jnp.stack([(key[0] % 7).astype(jnp.float32) - 3.0, jnp.float32(0.5)]),
+        observe=lambda state: state,
+        step=lambda state, action: (state, action[0], jnp.bool_(True)),
+        descriptor=lambda state: state,
+        goal_distance=lambda state: jnp.float32(jnp.nan),
+    )
+    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: one_step)
+    parameters_D = random_parameters(5)
+    result = run(EvaluationChunk(1, 0), spec(), parameters_D)
+    assert isinstance(result, EpisodesResult)
+    policy = Policy(SHAPE, parameters_D, MEAN, STD, 5.0)
+    np.testing.assert_allclose(result.returns, policy(result.descriptor)[:, 0], atol=1e-6)
+    assert np.isnan(result.goal_distance).all()
+
+
+def test_initial_columns_have_their_norms_and_layers_differ():
+    shape = policy_shape(8, (8, 8), 8)  # equal shapes on purpose: one key for all layers would make them equal
+    for init, norms in (("unit_columns", (1.0, 1.0, 0.01)), ("small_columns", (0.01, 0.01, 0.01))):
+        flat = initial_parameters(shape, init, seed=0)
+        layers = [flat[start : start + 64].reshape(8, 8) for start in (0, 72, 144)]
+        biases = [flat[start : start + 8] for start in (64, 136, 208)]
+        for weights, norm in zip(layers, norms, strict=True):
+            np.testing.assert_allclose(np.linalg.norm(weights, axis=0), norm, rtol=1e-5)
+        assert not np.any(biases)
+        assert not np.allclose(layers[0] / norms[0], layers[1] / norms[1])
+    other = initial_parameters(shape, "unit_columns", seed=0, member=1)
+    assert not np.allclose(other, initial_parameters(shape, "unit_columns", seed=0))
+
+
+def test_merged_moments_equal_those_of_all_observations_at_once():
+    rng = np.random.default_rng(0)
+    parts = [rng.normal(3.0, 2.0, (n, 2)) for n in (5, 1, 100)]
+    from es_service.protocol import Moments
+
+    moments = [Moments(len(x), x.mean(0), x.var(0) * len(x)) for x in parts]
+    total = merge_moments(no_observations(2), [*moments, no_observations(2)])
+    everything = np.concatenate(parts)
+    assert total.count == 106
+    np.testing.assert_allclose(total.mean_O, everything.mean(0))
+    np.testing.assert_allclose(total.m2_O, everything.var(0) * 106)

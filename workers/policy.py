@@ -1,0 +1,88 @@
+"""The policy: a tanh multilayer perceptron as one flat vector of parameters.
+
+NumPy only, so that the driver can make the first centre and users can run a policy without JAX; the functions that also
+run inside compiled rollouts take the array namespace as `xp`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from es_service.noise import Domain, normals, stream_keys
+from es_service.protocol import FloatArray
+
+INITIAL_COLUMN_NORMS = {"unit_columns": (1.0, 0.01), "small_columns": (0.01, 0.01)}
+"""`policy.init` -> (column norm of hidden layers, of the output layer).
+
+Sources: unit_columns, OpenAI ES and deep-neuroevolution; small_columns, the released ME-ES code.
+"""
+
+
+@dataclass(frozen=True)
+class PolicyShape:
+    """Layer widths from observation to action; the flat vector holds, layer by layer, weights [in, out] then biases."""
+
+    widths: tuple[int, ...]
+
+    @property
+    def layers(self) -> tuple[tuple[int, int], ...]:
+        """(inputs, outputs) of every layer."""
+        return tuple(zip(self.widths[:-1], self.widths[1:], strict=True))
+
+    @property
+    def parameters(self) -> int:
+        """D, the length of the flat vector."""
+        return sum(inputs * outputs + outputs for inputs, outputs in self.layers)
+
+
+def policy_shape(observation_size: int, hidden: Sequence[int], action_size: int) -> PolicyShape:
+    """The shape of the network between a task's observation and action."""
+    return PolicyShape((observation_size, *hidden, action_size))
+
+
+Layers = list[tuple[Any, Any]]
+
+
+def split_layers(shape: PolicyShape, parameters_D: Any) -> Layers:
+    """Views of the flat vector: (weights [in, out], biases [out]) per layer."""
+    layers, start = [], 0
+    for inputs, outputs in shape.layers:
+        biases = start + inputs * outputs
+        layers.append((parameters_D[start:biases].reshape(inputs, outputs), parameters_D[biases : biases + outputs]))
+        start = biases + outputs
+    return layers
+
+
+def act(xp: Any, layers: Layers, observation_O: Any) -> Any:
+    """Action in [-1, 1] for one normalised observation: tanh after every layer, the output included."""
+    x = observation_O
+    for weights, biases in layers:
+        x = xp.tanh(x @ weights + biases)
+    return x
+
+
+def normalise(xp: Any, observation_O: Any, mean_O: Any, std_O: Any, clip: float | None) -> Any:
+    """(observation - mean) / std, clipped to [-clip, clip] unless `clip` is None."""
+    x = (observation_O - mean_O) / std_O
+    return x if clip is None else xp.clip(x, np.float32(-clip), np.float32(clip))
+
+
+def initial_parameters(shape: PolicyShape, init: str, seed: int, member: int = 0) -> FloatArray:
+    """First centre of a member: Gaussian weights scaled so that each output's column of weights has a set norm.
+
+    Args:
+        init: a key of INITIAL_COLUMN_NORMS. Biases are 0.
+        member: members of one run start from different streams.
+    """
+    hidden_norm, output_norm = INITIAL_COLUMN_NORMS[init]
+    key = stream_keys(seed, Domain.INITIALISATION, 0, member)
+    parameters_D = normals(key, shape.parameters)
+    for layer, (weights, biases) in enumerate(split_layers(shape, parameters_D)):
+        norm = output_norm if layer == len(shape.layers) - 1 else hidden_norm
+        weights *= np.float32(norm) / np.sqrt(np.sum(np.square(weights), axis=0, keepdims=True))
+        biases[:] = 0.0
+    return parameters_D

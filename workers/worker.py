@@ -1,0 +1,116 @@
+"""A worker as one function: (centre, chunk) -> result. Shells around it (child process, Ray actor) add only transport.
+
+A worker holds nothing that a restart would lose: every result is a pure function of its arguments and the spec.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from es_service.noise import NORMAL_STD, Domain, Keys, stream_keys
+from es_service.protocol import (
+    EVALUATION_EPISODES_PER_CHUNK,
+    Centre,
+    Chunk,
+    ChunkResult,
+    EpisodesResult,
+    EvaluationChunk,
+    GradientChunk,
+    GradientResult,
+    Moments,
+    TrainingChunk,
+    WorkerSpec,
+)
+from workers.environments import TASKS, make_environment
+from workers.gradient import make_gradient_sum
+from workers.policy import policy_shape
+from workers.rollout import Episodes, make_evaluation_rollout, make_training_rollout
+
+
+def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
+    """Build the compiled functions of a run (compiled on first use) and return what runs its chunks."""
+    task = TASKS[spec.environment]
+    environment = make_environment(spec.environment, spec.environment_options)
+    shape = policy_shape(task.observation_size, spec.hidden, task.action_size)
+    training_rollout = make_training_rollout(environment, shape, spec)
+    evaluation_rollout = make_evaluation_rollout(environment, shape, spec)
+    gradient_sum = make_gradient_sum(shape.parameters)
+
+    def train(centre: Centre, chunk: TrainingChunk) -> EpisodesResult:
+        pairs_P = chunk.chunk_id * spec.chunk_pairs + np.arange(spec.chunk_pairs)
+        episodes = training_rollout(
+            centre.parameters_D,
+            np.float32(centre.sigma / NORMAL_STD),
+            centre.observation_mean_O,
+            centre.observation_std_O,
+            stream_keys(spec.seed, Domain.PARAMETER_NOISE, chunk.generation, pairs_P),
+            episode_keys(spec, Domain.TRAINING_RESET, chunk.generation, pairs_P),
+            episode_keys(spec, Domain.ACTION_NOISE, chunk.generation, pairs_P),
+        )
+        return _episodes_result(episodes, centre.observation_mean_O)
+
+    def evaluate(centre: Centre, chunk: EvaluationChunk) -> EpisodesResult:
+        episodes_E = chunk.chunk_id * EVALUATION_EPISODES_PER_CHUNK + np.arange(EVALUATION_EPISODES_PER_CHUNK)
+        episodes = evaluation_rollout(
+            centre.parameters_D,
+            centre.observation_mean_O,
+            centre.observation_std_O,
+            stream_keys(spec.seed, Domain.EVALUATION_RESET, chunk.generation, episodes_E),
+        )
+        return _episodes_result(episodes, None)
+
+    def gradient(chunk: GradientChunk) -> GradientResult:
+        pairs_P = chunk.chunk_id * spec.gradient_block_pairs + np.arange(spec.gradient_block_pairs)
+        keys_P = stream_keys(spec.seed, Domain.PARAMETER_NOISE, chunk.generation, pairs_P)
+        return GradientResult(np.asarray(gradient_sum(chunk.weights_P, keys_P)), seconds=0.0)
+
+    def run_chunk(centre: Centre, chunk: Chunk) -> ChunkResult:
+        started = time.perf_counter()
+        if isinstance(chunk, TrainingChunk):
+            result = train(centre, chunk)
+        elif isinstance(chunk, EvaluationChunk):
+            result = evaluate(centre, chunk)
+        else:
+            result = gradient(chunk)
+        object.__setattr__(result, "seconds", time.perf_counter() - started)
+        return result
+
+    return run_chunk
+
+
+def episode_keys(spec: WorkerSpec, domain: Domain, generation: int, pairs_P: Any) -> Keys:
+    """Stream keys of training episodes, axes [P, S, E, 4]; with common random numbers both signs have the same."""
+    sign_S = np.zeros(2, int) if spec.common_random_numbers else np.arange(2)
+    episode_E = np.arange(spec.episodes_per_member)
+    return stream_keys(spec.seed, domain, generation, pairs_P[:, None, None], sign_S[None, :, None], episode_E)
+
+
+def _episodes_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
+    """Copy a finished batch to the host, and reduce its observation sums in float64."""
+    host = Episodes(*(np.array(x) for x in episodes))
+    return EpisodesResult(
+        fitness=host.fitness,
+        returns=host.returns,
+        descriptor=host.descriptor,
+        steps=host.steps,
+        goal_distance=host.goal_distance,
+        moments=None if shift_O is None else _moments(host, shift_O),
+        seconds=0.0,
+    )
+
+
+def _moments(host: Episodes, shift_O: Any) -> Moments:
+    """Moments of all counted observations; episodes whose sums are not finite are left out, or they would poison all."""
+    size = host.shifted_sum_O.shape[-1]
+    sums, squares = (x.reshape(-1, size).astype(np.float64) for x in (host.shifted_sum_O, host.shifted_square_sum_O))
+    finite = np.isfinite(sums).all(axis=1) & np.isfinite(squares).all(axis=1)
+    count = float(host.steps.reshape(-1)[finite].sum())
+    if count == 0.0:
+        return Moments(0.0, np.zeros(size), np.zeros(size))
+    mean_O = sums[finite].sum(axis=0) / count
+    m2_O = np.maximum(squares[finite].sum(axis=0) - count * np.square(mean_O), 0.0)
+    return Moments(count, mean_O + shift_O, m2_O)
