@@ -15,7 +15,7 @@ from es_service import config_loading, digest, driver
 from es_service.algorithms import ALGORITHMS
 from es_service.config import RunConfig, changed_constants, describe_changes, worker_spec
 from es_service.dispatch.inline_engine import InlineEngine
-from es_service.dispatch.scheduler import Policy as SchedulingPolicy
+from es_service.dispatch.messages import Policy as SchedulingPolicy
 from es_service.errors import ConfigError
 from es_service.history import history_columns
 from es_service.platform_info import platform_info
@@ -151,7 +151,8 @@ def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -
         listed = "\n".join(f"  {name}: {old} -> {new}" for name, old, new in unfit)
         raise ConfigError(
             f"{origin.folder}: its state does not fit these changes:\n{listed}\n"
-            f"to start afresh from its centre (same task and network): run CONFIG --set search.init_from={origin.folder}"
+            f"to start afresh from its centre (same task and network): "
+            f"es-service run CONFIG --set search.init_from={origin.folder}"
         )
     return config
 
@@ -190,7 +191,7 @@ def _work(config: RunConfig, store: RunStore, on_generation: Callable[[Mapping[s
     scheduling = SchedulingPolicy(
         workers=worker_count(config),
         max_attempts=compute.max_attempts,
-        start_deadline_s=compute.compile_timeout_s,
+        start_deadline_s=compute.no_worker_timeout_s / 2,  # two tries fit in
         first_deadline_s=compute.compile_timeout_s,
         min_deadline_s=compute.chunk_timeout_s,
         no_worker_timeout_s=compute.no_worker_timeout_s,
@@ -216,8 +217,8 @@ def _initial(config: RunConfig) -> tuple[FloatArray, Moments]:
     origin = open_run(config.search.init_from)
     if origin.policy_shape != shape:
         raise ConfigError(
-            f"search.init_from: the policy of {origin.folder} has layers {list(origin.policy_shape.widths)}, this run's "
-            f"has {list(shape.widths)}; use the same task and policy.hidden"
+            f"search.init_from: the policy of {origin.folder} has layers {list(origin.policy_shape.widths)}, "
+            f"this run's has {list(shape.widths)}; use the same task and policy.hidden"
         )
     return origin.centre(), origin.observations()
 

@@ -52,7 +52,7 @@ def run(
     overrides = _overrides(set_, seed=seed, **{"compute.workers": workers, "compute.engine": engine})
     loaded = api.load_config(config, overrides)
     for warning in config_warnings(loaded):
-        errors.print(f"note: {warning}", highlight=False, markup=False)
+        _print_note(f"note: {warning}")
     folder = out if out is not None else api.default_folder(loaded)
     _session(folder, lambda show: api.run(loaded, folder, on_generation=show))
 
@@ -69,7 +69,9 @@ def resume(
 @app.command()
 def fork(
     parent: RunArgument,
-    generation: Annotated[int | None, typer.Option("--generation", help="One of the last two; default: newest.")] = None,
+    generation: Annotated[
+        int | None, typer.Option("--generation", help="One of the last two; default: newest.")
+    ] = None,
     set_: SetOption = None,
     out: OutOption = None,
     workers: WorkersOption = None,
@@ -123,11 +125,7 @@ def doctor() -> None:
 def main() -> None:
     """Entry point: run the command, turn errors into one readable message and an exit code."""
     try:
-        app(standalone_mode=False)
-    except typer.Exit as stop:
-        sys.exit(stop.exit_code)
-    except typer.Abort:
-        sys.exit(130)
+        app()
     except Interrupted as stop:
         sys.exit(128 + stop.signal_number)
     except ConfigError as error:
@@ -135,9 +133,6 @@ def main() -> None:
         sys.exit(2)
     except ServiceError as error:
         _print_error(str(error))
-        sys.exit(1)
-    except BrokenPipeError:  # `es-service status RUN | head`
-        sys.stderr.close()
         sys.exit(1)
 
 
@@ -147,16 +142,20 @@ def _session(folder: Path, work: Callable[[Callable], api.Outcome]) -> None:
         with show_progress(console, str(folder)) as show:
             outcome = work(show)
     except Interrupted:
-        errors.print(f"interrupted; every finished generation is saved. Go on with: es-service resume {folder}")
+        _print_note(f"interrupted; every finished generation is saved. Go on with: es-service resume {folder}")
         raise
     for notice in outcome.notices:
-        errors.print(f"note: {notice}", highlight=False, markup=False)
+        _print_note(f"note: {notice}")
     print_summary(console, outcome.run, outcome.reason)
 
 
 def _overrides(set_: list[str] | None, **options: object) -> list[str]:
     """`--set` values, then options that stand for a key; the later ones win."""
     return [*(set_ or []), *(f"{key}={value}" for key, value in options.items() if value is not None)]
+
+
+def _print_note(message: str) -> None:
+    errors.print(message, highlight=False, markup=False, soft_wrap=True)
 
 
 def _print_error(message: str) -> None:

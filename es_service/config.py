@@ -137,10 +137,14 @@ class ComputeConfig(_Section):
     chunk_timeout_s: Positive = Field(
         30.0, description="Least deadline of a chunk in seconds; slow chunks raise it for those that follow."
     )
-    compile_timeout_s: Positive = Field(600.0, description="Deadline of a worker's start and compilation in seconds.")
+    compile_timeout_s: Positive = Field(
+        600.0, description="Deadline of a worker's first chunk of each kind, which compiles."
+    )
     max_attempts: Count = Field(4, description="Times a chunk is tried before the run stops with its error.")
     no_worker_timeout_s: Positive = Field(
-        120.0, description="Seconds without any live worker after which the run stops."
+        120.0,
+        description="Seconds without any live worker after which the run stops; a worker that takes half as long to "
+        "start is replaced.",
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from es_service.dispatch.inline_engine import InlineEngine
-from es_service.dispatch.scheduler import Policy
+from es_service.dispatch.messages import Policy
 from es_service.errors import ServiceError
 from es_service.noise import TEST_VECTORS, normal_integers, stream_keys
 from es_service.platform_info import platform_info
@@ -75,7 +75,8 @@ def _disk() -> Iterator[Finding]:
 
 def _noise() -> Iterator[Finding]:
     for (seed, domain, generation, ids), expected in TEST_VECTORS:
-        found = normal_integers(np, stream_keys(seed, domain, generation, *ids), np.arange(len(expected), dtype=np.uint32))
+        key = stream_keys(seed, domain, generation, *ids)
+        found = normal_integers(np, key, np.arange(len(expected), dtype=np.uint32))
         if found.tolist() != list(expected):
             yield "FAIL", f"noise of stream {(seed, domain, generation, *ids)} is {found.tolist()}, not {expected}"
             return

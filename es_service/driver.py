@@ -128,9 +128,7 @@ def _next_generation(
     plan = algorithm.plan(state.search)
     centre = _centre(search, generation, plan.centre_D, state.observations)
     clock.lap("seconds_driver")
-    population, observed = evaluate_population(
-        evaluator, centre, pairs=settings.pairs, chunk_pairs=sizes.chunk_pairs
-    )
+    population, observed = evaluate_population(evaluator, centre, pairs=settings.pairs, chunk_pairs=sizes.chunk_pairs)
     clock.lap("seconds_rollout")
     population, invalid = invalidate(population, settings.max_invalid_fraction, generation)
     weights_P = algorithm.weights(state.search, population)
@@ -150,7 +148,8 @@ def _next_generation(
         observations=merge_moments(state.observations, observed),
         best=_better(state.best, new_centre, evaluation),
         env_steps=state.env_steps + _steps(population) + _steps(evaluation),
-        episodes=state.episodes + population.fitness.size * search.config.task.episodes_per_member
+        episodes=state.episodes
+        + population.fitness.size * search.config.task.episodes_per_member
         + evaluation.fitness.size,
         wall_clock_s=clock.total(),
     )

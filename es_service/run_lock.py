@@ -70,14 +70,8 @@ def _acquire(folder: Path, deadline: float) -> RunLock:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.samestat(os.fstat(descriptor), os.stat(path)):
-                identity = {
-                    "host": socket.gethostname(),
-                    "pid": os.getpid(),
-                    "since": datetime.now(UTC).isoformat(timespec="seconds"),
-                }
-                os.ftruncate(descriptor, 0)
-                os.pwrite(descriptor, json.dumps(identity).encode(), 0)
+            if _is_at(descriptor, path):
+                _write_identity(descriptor)
                 return RunLock(descriptor)
         except BlockingIOError:
             if time.monotonic() > deadline:
@@ -88,6 +82,26 @@ def _acquire(folder: Path, deadline: float) -> RunLock:
             os.close(descriptor)
             raise
         os.close(descriptor)
+
+
+def _write_identity(descriptor: int) -> None:
+    identity = {
+        "host": socket.gethostname(),
+        "pid": os.getpid(),
+        "since": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    # The lock is what counts: on a full disk it goes without a name.
+    with contextlib.suppress(OSError):
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, json.dumps(identity).encode(), 0)
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    """Whether the open file still is the one at `path`: a creation that failed takes its lock file away."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
+    except FileNotFoundError:
+        return False
 
 
 def lock_holder(folder: Path) -> dict[str, Any] | None:

@@ -9,7 +9,17 @@ from contextlib import closing
 from pathlib import Path
 
 from es_service.errors import StoreError
-from es_service.run_folder import CONFIG, COPY, DATABASE, LOCK, explained, remove_database, sync_file, sync_folder
+from es_service.run_folder import (
+    CONFIG,
+    COPY,
+    DATABASE,
+    LOCK,
+    explained,
+    is_disk_full,
+    remove_database,
+    sync_file,
+    sync_folder,
+)
 from es_service.run_lock import RunLock, acquire_lock
 from es_service.store_repair import connect
 from es_service.store_schema import create_tables
@@ -42,6 +52,8 @@ def _create(folder: Path, config_yaml: str, meta_text: str) -> RunLock:
     try:
         place.mkdir(exist_ok=True)
     except OSError as error:
+        if is_disk_full(error, parent):
+            raise
         raise StoreError(
             f"cannot create {folder}: {error.strerror} in {parent}; make that folder writable or choose another --out"
         ) from error

@@ -33,31 +33,47 @@ def reading(folder: Path) -> Iterator[tuple[sqlite3.Connection, RunMeta]]:
     """
     folder = Path(folder)
     try:
-        require_run_folder(folder)
-        file = folder / DATABASE
-        if not file.exists():
-            raise StoreError(f"{file} is missing; `es-service resume {folder}` restores it from {COPY}")
-        if is_network_filesystem(folder) and lock_holder(folder) and (folder / COPY).exists():
-            file = folder / COPY
-        connection = sqlite3.connect(
-            f"{file.absolute().as_uri()}?mode=ro", uri=True, timeout=_BUSY_S, isolation_level=None
-        )
-    except (OSError, sqlite3.Error) as error:
-        raise StoreError(f"{folder} cannot be read: {error}") from error
+        connection, meta = _connected(folder)
+    except (sqlite3.Error, Damaged, OSError) as error:
+        raise _unreadable(folder, error) from error
+    with contextlib.closing(connection):
+        try:
+            yield connection, meta
+        except (sqlite3.Error, Damaged) as error:
+            raise _unreadable(folder, error) from error
+
+
+def _connected(folder: Path) -> tuple[sqlite3.Connection, RunMeta]:
+    require_run_folder(folder)
+    if not (folder / DATABASE).exists():
+        raise StoreError(f"{folder / DATABASE} is missing; `es-service resume {folder}` restores it from {COPY}")
+    if not is_network_filesystem(folder) or not (folder / COPY).exists():
+        return _connected_to(folder / DATABASE)
+    # There the database of a writer at work is left alone.
+    if lock_holder(folder) is None:
+        # What a killed writer left may have to be rolled back, which is not for readers to do.
+        with contextlib.suppress(sqlite3.Error):
+            return _connected_to(folder / DATABASE)
+    return _connected_to(folder / COPY)
+
+
+def _connected_to(file: Path) -> tuple[sqlite3.Connection, RunMeta]:
+    uri = f"{file.absolute().as_uri()}?mode=ro"
+    connection = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None)
     try:
-        with contextlib.closing(connection):
-            connection.execute("BEGIN")
-            yield connection, load_meta(connection, file)
-    except (sqlite3.Error, Damaged) as error:
-        what = "is not a run folder" if _is_no_database(error) else "cannot be read"
-        raise StoreError(
-            f"{folder} {what}: {file.name}: {error}. If it is a run, `es-service resume {folder}` repairs what can be."
-        ) from error
+        connection.execute("BEGIN")
+        # The first read fixes what the whole transaction sees.
+        return connection, load_meta(connection, file)
+    except BaseException:
+        connection.close()
+        raise
 
 
-def _is_no_database(error: Exception) -> bool:
+def _unreadable(folder: Path, error: Exception) -> StoreError:
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-    return code == sqlite3.SQLITE_NOTADB or "no such table: meta" in str(error)
+    is_database = code != sqlite3.SQLITE_NOTADB and "no such table: meta" not in str(error)
+    what = "cannot be read" if is_database else "is not a run folder"
+    return StoreError(f"{folder} {what}: {error}. If it is a run, `es-service resume {folder}` repairs what can be.")
 
 
 def read_meta(folder: Path) -> RunMeta:

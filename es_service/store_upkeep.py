@@ -52,6 +52,10 @@ class Upkeep:
         connection.execute("PRAGMA wal_autocheckpoint = 0")
         # Old states need not be overwritten with zeros before their pages are used again.
         connection.execute("PRAGMA secure_delete = OFF")
+        # Tells at once if the file cannot be written; and after a quick_check, SQLite refuses a checkpoint until some
+        # transaction has been.
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute("COMMIT")
         if network and not (folder / COPY).exists():
             self._copy()
 
@@ -76,6 +80,7 @@ class Upkeep:
         with contextlib.suppress(sqlite3.Error):
             self._connection.execute(f"PRAGMA busy_timeout = {_CLOSE_PATIENCE_MS}")
             self._checkpoint("TRUNCATE")
+        with contextlib.suppress(sqlite3.Error):
             self._connection.execute("PRAGMA journal_mode = DELETE")
 
     def _checkpoint(self, mode: str) -> None:

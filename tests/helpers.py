@@ -33,9 +33,7 @@ def spec(**changes: object) -> WorkerSpec:
 
 
 def centre(parameters_D: np.ndarray, generation: int = 1, sigma: float = 0.1) -> Centre:
-    return Centre(
-        generation, parameters_D.astype(np.float32), sigma, np.zeros(2, np.float32), np.ones(2, np.float32)
-    )
+    return Centre(generation, parameters_D.astype(np.float32), sigma, np.zeros(2, np.float32), np.ones(2, np.float32))
 
 
 def random_parameters(seed: int = 0, size: int = PARAMETERS, scale: float = 0.7) -> np.ndarray:

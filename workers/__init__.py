@@ -1,1 +1,1 @@
-"""What runs where the rollouts run: tasks, policy, compiled episodes. Imports of es_service: protocol and noise only."""
+"""What runs where the rollouts run: tasks, policy, compiled episodes. Of es_service it imports protocol and noise."""

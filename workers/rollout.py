@@ -31,7 +31,7 @@ class Episodes(NamedTuple):
     goal_distance: Any
     """[..., 2]: at the end and at its least."""
     shifted_sum_O: Any
-    """Sum over counted steps of (observation - statistics' mean); float32, one row per episode keeps it exact enough."""
+    """Sum over counted steps of (observation - statistics' mean); float32, exact enough for one episode."""
     shifted_square_sum_O: Any
 
 

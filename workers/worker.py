@@ -104,7 +104,7 @@ def _episodes_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
 
 
 def _moments(host: Episodes, shift_O: Any) -> Moments:
-    """Moments of all counted observations; episodes whose sums are not finite are left out, or they would poison all."""
+    """Moments of all counted observations; an episode whose sums are not finite is left out."""
     size = host.shifted_sum_O.shape[-1]
     sums, squares = (x.reshape(-1, size).astype(np.float64) for x in (host.shifted_sum_O, host.shifted_square_sum_O))
     finite = np.isfinite(sums).all(axis=1) & np.isfinite(squares).all(axis=1)

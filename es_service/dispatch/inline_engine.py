@@ -22,7 +22,7 @@ from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import IO, Any
 
-from es_service.dispatch import scheduler
+from es_service.dispatch import messages, scheduler
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts, WorkerSpec
 
@@ -57,7 +57,7 @@ class InlineEngine:
     """An Evaluator on this machine. Use as a context manager: leaving it kills the children, who hold nothing."""
 
     def __init__(
-        self, spec: WorkerSpec, policy: scheduler.Policy, should_stop: Callable[[], int | None] = lambda: None
+        self, spec: WorkerSpec, policy: messages.Policy, should_stop: Callable[[], int | None] = lambda: None
     ) -> None:
         """Start `policy.workers` children.
 
@@ -73,7 +73,7 @@ class InlineEngine:
         self._centre: Centre | None = None
         self._phase = 0
         self._results: dict[Any, ChunkResult] = {}
-        self._step(scheduler.Tick())
+        self._step(messages.Tick())
 
     @property
     def counts(self) -> DispatchCounts:
@@ -95,8 +95,8 @@ class InlineEngine:
         self._phase += 1  # so that a late answer of an earlier call is never taken for one of this call
         self._chunks = {(self._phase, chunk.chunk_id): chunk for chunk in chunks}
         self._results = {}
-        tasks = [scheduler.Task(key, type(chunk).__name__) for key, chunk in self._chunks.items()]
-        self._step(scheduler.Submit(tuple(tasks)))
+        tasks = [messages.Task(key, type(chunk).__name__) for key, chunk in self._chunks.items()]
+        self._step(messages.Submit(tuple(tasks)))
         while scheduler.pending(self._state):
             if (number := self._should_stop()) is not None:
                 raise Interrupted(number)
@@ -125,52 +125,57 @@ class InlineEngine:
                 self._handle(worker, message)
                 worker, message = self._inbox.get_nowait()
         except queue.Empty:
-            self._step(scheduler.Tick())
+            self._step(messages.Tick())
 
     def _handle(self, worker: int, message: Any) -> None:
         if worker not in self._children:  # killed meanwhile; what it still said is of no use
             return
         match message:
             case ("up", _):
-                self._step(scheduler.WorkerUp(worker))
+                self._step(messages.WorkerUp(worker))
             case ("result", key, attempt, result):
-                if self._step(scheduler.Result(worker, key, attempt)):
+                if self._step(messages.Result(worker, key, attempt)):
                     self._results[key] = result
             case ("failure", key, attempt, text):
-                self._step(scheduler.Failure(worker, key, attempt, text))
+                self._step(messages.Failure(worker, key, attempt, text))
             case ("broken", text):
                 self._kill(worker)
-                self._step(scheduler.WorkerLost(worker, text))
+                self._step(messages.WorkerLost(worker, text))
             case ("lost",):
                 reason = self._kill(worker)
-                self._step(scheduler.WorkerLost(worker, reason))
+                self._step(messages.WorkerLost(worker, reason))
 
-    def _step(self, event: scheduler.Event) -> bool:
+    def _step(self, event: messages.Event) -> bool:
         """Feed the scheduler and do as it says; whether it accepted a result."""
         self._state, commands = scheduler.step(self._state, event, time.monotonic())
         delivered, failure = False, None
         for command in commands:
             match command:
-                case scheduler.StartWorker(worker):
+                case messages.StartWorker(worker):
                     self._start(worker)
-                case scheduler.StopWorker(worker, _):
+                case messages.StopWorker(worker, _):
                     self._kill(worker)
-                case scheduler.Assign(worker, key, attempt):
+                case messages.Assign(worker, key, attempt):
                     self._send(worker, key, attempt)
-                case scheduler.Deliver(_):
+                case messages.Deliver(_):
                     delivered = True
-                case scheduler.Fail(message):
-                    failure = message
+                case messages.Fail(text):
+                    failure = text
         if failure is not None:
             raise EvaluationError(failure)
         return delivered
 
     def _start(self, worker: int) -> None:
         ours, theirs = Pipe(duplex=True)
+        import_path = os.pathsep.join(path or os.getcwd() for path in sys.path)
         log = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the child)
         process = subprocess.Popen(
             [sys.executable, "-m", "workers.process", str(theirs.fileno()), str(os.getpid())],
-            env={**os.environ, **FIXED_ENVIRONMENT, "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)},
+            env={
+                **os.environ,
+                **FIXED_ENVIRONMENT,
+                "PYTHONPATH": import_path,
+            },
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
             stdout=log,
@@ -208,7 +213,9 @@ class InlineEngine:
         last_words = child.log.read()[-2000:].decode(errors="replace").strip()
         child.log.close()
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
-        return f"worker {worker} (pid {child.process.pid}) ended with {how}" + (f":\n{last_words}" if last_words else "")
+        return f"worker {worker} (pid {child.process.pid}) ended with {how}" + (
+            f":\n{last_words}" if last_words else ""
+        )
 
 
 def _write(child: _Child) -> None:

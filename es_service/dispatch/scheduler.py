@@ -26,162 +26,28 @@ from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 
+from es_service.dispatch.messages import (
+    Assign,
+    Command,
+    Deliver,
+    Drain,
+    Event,
+    Fail,
+    Failure,
+    Policy,
+    Result,
+    SetWorkers,
+    StartWorker,
+    StopWorker,
+    Submit,
+    Task,
+    Tick,
+    WorkerLost,
+    WorkerUp,
+)
+
 RECENT_DURATIONS = 31
 """Durations per kind of task that the running median is taken over."""
-
-
-@dataclass(frozen=True)
-class Task:
-    """One piece of work. Two tasks with the same key must have the same result."""
-
-    key: Hashable
-    kind: str
-    """Tasks of one kind compile together and take about equally long."""
-
-
-@dataclass(frozen=True)
-class Policy:
-    """How faults are handled: config data. Raises ValueError for a count below 1."""
-
-    workers: int
-    """Workers wanted at the start; `SetWorkers` changes it."""
-    in_flight: int = 2
-    """Tasks assigned to one worker at a time: the one it runs and those prefetched behind it."""
-    max_attempts: int = 4
-    """A task that raised, or lost the worker running it, this often is poison. Keep above `max_failures_in_a_row`, so
-    that a single broken worker is replaced before its task is blamed."""
-    start_deadline_s: float = 120.0
-    first_deadline_s: float = 600.0
-    """For the first task of a kind on a worker, which compiles, and for any task while no duration is known."""
-    min_deadline_s: float = 30.0
-    deadline_factor: float = 5.0
-    """Later tasks may take max(min_deadline_s, deadline_factor x median of recent durations of their kind)."""
-    max_failures_in_a_row: int = 3
-    """A worker that raises this often in a row is killed and replaced."""
-    restart_backoff_s: float = 1.0
-    max_backoff_s: float = 60.0
-    """Wait before replacing the second, third ... loss without a success between: restart_backoff_s, doubling up to
-    max_backoff_s. The first replacement is immediate; losses during a wait share it (a node that died, say)."""
-    max_start_failures: int = 3
-    """This many workers in a row lost before they came up, and none up: the environment is broken."""
-    no_worker_timeout_s: float = 300.0
-    """Longest time with tasks waiting and no worker up; longer than `start_deadline_s` to be of any use."""
-
-    def __post_init__(self) -> None:
-        for name in ("workers", "in_flight", "max_attempts", "max_failures_in_a_row", "max_start_failures"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} ({getattr(self, name)}) must be at least 1")
-
-
-# Events: what an engine reports.
-
-
-@dataclass(frozen=True)
-class Submit:
-    """New tasks, to be assigned in this order. Raises ValueError for a key that still waits."""
-
-    tasks: tuple[Task, ...]
-
-
-@dataclass(frozen=True)
-class WorkerUp:
-    """The worker can take tasks."""
-
-    worker: int
-
-
-@dataclass(frozen=True)
-class WorkerLost:
-    """The worker is gone, whether it ever came up or not."""
-
-    worker: int
-    reason: str
-
-
-@dataclass(frozen=True)
-class Result:
-    """The worker answered; the engine holds the result until this step says `Deliver` or says nothing."""
-
-    worker: int
-    key: Hashable
-    attempt: int
-
-
-@dataclass(frozen=True)
-class Failure:
-    """The task raised; the worker lives."""
-
-    worker: int
-    key: Hashable
-    attempt: int
-    message: str
-
-
-@dataclass(frozen=True)
-class Tick:
-    """Time has passed."""
-
-
-@dataclass(frozen=True)
-class Drain:
-    """The worker gets no new task, finishes those it has, and is stopped; it is replaced now, without blame."""
-
-    worker: int
-
-
-@dataclass(frozen=True)
-class SetWorkers:
-    """Change the wanted number of workers; shrinking drains the newest. Raises ValueError below 1."""
-
-    workers: int
-
-
-Event = Submit | WorkerUp | WorkerLost | Result | Failure | Tick | Drain | SetWorkers
-
-
-# Commands: what an engine must do, in the order given.
-
-
-@dataclass(frozen=True)
-class StartWorker:
-    """Start a worker under this id; ids increase and are never used again."""
-
-    worker: int
-
-
-@dataclass(frozen=True)
-class StopWorker:
-    """Kill the worker. Reporting it lost afterwards is allowed and changes nothing."""
-
-    worker: int
-    reason: str
-
-
-@dataclass(frozen=True)
-class Assign:
-    """Send the task to the worker, behind those it has. `attempt` is 1 + the faults charged to the task so far."""
-
-    worker: int
-    key: Hashable
-    attempt: int
-
-
-@dataclass(frozen=True)
-class Deliver:
-    """Accept the result just reported; once per submitted task."""
-
-    key: Hashable
-
-
-@dataclass(frozen=True)
-class Fail:
-    """The run stops with this error; only `StopWorker` follows, one for every worker left."""
-
-    message: str
-
-
-Command = StartWorker | StopWorker | Assign | Deliver | Fail
-
 
 # State.
 

@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from es_service.algorithms import ALGORITHMS
+from es_service.config_yaml import show
 from es_service.presets import PRESETS, preset_table
 from workers.environments import TASKS
 
@@ -44,4 +45,5 @@ def print_catalogue(console: Console) -> None:
 
 
 def _value(value: object) -> str:
-    return {None: "null", True: "true", False: "false"}.get(value, str(value)) if not isinstance(value, float) else f"{value:g}"
+    """As one would type it in a config."""
+    return f"{value:g}" if isinstance(value, float) else show(value)

@@ -6,7 +6,6 @@ import time
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from es_service.report.progress import plain_line
 from es_service.run_lock import lock_holder
@@ -16,23 +15,18 @@ FOLLOW_INTERVAL_S = 1.0
 
 
 def print_status(console: Console, run: Run) -> None:
-    """A short table: settings, progress, best result, who is writing."""
+    """Settings, progress, best result, who is writing."""
     rows = run.history_rows()
-    constants = run.constants
-    holder = lock_holder(run.folder)
-    table = Table(show_header=False, box=None)
-    table.add_row("run", str(run.folder))
-    table.add_row("task", f"{constants['task.environment']}, {constants['task.episode_steps']} steps an episode")
-    table.add_row("search", f"{constants['search.algorithm']}, {constants['search.pairs']} pairs, seed {constants['seed']}")
-    if run.meta.parent:
-        parent = run.meta.parent
-        table.add_row("started from", f"{parent['folder']}, generation {parent['generation']}")
-    table.add_row("driver", f"running on {holder['host']}, pid {holder['pid']}" if holder else "none is running")
-    if not rows:
-        table.add_row("generation", "none is finished yet")
-    else:
-        _add_progress(table, rows)
-    console.print(table)
+    constants, parent, holder = run.constants, run.meta.parent, lock_holder(run.folder)
+    fields = {
+        "run": str(run.folder),
+        "task": f"{constants['task.environment']}, {constants['task.episode_steps']} steps an episode",
+        "search": f"{constants['search.algorithm']}, {constants['search.pairs']} pairs, seed {constants['seed']}",
+    }
+    if parent:
+        fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
+    fields["driver"] = f"running on {holder['host']}, pid {holder['pid']}" if holder else "none is running"
+    _print_fields(console, fields | (_progress(rows) if rows else {"generation": "none is finished yet"}))
 
 
 def follow_status(console: Console, run: Run) -> None:
@@ -45,7 +39,7 @@ def follow_status(console: Console, run: Run) -> None:
             next_generation = rows[-1]["generation"] + 1
             console.print(plain_line(rows[-1]), highlight=False, soft_wrap=True)
         if not running:
-            console.print(f"no driver is running; go on with: es-service resume {run.folder}", soft_wrap=True)
+            _print_line(console, f"no driver is running; go on with: es-service resume {run.folder}")
             return
         time.sleep(FOLLOW_INTERVAL_S)
 
@@ -53,27 +47,37 @@ def follow_status(console: Console, run: Run) -> None:
 def print_summary(console: Console, run: Run, reason: str) -> None:
     """What a session ends with: the result, the folder, the next commands."""
     rows = run.history_rows()
-    table = Table(show_header=False, box=None)
-    _add_progress(table, rows)
-    folder = run.folder
-    console.print(f"\nDone: {reason}.", highlight=False)
-    console.print(table)
-    console.print(f"\nThe run is in {folder}. Next:", highlight=False, soft_wrap=True)
+    folder, twice = run.folder, f"--set budget.generations={max(1, rows[-1]['generation']) * 2}"
+    _print_line(console, f"\nDone: {reason}.")
+    _print_fields(console, _progress(rows))
+    _print_line(console, f"\nThe run is in {folder}. Next:")
     for command in (
         f"es-service status {folder}",
         f"es-service digest {folder}",
-        f"es-service resume {folder} --set budget.generations={rows[-1]['generation'] * 2}",
-        f"es-service fork {folder} --set search.sigma=0.05 --set budget.generations={rows[-1]['generation'] * 2}",
+        f"es-service resume {folder} {twice}",
+        f"es-service fork {folder} --set search.sigma=0.05 {twice}",
     ):
-        console.print(f"  {command}", highlight=False, soft_wrap=True)
+        _print_line(console, f"  {command}")
 
 
-def _add_progress(table: Table, rows: list[dict[str, Any]]) -> None:
+def _progress(rows: list[dict[str, Any]]) -> dict[str, str]:
     last = rows[-1]
-    table.add_row("generation", str(last["generation"]))
-    table.add_row("best fitness", f"{last['best_fitness']:.2f}")
-    table.add_row("centre fitness", f"{last['centre_fitness_mean']:.2f} ± {last['centre_fitness_std']:.2f}")
-    table.add_row("goal distance", f"{last['goal_distance']:.3f} at the end, {last['goal_distance_min']:.3f} at its least")
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
-    table.add_row("environment steps", f"{last['env_steps']:,} in {last['episodes']:,} episodes")
-    table.add_row("time", f"{last['wall_clock_s']:.1f} s, {rate:,.0f} steps/s overall")
+    return {
+        "generation": str(last["generation"]),
+        "best fitness": f"{last['best_fitness']:.2f}",
+        "centre fitness": f"{last['centre_fitness_mean']:.2f} ± {last['centre_fitness_std']:.2f}",
+        "goal distance": f"{last['goal_distance']:.3f} at the end, {last['goal_distance_min']:.3f} at its least",
+        "environment steps": f"{last['env_steps']:,} in {last['episodes']:,} episodes",
+        "time": f"{last['wall_clock_s']:.1f} s, {rate:,.0f} steps/s overall",
+    }
+
+
+def _print_fields(console: Console, fields: dict[str, str]) -> None:
+    for name, value in fields.items():
+        _print_line(console, f"{name:<18} {value}")
+
+
+def _print_line(console: Console, text: str) -> None:
+    """As it is: folders and commands are there to be copied, so nothing is wrapped or cut."""
+    console.print(text, highlight=False, markup=False, soft_wrap=True)

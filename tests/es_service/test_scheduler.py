@@ -13,7 +13,7 @@ from random import Random
 
 import pytest
 
-from es_service.dispatch.scheduler import (
+from es_service.dispatch.messages import (
     Assign,
     Command,
     Deliver,
@@ -23,7 +23,6 @@ from es_service.dispatch.scheduler import (
     Failure,
     Policy,
     Result,
-    SchedulerState,
     SetWorkers,
     StartWorker,
     StopWorker,
@@ -32,6 +31,9 @@ from es_service.dispatch.scheduler import (
     Tick,
     WorkerLost,
     WorkerUp,
+)
+from es_service.dispatch.scheduler import (
+    SchedulerState,
     initial_state,
     next_deadline,
     pending,

@@ -168,7 +168,8 @@ def test_an_error_inside_the_transaction_takes_all_of_it_back(tmp_path):
 
     failing = None
     with create(tmp_path / "run", generations=4, hook=hook) as run:
-        for failing in ("before_begin", "mid_transaction", "before_commit"):
+        for name in ("before_begin", "mid_transaction", "before_commit"):
+            failing = name
             with pytest.raises(KeyboardInterrupt):
                 advance(run, 4)
             assert run.generation == 3

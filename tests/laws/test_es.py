@@ -77,7 +77,7 @@ def test_twenty_generations_equal_the_twin(finished):
 
 
 def test_history_counts_what_the_workers_did(finished):
-    config, state, store, evaluator, reason = finished
+    _, state, store, evaluator, reason = finished
     assert reason == "20 generations are done"
     assert [row["generation"] for row in store.rows] == list(range(21))
     trained = [r for _, chunk, r in evaluator.recorded if isinstance(chunk, TrainingChunk)]
@@ -102,14 +102,19 @@ def test_observation_statistics_are_those_of_the_generation_s_start(finished):
         by_generation.setdefault(chunk.generation, []).append((point, chunk, result))
     total = 0.0
     for generation in range(21):
-        seen = {(p.observation_mean_O.tobytes(), p.observation_std_O.tobytes()) for p, _, _ in by_generation[generation]}
+        seen = {
+            (p.observation_mean_O.tobytes(), p.observation_std_O.tobytes()) for p, _, _ in by_generation[generation]
+        }
         assert len(seen) == 1
         if generation in (0, 1):
             assert by_generation[generation][0][0].observation_std_O.tolist() == [1.0, 1.0]
         trained = [r for _, chunk, r in by_generation[generation] if isinstance(chunk, TrainingChunk)]
         total += sum(r.moments.count for r in trained)
-    assert state.observations.count == total == sum(int(r.steps.sum()) for _, c, r in evaluator.recorded
-                                                    if isinstance(c, TrainingChunk))
+    assert (
+        state.observations.count
+        == total
+        == sum(int(r.steps.sum()) for _, c, r in evaluator.recorded if isinstance(c, TrainingChunk))
+    )
 
 
 def test_normalisation_off_means_raw_observations():
@@ -184,7 +189,9 @@ def test_too_many_invalid_members_stop_the_run_with_a_named_error():
         return result
 
     config = small_config(max_invalid_fraction=0.25)
-    with pytest.raises(EvaluationError, match=r"generation 3: 54 of 96 members .* search.max_invalid_fraction \(0.25\)"):
+    with pytest.raises(
+        EvaluationError, match=r"generation 3: 54 of 96 members .* search.max_invalid_fraction \(0.25\)"
+    ):
         run_in_memory(config, Tampering(worker_spec(config), spoil))
 
 

@@ -1,0 +1,184 @@
+"""What the digest of a run sees and what it does not."""
+
+import contextlib
+import sqlite3
+
+import numpy as np
+import pytest
+
+from es_service import digest as digest_module
+from es_service import store_schema
+from es_service.digest import arrays_sha256, digest, digest_parts, is_mixed
+from es_service.errors import StoreError
+from es_service.store import RunStore
+from es_service.store_codec import encode_part
+from es_service.store_reader import verify_run
+from tests.es_service.store_examples import (
+    COLUMNS,
+    advance,
+    create,
+    finished,
+    flip_bit,
+    history_row,
+    meta,
+    parts_of,
+    position_of,
+    state_at,
+)
+
+GENERATIONS = 6
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return finished(tmp_path / "run", GENERATIONS)
+
+
+def change(folder, statement, *values):
+    """Change the database behind the store's back."""
+    with contextlib.closing(sqlite3.connect(folder / "run.db")) as connection, connection:
+        assert connection.execute(statement, values).rowcount == 1
+
+
+def changed_names(before, after):
+    assert before.keys() == after.keys()
+    return {name for name in before if before[name] != after[name]}
+
+
+def test_names_are_the_state_parts_and_the_tables(folder):
+    parts = digest_parts(folder)
+    assert list(parts) == ["state/member_0", "state/member_1", "state/member_2", "state/observations", "history"]
+    assert parts["state/member_1"] == arrays_sha256(state_at(GENERATIONS - 1)["member_1"])
+    assert all(len(value) == 64 for value in (*parts.values(), digest(folder)))
+
+
+def test_equal_runs_have_equal_digests_however_they_were_written(folder, tmp_path):
+    with create(tmp_path / "in_two_sessions", generations=2):
+        pass
+    with RunStore.open(tmp_path / "in_two_sessions") as store:
+        for generation in range(2, GENERATIONS):
+            advance(store, generation)
+            assert digest(store.folder) == digest(finished(tmp_path / str(generation), generation + 1))
+    assert digest(tmp_path / "in_two_sessions") == digest(folder)
+
+
+def test_layout_does_not_count(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(store_schema, "PAGE_BYTES", 1024)
+    expected = digest(folder)
+    with create(tmp_path / "other", run_meta=meta(columns=COLUMNS[::-1], run_id="other")) as store:
+        for generation in range(GENERATIONS):
+            parts = {part: dict(reversed(arrays.items())) for part, arrays in reversed(parts_of(generation).items())}
+            store.commit(generation, parts, history_row(generation))
+    assert digest(tmp_path / "other") == expected
+    with contextlib.closing(sqlite3.connect(tmp_path / "other" / "run.db")) as connection:
+        connection.execute("VACUUM")
+    assert digest(tmp_path / "other") == expected
+
+
+def test_when_a_part_was_last_written_does_not_count(folder, tmp_path):
+    with create(tmp_path / "all", generations=GENERATIONS - 1) as store:
+        store.commit(GENERATIONS - 1, state_at(GENERATIONS - 1), history_row(GENERATIONS - 1))
+    assert digest(tmp_path / "all") == digest(folder)
+
+
+def test_seconds_and_rates_do_not_count(folder):
+    before = digest(folder)
+    change(folder, "UPDATE history SET seconds_rollout = 1e9 WHERE generation = 3")
+    assert digest(folder) == before
+    assert verify_run(folder) != []
+
+
+def test_platforms_and_meta_do_not_count(folder, tmp_path):
+    with create(tmp_path / "elsewhere", run_meta=meta(config={}, created="later")) as store:
+        store.record_platform(0, {"cpu": "another"})
+        advance(store, GENERATIONS - 1)
+    assert digest(tmp_path / "elsewhere") == digest(folder)
+
+
+@pytest.mark.parametrize("part", ["member_0", "member_1", "member_2", "observations"])
+def test_one_flipped_bit_in_a_state_counts(folder, part):
+    before, whole = digest_parts(folder), digest(folder)
+    payload = encode_part(state_at(GENERATIONS - 1)[part])
+    position = position_of(folder / "run.db", payload[-40:]) + 39
+    flip_bit(folder / "run.db", position)
+    assert changed_names(before, digest_parts(folder)) == {f"state/{part}"}
+    assert digest(folder) != whole
+    assert any("does not match its SHA-256" in problem for problem in verify_run(folder))
+
+
+def test_a_state_that_cannot_be_read_is_an_error(folder):
+    change(folder, "UPDATE state SET payload = x'00' WHERE part = 'observations' AND generation = 5")
+    with pytest.raises(StoreError, match="does not start as one"):
+        digest(folder)
+
+
+@pytest.mark.parametrize("column", [column.name for column in COLUMNS if column.deterministic])
+def test_one_changed_deterministic_history_value_counts(folder, column):
+    before = digest_parts(folder)
+    if column == "generation":
+        change(folder, "UPDATE history SET generation = 77 WHERE generation = 5")
+    elif column == "env_steps":
+        change(folder, "UPDATE history SET env_steps = env_steps + 1 WHERE generation = 2")
+    else:
+        value = history_row(2)[column]
+        change(folder, f"UPDATE history SET {column} = ? WHERE generation = 2", float(np.nextafter(value, np.inf)))
+    assert changed_names(before, digest_parts(folder)) == {"history"}
+
+
+def test_no_value_is_not_zero(folder):
+    before = digest(folder)
+    change(folder, "UPDATE history SET goal_distance = 0.0 WHERE generation = 3")
+    assert digest(folder) != before
+
+
+def test_one_generation_less_or_another_seed_counts(folder, tmp_path):
+    less = digest_parts(finished(tmp_path / "less", GENERATIONS - 1))
+    assert {"history", "state/observations"} <= changed_names(digest_parts(folder), less)
+    other = digest_parts(finished(tmp_path / "seed", GENERATIONS, seed=1))
+    assert changed_names(digest_parts(folder), other) == {name for name in other if name != "history"}
+    change(folder, "DELETE FROM history WHERE generation = 5")
+    assert digest_parts(folder)["history"] == less["history"]
+
+
+def test_names_types_and_shapes_of_arrays_count():
+    array = np.arange(4, dtype=np.float32)
+    different = [
+        {"a": array},
+        {"b": array},
+        {"a": array.reshape(2, 2)},
+        {"a": array.view(np.int32)},
+        {"a": array.astype(np.float64)},
+        {"a": array[:2], "b": array[2:]},
+        {},
+    ]
+    assert len({arrays_sha256(arrays) for arrays in different}) == len(different)
+    assert arrays_sha256({"a": array.astype(">f4")}) == arrays_sha256({"a": array})
+    assert arrays_sha256({"a": np.asfortranarray(array.reshape(2, 2))}) == arrays_sha256({"a": array.reshape(2, 2)})
+
+
+def test_a_later_table_is_one_line(folder, monkeypatch):
+    before = digest(folder)
+    monkeypatch.setitem(digest_module.TABLES, "map", lambda connection, run: "0" * 64)
+    assert digest_parts(folder)["map"] == "0" * 64
+    assert digest(folder) != before
+
+
+def test_a_run_without_a_generation_has_a_digest(tmp_path):
+    create(tmp_path / "run").close()
+    assert list(digest_parts(tmp_path / "run")) == ["history"]
+
+
+def test_a_run_is_mixed_from_the_first_generation_on_another_platform(tmp_path):
+    folder = tmp_path / "run"
+    with create(folder) as store:
+        assert not is_mixed(folder)
+        store.record_platform(0, {"cpu": "a"})
+        advance(store, 2)
+        assert not is_mixed(folder)
+        store.record_platform(3, {"cpu": "b"})
+        assert not is_mixed(folder)
+        advance(store, 3)
+        assert is_mixed(folder)
+        store.record_platform(4, {"cpu": "a"})
+        advance(store, 4)
+    assert is_mixed(folder)

@@ -1,0 +1,88 @@
+"""One session of a run in a process of its own, which can be told to die: `python -m tests.system.session JSON`.
+
+JSON: {"folder", "config": mapping or null to resume, "kill": {"at": hook name, "nth": 1, "after_us": null}}. The kill
+is SIGKILL to itself at the nth time the store reaches the named point; with `after_us`, that many microseconds later,
+from a thread, while the main thread goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+SMALL = {
+    "task": {"environment": "point_maze", "episode_steps": 30},
+    "policy": {"hidden": [8]},
+    "search": {"algorithm": "es", "pairs": 16, "evaluation_episodes": 4},
+    "budget": {"generations": 30},
+    "compute": {"chunk_pairs": 8, "workers": 1},
+}
+"""A run of some milliseconds a generation."""
+
+
+def start(folder: Path, *, config: dict | None = None, kill: dict | None = None) -> subprocess.Popen[str]:
+    """Start a session; it resumes unless a config is given."""
+    arguments = json.dumps({"folder": str(folder), "config": config, "kill": kill})
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.system.session", arguments],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finish(folder: Path, *, config: dict | None = None, kill: dict | None = None) -> int:
+    """Run a session to its end; the exit code. A session that fails by itself shows its error."""
+    process = start(folder, config=config, kill=kill)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode in (0, -signal.SIGKILL), errors
+    return process.returncode
+
+
+def _main(folder: str, config: dict | None, kill: dict | None) -> None:
+    from es_service import api
+
+    seen = 0
+
+    def die() -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def hook(name: str) -> None:
+        nonlocal seen
+        if kill is None or name != kill["at"]:
+            return
+        seen += 1
+        if seen != kill.get("nth", 1):
+            return
+        delay_us = kill.get("after_us")
+        if delay_us is None:
+            die()
+        armed = threading.Event()
+
+        def later() -> None:
+            end = time.perf_counter_ns() + 1000 * delay_us
+            armed.set()
+            while time.perf_counter_ns() < end:
+                time.sleep(0)
+            die()
+
+        threading.Thread(target=later, daemon=True).start()
+        armed.wait()
+
+    if config is None:
+        api.resume(folder, hook=hook)
+    else:
+        api.run(api.load_config(config), folder, hook=hook)
+
+
+if __name__ == "__main__":
+    _main(**json.loads(sys.argv[1]))

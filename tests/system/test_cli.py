@@ -1,0 +1,327 @@
+"""The command line as a user meets it: exit codes, messages, signals, resume, fork, status, damage."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from es_service import open_run
+from es_service.store_reader import read_generation
+from tests.system.session import ROOT, SMALL
+
+COMMAND = [sys.executable, "-c", "from es_service.cli import main; main()"]
+
+
+def es(*arguments, cwd=ROOT, **environment):
+    """Run `es-service ...` to its end: (exit code, all it printed, without line breaks inside paragraphs)."""
+    result = subprocess.run(
+        [*COMMAND, *map(str, arguments)],
+        cwd=cwd,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert "Traceback" not in result.stderr, result.stderr
+    return result.returncode, result.stdout + result.stderr
+
+
+@pytest.fixture
+def config(tmp_path):
+    path = tmp_path / "small.yaml"
+    path.write_text(yaml.safe_dump(SMALL))
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A finished run of thirty generations."""
+    folder = tmp_path_factory.mktemp("finished")
+    path = folder / "small.yaml"
+    path.write_text(yaml.safe_dump(SMALL))
+    code, printed = es("run", path, "--out", folder / "run")
+    assert code == 0, printed
+    return folder / "run", printed
+
+
+def digest(folder):
+    code, printed = es("digest", folder)
+    assert code == 0, printed
+    return printed.strip()
+
+
+def test_run_ends_in_a_summary_with_the_next_commands(finished):
+    folder, printed = finished
+    assert "Done: 30 generations are done." in printed
+    for command in ("status", "digest", "resume", "fork"):
+        assert f"es-service {command} {folder}" in printed
+    assert {path.name for path in folder.iterdir()} == {"config.yaml", "run.db", "run.lock"}
+
+
+def test_resolved_config_is_complete_and_runs_to_the_same_digest(finished, tmp_path):
+    folder, _ = finished
+    recorded = yaml.safe_load((folder / "config.yaml").read_text())
+    assert recorded["search"]["sigma"] == 0.02
+    assert recorded["compute"]["gradient_block_pairs"] == 8
+    assert es("run", folder / "config.yaml", "--out", tmp_path / "again")[0] == 0
+    assert digest(tmp_path / "again") == digest(folder)
+
+
+def test_options_stand_for_keys(config, tmp_path):
+    folder = tmp_path / "run"
+    code, _ = es(
+        "run", config, "--out", folder, "--seed", 5, "--workers", 2, "--engine", "inline",
+        "--set", "search.sigma=0.05", "--set", "budget.generations=2",
+    )  # fmt: skip
+    assert code == 0
+    run = open_run(folder)
+    assert (run.config["seed"], run.config["search"]["sigma"], run.config["compute"]["workers"]) == (5, 0.05, 2)
+    assert run.generation == 2
+
+
+def test_resume_in_pieces_equals_one_run_and_another_seed_does_not(config, finished, tmp_path):
+    folder = tmp_path / "run"
+    assert es("run", config, "--out", folder, "--set", "budget.generations=7")[0] == 0
+    assert digest(folder) != digest(finished[0])
+    assert es("resume", folder, "--set", "budget.generations=8")[0] == 0
+    assert es("resume", folder, "--set", "budget.generations=30", "--workers", 2)[0] == 0
+    assert digest(folder) == digest(finished[0])
+    assert es("run", config, "--out", tmp_path / "other", "--seed", 1)[0] == 0
+    assert digest(tmp_path / "other") != digest(finished[0])
+
+
+def test_resume_of_a_finished_run_does_nothing(finished):
+    before = digest(finished[0])
+    code, printed = es("resume", finished[0])
+    assert code == 0
+    assert "30 generations are done" in printed
+    assert digest(finished[0]) == before
+
+
+def test_fork_without_changes_goes_on_as_its_parent_would(config, finished, tmp_path):
+    parent, child = tmp_path / "parent", tmp_path / "child"
+    assert es("run", config, "--out", parent, "--set", "budget.generations=10")[0] == 0
+    for generation in ([], ["--generation", 9]):
+        assert es("fork", parent, *generation, "--out", child, "--set", "budget.generations=30")[0] == 0
+        assert digest(child) == digest(finished[0])
+        origin = open_run(child).meta.parent
+        assert origin is not None
+        assert (origin["generation"], origin["digest"]) == (generation[1] if generation else 10, digest(parent))
+        assert re.search(rf"started from\s+{parent}, generation", es("status", child)[1].replace("\n", ""))
+        child = tmp_path / "child9"
+
+
+def test_fork_with_changes_and_what_does_not_fit(finished, tmp_path):
+    more = ("--set", "budget.generations=32")
+    code, _ = es("fork", finished[0], "--out", tmp_path / "a", "--set", "search.pairs=24", *more)
+    assert code == 0
+    assert open_run(tmp_path / "a").config["search"]["pairs"] == 24
+    assert len(open_run(tmp_path / "a").history) == 33
+    code, printed = es("fork", finished[0], "--out", tmp_path / "b", "--set", "policy.hidden=[16]", *more)
+    assert code == 2
+    assert "policy.hidden: [8] -> [16]" in printed
+    code, printed = es("fork", finished[0], "--generation", 3, "--out", tmp_path / "c", *more)
+    assert code == 1
+    assert "it keeps that of [29, 30]" in printed
+    assert not (tmp_path / "b").exists()
+    assert not (tmp_path / "c").exists()
+
+
+def test_init_from_starts_at_the_other_run_s_centre(config, finished, tmp_path):
+    code, printed = es("run", config, "--out", tmp_path / "r", "--set", f"search.init_from={finished[0]}",
+                       "--set", "budget.target_fitness=-1e9", "--set", "search.sigma=0.01")  # fmt: skip
+    assert code == 0, printed
+    child, parent = open_run(tmp_path / "r"), open_run(finished[0])
+    assert child.generation == 0
+    assert (child.centre() == parent.centre()).all()
+    assert child.observations().count == parent.observations().count
+    assert child.meta.parent is not None
+    assert child.meta.parent["digest"] == digest(finished[0])
+    code, printed = es("run", config, "--out", tmp_path / "s", "--set", f"search.init_from={finished[0]}",
+                       "--set", "policy.hidden=[16]")  # fmt: skip
+    assert code == 2
+    assert "has layers [2, 8, 2], this run's has [2, 16, 2]" in printed
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_stop_promptly_and_resume_equals_uninterrupted(config, finished, tmp_path, number, code):
+    folder = tmp_path / "run"
+    slow = ["--set", "search.pairs=16", "--set", "budget.generations=3000"]
+    process = subprocess.Popen(
+        [*COMMAND, "run", str(config), "--out", str(folder), *slow], cwd=ROOT, stderr=subprocess.PIPE, text=True
+    )
+    while not (folder / "run.db").exists() or (read_generation(folder) or 0) < 5:
+        time.sleep(0.01)
+    sent = time.monotonic()
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=20)
+    assert time.monotonic() - sent < 2.0
+    assert process.returncode == code
+    assert f"es-service resume {folder}" in errors.replace("\n", " ")
+    reached = read_generation(folder)
+    assert reached is not None
+    last = max(30, reached + 1)
+    assert es("resume", folder, "--set", f"budget.generations={last}")[0] == 0
+    assert es("run", config, "--out", tmp_path / "whole", "--set", f"budget.generations={last}")[0] == 0
+    assert digest(folder) == digest(tmp_path / "whole")
+
+
+def test_a_second_driver_is_refused_and_told_who_holds_the_run(config, tmp_path):
+    folder = tmp_path / "run"
+    process = subprocess.Popen(
+        [*COMMAND, "run", str(config), "--out", str(folder), "--set", "budget.generations=100000"],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        while not (folder / "run.db").exists() or read_generation(folder) is None:
+            time.sleep(0.01)
+        code, printed = es("resume", folder)
+        assert code == 1
+        assert f"{process.pid}" in printed
+        assert socket.gethostname() in printed
+        assert f"pid {process.pid}" in es("status", folder)[1]
+        follower = subprocess.Popen(
+            [*COMMAND, "status", str(folder), "--follow"], cwd=ROOT, stdout=subprocess.PIPE, text=True
+        )
+        time.sleep(3.0)
+    finally:
+        process.terminate()
+        process.wait(timeout=20)
+    followed, _ = follower.communicate(timeout=20)
+    seen = [int(number) for number in re.findall(r"^generation (\d+)", followed, re.MULTILINE)]
+    assert len(seen) >= 2
+    assert seen == sorted(set(seen))
+    assert seen[-1] == read_generation(folder)
+    assert "no driver is running" in followed
+
+
+def damage(path: Path, at: int) -> None:
+    with path.open("r+b") as file:
+        file.seek(at)
+        byte = file.read(1)
+        file.seek(at)
+        file.write(bytes([byte[0] ^ 0x10]))
+
+
+def test_damage_gives_the_same_digest_or_a_named_error(config, finished, tmp_path):
+    """A flipped byte in the newest state, in the file header, a truncated file."""
+    folder = tmp_path / "run"
+    assert es("run", config, "--out", folder, "--set", "budget.generations=20")[0] == 0
+    sound = (folder / "run.db").read_bytes()
+    newest = open_run(folder).centre().tobytes()
+    last = ["--set", "budget.generations=30"]
+
+    damage(folder / "run.db", sound.rindex(newest) + 8)
+    code, printed = es("resume", folder, *last)
+    assert code == 0
+    assert re.search(r"generation 20.*19", printed.replace("\n", " "))
+    assert digest(folder) == digest(finished[0])
+
+    for position, length in ((3, None), (40, None), (None, 5000), (None, len(sound) // 2)):
+        (folder / "run.db").write_bytes(sound[:length])
+        if position is not None:
+            damage(folder / "run.db", position)
+        code, printed = es("resume", folder, *last)
+        if code == 0:
+            assert digest(folder) == digest(finished[0])
+        else:
+            assert code == 1
+            assert str(folder) in printed.replace("\n", "")
+
+
+def test_other_versions_on_resume_are_told_and_make_the_digest_mixed(config, tmp_path, monkeypatch):
+    from es_service import api
+
+    folder = tmp_path / "run"
+    assert es("run", config, "--out", folder, "--set", "budget.generations=3")[0] == 0
+    assert "mixed" not in digest(folder)
+    monkeypatch.setattr(api, "platform_info", lambda: {"jax": "99.0"})
+    outcome = api.resume(folder, ["budget.generations=4"])
+    assert any("from generation 4 on" in notice for notice in outcome.notices)
+    assert digest(folder).endswith("mixed")
+
+
+BAD_CONFIGS = [
+    ({"search.sgima": 0.1}, "did you mean search.sigma?"),
+    ({"search.sigma": "big"}, "search.sigma: big"),
+    ({"search.sigma": 0}, "search.sigma: 0"),
+    ({"search.pairs": -4}, "search.pairs: -4"),
+    ({"task.environment": "point_mase"}, "point_maze"),
+    ({"search.algorithm": "ess"}, "es"),
+    ({"search.pairs": 20, "compute.chunk_pairs": 8}, "24"),
+    ({"budget": None}, "budget"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD_CONFIGS)
+def test_bad_configs_get_one_message_and_exit_code_two(tmp_path, changes, message):
+    mapping = yaml.safe_load(yaml.safe_dump(SMALL))
+    for name, value in changes.items():
+        *section, key = name.split(".")
+        target = mapping[section[0]] if section else mapping
+        target[key] = value
+    path = tmp_path / "bad.yaml"
+    path.write_text(yaml.safe_dump(mapping))
+    code, printed = es("run", path, "--out", tmp_path / "run")
+    assert code == 2
+    assert message in " ".join(printed.split())
+    assert not (tmp_path / "run").exists()
+
+
+def test_bad_paths(config, finished, tmp_path):
+    malformed = tmp_path / "malformed.yaml"
+    malformed.write_text("task: {environment: point_maze\nsearch: [\n")
+    cases = [
+        (("run", tmp_path / "none.yaml"), 2, "no such file"),
+        (("run", malformed), 2, "line"),
+        (("run", config, "--out", finished[0]), 1, f"es-service resume {finished[0]}"),
+        (("run", config, "--out", "/proc/nowhere/run"), 1, "/proc/nowhere"),
+        (("run", config, "--set", "search.sigma"), 2, "search.sigma"),
+        (("run", config, "--wrokers", "2"), 2, "--workers"),
+        (("rnu", config), 2, "run"),
+        (("resume", tmp_path), 1, "not a run folder"),
+        (("status", tmp_path / "nothing"), 1, "does not exist"),
+        (("digest", config), 1, "not a run folder"),
+        (("resume", finished[0], "--set", "search.sigma=0.5", "--set", "seed=3"), 2, "search.sigma: 0.02 -> 0.5"),
+    ]
+    for arguments, expected, message in cases:
+        code, printed = es(*arguments)
+        assert (code, message in " ".join(printed.split())) == (expected, True), (arguments, code, printed)
+
+
+def test_resume_with_an_edited_config_lists_every_changed_constant(config, tmp_path):
+    folder = tmp_path / "run"
+    assert es("run", config, "--out", folder, "--set", "budget.generations=2")[0] == 0
+    recorded = folder / "config.yaml"
+    recorded.write_text(recorded.read_text().replace("sigma: 0.02", "sigma: 0.5").replace("seed: 0", "seed: 9"))
+    code, printed = es("resume", folder)
+    assert code == 2
+    for change in ("search.sigma: 0.02 -> 0.5", "seed: 0 -> 9", "es-service fork"):
+        assert change in printed
+
+
+def test_unwritable_home_does_not_matter(config, tmp_path):
+    code, printed = es("run", config, "--out", tmp_path / "run", HOME="/proc/nowhere", XDG_CACHE_HOME="/proc/nowhere")
+    assert code == 0, printed
+
+
+def test_list_and_doctor(tmp_path):
+    code, printed = es("list")
+    assert code == 0
+    assert "point_maze" in printed
+    assert "search.pairs" in printed
+    code, printed = es("doctor", cwd=tmp_path, PYTHONPATH=str(ROOT))
+    assert code == 0, printed
+    assert "noise equals its" in printed
+    assert "FAIL" not in printed

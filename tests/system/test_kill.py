@@ -1,0 +1,118 @@
+"""`kill -9` at any instant, then resume: the run ends with the same bits as one that was never touched."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import time
+
+import pytest
+
+from es_service.digest import digest_parts
+from es_service.errors import StoreError
+from es_service.store_reader import read_generation
+from tests.system.session import SMALL, finish, start
+
+LONG = SMALL | {"budget": {"generations": 700}}
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """Digest of the run that nobody disturbs."""
+    folder = tmp_path_factory.mktemp("reference") / "run"
+    assert finish(folder, config=SMALL) == 0
+    return digest_parts(folder)
+
+
+HOOKS = ["opened", "before_begin", "mid_transaction", "before_commit", "after_commit", "before_checkpoint"]
+
+
+@pytest.mark.parametrize("nth", [1, 7])
+@pytest.mark.parametrize("at", HOOKS)
+def test_killed_at_a_hook(tmp_path, reference, at, nth):
+    if at in ("opened", "before_checkpoint"):
+        nth = 1  # once in so short a session: at its start, at its end
+    folder = tmp_path / "run"
+    assert finish(folder, config=SMALL, kill={"at": at, "nth": nth}) == -signal.SIGKILL
+    expected = {"opened": None, "before_checkpoint": 30, "after_commit": nth - 1}.get(at, nth - 2)
+    assert read_generation(folder) == (None if expected == -1 else expected)
+    assert finish(folder) == 0
+    assert digest_parts(folder) == reference
+
+
+def checkpoint_in_progress(folder) -> bool:
+    """Whether the process died with a checkpoint begun and not ended: SQLite's own note in the shared memory file.
+
+    The WAL index keeps, at bytes 96 and 128, how many frames are known to be in the database and how many a checkpoint
+    has begun to move there (SQLite file format, "WAL-index header").
+    """
+    index = (folder / "run.db-shm").read_bytes()
+    moved, attempted = (int.from_bytes(index[at : at + 4], "little") for at in (96, 128))
+    return attempted > moved
+
+
+def test_killed_during_a_wal_checkpoint(tmp_path, reference):
+    hits = 0
+    for trial in range(40):
+        folder = tmp_path / f"run{trial}"
+        kill = {"at": "before_checkpoint", "after_us": 20 * trial}
+        assert finish(folder, config=SMALL, kill=kill) == -signal.SIGKILL
+        if checkpoint_in_progress(folder):
+            hits += 1
+            assert finish(folder) == 0
+            assert digest_parts(folder) == reference
+        if hits == 2:
+            return
+    pytest.fail(f"{hits} of 40 kills fell into a checkpoint; widen the delays")
+
+
+def test_killed_during_start_up(tmp_path, reference):
+    """At any instant from nothing to the first commit: either there is no run yet, or it can be resumed."""
+    begun = 0
+    for trial in range(8):
+        folder = tmp_path / f"run{trial}"
+        process = start(folder, config=SMALL)
+        time.sleep(0.1 + 0.2 * trial)
+        process.kill()
+        process.communicate()
+        if (folder / "run.db").exists():
+            begun += 1
+            assert finish(folder) == 0
+        else:
+            assert finish(folder, config=SMALL) == 0
+        assert digest_parts(folder) == reference
+    assert 0 < begun < 8  # kills fell on both sides of the run's creation
+
+
+@pytest.mark.slow
+def test_killed_fifty_times_in_one_run(tmp_path):
+    """Fifty SIGKILLs at random instants of one run, at least forty of them between its first commit and its end."""
+    undisturbed, folder = tmp_path / "undisturbed", tmp_path / "run"
+    assert finish(undisturbed, config=LONG) == 0
+    rng = random.Random(0)
+    between = 0
+    for kill in range(50):
+        before = committed(folder)
+        process = start(folder, config=LONG if not (folder / "run.db").exists() else None)
+        if kill % 10 == 9:  # some before this session commits anything
+            time.sleep(rng.uniform(0.2, 1.5))
+        else:
+            while committed(folder) == before and process.poll() is None:
+                time.sleep(0.002)
+            time.sleep(rng.uniform(0.0, 0.03))
+        assert process.poll() is None, "the run ended before its kill; give it more generations"
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+        between += committed(folder) is not None
+    assert between >= 40
+    print(f"{between} of 50 kills fell between the first commit and the end, at generation {committed(folder)} of 700")
+    assert finish(folder) == 0
+    assert digest_parts(folder) == digest_parts(undisturbed)
+
+
+def committed(folder) -> int | None:
+    try:
+        return read_generation(folder)
+    except StoreError:
+        return None

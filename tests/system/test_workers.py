@@ -1,0 +1,156 @@
+"""Placement cannot change the answer: any number, order, loss or retry of workers gives the same bits."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from es_service import api
+from es_service.digest import digest_parts
+from es_service.dispatch import inline_engine
+from es_service.errors import EvaluationError
+from tests.system.session import ROOT
+
+CONFIG = {
+    "task": {"environment": "point_maze"},
+    "search": {"algorithm": "es", "pairs": 256, "evaluation_episodes": 20},
+    "budget": {"generations": 12},
+    "compute": {"workers": 2, "chunk_pairs": 32, "gradient_block_pairs": 32, "chunk_timeout_s": 1.0},
+}
+"""Some forty milliseconds a generation: time enough to hit one in the middle."""
+
+
+def run(folder: Path, on_generation=lambda row: None, **compute):
+    config = api.load_config(CONFIG | {"compute": CONFIG["compute"] | compute})
+    return api.run(config, folder, on_generation=on_generation)
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reference") / "run"
+    run(folder, workers=1)
+    return digest_parts(folder)
+
+
+def children() -> list[int]:
+    """Process ids of this process's worker processes."""
+    found = []
+    for pid in filter(str.isdigit, os.listdir("/proc")):
+        try:
+            parent = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+            command = Path(f"/proc/{pid}/cmdline").read_text()
+        except OSError:
+            continue
+        if parent == os.getpid() and "workers.process" in command:
+            found.append(int(pid))
+    return sorted(found)
+
+
+@pytest.mark.parametrize("workers", [2, 3])
+def test_number_of_workers(tmp_path, reference, workers):
+    run(tmp_path / "run", workers=workers)
+    assert digest_parts(tmp_path / "run") == reference
+
+
+def test_order_of_chunks(tmp_path, reference, monkeypatch):
+    """Chunks go out in random order, so answers come back in random order too."""
+    rng = random.Random(0)
+    evaluate = inline_engine.InlineEngine.evaluate
+
+    def shuffled(self, centre, chunks):
+        order = rng.sample(range(len(chunks)), len(chunks))
+        results = evaluate(self, centre, [chunks[i] for i in order])
+        return [result for _, result in sorted(zip(order, results, strict=True), key=lambda item: item[0])]
+
+    monkeypatch.setattr(inline_engine.InlineEngine, "evaluate", shuffled)
+    run(tmp_path / "run")
+    assert digest_parts(tmp_path / "run") == reference
+
+
+@pytest.mark.parametrize(("number", "after"), [(signal.SIGKILL, (4, 8)), (signal.SIGSTOP, (4,))])
+def test_a_worker_killed_or_stopped_in_mid_generation(tmp_path, reference, number, after):
+    hit = []
+
+    def strike(row):
+        if row["generation"] in after:  # the next generation has begun when the timer fires
+            victim = children()[-1]
+            hit.append(victim)
+            timer = threading.Timer(0.01, os.kill, (victim, number))
+            timer.start()
+
+    outcome = run(tmp_path / "run", strike)
+    history = outcome.run.history
+    assert len(hit) == len(after)
+    assert history["lost_workers"].sum() == len(after)
+    assert history["retries"].sum() >= 1
+    assert digest_parts(tmp_path / "run") == reference
+    assert children() == []
+
+
+def test_run_from_a_process_that_already_used_jax(tmp_path, reference):
+    """The caller's JAX has other threads, 64-bit types and flags; rollouts never see them."""
+    script = f"""
+import os
+os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=true --xla_backend_optimization_level=0"
+os.environ["JAX_DISABLE_JIT"] = "1"
+import jax
+jax.config.update("jax_enable_x64", True)
+assert (jax.numpy.ones(5) @ jax.numpy.ones(5)) == 5
+from es_service import load_config, run
+run(load_config({CONFIG!r}), {str(tmp_path / "run")!r})
+"""
+    environment = {k: v for k, v in os.environ.items() if k not in ("PJRT_NPROC", "JAX_PLATFORMS")}
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path, env=environment, timeout=120)
+    assert digest_parts(tmp_path / "run") == reference
+
+
+def test_a_chunk_that_fails_everywhere_ends_the_run_with_its_error(tmp_path, monkeypatch):
+    """A poison chunk: the message names it and carries the worker's own traceback; what is committed stays."""
+    evaluate = inline_engine.InlineEngine.evaluate
+
+    def poisoned(self, centre, chunks):
+        if centre.generation == 3:
+            chunks = [type(chunk)(chunk.generation, "two") if chunk.chunk_id == 2 else chunk for chunk in chunks]
+        return evaluate(self, centre, chunks)
+
+    monkeypatch.setattr(inline_engine.InlineEngine, "evaluate", poisoned)
+    with pytest.raises(EvaluationError, match=r"(?s)two.*4 .*TypeError"):
+        run(tmp_path / "run")
+    assert api.open_run(tmp_path / "run").generation == 2
+    assert children() == []
+
+
+def test_workers_that_cannot_start_end_the_run_with_their_last_words(tmp_path, monkeypatch):
+    monkeypatch.setitem(inline_engine.FIXED_ENVIRONMENT, "JAX_PLATFORMS", "no_such_platform")
+    with pytest.raises(EvaluationError, match="no_such_platform"):
+        run(tmp_path / "run")
+    assert children() == []
+
+
+def test_a_killed_driver_leaves_no_workers(tmp_path):
+    script = f"""
+from es_service import load_config, run
+run(load_config({CONFIG | {"budget": {"generations": 100_000}}!r}), {str(tmp_path / "run")!r})
+"""
+    process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
+    workers: list[str] = []
+    for _ in range(200):
+        listed = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        if len(listed) == 2 and (tmp_path / "run" / "run.db").exists():
+            workers = listed
+            break
+        time.sleep(0.05)
+    assert len(workers) == 2
+    time.sleep(1.0)
+    process.kill()
+    process.wait()
+    time.sleep(0.5)
+    assert not any(Path(f"/proc/{pid}").exists() for pid in workers)
