@@ -6,10 +6,9 @@ import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import pandas as pd
 
 from es_service import digest as run_digest
 from es_service import store_reader
@@ -20,6 +19,9 @@ from es_service.statistics import normalisation
 from es_service.store_schema import RunMeta
 from workers.environments import TASKS
 from workers.policy import PolicyShape, act, normalise, policy_shape, split_layers
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,8 @@ class Run:
     @property
     def history(self) -> pd.DataFrame:
         """One row per generation, indexed by generation; columns are documented in `es_service.history`."""
+        import pandas as pd  # a quarter of a second that starting a run need not spend
+
         columns = [column.name for column in self.meta.columns]
         return pd.DataFrame(self.history_rows(), columns=pd.Index(columns)).set_index("generation")
 

@@ -1,6 +1,8 @@
 """A small run whose every generation is known: what the tests of the run store write and expect to read back."""
 
+import contextlib
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import numpy as np
 from es_service import store_upkeep
 from es_service.history import Column
 from es_service.store import RunMeta, RunStore, no_hook
+from es_service.store_reader import read_history, read_parts
 
 CONFIG_YAML = "seed: 0\n"
 COLUMNS = (
@@ -127,3 +130,34 @@ def position_of(file, content):
     data = Path(file).read_bytes()
     assert data.count(content) == 1
     return data.index(content)
+
+
+def stored_bytes(folder):
+    """Content of all files but the shared memory of the log, which readers rebuild."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if not path.name.endswith("-shm")}
+
+
+def assert_sound(folder, generation):
+    """The run opens with exactly this generation and nothing to report; reading it before that gave the same."""
+    before = stored_bytes(folder)
+    assert_same_history(read_history(folder), generation + 1)
+    if generation >= 0:
+        assert_same_state(read_parts(folder)[1], state_at(generation))
+    assert stored_bytes(folder) == before
+    with RunStore.open(folder) as run:
+        assert run.notices == []
+        assert run.generation == (None if generation < 0 else generation)
+        assert_same_state(run.load(), state_at(generation))
+
+
+@contextlib.contextmanager
+def without_root_rights():
+    """Root may write anywhere; as nobody, permissions count."""
+    if os.geteuid() != 0:
+        yield
+        return
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)

@@ -57,6 +57,7 @@ def test_somebody_looking_at_the_lock_does_not_keep_a_writer_out(tmp_path):
     folder = finished(tmp_path / "run", 1)
     stream = (folder / "run.lock").open()
     fcntl.flock(stream, fcntl.LOCK_SH)
+    assert lock_holder(folder) is None
     threading.Timer(0.1, stream.close).start()
     RunStore.open(folder).close()
     assert stream.closed

@@ -1,3 +1,5 @@
+"""Creating a run and committing to it."""
+
 import contextlib
 import os
 import sqlite3
@@ -6,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from es_service import run_folder, store, store_create, store_reader, store_upkeep
+from es_service import store_create, store_upkeep
 from es_service.errors import StoreError
 from es_service.history import Column
-from es_service.run_folder import is_network_filesystem
 from es_service.store import RunStore
 from es_service.store_reader import read_generation, read_history, read_meta, read_parts, read_platforms
 from tests.es_service.store_examples import (
@@ -18,27 +19,14 @@ from tests.es_service.store_examples import (
     advance,
     assert_same_history,
     assert_same_state,
-    copy_at_every_commit,
     create,
     finished,
     history_row,
     meta,
     parts_of,
     state_at,
+    without_root_rights,
 )
-
-
-@contextlib.contextmanager
-def without_root_rights():
-    """Root may write anywhere; as nobody, permissions count."""
-    if os.geteuid() != 0:
-        yield
-        return
-    os.seteuid(65534)
-    try:
-        yield
-    finally:
-        os.seteuid(0)
 
 
 def rows(folder, query):
@@ -269,208 +257,3 @@ def test_platforms_are_recorded_where_they_change(tmp_path):
         with pytest.raises(StoreError, match="generation 4 is stored already"):
             run.record_platform(4, {"cpu": "c"})
     assert read_platforms(folder) == [(0, {"cpu": "a", "jax": "1"}), (5, {"cpu": "b"})]
-
-
-# Closing, and readers beside
-
-
-def test_a_clean_end_leaves_one_file_that_a_read_only_folder_can_hold(tmp_path):
-    with tempfile.TemporaryDirectory() as parent:
-        os.chmod(parent, 0o755)
-        folder = finished(Path(parent) / "run", 4)
-        assert (folder / "run.db").read_bytes()[18:20] == b"\x01\x01"
-        assert sorted(path.name for path in folder.iterdir()) == ["config.yaml", "run.db", "run.lock"]
-        os.chmod(folder, 0o555)
-        for path in folder.iterdir():
-            os.chmod(path, 0o444)
-        with without_root_rights():
-            assert_same_history(read_history(folder), 4)
-            assert_same_state(read_parts(folder)[1], state_at(3))
-            with pytest.raises(StoreError, match="Permission denied"):
-                RunStore.open(folder)
-        assert len(list(folder.iterdir())) == 3
-        os.chmod(folder, 0o755)
-
-
-def test_a_reader_that_holds_on_does_not_fail_the_end(tmp_path, monkeypatch):
-    monkeypatch.setattr(store_upkeep, "_CLOSE_PATIENCE_MS", 50)
-    folder = tmp_path / "run"
-    run = create(folder, generations=3)
-    with store_reader.reading(folder) as (connection, _):
-        assert connection.execute("SELECT count(*) FROM history").fetchone() == (3,)
-        run.close()
-    assert_same_history(read_history(folder), 3)
-    with RunStore.open(folder) as run:
-        assert (run.generation, run.notices) == (2, [])
-    assert sorted(path.name for path in folder.iterdir()) == ["config.yaml", "run.db", "run.lock"]
-
-
-def test_the_copy_is_a_verified_single_file_refreshed_when_it_is_time(tmp_path, monkeypatch):
-    folder = tmp_path / "run"
-    with create(folder, generations=3) as run:
-        assert not (folder / "run.db.copy").exists()
-        copy_at_every_commit(monkeypatch)
-        run.upkeep.copy_interval_s = 0.0
-        advance(run, 4)
-        assert not list(folder.glob("run.db.copy.*"))
-        assert (folder / "run.db.copy").read_bytes()[18:20] == b"\x01\x01"
-        run.upkeep.copy_interval_s = 1000.0
-        advance(run, 6)
-    (folder / "run.db").unlink()
-    with RunStore.open(folder) as run:
-        assert run.generation == 4
-        assert any("missing" in notice and "generation 4" in notice for notice in run.notices)
-
-
-def test_a_young_copy_of_an_earlier_session_is_not_refreshed_at_once(tmp_path, monkeypatch):
-    folder = tmp_path / "run"
-    with monkeypatch.context() as patch:
-        copy_at_every_commit(patch)
-        finished(folder, 2)
-    made = (folder / "run.db.copy").stat().st_mtime
-    with RunStore.open(folder) as run:
-        advance(run, 2)
-        assert (folder / "run.db.copy").stat().st_mtime == made
-    os.utime(folder / "run.db.copy", (0, made - store_upkeep.LOCAL_COPY_INTERVAL_S))
-    with RunStore.open(folder) as run:
-        advance(run, 3)
-        assert (folder / "run.db.copy").stat().st_mtime > made
-
-
-def test_a_copy_that_cannot_be_made_is_a_notice(tmp_path, monkeypatch):
-    def full(connection, folder):
-        raise OSError(28, "No space left on device")
-
-    copy_at_every_commit(monkeypatch)
-    monkeypatch.setattr(store_upkeep, "make_copy", full)
-    with create(tmp_path / "run", generations=3) as run:
-        assert run.generation == 2
-        assert len(run.notices) == 1
-        assert "disk full: could not refresh run.db.copy" in run.notices[0]
-
-
-# Network file systems
-
-
-@pytest.fixture
-def on_network(monkeypatch):
-    for module in (store, store_reader):
-        monkeypatch.setattr(module, "is_network_filesystem", lambda path: True)
-
-
-@pytest.mark.usefixtures("on_network")
-def test_on_a_network_there_is_no_wal_and_readers_read_the_copy(tmp_path):
-    folder = tmp_path / "run"
-    with create(folder) as run:
-        assert read_generation(folder) is None
-        assert run.upkeep.copy_interval_s == store_upkeep.NETWORK_COPY_INTERVAL_S == 10.0
-        advance(run, 3)
-        assert read_generation(folder) is None
-        run.upkeep.copy_interval_s = run.upkeep._copy_seconds = 0.0
-        advance(run, 4)
-        assert read_generation(folder) == 4
-        assert not (folder / "run.db-wal").exists()
-        assert run._connection.execute("PRAGMA synchronous").fetchone() == (2,)
-        run.upkeep.copy_interval_s = 1000.0
-        advance(run, 5)
-    assert read_generation(folder) == 5
-    (folder / "run.db").unlink()
-    with RunStore.open(folder) as run:
-        assert run.generation == 5
-
-
-MOUNTS = r"""
-22 27 0:21 / / rw,relatime - ext4 /dev/vda rw
-23 22 0:22 / /home rw shared:1 - nfs4 server:/home rw
-24 22 0:23 / /home/local rw - xfs /dev/vdb rw
-25 22 0:24 / /with\040space rw - fuse.sshfs me@host: rw
-26 22 0:25 / /lake rw master:2 propagate_from:3 - lustre 10.0.0.1@tcp:/lake rw
-27 22 0:26 / /over rw - nfs server:/a rw
-28 22 0:27 / /over rw - tmpfs tmpfs rw
-29 22 0:28 / /docker rw - fuse.fuse-overlayfs fuse-overlayfs rw
-30 22 0:29 / /shared rw - 9p hostshare rw
-31 22 0:30 / /windows rw - fuseblk /dev/sdb1 rw
-"""
-
-
-@pytest.mark.parametrize(
-    ("path", "network"),
-    [
-        ("/runs/a", False),
-        ("/home/me/runs/a", True),
-        ("/homework", False),
-        ("/home/local/a", False),
-        ("/with space/a", True),
-        ("/lake/a", True),
-        ("/over/a", False),
-        ("/docker/a", False),
-        ("/shared/a", True),
-        ("/windows/a", False),
-    ],
-)
-def test_network_file_systems_are_told_by_their_type(path, network):
-    assert is_network_filesystem(Path(path), MOUNTS) is network
-
-
-def test_this_machines_mounts_can_be_read():
-    assert is_network_filesystem(Path("/proc")) is False
-    assert is_network_filesystem(Path("/"), "no mounts at all\n1 2 3 - \n") is False
-    assert {"nfs", "nfs4", "cifs", "smb3", "lustre", "gpfs", "ceph", "9p", "afs"} <= run_folder.NETWORK_FILE_SYSTEMS
-
-
-# Reading
-
-
-def test_readers_follow_a_writer(tmp_path):
-    folder = tmp_path / "run"
-    with create(folder) as run:
-        assert read_history(folder) == []
-        with pytest.raises(StoreError, match="no generation yet"):
-            read_parts(folder)
-        for generation in range(5):
-            advance(run, generation)
-            assert read_generation(folder) == generation
-            assert_same_history(read_history(folder), generation + 1)
-            assert [row["generation"] for row in read_history(folder, 3)] == list(range(3, generation + 1))
-            assert_same_state(read_parts(folder)[1], state_at(generation))
-
-
-def test_a_generation_that_is_not_kept_is_refused_with_those_that_are(tmp_path):
-    folder = finished(tmp_path / "run", 6)
-    for generation in (0, 3, 6, -1):
-        with pytest.raises(StoreError, match=rf"state of generation {generation}; it keeps that of \[4, 5\]"):
-            read_parts(folder, generation)
-
-
-def test_readers_change_nothing(tmp_path):
-    folder = finished(tmp_path / "run", 3)
-    before = {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
-    read_meta(folder), read_history(folder), read_parts(folder), read_platforms(folder), store_reader.verify_run(folder)
-    assert {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()} == before
-
-
-def test_what_is_no_run_folder_is_called_that(tmp_path):
-    (tmp_path / "file").write_text("")
-    (tmp_path / "other").mkdir()
-    for content, name in ((b"not a database" * 100, "text"), (b"", "empty")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "run.db").write_bytes(content)
-    (tmp_path / "foreign").mkdir()
-    with contextlib.closing(sqlite3.connect(tmp_path / "foreign" / "run.db")) as connection:
-        connection.execute("CREATE TABLE a (b)")
-    for name in ("file", "other", "missing", "text", "empty", "foreign"):
-        for use in (RunStore.open, read_meta, read_history, read_parts):
-            with pytest.raises(StoreError, match="not a run folder"):
-                use(tmp_path / name)
-    assert not (tmp_path / "other" / "run.lock").exists()
-
-
-def test_a_newer_schema_version_names_both_and_says_upgrade(tmp_path, monkeypatch):
-    from es_service import store_schema
-
-    with monkeypatch.context() as patch:
-        patch.setattr(store_schema, "SCHEMA_VERSION", 7)
-        folder = finished(tmp_path / "run", 1)
-    for use in (RunStore.open, read_meta, read_history):
-        with pytest.raises(StoreError, match=r"schema version 7; .* versions up to 1\. Upgrade"):
-            use(folder)

@@ -14,7 +14,7 @@ from es_service.errors import StoreError
 from es_service.store_reader import read_generation
 from tests.system.session import SMALL, finish, start
 
-LONG = SMALL | {"budget": {"generations": 700}}
+LONG = SMALL | {"budget": {"generations": 400}}
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_killed_fifty_times_in_one_run(tmp_path):
         process.communicate()
         between += committed(folder) is not None
     assert between >= 40
-    print(f"{between} of 50 kills fell between the first commit and the end, at generation {committed(folder)} of 700")
+    print(f"{between} of 50 kills fell between the first commit and the end, at generation {committed(folder)} of 400")
     assert finish(folder) == 0
     assert digest_parts(folder) == digest_parts(undisturbed)
 

@@ -1,27 +1,24 @@
-"""Kills, damaged files and full disks: the run continues with the same bits, or says that it cannot."""
+"""Damaged files: the run continues with the same bits, or says that it cannot."""
 
 import contextlib
 import os
 import random
 import shutil
 import sqlite3
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from es_service import store, store_reader
 from es_service.digest import digest, digest_parts
 from es_service.errors import StoreError
 from es_service.store import RunStore
 from es_service.store_codec import encode_part
-from es_service.store_reader import read_generation, read_history, read_parts, verify_run
+from es_service.store_reader import read_generation, read_history, read_parts, read_platforms, verify_run
 from tests.es_service.store_examples import (
     advance,
     assert_same_history,
     assert_same_state,
+    assert_sound,
     copy_at_every_commit,
     create,
     finished,
@@ -31,141 +28,6 @@ from tests.es_service.store_examples import (
     position_of,
     state_at,
 )
-from tests.es_service.store_killer import GENERATIONS
-
-ROOT = Path(__file__).parents[2]
-
-
-def killed(tmp_path, jobs):
-    """Names of the jobs that were killed; the others ended by themselves, well."""
-    program = subprocess.run(
-        [sys.executable, "-m", "tests.es_service.store_killer", str(tmp_path)],
-        input="".join(f"{' '.join(map(str, job))}\n" for job in jobs),
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-        check=True,
-        timeout=120,
-    )
-    ends = dict(line.split() for line in program.stdout.splitlines())
-    assert set(ends.values()) <= {"killed", "0"}, program.stderr
-    return {name for name, end in ends.items() if end == "killed"}
-
-
-def assert_sound(folder, generation):
-    """The run opens with exactly this generation and nothing to report; reading it before that gave the same."""
-    assert_same_history(read_history(folder), generation + 1)
-    if generation >= 0:
-        assert_same_state(read_parts(folder)[1], state_at(generation))
-    with RunStore.open(folder) as run:
-        assert run.notices == []
-        assert run.generation == (None if generation < 0 else generation)
-        assert_same_state(run.load(), state_at(generation))
-
-
-# Kills
-
-# With 50,000 bytes a checkpoint follows generation 0 and every second one after it, give or take; what is committed
-# does not depend on that.
-KILLS = [
-    *(("opened", count, -1) for count in (1,)),
-    *((hook, count, count - 2) for hook in ("before_begin", "mid_transaction", "before_commit") for count in (1, 2, 5)),
-    *(("after_commit", count, count - 1) for count in (1, 2, 6)),
-]
-
-
-def test_a_killed_writer_loses_the_generation_in_flight_and_nothing_else(tmp_path):
-    jobs = [("hook", f"{hook}-{count}", hook, count) for hook, count, _ in KILLS]
-    checkpoints = [
-        (f"{hook}-{count}", hook, count) for hook in ("before_checkpoint", "after_checkpoint") for count in (1, 2)
-    ]
-    jobs += [("hook", *checkpoint) for checkpoint in checkpoints]
-    assert killed(tmp_path, jobs) == {job[1] for job in jobs}
-    expected_digest = digest(finished(tmp_path / "uninterrupted", GENERATIONS))
-    for hook, count, generation in KILLS:
-        assert_sound(tmp_path / f"{hook}-{count}", generation)
-    reached = {name: read_generation(tmp_path / name) for name, _, _ in checkpoints}
-    assert reached["before_checkpoint-1"] == reached["after_checkpoint-1"]
-    assert reached["before_checkpoint-1"] < reached["before_checkpoint-2"] <= GENERATIONS - 1
-    for name, generation in reached.items():
-        assert_sound(tmp_path / name, generation)
-    for _, name, _, _ in jobs:
-        with RunStore.open(tmp_path / name) as run:
-            advance(run, GENERATIONS - 1)
-        assert digest(tmp_path / name) == expected_digest
-
-
-def test_a_creation_killed_at_any_file_operation_can_be_continued_or_repeated(tmp_path):
-    names = [f"{kind}-{count}" for kind in ("new", "existing") for count in range(1, 60)]
-    for name in names:
-        if name.startswith("existing"):
-            (tmp_path / name).mkdir()
-    died = killed(tmp_path, [("create", name, "-", name.split("-")[1]) for name in names])
-    assert {"new-1", "new-10", "existing-1", "existing-10"} <= died < set(names)
-    outcomes = set()
-    for name in names:
-        folder = tmp_path / name
-        if (folder / "run.db").exists():
-            outcomes.add(("resumed", name in died))
-            with RunStore.open(folder) as run:
-                assert run.generation is None
-                assert (folder / "config.yaml").read_text() == "seed: 0\n"
-                advance(run, 0)
-        else:
-            outcomes.add(("repeated", name in died))
-            assert folder.exists() is name.startswith("existing")
-            if folder.exists():
-                with pytest.raises(StoreError, match="give the same command again"):
-                    RunStore.open(folder)
-            create(folder, generations=1).close()
-        assert_sound(folder, 0)
-        assert sorted(path.name for path in folder.iterdir()) == ["config.yaml", "run.db", "run.lock"]
-    assert outcomes == {("resumed", True), ("repeated", True), ("resumed", False)}
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
-
-
-def test_a_repair_killed_at_any_file_operation_can_be_done_again(tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        copy_at_every_commit(patch)
-        finished(tmp_path / "whole", 3)
-    with create(tmp_path / "left", generations=3, seed=1):
-        log = (tmp_path / "left" / "run.db-wal").read_bytes()
-    names = [f"open-{count}" for count in range(1, 60)]
-    for name in names:
-        shutil.copytree(tmp_path / "whole", tmp_path / name)
-        # The log beside it would replay well: it must not be, into the copy.
-        flip_bit(tmp_path / name / "run.db", 0)
-        (tmp_path / name / "run.db-wal").write_bytes(log)
-    died = killed(tmp_path, [("open", name, "-", name.split("-")[1]) for name in names])
-    assert {"open-1", "open-10"} <= died < set(names)
-    for name in names:
-        with RunStore.open(tmp_path / name) as run:
-            assert run.generation == 2
-            assert_same_state(run.load(), state_at(2))
-            assert len(run.notices) <= 1
-        assert (tmp_path / name / "run.db.damaged").exists()
-        assert not list((tmp_path / name).glob("run.db.restored*"))
-        assert_sound(tmp_path / name, 2)
-
-
-def test_on_a_network_a_killed_writer_loses_no_more(tmp_path, monkeypatch):
-    for module in (store, store_reader):
-        monkeypatch.setattr(module, "is_network_filesystem", lambda path: True)
-    jobs = [job for job in KILLS if job[1] > 1]
-    died = killed(tmp_path, [("network", f"{hook}-{count}", hook, count) for hook, count, _ in jobs])
-    assert len(died) == len(jobs)
-    for hook, count, generation in jobs:
-        folder = tmp_path / f"{hook}-{count}"
-        before = {path.name: path.read_bytes() for path in folder.iterdir()}
-        # A journal to be rolled back sends readers to the copy, which here is as new.
-        assert ("run.db-journal" in before) is (hook in ("mid_transaction", "before_commit"))
-        assert_same_history(read_history(folder), generation + 1)
-        assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-        assert_sound(folder, generation)
-
-
-# Damage
 
 
 def test_a_damaged_newest_state_falls_back_one_generation(tmp_path):
@@ -271,14 +133,52 @@ def test_a_state_row_that_vanished_is_not_replaced_by_an_older_one(tmp_path):
         assert "fell back" in run.notices[0]
 
 
-def test_swapped_columns_and_foreign_tables_are_noticed(tmp_path):
+def behind_the_stores_back(folder, *statements):
+    with contextlib.closing(sqlite3.connect(folder / "run.db")) as connection, connection:
+        for statement in statements:
+            connection.execute(statement)
+
+
+def test_a_history_row_that_vanished_is_noticed(tmp_path):
     folder = finished(tmp_path / "run", 6)
-    with sqlite3.connect(folder / "run.db") as connection:
-        connection.execute("ALTER TABLE history RENAME COLUMN goal_distance TO other")
-    connection.close()
+    behind_the_stores_back(folder, "DELETE FROM history WHERE generation = 2")
     for use in (RunStore.open, read_history):
-        with pytest.raises(StoreError, match=r"not those of a run|no such column"):
+        with pytest.raises(StoreError, match=r"history row of generation 2 is (damaged or )?missing"):
             use(folder)
+
+
+def test_other_tables_and_columns_are_noticed(tmp_path):
+    for statement in ("ALTER TABLE history RENAME COLUMN goal_distance TO other", "CREATE TABLE other (a)"):
+        folder = finished(tmp_path / statement[:5], 3)
+        behind_the_stores_back(folder, statement)
+        with pytest.raises(StoreError, match="its tables are not those of a run"):
+            RunStore.open(folder)
+    with pytest.raises(StoreError, match="no such column"):
+        read_history(tmp_path / "ALTER")
+
+
+def test_another_platform_or_meta_is_noticed(tmp_path):
+    with create(tmp_path / "run") as run:
+        run.record_platform(0, {"cpu": "a"})
+        advance(run, 2)
+    behind_the_stores_back(tmp_path / "run", """UPDATE platform SET platform = '{"cpu": "b"}'""")
+    for use in (RunStore.open, read_platforms):
+        with pytest.raises(StoreError, match="platform recorded at generation 0 does not match"):
+            use(tmp_path / "run")
+    behind_the_stores_back(tmp_path / "run", "UPDATE meta SET value = replace(value, '0', '1') WHERE key = 'run'")
+    with pytest.raises(StoreError, match="record 'run' of what the run is does not match"):
+        read_history(tmp_path / "run")
+
+
+@pytest.mark.parametrize(("position", "complaint"), [(18, "unknown file format"), (39, "quick_check"), (0, "SQLite")])
+def test_a_damaged_header_takes_the_copy(tmp_path, monkeypatch, position, complaint):
+    copy_at_every_commit(monkeypatch)
+    folder = finished(tmp_path / "run", 3)
+    flip_bit(folder / "run.db", position, bit=1)
+    with RunStore.open(folder) as run:
+        assert complaint in run.notices[0]
+        assert "Restored" in run.notices[0]
+    assert_sound(folder, 2)
 
 
 def damaged_at_random(folder, target, damage, with_copy):
@@ -370,79 +270,6 @@ def test_a_damaged_log_costs_generations_but_never_changes_them(tmp_path):
         reached.add(generation)
         assert_sound(folder, 5)
     assert len(reached) > 2
-
-
-# Full disks
-
-
-def test_a_full_database_stops_the_commit_and_keeps_the_rest(tmp_path):
-    folder = tmp_path / "run"
-    with create(folder, generations=3) as run:
-        connection = run._connection
-        pages = connection.execute("PRAGMA page_count").fetchone()[0]
-        connection.execute(f"PRAGMA max_page_count = {pages}")
-        big = {"member_0": {"centre_D": np.zeros(100_000, np.float32)}}
-        with pytest.raises(
-            StoreError, match=r"disk full while storing generation 3 .* free space, then `es-service resume"
-        ):
-            run.commit(3, big, history_row(3))
-        assert run.generation == 2
-        assert_same_state(run.load(), state_at(2))
-        connection.execute("PRAGMA max_page_count = 1000000")
-        advance(run, 3)
-    assert_sound(folder, 3)
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], capture_output=True, text=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip(f"cannot mount a small disk: {mounted.stderr.strip()}")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
-
-
-def fill(disk):
-    """Leave not a byte of space."""
-    ballast = os.open(disk / "ballast", os.O_WRONLY | os.O_CREAT)
-    with contextlib.suppress(OSError):
-        while True:
-            os.write(ballast, bytes(4096))
-    os.close(ballast)
-    assert shutil.disk_usage(disk).free == 0
-
-
-def test_a_full_disk_stops_the_run_which_continues_when_there_is_space(small_disk):
-    folder = small_disk / "run"
-    with create(folder, generations=2) as run:
-        with pytest.raises(StoreError, match="disk full while storing generation"):
-            advance(run, 2000)
-        reached = run.generation
-        assert 2 < reached < 1999
-        assert_same_state(run.load(), state_at(reached))
-    assert_same_history(read_history(folder), reached + 1)
-    fill(small_disk)
-    with pytest.raises(StoreError, match="disk full"), RunStore.open(folder) as run:
-        advance(run, reached + 100)
-    assert_same_state(read_parts(folder)[1], state_at(reached))
-    (small_disk / "ballast").unlink()
-    subprocess.run(["mount", "-o", "remount,size=8m", str(small_disk)], check=True)
-    with RunStore.open(folder) as run:
-        assert run.notices == []
-        assert run.generation == reached
-        advance(run, reached + 3)
-    assert_sound(folder, reached + 3)
-
-
-def test_creating_a_run_on_a_full_disk_says_so(small_disk):
-    fill(small_disk)
-    with pytest.raises(StoreError, match=r"disk full while .* free space, then give the same command again"):
-        create(small_disk / "run")
-    assert [path.name for path in small_disk.iterdir()] == ["ballast"]
 
 
 def test_digest_parts_of_a_restored_run_equal_the_original(tmp_path, monkeypatch):

@@ -1,0 +1,72 @@
+"""Reading beside a writer, of what is kept, and of what is no run."""
+
+import contextlib
+import sqlite3
+
+import pytest
+
+from es_service import store_reader, store_schema
+from es_service.errors import StoreError
+from es_service.store import RunStore
+from es_service.store_reader import read_generation, read_history, read_meta, read_parts, read_platforms
+from tests.es_service.store_examples import (
+    advance,
+    assert_same_history,
+    assert_same_state,
+    create,
+    finished,
+    state_at,
+)
+
+
+def test_readers_follow_a_writer(tmp_path):
+    folder = tmp_path / "run"
+    with create(folder) as run:
+        assert read_history(folder) == []
+        with pytest.raises(StoreError, match="no generation yet"):
+            read_parts(folder)
+        for generation in range(5):
+            advance(run, generation)
+            assert read_generation(folder) == generation
+            assert_same_history(read_history(folder), generation + 1)
+            assert [row["generation"] for row in read_history(folder, 3)] == list(range(3, generation + 1))
+            assert_same_state(read_parts(folder)[1], state_at(generation))
+
+
+def test_a_generation_that_is_not_kept_is_refused_with_those_that_are(tmp_path):
+    folder = finished(tmp_path / "run", 6)
+    for generation in (0, 3, 6, -1):
+        with pytest.raises(StoreError, match=rf"state of generation {generation}; it keeps that of \[4, 5\]"):
+            read_parts(folder, generation)
+
+
+def test_readers_change_nothing(tmp_path):
+    folder = finished(tmp_path / "run", 3)
+    before = {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
+    read_meta(folder), read_history(folder), read_parts(folder), read_platforms(folder), store_reader.verify_run(folder)
+    assert {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()} == before
+
+
+def test_what_is_no_run_folder_is_called_that(tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "other").mkdir()
+    for content, name in ((b"not a database" * 100, "text"), (b"", "empty")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.db").write_bytes(content)
+    (tmp_path / "foreign").mkdir()
+    with contextlib.closing(sqlite3.connect(tmp_path / "foreign" / "run.db")) as connection:
+        connection.execute("CREATE TABLE a (b)")
+    for name in ("file", "other", "missing", "text", "empty", "foreign"):
+        for use in (RunStore.open, read_meta, read_history, read_parts):
+            with pytest.raises(StoreError, match="not a run folder"):
+                use(tmp_path / name)
+    assert not (tmp_path / "other" / "run.lock").exists()
+
+
+def test_a_newer_schema_version_names_both_and_says_upgrade(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(store_schema, "SCHEMA_VERSION", 7)
+        folder = finished(tmp_path / "run", 1)
+    for use in (RunStore.open, read_meta, read_history):
+        with pytest.raises(StoreError, match=r"schema version 7; .* versions up to 1\. Upgrade"):
+            use(folder)

@@ -1,0 +1,60 @@
+"""The README's commands and code, run in order as a reader would, and its tables held against the code."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from es_service.config_yaml import show
+from es_service.presets import preset_table
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+
+
+def between(name: str) -> str:
+    return README.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0].strip()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reader")
+    (folder / "configs").symlink_to(ROOT / "configs")
+    return folder
+
+
+def test_every_command_and_every_line_of_python_works(folder):
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    commands = [line for block in blocks("bash") for line in block.splitlines()]
+    assert {line.split()[1] for line in commands} >= {"run", "resume", "fork", "status", "digest", "list", "doctor"}
+    for command in commands:
+        result = subprocess.run(
+            command, shell=True, cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False
+        )
+        assert result.returncode == 0, (command, result.stdout, result.stderr)
+    for code in blocks("python"):
+        subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, check=True, timeout=120)
+
+
+def test_make_targets_exist():
+    makefile = (ROOT / "Makefile").read_text()
+    for target in re.findall(r"^make (\w+)", README, re.MULTILINE):
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE)
+    assert "make test" in (ROOT / ".ci" / "run").read_text()
+
+
+def test_preset_table_is_the_code_s():
+    rows = [f"| `{row.key}` | {show(row.literature)} | {show(row.uber)} |" for row in preset_table()]
+    assert between("presets").splitlines()[2:] == rows
+
+
+def test_files_it_names_exist():
+    for path in re.findall(r"\]\(([^)#]+)\)", README):
+        assert (ROOT / path).exists(), path
