@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from es_service import config_loading, digest, driver
+from es_service import digest, driver
 from es_service.algorithms import ALGORITHMS
-from es_service.config import RunConfig, changed_constants, describe_changes, worker_spec
+from es_service.config import loading
+from es_service.config.model import RunConfig, changed_constants, describe_changes, worker_spec
 from es_service.dispatch.inline_engine import InlineEngine
 from es_service.dispatch.messages import Policy as SchedulingPolicy
 from es_service.errors import ConfigError
@@ -23,7 +24,7 @@ from es_service.protocol import FloatArray, Moments
 from es_service.run_view import Run, open_run
 from es_service.signals import stop_on_signals
 from es_service.statistics import no_observations
-from es_service.store import RunMeta, RunStore, no_hook
+from es_service.store.writer import RunMeta, RunStore, no_hook
 from workers.environments import TASKS
 from workers.policy import initial_parameters, policy_shape
 
@@ -42,17 +43,17 @@ class Outcome:
     """What had to be repaired or should be known, in words."""
 
 
-def load_config(source: config_loading.Source, overrides: Iterable[str] = ()) -> RunConfig:
+def load_config(source: loading.Source, overrides: Iterable[str] = ()) -> RunConfig:
     """Read a YAML file (or a mapping like one), apply overrides such as "search.sigma=0.05", resolve and check it all.
 
     Raises:
         ConfigError: lists every problem found.
     """
-    return config_loading.load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+    return loading.load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
 
 
 def run(
-    config: RunConfig | config_loading.Source,
+    config: RunConfig | loading.Source,
     out: str | os.PathLike[str] | None = None,
     *,
     on_generation: Callable[[Mapping[str, Any]], None] = lambda row: None,
@@ -94,7 +95,7 @@ def resume(
     with RunStore.open(folder, hook=hook) as store:
         edited = folder / "config.yaml"
         source = edited if edited.exists() else store.meta.config
-        config = config_loading.resume_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+        config = loading.resume_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
         if changes := changed_constants(store.meta.constants, config.constants()):
             raise ConfigError(f"{folder}: {describe_changes(changes, str(folder))}")
         return _work(config, store, on_generation)
@@ -145,7 +146,7 @@ def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -
     if "search.pairs" in keys:
         for shape in ("chunk_pairs", "rollout_block_pairs", "gradient_block_pairs"):
             mapping["compute"][shape] = "auto"
-    config = config_loading.load_config(mapping, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+    config = loading.load_config(mapping, overrides, tasks=TASKS, algorithms=ALGORITHMS)
     fixed = ("task.environment", "policy.hidden", "search.algorithm")
     if unfit := [change for change in changed_constants(origin.constants, config.constants()) if change[0] in fixed]:
         listed = "\n".join(f"  {name}: {old} -> {new}" for name, old, new in unfit)

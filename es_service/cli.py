@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 
 from es_service import api, digest
-from es_service.config_resolution import config_warnings
+from es_service.config.resolution import config_warnings
 from es_service.errors import ConfigError, Interrupted, ServiceError
 from es_service.report.catalogue import print_catalogue
 from es_service.report.progress import show_progress

@@ -2,7 +2,7 @@
 
 Hashed are values, each with its name, type and shape: not payload bytes as stored, row order on disk, seconds, rates,
 workers, hosts or paths. It is taken from what the tables contain, without looking at the SHA-256 stored beside it
-(`store_reader.verify_run` does that): a flipped bit in a state payload or a deterministic history value gives another
+(`store.reader.verify_run` does that): a flipped bit in a state payload or a deterministic history value gives another
 digest, or a StoreError where the value can no longer be read as one.
 """
 
@@ -18,9 +18,9 @@ from typing import Any
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
-from es_service.store_codec import decode_part, row_bytes
-from es_service.store_reader import read_platforms, reading, state_payload
-from es_service.store_schema import RunMeta, history_select
+from es_service.store.codec import decode_part, row_bytes
+from es_service.store.reader import read_platforms, reading, state_payload
+from es_service.store.schema import RunMeta, history_select
 
 Connection = sqlite3.Connection
 

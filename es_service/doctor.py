@@ -19,7 +19,7 @@ from es_service.errors import ServiceError
 from es_service.noise import TEST_VECTORS, normal_integers, stream_keys
 from es_service.platform_info import platform_info
 from es_service.protocol import Centre, EpisodesResult, TrainingChunk, WorkerSpec
-from es_service.run_folder import is_network_filesystem
+from es_service.store.folder import is_network_filesystem
 from workers.environments import TASKS
 from workers.policy import initial_parameters, policy_shape
 

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from es_service.algorithms.base import Algorithm
-from es_service.config import BudgetConfig, RunConfig
+from es_service.config.model import BudgetConfig, RunConfig
 from es_service.generation import estimate_gradient, evaluate_centre, evaluate_population, invalidate
 from es_service.history import evaluation_columns, population_columns
 from es_service.protocol import Centre, DispatchCounts, EpisodesResult, Evaluator, FloatArray, Moments

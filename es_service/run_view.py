@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from es_service import digest as run_digest
-from es_service import store_reader
 from es_service.algorithms.base import member_from_arrays, member_part
 from es_service.protocol import FloatArray, Moments
 from es_service.run_state import best_from_arrays, moments_from_arrays
 from es_service.statistics import normalisation
-from es_service.store_schema import RunMeta
+from es_service.store import reader
+from es_service.store.schema import RunMeta
 from workers.environments import TASKS
 from workers.policy import PolicyShape, act, normalise, policy_shape, split_layers
 
@@ -53,7 +53,7 @@ class Run:
     @cached_property
     def meta(self) -> RunMeta:
         """What was fixed when the run was created."""
-        return store_reader.read_meta(self.folder)
+        return reader.read_meta(self.folder)
 
     @property
     def run_id(self) -> str:
@@ -80,16 +80,16 @@ class Run:
 
     def history_rows(self, since_generation: int | None = None) -> list[dict[str, Any]]:
         """History as dictionaries, oldest first; only from `since_generation` on if given."""
-        return store_reader.read_history(self.folder, since_generation)
+        return reader.read_history(self.folder, since_generation)
 
     def parts(self, generation: int | None = None) -> tuple[int, dict[str, dict[str, np.ndarray]]]:
         """(generation, state parts), verified; the newest, or one of the last two generations."""
-        return store_reader.read_parts(self.folder, generation)
+        return reader.read_parts(self.folder, generation)
 
     @property
     def generation(self) -> int | None:
         """Newest committed generation; None before the first."""
-        return store_reader.read_generation(self.folder)
+        return reader.read_generation(self.folder)
 
     def digest(self) -> str:
         """SHA-256 over everything deterministic in the run."""

@@ -10,6 +10,6 @@ from collections.abc import Callable
 
 from es_service.algorithms.base import Algorithm
 from es_service.algorithms.es import es
-from es_service.config import SearchConfig
+from es_service.config.model import SearchConfig
 
 ALGORITHMS: dict[str, Callable[[SearchConfig], Algorithm]] = {"es": es}

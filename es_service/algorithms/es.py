@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.algorithms.base import Algorithm, Member, Plan, SearchState
-from es_service.config import SearchConfig
+from es_service.config.model import SearchConfig
 from es_service.optimizer import adam_ascent, fresh_adam
 from es_service.protocol import EpisodesResult, FloatArray
 from es_service.shaping import centred_ranks, pair_weights

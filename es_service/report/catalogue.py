@@ -6,8 +6,8 @@ from rich.console import Console
 from rich.table import Table
 
 from es_service.algorithms import ALGORITHMS
-from es_service.config_yaml import show
-from es_service.presets import PRESETS, preset_table
+from es_service.config.presets import PRESETS, preset_table
+from es_service.config.yaml_text import show
 from workers.environments import TASKS
 
 

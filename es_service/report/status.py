@@ -8,8 +8,8 @@ from typing import Any
 from rich.console import Console
 
 from es_service.report.progress import plain_line
-from es_service.run_lock import lock_holder
 from es_service.run_view import Run
+from es_service.store.lock import lock_holder
 
 FOLLOW_INTERVAL_S = 1.0
 

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from es_service import api
-from es_service.config import worker_spec
+from es_service.config.model import worker_spec
 from es_service.dispatch.inline_engine import InlineEngine
 from es_service.dispatch.messages import Policy
 from es_service.protocol import EpisodesResult, TrainingChunk

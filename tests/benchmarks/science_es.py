@@ -113,7 +113,7 @@ def _maze_panel(ways: list[np.ndarray], left: float, top: float, size: float) ->
         box(-1, -1, 1, 1, 'fill="#fafafa" stroke="#333"'),
         box(maze.START_X[0], maze.START_Y[0], maze.START_X[1], maze.START_Y[1], 'fill="#dfe7ee"'),
         box(maze.GOAL[0] - half, maze.GOAL[1] - half, maze.GOAL[0] + half, maze.GOAL[1] + half, 'fill="#7bc47f"'),
-        box(maze.LOWER_WALL_FROM_X, *[maze.LOWER_WALL[0]], 1, maze.LOWER_WALL[1], 'fill="#333" stroke="#333"'),
+        box(maze.LOWER_WALL_FROM_X, maze.LOWER_WALL[0], 1, maze.LOWER_WALL[1], 'fill="#333" stroke="#333"'),
         box(-1, maze.UPPER_WALL[0], maze.UPPER_WALL_TO_X, maze.UPPER_WALL[1], 'fill="#333" stroke="#333"'),
     ]
     for way, colour in zip(ways, COLOURS, strict=True):
@@ -148,9 +148,8 @@ def _curve_panel(curves: list[np.ndarray], left: float, top: float, width: float
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*row) for row in curve))
         parts.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.4"/>')
     parts.append(f'<text x="{left}" y="{top + height + 20}">0</text>')
-    parts.append(
-        f'<text x="{left + width}" y="{top + height + 20}" text-anchor="end">{most / 1e6:.0f} M environment steps</text>'
-    )
+    label = f"{most / 1e6:.0f} M environment steps"
+    parts.append(f'<text x="{left + width}" y="{top + height + 20}" text-anchor="end">{label}</text>')
     return parts
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from es_service import store_upkeep
 from es_service.history import Column
-from es_service.store import RunMeta, RunStore, no_hook
-from es_service.store_reader import read_history, read_parts
+from es_service.store import upkeep as store_upkeep
+from es_service.store.reader import read_history, read_parts
+from es_service.store.writer import RunMeta, RunStore, no_hook
 
 CONFIG_YAML = "seed: 0\n"
 COLUMNS = (

@@ -9,8 +9,9 @@ import signal
 import sys
 from pathlib import Path
 
-from es_service import store, store_upkeep
-from es_service.store import RunStore
+from es_service.store import upkeep as store_upkeep
+from es_service.store import writer as store
+from es_service.store.writer import RunStore
 from tests.es_service.store_examples import advance, create
 
 GENERATIONS = 6

@@ -12,17 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from es_service.config import RunConfig, changed_constants, describe_changes, worker_spec
-from es_service.config_loading import load_config, resume_config
-from es_service.config_resolution import (
+from es_service.config.loading import load_config, resume_config
+from es_service.config.model import RunConfig, changed_constants, describe_changes, worker_spec
+from es_service.config.presets import PRESETS, preset_table, preset_values
+from es_service.config.resolution import (
     config_warnings,
     default_chunk_pairs,
     default_gradient_block_pairs,
     default_rollout_block_pairs,
 )
-from es_service.config_yaml import dump_yaml, parse_value
+from es_service.config.yaml_text import dump_yaml, parse_value
 from es_service.errors import ConfigError
-from es_service.presets import PRESETS, preset_table, preset_values
 from es_service.protocol import TaskSpec
 
 POINT_MAZE = TaskSpec(

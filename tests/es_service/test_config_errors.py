@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from es_service.config import RunConfig
-from es_service.config_loading import load_config
+from es_service.config.loading import load_config
+from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
 from es_service.protocol import TaskSpec
 

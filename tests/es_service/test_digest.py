@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from es_service import digest as digest_module
-from es_service import store_schema
 from es_service.digest import arrays_sha256, digest, digest_parts, is_mixed
 from es_service.errors import StoreError
-from es_service.store import RunStore
-from es_service.store_codec import encode_part
-from es_service.store_reader import verify_run
+from es_service.store import schema as store_schema
+from es_service.store.codec import encode_part
+from es_service.store.reader import verify_run
+from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     COLUMNS,
     advance,

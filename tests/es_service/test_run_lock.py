@@ -8,10 +8,10 @@ import time
 
 import pytest
 
-from es_service import run_lock
 from es_service.errors import RunLockedError, StoreError
-from es_service.run_lock import acquire_lock, lock_holder
-from es_service.store import RunStore
+from es_service.store import lock as run_lock
+from es_service.store.lock import acquire_lock, lock_holder
+from es_service.store.writer import RunStore
 from tests.es_service.store_examples import create, finished
 
 
@@ -65,7 +65,7 @@ def test_somebody_looking_at_the_lock_does_not_keep_a_writer_out(tmp_path):
 
 def test_a_forked_child_that_outlives_the_writer_does_not_hold_the_lock(tmp_path):
     script = (
-        "import os, sys, time; from pathlib import Path; from es_service.run_lock import acquire_lock\n"
+        "import os, sys, time; from pathlib import Path; from es_service.store.lock import acquire_lock\n"
         "lock = acquire_lock(Path(sys.argv[1]))\n"
         "child = os.fork()\n"
         "if child == 0: time.sleep(60)\n"

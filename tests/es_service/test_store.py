@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from es_service import store_create, store_upkeep
 from es_service.errors import StoreError
 from es_service.history import Column
-from es_service.store import RunStore
-from es_service.store_reader import read_generation, read_history, read_meta, read_parts, read_platforms
+from es_service.store import create as store_create
+from es_service.store import upkeep as store_upkeep
+from es_service.store.reader import read_generation, read_history, read_meta, read_parts, read_platforms
+from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     COLUMNS,
     CONFIG_YAML,

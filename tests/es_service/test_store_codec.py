@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
-from es_service.store_codec import decode_part, encode_part, part_sha256, row_bytes, row_values, state_sha256
+from es_service.store.codec import decode_part, encode_part, part_sha256, row_bytes, row_values, state_sha256
 from tests.es_service.store_examples import COLUMNS, assert_same_state, history_row
 
 ARRAYS = {

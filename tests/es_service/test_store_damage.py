@@ -11,9 +11,9 @@ import pytest
 
 from es_service.digest import digest, digest_parts
 from es_service.errors import StoreError
-from es_service.store import RunStore
-from es_service.store_codec import encode_part
-from es_service.store_reader import read_generation, read_history, read_parts, read_platforms, verify_run
+from es_service.store.codec import encode_part
+from es_service.store.reader import read_generation, read_history, read_parts, read_platforms, verify_run
+from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     advance,
     assert_same_history,

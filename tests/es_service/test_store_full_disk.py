@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
-from es_service.run_folder import explained
-from es_service.store import RunStore
-from es_service.store_reader import read_history, read_parts
+from es_service.store.folder import explained
+from es_service.store.reader import read_history, read_parts
+from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     advance,
     assert_same_history,

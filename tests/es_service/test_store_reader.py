@@ -5,10 +5,11 @@ import sqlite3
 
 import pytest
 
-from es_service import store_reader, store_schema
 from es_service.errors import StoreError
-from es_service.store import RunStore
-from es_service.store_reader import read_generation, read_history, read_meta, read_parts, read_platforms
+from es_service.store import reader as store_reader
+from es_service.store import schema as store_schema
+from es_service.store.reader import read_generation, read_history, read_meta, read_parts, read_platforms
+from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     advance,
     assert_same_history,

@@ -6,11 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from es_service import run_folder, store, store_reader, store_upkeep
 from es_service.errors import StoreError
-from es_service.run_folder import is_network_filesystem
-from es_service.store import RunStore
-from es_service.store_reader import read_generation, read_history, read_parts
+from es_service.store import folder as run_folder
+from es_service.store import reader as store_reader
+from es_service.store import upkeep as store_upkeep
+from es_service.store import writer as store
+from es_service.store.folder import is_network_filesystem
+from es_service.store.reader import read_generation, read_history, read_parts
+from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     advance,
     assert_same_history,

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 from es_service import driver
 from es_service.algorithms import ALGORITHMS
 from es_service.api import load_config
-from es_service.config import worker_spec
+from es_service.config.model import worker_spec
 from es_service.errors import EvaluationError
 from es_service.generation import estimate_gradient, tree_sum
 from es_service.noise import Domain, normals, stream_keys

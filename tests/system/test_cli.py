@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from es_service import open_run
-from es_service.store_reader import read_generation
+from es_service.store.reader import read_generation
 from tests.system.session import ROOT, SMALL
 
 COMMAND = [sys.executable, "-c", "from es_service.cli import main; main()"]

@@ -11,7 +11,7 @@ import pytest
 
 from es_service.digest import digest_parts
 from es_service.errors import StoreError
-from es_service.store_reader import read_generation
+from es_service.store.reader import read_generation
 from tests.system.session import SMALL, finish, start
 
 LONG = SMALL | {"budget": {"generations": 400}}

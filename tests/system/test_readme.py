@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from es_service.config_yaml import show
-from es_service.presets import preset_table
+from es_service.config.presets import preset_table
+from es_service.config.yaml_text import show
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()

@@ -1,6 +1,6 @@
 """What a run is: the resolved, frozen config, and what of it can never change once the run exists.
 
-A `RunConfig` holds no `auto` that would change results: `config_loading.load_config` fills in presets, defaults and
+A `RunConfig` holds no `auto` that would change results: `loading.load_config` fills in presets, defaults and
 shapes and checks the sections against each other, so build one with it and not by hand.
 """
 
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from es_service.config_yaml import dump_yaml, show
+from es_service.config.yaml_text import dump_yaml, show
 from es_service.protocol import WorkerSpec
 
 # A string beside a type is what error messages say is allowed.

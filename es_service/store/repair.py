@@ -12,9 +12,9 @@ from contextlib import closing
 from pathlib import Path
 
 from es_service.errors import StoreError
-from es_service.run_folder import COPY, DAMAGED, DATABASE, explained, remove_database, sync_file, sync_folder
-from es_service.store_schema import GENERATION_TABLES, Damaged
-from es_service.store_verify import Verdict, check_header, verify
+from es_service.store.folder import COPY, DAMAGED, DATABASE, explained, remove_database, sync_file, sync_folder
+from es_service.store.schema import GENERATION_TABLES, Damaged
+from es_service.store.verify import Verdict, check_header, verify
 
 _BUSY_S = 10.0
 

@@ -15,11 +15,11 @@ from typing import Any
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
-from es_service.run_folder import COPY, DATABASE, is_network_filesystem, require_run_folder
-from es_service.run_lock import lock_holder
-from es_service.store_codec import column_bytes, decode_part, part_sha256, row_dict, row_sha256, text_sha256
-from es_service.store_schema import Damaged, RunMeta, history_select, load_meta
-from es_service.store_verify import KeptRows, rows_in_force, state_in_force, verify
+from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict, row_sha256, text_sha256
+from es_service.store.folder import COPY, DATABASE, is_network_filesystem, require_run_folder
+from es_service.store.lock import lock_holder
+from es_service.store.schema import Damaged, RunMeta, history_select, load_meta
+from es_service.store.verify import KeptRows, rows_in_force, state_in_force, verify
 
 _BUSY_S = 5.0
 

@@ -8,9 +8,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from es_service.run_folder import COPY, DATABASE, is_disk_full
-from es_service.store_repair import make_copy
-from es_service.store_schema import Damaged
+from es_service.store.folder import COPY, DATABASE, is_disk_full
+from es_service.store.repair import make_copy
+from es_service.store.schema import Damaged
 
 LOCAL_COPY_INTERVAL_S = 180.0
 NETWORK_COPY_INTERVAL_S = 10.0

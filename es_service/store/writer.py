@@ -19,9 +19,7 @@ from typing import Any, Self
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
-from es_service.run_folder import DATABASE, explained, is_network_filesystem, require_run_folder
-from es_service.run_lock import RunLock, acquire_lock, lock_holder
-from es_service.store_codec import (
+from es_service.store.codec import (
     Part,
     column_bytes,
     decode_part,
@@ -32,11 +30,13 @@ from es_service.store_codec import (
     row_values,
     text_sha256,
 )
-from es_service.store_create import create_run_folder
-from es_service.store_repair import open_sound
-from es_service.store_schema import PAGE_BYTES, RunMeta, history_insert, history_select, meta_text
-from es_service.store_upkeep import Upkeep
-from es_service.store_verify import rows_in_force, state_in_force
+from es_service.store.create import create_run_folder
+from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
+from es_service.store.lock import RunLock, acquire_lock, lock_holder
+from es_service.store.repair import open_sound
+from es_service.store.schema import PAGE_BYTES, RunMeta, history_insert, history_select, meta_text
+from es_service.store.upkeep import Upkeep
+from es_service.store.verify import rows_in_force, state_in_force
 
 __all__ = ["Part", "RunMeta", "RunStore", "Values", "is_network_filesystem", "lock_holder", "no_hook"]
 

@@ -13,8 +13,8 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from es_service.config import RunConfig
-from es_service.config_yaml import show
+from es_service.config.model import RunConfig
+from es_service.config.yaml_text import show
 from es_service.protocol import TaskSpec
 
 LEFT_OPEN: dict[str, str | None] = {

@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 from es_service.errors import StoreError
-from es_service.run_folder import (
+from es_service.store.folder import (
     CONFIG,
     COPY,
     DATABASE,
@@ -20,9 +20,9 @@ from es_service.run_folder import (
     sync_file,
     sync_folder,
 )
-from es_service.run_lock import RunLock, acquire_lock
-from es_service.store_repair import connect
-from es_service.store_schema import create_tables
+from es_service.store.lock import RunLock, acquire_lock
+from es_service.store.repair import connect
+from es_service.store.schema import create_tables
 
 _NEW_DATABASE = "run.db.new"
 _LEFT_BEHIND = {LOCK, CONFIG, _NEW_DATABASE, f"{_NEW_DATABASE}-journal"}

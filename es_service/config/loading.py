@@ -15,8 +15,9 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from es_service.config import RunConfig, changed_constants, describe_changes
-from es_service.config_resolution import (
+from es_service.config.model import RunConfig, changed_constants, describe_changes
+from es_service.config.presets import PRESETS, preset_values
+from es_service.config.resolution import (
     LEFT_OPEN,
     OPTIONS,
     did_you_mean,
@@ -26,9 +27,8 @@ from es_service.config_resolution import (
     shape_problems,
     task_problems,
 )
-from es_service.config_yaml import config_error, parse_value, read_yaml_file, show
+from es_service.config.yaml_text import config_error, parse_value, read_yaml_file, show
 from es_service.errors import ConfigError
-from es_service.presets import PRESETS, preset_values
 from es_service.protocol import TaskSpec
 
 Source = str | os.PathLike[str] | Mapping[str, Any]

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from es_service.errors import RunLockedError, StoreError
-from es_service.run_folder import LOCK, explained
+from es_service.store.folder import LOCK, explained
 
 _PATIENCE_S = 0.5
 """`lock_holder` takes a shared lock for an instant; a writer that starts just then tries again for this long."""

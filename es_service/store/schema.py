@@ -11,7 +11,7 @@ from typing import Any
 
 from es_service.errors import StoreError
 from es_service.history import Column
-from es_service.store_codec import text_sha256
+from es_service.store.codec import text_sha256
 
 SCHEMA_VERSION = 1
 APPLICATION_ID = 0x45535256

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from es_service.store_codec import (
+from es_service.store.codec import (
     column_bytes,
     decode_part,
     part_sha256,
@@ -15,7 +15,7 @@ from es_service.store_codec import (
     state_sha256,
     text_sha256,
 )
-from es_service.store_schema import Damaged, RunMeta, history_select, load_meta, table_statements
+from es_service.store.schema import Damaged, RunMeta, history_select, load_meta, table_statements
 
 _NOT_DAMAGE = {
     sqlite3.SQLITE_BUSY,

@@ -1,0 +1,1 @@
+"""YAML and overrides -> a validated, fully resolved `RunConfig` (`loading.py` in, `model.py` out)."""
