@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by S
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,7 @@ from es_service.errors import ConfigError, Interrupted, ServiceError
 from es_service.report.catalogue import print_catalogue
 from es_service.report.progress import show_progress
 from es_service.report.status import follow_status, print_status, print_summary
+from es_service.store.folder import DATABASE
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -124,6 +126,8 @@ def doctor() -> None:
 
 def main() -> None:
     """Entry point: run the command, turn errors into one readable message and an exit code."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt)
     try:
         app()
     except Interrupted as stop:
@@ -136,13 +140,20 @@ def main() -> None:
         sys.exit(1)
 
 
+def _interrupt(number: int, frame: object) -> None:
+    raise Interrupted(number)
+
+
 def _session(folder: Path, work: Callable[[Callable], api.Outcome]) -> None:
     """Show a run while it works, and at its end what came of it."""
     try:
         with show_progress(console, str(folder)) as show:
             outcome = work(show)
     except Interrupted:
-        _print_note(f"interrupted; every finished generation is saved. Go on with: es-service resume {folder}")
+        if (folder / DATABASE).exists():
+            _print_note(f"interrupted; every finished generation is saved. Go on with: es-service resume {folder}")
+        else:
+            _print_note("interrupted before the run began; nothing was written")
         raise
     for notice in outcome.notices:
         _print_note(f"note: {notice}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 import time
 from typing import Any
 
@@ -51,13 +53,14 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
     _print_line(console, f"\nDone: {reason}.")
     _print_fields(console, _progress(rows))
     _print_line(console, f"\nThe run is in {folder}. Next:")
+    program = "es-service" if shutil.which("es-service") else sys.argv[0]  # `make run` has it in .venv/bin only
     for command in (
-        f"es-service status {folder}",
-        f"es-service digest {folder}",
-        f"es-service resume {folder} {twice}",
-        f"es-service fork {folder} --set search.sigma=0.05 {twice}",
+        f"status {folder}",
+        f"digest {folder}",
+        f"resume {folder} {twice}",
+        f"fork {folder} --set search.sigma=0.05 {twice}",
     ):
-        _print_line(console, f"  {command}")
+        _print_line(console, f"  {program} {command}")
 
 
 def _progress(rows: list[dict[str, Any]]) -> dict[str, str]:

@@ -1,6 +1,7 @@
 """ES against its twin, and the laws any rank-based antithetic ES obeys."""
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from es_service.errors import EvaluationError
 from es_service.generation import estimate_gradient, tree_sum
 from es_service.noise import Domain, normals, stream_keys
 from es_service.optimizer import adam_ascent, fresh_adam
-from es_service.protocol import EpisodesResult, TrainingChunk
+from es_service.protocol import DispatchCounts, EpisodesResult, GradientChunk, GradientResult, TrainingChunk
 from es_service.shaping import centred_ranks, pair_weights
 from es_service.statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore, centre
@@ -205,6 +206,43 @@ def test_an_invalid_centre_is_never_the_best():
     state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config), spoil))
     assert state.best.generation == 4
     assert store.rows[3]["best_fitness"] == -np.inf
+
+
+class Inventing:
+    """Answers every chunk at once, with made-up numbers and one shared partial gradient."""
+
+    counts = DispatchCounts()
+
+    def __init__(self, parameters):
+        self.sum_D = np.ones(parameters, np.float32)
+        self.rng = np.random.default_rng(0)
+
+    def evaluate(self, centre, chunks):
+        return [self.answer(chunk) for chunk in chunks]
+
+    def answer(self, chunk):
+        if isinstance(chunk, GradientChunk):
+            return GradientResult(self.sum_D, 0.0)
+        axes = (64, 2) if isinstance(chunk, TrainingChunk) else (16,)
+        fitness = self.rng.normal(size=axes).astype(np.float32)
+        steps = np.full(axes, 200, np.int32)
+        descriptor = np.zeros((*axes, 2), np.float32)
+        return EpisodesResult(fitness, fitness, descriptor, steps, descriptor, no_observations(2), 0.0)
+
+
+def test_the_driver_holds_no_population_times_parameters_array():
+    """2,048 pairs of 4,482 parameters would be 37 MB; the driver gets by with a few vectors of parameters."""
+    mapping = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es", "pairs": 2048}}
+    config = load_config(mapping | {"budget": {"generations": 3}})
+    shape = policy_shape(2, (64, 64), 2)
+    first = initial_parameters(shape, "unit_columns", 0)
+    search = driver.Search(config, ALGORITHMS["es"](config.search), lambda: (first, no_observations(2)), ("x", "y"))
+    evaluator = Inventing(shape.parameters)
+    tracemalloc.start()
+    driver.run(search, evaluator, MemoryStore(), lambda row: None)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2048 * shape.parameters * 4 / 10
 
 
 # Ranks

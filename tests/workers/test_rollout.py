@@ -1,5 +1,8 @@
 """Compiled episodes against a step-by-step NumPy episode, and the ways episodes have silently gone wrong elsewhere."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,9 +15,10 @@ from es_service.statistics import merge_moments, no_observations
 from tests.helpers import PARAMETERS, centre, random_parameters, spec
 from tests.twins import noise as noise_twin
 from tests.twins import point_maze as maze_twin
-from workers.environments import Environment
+from workers.environments import Environment, make_environment
 from workers.policy import initial_parameters, policy_shape
-from workers.worker import make_worker
+from workers.rollout import make_training_rollout
+from workers.worker import episode_keys, make_worker
 
 SHAPE = policy_shape(2, (8, 8), 2)
 MEAN, STD = np.float32([0.1, -0.4]), np.float32([0.3, 0.6])
@@ -182,6 +186,51 @@ def test_steps_after_done_never_count(monkeypatch, fitness):
     counted = np.concatenate([np.arange(k) for k in n.ravel()])  # the step number, observed before each step
     assert result.moments.mean_O[1] == pytest.approx(counted.mean())
     assert result.moments.m2_O[1] == pytest.approx(counted.var() * counted.size, rel=1e-5)
+
+
+def test_a_chunk_stops_when_all_its_members_are_done(monkeypatch):
+    environment = counting_environment([1, 5, 17], poison_after_done=False)
+    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: environment)
+    endless = spec(episode_steps=2_000_000_000)  # hours, if it did not
+    result = make_worker(endless)(centre(random_parameters()), TrainingChunk(1, 0))
+    assert isinstance(result, EpisodesResult)
+    assert result.steps.max() == 17
+
+
+def test_memory_does_not_grow_with_the_length_of_episodes():
+    """What XLA sets aside for a chunk is the same for 200 steps and for 20,000."""
+    sizes = []
+    for steps in (200, 20_000):
+        worker_spec = spec(episode_steps=steps)
+        rollout = make_training_rollout(make_environment("point_maze", {}), SHAPE, worker_spec)
+        pairs = np.arange(8)
+        keys = stream_keys(0, Domain.PARAMETER_NOISE, 1, pairs)
+        episodes = episode_keys(worker_spec, Domain.TRAINING_RESET, 1, pairs)
+        arguments = (random_parameters(), np.float32(0.1), MEAN, STD, keys, episodes, episodes)
+        compiled = jax.jit(rollout).lower(*arguments).compile()
+        sizes.append(compiled.memory_analysis().temp_size_in_bytes)
+    assert sizes[0] == sizes[1] > 0
+
+
+def test_every_function_is_traced_once(monkeypatch):
+    """Recompiling for a new generation, chunk or centre would cost more than the rollout."""
+    traces = []
+    original = make_environment("point_maze", {})
+
+    def step(state, action):
+        traces.append(1)
+        return original.step(state, action)
+
+    counted = dataclasses.replace(original, step=step)
+    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: counted)
+    worker = make_worker(spec())
+    for generation in range(1, 4):
+        for chunk in (0, 1):
+            worker(centre(random_parameters(generation), generation), TrainingChunk(generation, chunk))
+            worker(centre(random_parameters(generation), generation), EvaluationChunk(generation, chunk))
+        if generation == 1:
+            first = len(traces)
+    assert len(traces) == first
 
 
 def test_a_member_that_returns_nan_is_seen_and_does_not_poison_the_statistics(monkeypatch):
