@@ -1,6 +1,23 @@
 """Settings every test shares. Must run before anything imports jax: rollouts are compared at one XLA thread."""
 
 import os
+import subprocess
+
+import pytest
 
 os.environ["PJRT_NPROC"] = "1"
 os.environ["JAX_PLATFORMS"] = "cpu"
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of one megabyte of its own; remount it to make it larger."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], capture_output=True, text=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip(f"cannot mount a small disk: {mounted.stderr.strip()}")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)

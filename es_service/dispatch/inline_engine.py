@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from types import TracebackType
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 from es_service.dispatch import messages, scheduler
 from es_service.errors import EvaluationError, Interrupted
@@ -31,14 +31,27 @@ POLL_S = 0.1
 FIXED_ENVIRONMENT = {
     "PJRT_NPROC": "1",
     "JAX_PLATFORMS": "cpu",
-    "XLA_FLAGS": "",
-    "JAX_ENABLE_X64": "0",
-    "JAX_DISABLE_JIT": "0",
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "PYTHONSAFEPATH": "1",
 }
-"""Settings that could change the bits of a rollout; children start with these, whatever the caller has."""
+"""One thread, on the CPU. Children start with these, and without any other setting named below, so that nothing the
+caller has set can change the bits of a rollout."""
+NOT_INHERITED = ("JAX_", "XLA_", "PJRT_")
+"""Beginnings of the names of environment variables that children do not inherit."""
+
+
+class _Key(NamedTuple):
+    """What the scheduler calls a chunk."""
+
+    phase: int
+    """Number of the `evaluate` call, so that a late answer of an earlier call is never taken for one of this call."""
+    kind: str
+    generation: int
+    chunk_id: int
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.chunk_id} of generation {self.generation}"
 
 
 @dataclass(frozen=True)
@@ -69,10 +82,10 @@ class InlineEngine:
         self._children: dict[int, _Child] = {}
         self._inbox: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
         self._state = scheduler.initial_state(policy)
-        self._chunks: dict[Any, Chunk] = {}
+        self._chunks: dict[_Key, Chunk] = {}
         self._centre: Centre | None = None
         self._phase = 0
-        self._results: dict[Any, ChunkResult] = {}
+        self._results: dict[_Key, ChunkResult] = {}
         self._step(messages.Tick())
 
     @property
@@ -92,10 +105,12 @@ class InlineEngine:
             EvaluationError: a chunk that fails everywhere, workers that do not start. Interrupted: asked to stop.
         """
         self._centre = centre
-        self._phase += 1  # so that a late answer of an earlier call is never taken for one of this call
-        self._chunks = {(self._phase, chunk.chunk_id): chunk for chunk in chunks}
+        self._phase += 1
+        self._chunks = {
+            _Key(self._phase, type(chunk).__name__, chunk.generation, chunk.chunk_id): chunk for chunk in chunks
+        }
         self._results = {}
-        tasks = [messages.Task(key, type(chunk).__name__) for key, chunk in self._chunks.items()]
+        tasks = [messages.Task(key, key.kind) for key in self._chunks]
         self._step(messages.Submit(tuple(tasks)))
         while scheduler.pending(self._state):
             if (number := self._should_stop()) is not None:
@@ -128,8 +143,8 @@ class InlineEngine:
             self._step(messages.Tick())
 
     def _handle(self, worker: int, message: Any) -> None:
-        if worker not in self._children:  # killed meanwhile; what it still said is of no use
-            return
+        if worker not in self._children and message[0] != "broken":
+            return  # killed meanwhile; what it still said is of no use
         match message:
             case ("up", _):
                 self._step(messages.WorkerUp(worker))
@@ -166,29 +181,13 @@ class InlineEngine:
         return delivered
 
     def _start(self, worker: int) -> None:
-        ours, theirs = Pipe(duplex=True)
-        import_path = os.pathsep.join(path or os.getcwd() for path in sys.path)
-        log = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the child)
-        process = subprocess.Popen(
-            [sys.executable, "-m", "workers.process", str(theirs.fileno()), str(os.getpid())],
-            env={
-                **os.environ,
-                **FIXED_ENVIRONMENT,
-                "PYTHONPATH": import_path,
-            },
-            pass_fds=[theirs.fileno()],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-        )
-        theirs.close()
-        child = _Child(process, ours, queue.SimpleQueue(), log, [])
+        try:
+            child = _start_child()
+        except OSError as error:  # no process, no file descriptor or no disk space to be had
+            self._inbox.put((worker, ("broken", f"worker {worker} cannot be started: {error}")))
+            return
         self._children[worker] = child
-        threading.Thread(target=_write, args=(child,), daemon=True, name=f"to-worker-{worker}").start()
-        threading.Thread(
-            target=_read, args=(worker, child, self._inbox), daemon=True, name=f"from-worker-{worker}"
-        ).start()
+        threading.Thread(target=_read, args=(worker, child, self._inbox), daemon=True, name=f"worker-{worker}").start()
         child.outbox.put(pickle.dumps(self._spec, pickle.HIGHEST_PROTOCOL))
 
     def _send(self, worker: int, key: Any, attempt: int) -> None:
@@ -207,8 +206,6 @@ class InlineEngine:
             return "killed before"
         child.process.kill()
         code = child.process.wait()
-        child.outbox.put(None)
-        child.connection.close()
         child.log.seek(0)
         last_words = child.log.read()[-2000:].decode(errors="replace").strip()
         child.log.close()
@@ -218,19 +215,44 @@ class InlineEngine:
         )
 
 
+def _start_child() -> _Child:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(NOT_INHERITED)}
+    environment |= FIXED_ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+    ours, theirs = Pipe(duplex=True)
+    with theirs:
+        log = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the child)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "workers.process", str(theirs.fileno()), str(os.getpid())],
+            env=environment,
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
+    return _Child(process, ours, queue.SimpleQueue(), log, [])
+
+
+def _read(worker: int, child: _Child, inbox: queue.SimpleQueue[tuple[int, Any]]) -> None:
+    """Pass on what the child says until it is dead; then close the connection, once nobody uses it any more.
+
+    Closing it from elsewhere could let a thread read or write a new connection that was given the same number.
+    """
+    writer = threading.Thread(target=_write, args=(child,), daemon=True, name=f"to-worker-{worker}")
+    writer.start()
+    try:
+        while True:
+            inbox.put((worker, child.connection.recv()))
+    except Exception:  # end of file, or a message cut short by a kill
+        child.outbox.put(None)
+        writer.join()
+        child.connection.close()
+        inbox.put((worker, ("lost",)))
+
+
 def _write(child: _Child) -> None:
     while (message := child.outbox.get()) is not None:
         try:
             child.connection.send_bytes(message)
         except OSError:
             return  # gone; the reader reports it
-
-
-def _read(worker: int, child: _Child, inbox: queue.SimpleQueue[tuple[int, Any]]) -> None:
-    while True:
-        try:
-            message = child.connection.recv()
-        except Exception:  # closed, or killed in mid-message
-            inbox.put((worker, ("lost",)))
-            return
-        inbox.put((worker, message))

@@ -43,19 +43,6 @@ def test_a_full_database_stops_the_commit_and_keeps_the_rest(tmp_path):
     assert_sound(folder, 3)
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], capture_output=True, text=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip(f"cannot mount a small disk: {mounted.stderr.strip()}")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
-
-
 def fill(disk):
     """Leave not a byte of space."""
     ballast = os.open(disk / "ballast", os.O_WRONLY | os.O_CREAT)

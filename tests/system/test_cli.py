@@ -206,6 +206,18 @@ def test_a_second_driver_is_refused_and_told_who_holds_the_run(config, tmp_path)
     assert "no driver is running" in followed
 
 
+def test_a_disk_that_fills_up_stops_the_run_and_resume_goes_on(config, small_disk, tmp_path):
+    folder, wide = small_disk / "run", ["--set", "policy.hidden=[64]", "--set", "budget.generations=400"]
+    code, printed = es("run", config, "--out", folder, *wide)
+    assert code == 1
+    assert f"disk full while storing generation {read_generation(folder) + 1}" in printed
+    assert f"free space, then `es-service resume {folder}`" in printed
+    subprocess.run(["mount", "-o", "remount,size=50m", str(small_disk)], check=True)
+    assert es("resume", folder)[0] == 0
+    assert es("run", config, "--out", tmp_path / "whole", *wide)[0] == 0
+    assert digest(folder) == digest(tmp_path / "whole")
+
+
 def damage(path: Path, at: int) -> None:
     with path.open("r+b") as file:
         file.seek(at)
