@@ -3,33 +3,53 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from es_service import digest, driver
+import numpy as np
+
+from es_service import driver
 from es_service.algorithms import ALGORITHMS
+from es_service.algorithms.base import member_from_arrays, member_part
 from es_service.config import loading
-from es_service.config.model import RunConfig, changed_constants, describe_changes, worker_spec
-from es_service.dispatch.inline_engine import InlineEngine
+from es_service.config.model import RunConfig, changed_constants, describe_changes, policy_shape, worker_spec
+from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy as SchedulingPolicy
-from es_service.errors import ConfigError
+from es_service.errors import ConfigError, StoreError
 from es_service.history import history_columns
 from es_service.platform_info import platform_info
-from es_service.protocol import FloatArray, Moments
+from es_service.protocol import FloatArray, Moments, TaskSpec
+from es_service.run_state import moments_from_arrays, moments_to_arrays
 from es_service.run_view import Run, open_run
 from es_service.signals import stop_on_signals
 from es_service.statistics import no_observations
+from es_service.store import reader
+from es_service.store.beginning import Beginning
+from es_service.store.folder import explained, write_config
 from es_service.store.writer import RunMeta, RunStore, no_hook
 from workers.environments import TASKS
-from workers.policy import initial_parameters, policy_shape
+from workers.policy import initial_parameters
 
 RUNS_FOLDER = Path("runs")
 """Where runs go unless told otherwise, relative to the current folder."""
+
+OnGeneration = Callable[[Mapping[str, Any]], None]
+"""Called with each history row once it is safe."""
+OnNotice = Callable[[str], None]
+"""Called with what had to be repaired, or what the user should know, as soon as it is known."""
+
+
+def _ignore(row: Mapping[str, Any]) -> None:
+    """Nothing to do for a generation."""
+
+
+def _warn(notice: str) -> None:
+    warnings.warn(notice, RuntimeWarning, stacklevel=2)
 
 
 @dataclass(frozen=True)
@@ -39,8 +59,6 @@ class Outcome:
     run: Run
     reason: str
     """Which budget was spent, in words."""
-    notices: tuple[str, ...]
-    """What had to be repaired or should be known, in words."""
 
 
 def load_config(source: loading.Source, overrides: Iterable[str] = ()) -> RunConfig:
@@ -56,14 +74,14 @@ def run(
     config: RunConfig | loading.Source,
     out: str | os.PathLike[str] | None = None,
     *,
-    on_generation: Callable[[Mapping[str, Any]], None] = lambda row: None,
+    on_generation: OnGeneration = _ignore,
+    on_notice: OnNotice = _warn,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Start a run and work until its budget is spent.
 
     Args:
         out: folder of the run, new or empty; default runs/<environment>_<algorithm>_seed<seed>_<time>.
-        on_generation: called with each history row once it is safe.
         hook: called at the store's named points; for tests that kill the process there.
 
     Raises:
@@ -71,34 +89,45 @@ def run(
     """
     if not isinstance(config, RunConfig):
         config = load_config(config)
-    parent = _parent(config.search.init_from) if config.search.init_from else None
-    with RunStore.create(_new_folder(config, out), config.resolved_yaml(), _meta(config, parent), hook=hook) as store:
-        return _work(config, store, on_generation)
+    parent, beginning = None, Beginning()
+    if config.search.init_from is not None:
+        parent, beginning = _start_from(config, config.search.init_from)
+    return _create_and_work(config, out, parent, beginning, on_generation, on_notice, hook)
 
 
 def resume(
     folder: str | os.PathLike[str],
     overrides: Iterable[str] = (),
     *,
-    on_generation: Callable[[Mapping[str, Any]], None] = lambda row: None,
+    on_generation: OnGeneration = _ignore,
+    on_notice: OnNotice = _warn,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Go on with a run from its last committed generation; it ends with the same bits as if never interrupted.
 
     Args:
-        overrides: only budget, engine, workers and time limits may change.
+        overrides: only budget, engine, workers and time limits may change; the run's `config.yaml` then says so.
 
     Raises:
         ConfigError: a constant of the run would change (all are listed). Otherwise as `run`.
     """
     folder = Path(folder)
     with RunStore.open(folder, hook=hook) as store:
-        edited = folder / "config.yaml"
-        source = edited if edited.exists() else store.meta.config
+        recorded = folder / "config.yaml"
+        source = recorded if recorded.exists() else store.meta.config
         config = loading.resume_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
         if changes := changed_constants(store.meta.constants, config.constants()):
             raise ConfigError(f"{folder}: {describe_changes(changes, str(folder))}")
-        return _work(config, store, on_generation)
+        if store.meta.columns != history_columns(_task(config)):
+            raise StoreError(
+                f"{folder} was written by a version of es-service with other history columns; continue it with that "
+                f"version, or go on from its state in a new run: es-service fork {folder}"
+            )
+        try:
+            write_config(folder, config.resolved_yaml())
+        except OSError as error:
+            raise explained(error, folder, "writing config.yaml") from error
+        return _work(config, store, on_generation, on_notice)
 
 
 def fork(
@@ -107,12 +136,15 @@ def fork(
     *,
     generation: int | None = None,
     out: str | os.PathLike[str] | None = None,
-    on_generation: Callable[[Mapping[str, Any]], None] = lambda row: None,
+    on_generation: OnGeneration = _ignore,
+    on_notice: OnNotice = _warn,
+    hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Start a new run from another run's state (the newest, or that of `generation` if it is kept), settings changed.
 
     The history up to there comes along and generations count on, so a fork that changes nothing ends with the same
-    bits as its parent would.
+    bits as its parent would. Where a setting of the task changes, fitness no longer means the same, so the best centre
+    so far no longer counts as one.
 
     Raises:
         ConfigError: a change that the state does not fit (another task, network or algorithm). StoreError: the
@@ -120,11 +152,12 @@ def fork(
     """
     origin, config = open_run(parent), fork_config(parent, overrides)
     at, parts = origin.parts(generation)
+    if any(name.startswith("task.") for name, _, _ in changed_constants(origin.constants, config.constants())):
+        parts["best"] = parts["best"] | {"fitness": np.asarray(-np.inf)}
     history = [row for row in origin.history_rows() if row["generation"] <= at]
-    lineage = {"run_id": origin.run_id, "folder": str(origin.folder), "generation": at, "digest": origin.digest()}
-    with RunStore.create(_new_folder(config, out), config.resolved_yaml(), _meta(config, lineage)) as store:
-        store.adopt(history, parts)
-        return _work(config, store, on_generation)
+    platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
+    lineage = _lineage(origin, at)
+    return _create_and_work(config, out, lineage, Beginning(history, parts, platforms), on_generation, on_notice, hook)
 
 
 def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -> RunConfig:
@@ -166,28 +199,63 @@ def default_folder(config: RunConfig) -> Path:
     return RUNS_FOLDER / (f"{name}-{taken + 1}" if taken else name)
 
 
-def _new_folder(config: RunConfig, out: str | os.PathLike[str] | None) -> Path:
-    folder = Path(out) if out is not None else default_folder(config)
-    if folder.parent == RUNS_FOLDER:
-        RUNS_FOLDER.mkdir(exist_ok=True)
-    return folder
-
-
 def worker_count(config: RunConfig) -> int:
     """Workers to start: as configured, or one per core this process may use."""
     workers = config.compute.workers
     return len(os.sched_getaffinity(0)) if workers == "auto" else workers
 
 
-def _work(config: RunConfig, store: RunStore, on_generation: Callable[[Mapping[str, Any]], None]) -> Outcome:
+def _create_and_work(
+    config: RunConfig,
+    out: str | os.PathLike[str] | None,
+    parent: dict[str, Any] | None,
+    beginning: Beginning,
+    on_generation: OnGeneration,
+    on_notice: OnNotice,
+    hook: Callable[[str], None],
+) -> Outcome:
+    folder = Path(out) if out is not None else default_folder(config)
+    if folder.parent == RUNS_FOLDER:
+        try:
+            RUNS_FOLDER.mkdir(exist_ok=True)
+        except OSError as error:
+            raise StoreError(
+                f"cannot create the folder {RUNS_FOLDER} in {Path.cwd()}: {error.strerror}; choose another --out"
+            ) from error
+    task = _task(config)
+    meta = RunMeta(
+        run_id=uuid4().hex,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        config=config.model_dump(mode="json"),
+        constants=config.constants(),
+        task=asdict(task),
+        columns=history_columns(task),
+        parent=parent,
+    )
+    with RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=hook) as store:
+        return _work(config, store, on_generation, on_notice)
+
+
+def _work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_notice: OnNotice) -> Outcome:
     """Run the loop on the inline engine until the budget is spent."""
-    notices = list(store.notices)
+    task = _task(config)
+    told = 0
+
+    def tell_notices() -> None:
+        nonlocal told
+        for notice in store.notices[told:]:
+            on_notice(notice)
+        told = len(store.notices)
+
+    def after_generation(row: Mapping[str, Any]) -> None:
+        tell_notices()
+        on_generation(row)
+
+    tell_notices()
     platform = platform_info()
     first = 0 if store.generation is None else store.generation + 1
     if store.record_platform(first, platform) and first:
-        notices.append(
-            f"from generation {first} on this run has another platform: {platform}. Its digest now says `mixed`."
-        )
+        on_notice(f"from generation {first} on this run has another platform: {platform}. Its digest now says `mixed`.")
     compute = config.compute
     scheduling = SchedulingPolicy(
         workers=worker_count(config),
@@ -200,47 +268,45 @@ def _work(config: RunConfig, store: RunStore, on_generation: Callable[[Mapping[s
     search = driver.Search(
         config=config,
         algorithm=ALGORITHMS[config.search.algorithm](config.search),
-        initial=partial(_initial, config),
-        descriptor_names=TASKS[config.task.environment].descriptor_names,
+        initial=lambda: _initial(config, store),
+        task=task,
     )
-    with stop_on_signals() as should_stop, InlineEngine(worker_spec(config), scheduling, should_stop) as engine:
-        _, reason = driver.run(search, engine, store, on_generation)
-    return Outcome(open_run(store.folder), reason, tuple(notices))
+    with stop_on_signals() as should_stop, inline_engine(worker_spec(config, task), scheduling, should_stop) as engine:
+        _, reason = driver.run(search, engine, store, after_generation)
+    return Outcome(open_run(store.folder), reason)
 
 
-def _initial(config: RunConfig) -> tuple[FloatArray, Moments]:
-    """The first centre with its observation statistics: random with none, or those of the run in `search.init_from`."""
-    task = TASKS[config.task.environment]
-    shape = policy_shape(task.observation_size, config.policy.hidden, task.action_size)
-    if config.search.init_from is None:
-        centre_D = initial_parameters(shape, config.policy.init, config.seed)
-        return centre_D, no_observations(task.observation_size)
-    origin = open_run(config.search.init_from)
+def _task(config: RunConfig) -> TaskSpec:
+    return TASKS[config.task.environment]
+
+
+def _initial(config: RunConfig, store: RunStore) -> tuple[FloatArray, Moments]:
+    """The first centre with its observation statistics: random with none, or those the run was created with."""
+    task = _task(config)
+    if store.start is not None:
+        return store.start["centre_D"], moments_from_arrays(store.start)
+    centre_D = initial_parameters(policy_shape(config, task), config.policy.init, config.seed)
+    return centre_D, no_observations(task.observation_size)
+
+
+def _start_from(config: RunConfig, folder: str) -> tuple[dict[str, Any], Beginning]:
+    """What a run records and keeps of the one whose newest centre it starts from; all of one generation."""
+    origin, shape = open_run(folder), policy_shape(config, _task(config))
     if origin.policy_shape != shape:
         raise ConfigError(
             f"search.init_from: the policy of {origin.folder} has layers {list(origin.policy_shape.widths)}, "
             f"this run's has {list(shape.widths)}; use the same task and policy.hidden"
         )
-    return origin.centre(), origin.observations()
+    at, parts = origin.parts()
+    member = member_from_arrays(parts[member_part(0)])
+    start = {"centre_D": member.centre_D, **moments_to_arrays(moments_from_arrays(parts["observations"]))}
+    return _lineage(origin, at), Beginning(start=start)
 
 
-def _parent(folder: str) -> dict[str, Any]:
-    """What a run records of the one its centre came from."""
-    origin = open_run(folder)
+def _lineage(origin: Run, generation: int) -> dict[str, Any]:
     return {
         "run_id": origin.run_id,
-        "folder": str(origin.folder),
-        "generation": origin.generation,
-        "digest": digest.digest(origin.folder),
+        "folder": str(origin.folder.absolute()),
+        "generation": generation,
+        "digest": origin.digest(),
     }
-
-
-def _meta(config: RunConfig, parent: dict[str, Any] | None) -> RunMeta:
-    return RunMeta(
-        run_id=uuid4().hex,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        config=config.model_dump(mode="json"),
-        constants=config.constants(),
-        columns=history_columns(TASKS[config.task.environment].descriptor_names),
-        parent=parent,
-    )

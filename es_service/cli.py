@@ -5,9 +5,9 @@ Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by S
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -16,11 +16,12 @@ from rich.console import Console
 
 from es_service import api, digest
 from es_service.config.resolution import config_warnings
-from es_service.errors import ConfigError, Interrupted, ServiceError
+from es_service.errors import ConfigError, EvaluationError, Interrupted, ServiceError
 from es_service.report.catalogue import print_catalogue
 from es_service.report.progress import show_progress
 from es_service.report.status import follow_status, print_status, print_summary
 from es_service.store.folder import DATABASE
+from workers.environments import TASKS
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -56,7 +57,7 @@ def run(
     for warning in config_warnings(loaded):
         _print_note(f"note: {warning}")
     folder = out if out is not None else api.default_folder(loaded)
-    _session(folder, lambda show: api.run(loaded, folder, on_generation=show))
+    _session(folder, partial(api.run, loaded, folder))
 
 
 @app.command()
@@ -65,7 +66,7 @@ def resume(
 ) -> None:
     """Go on with a run; only budget, engine, workers and time limits may change."""
     overrides = _overrides(set_, **{"compute.workers": workers, "compute.engine": engine})
-    _session(folder, lambda show: api.resume(folder, overrides, on_generation=show))
+    _session(folder, partial(api.resume, folder, overrides))
 
 
 @app.command()
@@ -82,7 +83,7 @@ def fork(
     """Start a new run from another run's state, with changed settings."""
     overrides = _overrides(set_, **{"compute.workers": workers, "compute.engine": engine})
     folder = out if out is not None else api.default_folder(api.fork_config(parent, overrides))
-    _session(folder, lambda show: api.fork(parent, overrides, generation=generation, out=folder, on_generation=show))
+    _session(folder, partial(api.fork, parent, overrides, generation=generation, out=folder))
 
 
 @app.command()
@@ -113,7 +114,7 @@ def digest_(
 @app.command(name="list")
 def list_() -> None:
     """Show tasks, algorithms and presets."""
-    print_catalogue(console)
+    print_catalogue(console, TASKS)
 
 
 @app.command()
@@ -125,13 +126,9 @@ def doctor() -> None:
 
 
 def main() -> None:
-    """Entry point: run the command, turn errors into one readable message and an exit code."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _interrupt)
+    """Run the command; turn errors into one readable message and an exit code. `__main__` is the way in."""
     try:
         app()
-    except Interrupted as stop:
-        sys.exit(128 + stop.signal_number)
     except ConfigError as error:
         _print_error(str(error))
         sys.exit(2)
@@ -140,23 +137,18 @@ def main() -> None:
         sys.exit(1)
 
 
-def _interrupt(number: int, frame: object) -> None:
-    raise Interrupted(number)
-
-
-def _session(folder: Path, work: Callable[[Callable], api.Outcome]) -> None:
+def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
     """Show a run while it works, and at its end what came of it."""
     try:
-        with show_progress(console, str(folder)) as show:
-            outcome = work(show)
-    except Interrupted:
+        with show_progress(console, errors, str(folder)) as (show, note):
+            outcome = work(on_generation=show, on_notice=note)
+    except (Interrupted, EvaluationError) as stop:
+        what = "interrupted" if isinstance(stop, Interrupted) else "stopped by an error"
         if (folder / DATABASE).exists():
-            _print_note(f"interrupted; every finished generation is saved. Go on with: es-service resume {folder}")
+            _print_note(f"{what}; every finished generation is saved. Go on with: es-service resume {folder}")
         else:
-            _print_note("interrupted before the run began; nothing was written")
+            _print_note(f"{what} before the run began; nothing was written")
         raise
-    for notice in outcome.notices:
-        _print_note(f"note: {notice}")
     print_summary(console, outcome.run, outcome.reason)
 
 

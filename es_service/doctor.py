@@ -13,15 +13,18 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from es_service.dispatch.inline_engine import InlineEngine
+from es_service.api import load_config
+from es_service.config.model import worker_spec
+from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy
 from es_service.errors import ServiceError
 from es_service.noise import TEST_VECTORS, normal_integers, stream_keys
 from es_service.platform_info import platform_info
-from es_service.protocol import Centre, EpisodesResult, TrainingChunk, WorkerSpec
+from es_service.protocol import Centre, EpisodesResult, TrainingChunk
+from es_service.statistics import no_observations, normalisation
 from es_service.store.folder import is_network_filesystem
 from workers.environments import TASKS
-from workers.policy import initial_parameters, policy_shape
+from workers.policy import initial_parameters
 
 Finding = tuple[str, str]
 """("ok" | "note" | "FAIL", text)."""
@@ -85,29 +88,15 @@ def _noise() -> Iterator[Finding]:
 
 def _rollout() -> Iterator[Finding]:
     """Start one worker as a run would, and let it work for a moment."""
-    spec = WorkerSpec(
-        seed=0,
-        environment="point_maze",
-        environment_options={},
-        episode_steps=200,
-        fitness="sum",
-        episodes_per_member=1,
-        hidden=(64, 64),
-        observation_clip=None,
-        action_noise=0.01,
-        common_random_numbers=True,
-        chunk_pairs=64,
-        rollout_block_pairs=32,
-        gradient_block_pairs=64,
+    config = load_config(
+        {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
     )
     task = TASKS["point_maze"]
-    shape = policy_shape(task.observation_size, spec.hidden, task.action_size)
-    size = task.observation_size
-    centre = Centre(
-        0, initial_parameters(shape, "unit_columns", 0), 0.02, np.zeros(size, np.float32), np.ones(size, np.float32)
-    )
+    spec = worker_spec(config, task)
+    mean_O, std_O = normalisation(no_observations(task.observation_size), enabled=False)
+    centre = Centre(0, initial_parameters(spec.policy, config.policy.init, 0), config.search.sigma, mean_O, std_O)
     started = time.perf_counter()
-    with InlineEngine(spec, Policy(workers=1)) as engine:
+    with inline_engine(spec, Policy(workers=1)) as engine:
         engine.evaluate(centre, [TrainingChunk(0, 0)])
         ready = time.perf_counter()
         results = engine.evaluate(centre, [TrainingChunk(1, chunk) for chunk in range(8)])

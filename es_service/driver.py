@@ -16,9 +16,9 @@ import numpy as np
 
 from es_service.algorithms.base import Algorithm
 from es_service.config.model import BudgetConfig, RunConfig
-from es_service.generation import estimate_gradient, evaluate_centre, evaluate_population, invalidate
+from es_service.generation import estimate_gradient, evaluate_centre, evaluate_population, invalidate, valid_members
 from es_service.history import evaluation_columns, population_columns
-from es_service.protocol import Centre, DispatchCounts, EpisodesResult, Evaluator, FloatArray, Moments
+from es_service.protocol import Centre, DispatchCounts, EpisodesResult, Evaluator, FloatArray, Moments, TaskSpec
 from es_service.run_state import Arrays, Best, RunState, state_from_parts, state_parts
 from es_service.statistics import merge_moments, normalisation
 
@@ -38,13 +38,13 @@ class Store(Protocol):
 
 @dataclass(frozen=True)
 class Search:
-    """What a run is about, apart from where it runs: settings, method, starting point, names for the history."""
+    """What a run is about, apart from where it runs: task, settings, method, starting point."""
 
     config: RunConfig
     algorithm: Algorithm
     initial: Callable[[], tuple[FloatArray, Moments]]
     """First centre and the observation statistics it comes with (none counted unless it is another run's)."""
-    descriptor_names: tuple[str, ...]
+    task: TaskSpec
 
 
 def run(
@@ -111,7 +111,7 @@ def _first_generation(search: Search, evaluator: Evaluator, clock: _Clock) -> tu
         "parameter_norm": _norm(centre_D),
         "invalid_members": 0,
         **population_columns(None),
-        **evaluation_columns(evaluation, search.descriptor_names),
+        **evaluation_columns(evaluation, search.task),
         **_faults(evaluator, DispatchCounts()),
     }
     return state, row
@@ -158,7 +158,7 @@ def _next_generation(
         "parameter_norm": _norm(new_centre_D),
         "invalid_members": invalid,
         **population_columns(population),
-        **evaluation_columns(evaluation, search.descriptor_names),
+        **evaluation_columns(evaluation, search.task),
         **_faults(evaluator, counts),
     }
     return state, row
@@ -201,7 +201,7 @@ def _centre(search: Search, generation: int, centre_D: FloatArray, observations:
 def _better(best: Best, centre: Centre, evaluation: EpisodesResult) -> Best:
     """The better of the best so far and a centre just evaluated; an invalid centre (not finite) is no improvement."""
     fitness = float(np.mean(evaluation.fitness, dtype=np.float64))
-    if not (math.isfinite(fitness) and fitness > best.fitness):
+    if not valid_members(evaluation).all() or fitness <= best.fitness:
         return best
     mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
     return Best(centre.generation, fitness, centre.parameters_D, mean_O, std_O)

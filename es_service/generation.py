@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +26,15 @@ from es_service.protocol import (
     TrainingChunk,
 )
 
+Result = TypeVar("Result", EpisodesResult, GradientResult)
+
 
 def evaluate_population(
     evaluator: Evaluator, centre: Centre, *, pairs: int, chunk_pairs: int
 ) -> tuple[EpisodesResult, list[Moments]]:
     """Roll out all pairs around the centre: results with axes [P, S], and each chunk's observations in chunk order."""
     chunks = [TrainingChunk(centre.generation, chunk_id) for chunk_id in range(pairs // chunk_pairs)]
-    results = _episodes(evaluator.evaluate(centre, chunks))
+    results = _all_of(EpisodesResult, evaluator.evaluate(centre, chunks))
     return _concatenate(results, pairs), [result.moments for result in results if result.moments is not None]
 
 
@@ -39,7 +42,7 @@ def evaluate_centre(evaluator: Evaluator, centre: Centre, episodes: int) -> Epis
     """Roll out the unperturbed centre: results with axis [E]. Episodes past the wanted number are discarded."""
     chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
     results = evaluator.evaluate(centre, [EvaluationChunk(centre.generation, chunk_id) for chunk_id in range(chunks)])
-    return _concatenate(_episodes(results), episodes)
+    return _concatenate(_all_of(EpisodesResult, results), episodes)
 
 
 def estimate_gradient(evaluator: Evaluator, centre: Centre, weights_P: FloatArray, block_pairs: int) -> FloatArray:
@@ -49,9 +52,8 @@ def estimate_gradient(evaluator: Evaluator, centre: Centre, weights_P: FloatArra
         block_P = weights_P[first : first + block_pairs]
         padded_P = np.pad(block_P, (0, block_pairs - block_P.size))
         chunks.append(GradientChunk(centre.generation, chunk_id, padded_P))
-    results = evaluator.evaluate(centre, chunks)
-    sums = [result.sum_D for result in results if isinstance(result, GradientResult)]
-    return tree_sum(sums) * np.float32(1.0 / weights_P.size)
+    results = _all_of(GradientResult, evaluator.evaluate(centre, chunks))
+    return tree_sum([result.sum_D for result in results]) * np.float32(1.0 / weights_P.size)
 
 
 def tree_sum(blocks: Sequence[FloatArray]) -> FloatArray:
@@ -89,8 +91,11 @@ def invalidate(population: EpisodesResult, max_invalid_fraction: float, generati
     return replace(population, fitness=fitness_P_S), invalid
 
 
-def _episodes(results: Sequence[object]) -> list[EpisodesResult]:
-    return [result for result in results if isinstance(result, EpisodesResult)]
+def _all_of(kind: type[Result], results: Sequence[object]) -> list[Result]:
+    """The same results, known to be of one kind."""
+    checked = [result for result in results if isinstance(result, kind)]
+    assert len(checked) == len(results), f"an evaluator answered with something else than {kind.__name__}"
+    return checked
 
 
 def _concatenate(results: Sequence[EpisodesResult], count: int) -> EpisodesResult:
@@ -106,5 +111,4 @@ def _concatenate(results: Sequence[EpisodesResult], count: int) -> EpisodesResul
         steps=join("steps"),
         goal_distance=join("goal_distance"),
         moments=None,
-        seconds=sum(result.seconds for result in results),
     )

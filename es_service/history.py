@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from es_service.protocol import EpisodesResult
+from es_service.protocol import EpisodesResult, TaskSpec
 
 
 @dataclass(frozen=True)
@@ -21,7 +20,7 @@ class Column:
     meaning: str
 
 
-_BEFORE_DESCRIPTOR = (
+_FITNESS = (
     Column("generation", "INTEGER", True, "generations completed; 0 is the initial centre's evaluation"),
     Column("env_steps", "INTEGER", True, "environment steps so far, evaluations counted, none after done"),
     Column("episodes", "INTEGER", True, "episodes so far, evaluations counted"),
@@ -31,14 +30,21 @@ _BEFORE_DESCRIPTOR = (
     Column("centre_return_std", "REAL", True, "standard deviation of the return over the same episodes"),
     Column("best_fitness", "REAL", True, "highest centre_fitness_mean so far"),
     Column("population_fitness_min", "REAL", True, "lowest fitness of a valid member of this generation"),
-    Column("population_fitness_q25", "REAL", True, "first quartile of the members' fitness"),
-    Column("population_fitness_median", "REAL", True, "median of the members' fitness"),
-    Column("population_fitness_q75", "REAL", True, "third quartile of the members' fitness"),
+    Column("population_fitness_q25", "REAL", True, "first quartile of the valid members' fitness"),
+    Column("population_fitness_median", "REAL", True, "median of the valid members' fitness"),
+    Column("population_fitness_q75", "REAL", True, "third quartile of the valid members' fitness"),
     Column("population_fitness_max", "REAL", True, "highest fitness of a member: a noisy single value, not the best"),
+    Column("population_return_min", "REAL", True, "the same for the valid members' returns"),
+    Column("population_return_q25", "REAL", True, "first quartile"),
+    Column("population_return_median", "REAL", True, "median"),
+    Column("population_return_q75", "REAL", True, "third quartile"),
+    Column("population_return_max", "REAL", True, "highest"),
 )
-_AFTER_DESCRIPTOR = (
+_GOAL = (
     Column("goal_distance", "REAL", True, "mean distance to the goal at the end of the evaluation episodes"),
     Column("goal_distance_min", "REAL", True, "least distance to the goal along any evaluation episode"),
+)
+_SEARCH_AND_TIMES = (
     Column("update_norm", "REAL", True, "Euclidean norm of the step from the old centre to the new one"),
     Column("parameter_norm", "REAL", True, "Euclidean norm of the new centre"),
     Column("invalid_members", "INTEGER", True, "members with a non-finite fitness or descriptor"),
@@ -55,34 +61,41 @@ _AFTER_DESCRIPTOR = (
 )
 
 
-def history_columns(descriptor_names: Sequence[str], extra: Sequence[Column] = ()) -> tuple[Column, ...]:
-    """All columns of a run: the trunk's, one `centre_<name>` per descriptor dimension, the algorithm's own."""
+def history_columns(task: TaskSpec) -> tuple[Column, ...]:
+    """All columns of a run: one `centre_<name>` per descriptor dimension, goal distances if the task has a goal."""
     descriptor = tuple(
         Column(f"centre_{name}", "REAL", True, f"mean descriptor of the evaluation episodes: {name}")
-        for name in descriptor_names
+        for name in task.descriptor_names
     )
-    return (*_BEFORE_DESCRIPTOR, *descriptor, *extra, *_AFTER_DESCRIPTOR)
+    return (*_FITNESS, *descriptor, *(_GOAL if task.has_goal else ()), *_SEARCH_AND_TIMES)
 
 
 def population_columns(population: EpisodesResult | None) -> dict[str, float | None]:
-    """Quartiles of the valid members' fitness; None for generation 0, which has no population."""
-    names = [f"population_fitness_{name}" for name in ("min", "q25", "median", "q75", "max")]
-    if population is None:
-        return dict.fromkeys(names)
-    fitness = population.fitness[np.isfinite(population.fitness)].astype(np.float64)
-    values = np.quantile(fitness, [0.0, 0.25, 0.5, 0.75, 1.0]) if fitness.size else np.full(5, np.nan)
-    return dict(zip(names, values.tolist(), strict=True))
+    """Quartiles of the valid members' fitness and return; None for generation 0, which has no population."""
+    columns: dict[str, float | None] = {}
+    for quantity in ("fitness", "return"):
+        names = [f"population_{quantity}_{name}" for name in ("min", "q25", "median", "q75", "max")]
+        if population is None:
+            columns |= dict.fromkeys(names)
+            continue
+        values = population.fitness if quantity == "fitness" else population.returns
+        values = values[np.isfinite(population.fitness) & np.isfinite(values)].astype(np.float64)
+        quartiles = np.quantile(values, [0.0, 0.25, 0.5, 0.75, 1.0]) if values.size else np.full(5, np.nan)
+        columns |= dict(zip(names, quartiles.tolist(), strict=True))
+    return columns
 
 
-def evaluation_columns(evaluation: EpisodesResult, descriptor_names: Sequence[str]) -> dict[str, float]:
+def evaluation_columns(evaluation: EpisodesResult, task: TaskSpec) -> dict[str, float]:
     """What the new centre's evaluation episodes say: fitness, return, where they end, how near the goal."""
     descriptor_B = evaluation.descriptor.mean(axis=0, dtype=np.float64).tolist()
-    return {
+    columns = {
         "centre_fitness_mean": float(evaluation.fitness.mean(dtype=np.float64)),
         "centre_fitness_std": float(evaluation.fitness.std(dtype=np.float64)),
         "centre_return_mean": float(evaluation.returns.mean(dtype=np.float64)),
         "centre_return_std": float(evaluation.returns.std(dtype=np.float64)),
-        **{f"centre_{name}": value for name, value in zip(descriptor_names, descriptor_B, strict=True)},
-        "goal_distance": float(evaluation.goal_distance[:, 0].mean(dtype=np.float64)),
-        "goal_distance_min": float(evaluation.goal_distance[:, 1].min()),
+        **{f"centre_{name}": value for name, value in zip(task.descriptor_names, descriptor_B, strict=True)},
     }
+    if task.has_goal:
+        columns["goal_distance"] = float(evaluation.goal_distance[:, 0].mean(dtype=np.float64))
+        columns["goal_distance_min"] = float(evaluation.goal_distance[:, 1].min())
+    return columns

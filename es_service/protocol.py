@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ EVALUATION_EPISODES_PER_CHUNK = 16
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """What the driver must know about a task before any worker starts; plain data."""
+    """What the driver must know about a task before any worker starts; plain data, kept with every run."""
 
     name: str
     observation_size: int
@@ -34,9 +34,28 @@ class TaskSpec:
     """(low, high) per descriptor dimension, in the units of the task."""
     final_fitness: bool
     """Whether `task.fitness: final` (the reward of the last valid step) makes sense here."""
+    has_goal: bool
+    """Whether there is a place to reach, so that distances to it are kept in the history."""
     options: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Task options a config may set, each with its allowed values; the first is the default."""
     summary: str = ""
+
+
+@dataclass(frozen=True)
+class PolicyShape:
+    """Layer widths from observation to action; the flat vector holds, layer by layer, weights [in, out] then biases."""
+
+    widths: tuple[int, ...]
+
+    @property
+    def layers(self) -> tuple[tuple[int, int], ...]:
+        """(inputs, outputs) of every layer."""
+        return tuple(zip(self.widths[:-1], self.widths[1:], strict=True))
+
+    @property
+    def parameters(self) -> int:
+        """D, the length of the flat vector."""
+        return sum(inputs * outputs + outputs for inputs, outputs in self.layers)
 
 
 @dataclass(frozen=True)
@@ -46,10 +65,10 @@ class WorkerSpec:
     seed: int
     environment: str
     environment_options: dict[str, str]
+    policy: PolicyShape
     episode_steps: int
     fitness: Literal["sum", "final"]
     episodes_per_member: int
-    hidden: tuple[int, ...]
     observation_clip: float | None
     action_noise: float
     common_random_numbers: bool
@@ -103,6 +122,19 @@ class GradientChunk:
 Chunk = TrainingChunk | EvaluationChunk | GradientChunk
 
 
+class ChunkKey(NamedTuple):
+    """What engines, scheduler and workers call a chunk."""
+
+    phase: int
+    """Number of the `evaluate` call, so that a late answer of an earlier call is never taken for one of this call."""
+    kind: str
+    generation: int
+    chunk_id: int
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.chunk_id} of generation {self.generation}"
+
+
 @dataclass(frozen=True)
 class Moments:
     """Count, mean and sum of squared deviations of observations, in float64; mergeable."""
@@ -128,7 +160,6 @@ class EpisodesResult:
     """Leading axes + 2: distance to the goal at the end of the episode, and its minimum; NaN without a goal."""
     moments: Moments | None
     """Of every observation acted on before `done`; None for evaluations, which feed no statistics."""
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -136,7 +167,6 @@ class GradientResult:
     """One partial sum of the gradient estimate, in units of weight x standard normal noise."""
 
     sum_D: FloatArray
-    seconds: float
 
 
 ChunkResult = EpisodesResult | GradientResult
@@ -148,7 +178,6 @@ class DispatchCounts:
 
     retries: int = 0
     lost_workers: int = 0
-    duplicates: int = 0
     workers: int = 0
     """Workers the evaluator was asked to keep."""
 

@@ -42,7 +42,7 @@ class RunState:
 def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
     """The parts of `state` that differ from `before` (all of them for None), as the store keeps them."""
     parts = {
-        "observations": _moments_to_arrays(state.observations),
+        "observations": moments_to_arrays(state.observations),
         "counters": {
             "env_steps": np.asarray(state.env_steps, np.int64),
             "episodes": np.asarray(state.episodes, np.int64),
@@ -73,12 +73,13 @@ def state_from_parts(parts: Mapping[str, Mapping[str, np.ndarray]], generation: 
     )
 
 
-def _moments_to_arrays(moments: Moments) -> Arrays:
+def moments_to_arrays(moments: Moments) -> Arrays:
+    """Observation statistics as the store keeps them."""
     return {"count": np.asarray(moments.count, np.float64), "mean_O": moments.mean_O, "m2_O": moments.m2_O}
 
 
 def moments_from_arrays(arrays: Mapping[str, np.ndarray]) -> Moments:
-    """Observation statistics from the store's part `observations`."""
+    """Inverse of `moments_to_arrays`."""
     return Moments(float(arrays["count"]), arrays["mean_O"], arrays["m2_O"])
 
 

@@ -12,13 +12,12 @@ import numpy as np
 
 from es_service import digest as run_digest
 from es_service.algorithms.base import member_from_arrays, member_part
-from es_service.protocol import FloatArray, Moments
+from es_service.protocol import FloatArray, PolicyShape
 from es_service.run_state import best_from_arrays, moments_from_arrays
 from es_service.statistics import normalisation
 from es_service.store import reader
 from es_service.store.schema import RunMeta
-from workers.environments import TASKS
-from workers.policy import PolicyShape, act, normalise, policy_shape, split_layers
+from workers.policy import act, normalise, split_layers
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -98,16 +97,8 @@ class Run:
     @property
     def policy_shape(self) -> PolicyShape:
         """Layer widths of this run's policies."""
-        task = TASKS[self.constants["task.environment"]]
-        return policy_shape(task.observation_size, self.constants["policy.hidden"], task.action_size)
-
-    def centre(self) -> FloatArray:
-        """Parameters of the newest centre (of the first member)."""
-        return member_from_arrays(self.parts()[1][member_part(0)]).centre_D
-
-    def observations(self) -> Moments:
-        """Observation statistics after the newest generation."""
-        return moments_from_arrays(self.parts()[1]["observations"])
+        task = self.meta.task
+        return PolicyShape((task["observation_size"], *self.constants["policy.hidden"], task["action_size"]))
 
     def policy(self, which: Literal["best", "centre"] = "best") -> Policy:
         """The best centre so far with the statistics it was evaluated with, or the newest centre with the newest."""

@@ -1,12 +1,16 @@
-"""SIGINT and SIGTERM as a request: the first is noticed at the next wait, the second ends the process at once."""
+"""SIGINT and SIGTERM as a request: the first is noticed at the next wait, a later one ends the process at once."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+REPEAT_S = 1.0
+"""A second signal within this time is the same request: launchers forward what the terminal has sent already."""
 
 
 class StopRequest:
@@ -14,15 +18,18 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.number: int | None = None
+        self._since_s = 0.0
 
     def __call__(self) -> int | None:
         return self.number
 
     def handle(self, number: int, frame: object) -> None:
         """Signal handler. Nothing is interrupted half-way: a transaction in hand is finished first."""
-        if self.number is not None:
-            os._exit(128 + number)  # asked twice; what is committed is safe
-        self.number = number
+        now = time.monotonic()
+        if self.number is None:
+            self.number, self._since_s = number, now
+        elif now - self._since_s > REPEAT_S:
+            os._exit(128 + number)  # asked again; what is committed is safe
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts, WorkerSpec
+from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts, PolicyShape, WorkerSpec
 from workers.worker import make_worker
 
 SPEC = WorkerSpec(
@@ -17,7 +17,7 @@ SPEC = WorkerSpec(
     episode_steps=200,
     fitness="sum",
     episodes_per_member=1,
-    hidden=(8, 8),
+    policy=PolicyShape((2, 8, 8, 2)),
     observation_clip=5.0,
     action_noise=0.01,
     common_random_numbers=True,
@@ -25,7 +25,7 @@ SPEC = WorkerSpec(
     rollout_block_pairs=4,
     gradient_block_pairs=8,
 )
-PARAMETERS = 2 * 8 + 8 + 8 * 8 + 8 + 8 * 2 + 2
+PARAMETERS = SPEC.policy.parameters
 
 
 def spec(**changes: object) -> WorkerSpec:

@@ -6,42 +6,18 @@ run inside compiled rollouts take the array namespace as `xp`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from es_service.noise import Domain, normals, stream_keys
-from es_service.protocol import FloatArray
+from es_service.protocol import FloatArray, PolicyShape
 
 INITIAL_COLUMN_NORMS = {"unit_columns": (1.0, 0.01), "small_columns": (0.01, 0.01)}
 """`policy.init` -> (column norm of hidden layers, of the output layer).
 
 Sources: unit_columns, OpenAI ES and deep-neuroevolution; small_columns, the released ME-ES code.
 """
-
-
-@dataclass(frozen=True)
-class PolicyShape:
-    """Layer widths from observation to action; the flat vector holds, layer by layer, weights [in, out] then biases."""
-
-    widths: tuple[int, ...]
-
-    @property
-    def layers(self) -> tuple[tuple[int, int], ...]:
-        """(inputs, outputs) of every layer."""
-        return tuple(zip(self.widths[:-1], self.widths[1:], strict=True))
-
-    @property
-    def parameters(self) -> int:
-        """D, the length of the flat vector."""
-        return sum(inputs * outputs + outputs for inputs, outputs in self.layers)
-
-
-def policy_shape(observation_size: int, hidden: Sequence[int], action_size: int) -> PolicyShape:
-    """The shape of the network between a task's observation and action."""
-    return PolicyShape((observation_size, *hidden, action_size))
 
 
 Layers = list[tuple[Any, Any]]

@@ -22,7 +22,6 @@ def main(descriptor: int, parent: int) -> None:
     In: the WorkerSpec, then ("centre", Centre) and ("chunk", key, attempt, Chunk).
     Out: ("up", pid) or ("broken", text), then ("result", key, attempt, ChunkResult) or ("failure", key, attempt, text).
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole terminal group; the parent decides
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # a killed driver leaves no orphans computing
     if os.getppid() != parent:
         return

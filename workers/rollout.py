@@ -18,7 +18,7 @@ from jax import lax
 from es_service.noise import NORMAL_STD, normal_integers
 from es_service.protocol import SIGNS, WorkerSpec
 from workers.environments import Environment
-from workers.policy import Layers, PolicyShape, act, normalise, split_layers
+from workers.policy import Layers, act, normalise, split_layers
 
 
 class Episodes(NamedTuple):
@@ -43,7 +43,7 @@ class _Carry(NamedTuple):
     episodes: Episodes
 
 
-def make_training_rollout(environment: Environment, shape: PolicyShape, spec: WorkerSpec) -> Callable[..., Episodes]:
+def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
     """Compile-once rollout of one training chunk.
 
     Returns:
@@ -51,9 +51,9 @@ def make_training_rollout(environment: Environment, shape: PolicyShape, spec: Wo
         leading axes [P, S]; `unit` is sigma / NORMAL_STD. Pairs step in blocks of `rollout_block_pairs`, one block
         after the other, so that a block's weights stay in cache.
     """
-    episodes = _make_member_episodes(environment, shape, spec, training=True)
+    episodes = _make_member_episodes(environment, spec, training=True)
     block_pairs = spec.rollout_block_pairs
-    coordinates_D = np.arange(shape.parameters, dtype=np.uint32)
+    coordinates_D = np.arange(spec.policy.parameters, dtype=np.uint32)
     signs_S = np.asarray(SIGNS, np.float32)
 
     def rollout(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
@@ -78,21 +78,21 @@ def make_training_rollout(environment: Environment, shape: PolicyShape, spec: Wo
     return jax.jit(rollout)
 
 
-def make_evaluation_rollout(environment: Environment, shape: PolicyShape, spec: WorkerSpec) -> Callable[..., Episodes]:
+def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
     """Compile-once rollout of one evaluation chunk: episodes of one policy, without action noise.
 
     Returns:
         f(centre_D, mean_O, std_O, reset_keys_E_4) -> Episodes with leading axis [E].
     """
-    return jax.jit(_make_episodes(environment, shape, spec, training=False))
+    return jax.jit(_make_episodes(environment, spec, training=False))
 
 
-def _make_member_episodes(environment: Environment, shape: PolicyShape, spec: WorkerSpec, *, training: bool):
+def _make_member_episodes(environment: Environment, spec: WorkerSpec, *, training: bool):
     """f(parameters_M_D, mean_O, std_O, reset_keys_M_E_4, action_keys_M_E_4): a member's episodes, one after another.
 
     Fitness, return, descriptor and goal distance are means over E, least distances minima, steps and sums totals.
     """
-    one_each = _make_episodes(environment, shape, spec, training=training)
+    one_each = _make_episodes(environment, spec, training=training)
 
     def episodes(parameters_M_D, mean_O, std_O, reset_keys_M_E, action_keys_M_E):
         by_episode = (jnp.swapaxes(reset_keys_M_E, 0, 1), jnp.swapaxes(action_keys_M_E, 0, 1))
@@ -111,13 +111,13 @@ def _make_member_episodes(environment: Environment, shape: PolicyShape, spec: Wo
     return episodes
 
 
-def _make_episodes(environment: Environment, shape: PolicyShape, spec: WorkerSpec, *, training: bool):
+def _make_episodes(environment: Environment, spec: WorkerSpec, *, training: bool):
     """One episode per lane: f(parameters, mean_O, std_O, reset_keys_L_4[, action_keys_L_4]) -> Episodes [L].
 
     In training every lane has its own parameters [L, D] and action noise; otherwise all share parameters [D].
     """
     action_unit = np.float32(spec.action_noise / NORMAL_STD)
-    action_size = shape.widths[-1]
+    action_size = spec.policy.widths[-1]
     noisy = training and spec.action_noise > 0.0
 
     def policy(layers: Layers, observation_O, mean_O, std_O):
@@ -128,7 +128,7 @@ def _make_episodes(environment: Environment, shape: PolicyShape, spec: WorkerSpe
         return action_unit * normal_integers(jnp, key, coordinates).astype(jnp.float32)
 
     def split(parameters_D):
-        return split_layers(shape, parameters_D)
+        return split_layers(spec.policy, parameters_D)
 
     policies = jax.vmap(policy, in_axes=(0 if training else None, 0, None, None))
 

@@ -5,7 +5,6 @@ A worker holds nothing that a restart would lose: every result is a pure functio
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -25,20 +24,17 @@ from es_service.protocol import (
     TrainingChunk,
     WorkerSpec,
 )
-from workers.environments import TASKS, make_environment
+from workers.environments import make_environment
 from workers.gradient import make_gradient_sum
-from workers.policy import policy_shape
 from workers.rollout import Episodes, make_evaluation_rollout, make_training_rollout
 
 
 def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
     """Build the compiled functions of a run (compiled on first use) and return what runs its chunks."""
-    task = TASKS[spec.environment]
     environment = make_environment(spec.environment, spec.environment_options)
-    shape = policy_shape(task.observation_size, spec.hidden, task.action_size)
-    training_rollout = make_training_rollout(environment, shape, spec)
-    evaluation_rollout = make_evaluation_rollout(environment, shape, spec)
-    gradient_sum = make_gradient_sum(shape.parameters)
+    training_rollout = make_training_rollout(environment, spec)
+    evaluation_rollout = make_evaluation_rollout(environment, spec)
+    gradient_sum = make_gradient_sum(spec.policy.parameters)
 
     def train(centre: Centre, chunk: TrainingChunk) -> EpisodesResult:
         pairs_P = chunk.chunk_id * spec.chunk_pairs + np.arange(spec.chunk_pairs)
@@ -66,18 +62,16 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
     def gradient(chunk: GradientChunk) -> GradientResult:
         pairs_P = chunk.chunk_id * spec.gradient_block_pairs + np.arange(spec.gradient_block_pairs)
         keys_P = stream_keys(spec.seed, Domain.PARAMETER_NOISE, chunk.generation, pairs_P)
-        return GradientResult(np.asarray(gradient_sum(chunk.weights_P, keys_P)), seconds=0.0)
+        return GradientResult(np.array(gradient_sum(chunk.weights_P, keys_P)))
 
     def run_chunk(centre: Centre, chunk: Chunk) -> ChunkResult:
-        started = time.perf_counter()
-        if isinstance(chunk, TrainingChunk):
-            result = train(centre, chunk)
-        elif isinstance(chunk, EvaluationChunk):
-            result = evaluate(centre, chunk)
-        else:
-            result = gradient(chunk)
-        object.__setattr__(result, "seconds", time.perf_counter() - started)
-        return result
+        match chunk:
+            case TrainingChunk():
+                return train(centre, chunk)
+            case EvaluationChunk():
+                return evaluate(centre, chunk)
+            case GradientChunk():
+                return gradient(chunk)
 
     return run_chunk
 
@@ -99,7 +93,6 @@ def _episodes_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
         steps=host.steps,
         goal_distance=host.goal_distance,
         moments=None if shift_O is None else _moments(host, shift_O),
-        seconds=0.0,
     )
 
 

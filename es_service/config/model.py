@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from es_service.config.yaml_text import dump_yaml, show
-from es_service.protocol import WorkerSpec
+from es_service.protocol import PolicyShape, TaskSpec, WorkerSpec
 
 # A string beside a type is what error messages say is allowed.
 Count = Annotated[int, Field(ge=1), "a whole number, at least 1"]
@@ -128,7 +128,7 @@ class ComputeConfig(_Section):
     )
     rollout_block_pairs: Count = Field(
         description="Pairs that step together, so that their weights stay in cache; divides chunk_pairs. auto: the "
-        "largest divisor of it not above 32."
+        "largest divisor of it not above 32 whose weights take at most 5 MiB."
     )
     gradient_block_pairs: Count = Field(
         description="Pairs summed into one partial gradient; not above search.pairs. auto: as many whole chunks as "
@@ -207,17 +207,22 @@ def describe_changes(changes: Sequence[tuple[str, Any, Any]], run: str = "RUN") 
     )
 
 
-def worker_spec(config: RunConfig) -> WorkerSpec:
+def policy_shape(config: RunConfig, task: TaskSpec) -> PolicyShape:
+    """The network between the task's observation and action."""
+    return PolicyShape((task.observation_size, *config.policy.hidden, task.action_size))
+
+
+def worker_spec(config: RunConfig, task: TaskSpec) -> WorkerSpec:
     """What every worker of the run is told once, when it starts."""
-    task, policy, compute = config.task, config.policy, config.compute
+    settings, policy, compute = config.task, config.policy, config.compute
     return WorkerSpec(
         seed=config.seed,
-        environment=task.environment,
-        environment_options=dict(task.options),
-        episode_steps=task.episode_steps,
-        fitness=task.fitness,
-        episodes_per_member=task.episodes_per_member,
-        hidden=policy.hidden,
+        environment=settings.environment,
+        environment_options=dict(settings.options),
+        policy=policy_shape(config, task),
+        episode_steps=settings.episode_steps,
+        fitness=settings.fitness,
+        episodes_per_member=settings.episodes_per_member,
         observation_clip=policy.observation_clip,
         action_noise=policy.action_noise,
         common_random_numbers=config.search.common_random_numbers,

@@ -13,9 +13,9 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from es_service.config.model import RunConfig
+from es_service.config.model import PolicyConfig, RunConfig
 from es_service.config.yaml_text import show
-from es_service.protocol import TaskSpec
+from es_service.protocol import PolicyShape, TaskSpec
 
 LEFT_OPEN: dict[str, str | None] = {
     "task.episode_steps": None,
@@ -30,7 +30,9 @@ OPTIONS = "task.options."
 MOST_CHUNK_PAIRS = 64
 """Enough to fill vector units and hide a message's cost; few enough that a lost chunk is cheap."""
 MOST_ROLLOUT_BLOCK_PAIRS = 32
-"""Above this the weights of the pairs that step together fall out of a core's cache."""
+"""Enough to fill vector units."""
+MOST_ROLLOUT_BLOCK_BYTES = 5 * 2**20
+"""Above this the weights of the pairs that step together fall out of a core's share of the cache."""
 MOST_GRADIENT_BLOCKS = 32
 """A partial gradient is as large as the policy, so a generation sends few of them."""
 FEW_CHUNK_PAIRS = 8
@@ -43,9 +45,13 @@ def default_chunk_pairs(pairs: int) -> int:
     return max([size for size in divisors if size % 8 == 0] or divisors)
 
 
-def default_rollout_block_pairs(chunk_pairs: int) -> int:
-    """The largest divisor of `chunk_pairs` not above 32: 64 -> 32, 40 -> 20."""
-    return max(size for size in range(1, MOST_ROLLOUT_BLOCK_PAIRS + 1) if chunk_pairs % size == 0)
+def default_rollout_block_pairs(chunk_pairs: int, parameters: int) -> int:
+    """The largest divisor of `chunk_pairs` not above 32 whose weights (float32, both signs) take at most 5 MiB.
+
+    (64, 4482) -> 32; (40, 75528) -> 8.
+    """
+    most = max(1, min(MOST_ROLLOUT_BLOCK_PAIRS, MOST_ROLLOUT_BLOCK_BYTES // (2 * 4 * parameters)))
+    return max(size for size in range(1, most + 1) if chunk_pairs % size == 0)
 
 
 def default_gradient_block_pairs(pairs: int, chunk_pairs: int) -> int:
@@ -74,8 +80,10 @@ def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpe
     if pairs is not None and "compute.chunk_pairs" in left_open:
         values["compute.chunk_pairs"] = default_chunk_pairs(pairs)
     chunk_pairs = values.get("compute.chunk_pairs")
-    if chunk_pairs is not None and "compute.rollout_block_pairs" in left_open:
-        values["compute.rollout_block_pairs"] = default_rollout_block_pairs(chunk_pairs)
+    if "compute.rollout_block_pairs" in left_open and chunk_pairs is not None and task is not None:
+        hidden = values.get("policy.hidden", PolicyConfig.model_fields["hidden"].default)
+        shape = PolicyShape((task.observation_size, *hidden, task.action_size))
+        values["compute.rollout_block_pairs"] = default_rollout_block_pairs(chunk_pairs, shape.parameters)
     if pairs is not None and chunk_pairs is not None and "compute.gradient_block_pairs" in left_open:
         values["compute.gradient_block_pairs"] = min(pairs, default_gradient_block_pairs(pairs, chunk_pairs))
     if isinstance(values.get("search.init_from"), str):

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from rich.console import Console
 from rich.table import Table
 
 from es_service.algorithms import ALGORITHMS
 from es_service.config.presets import PRESETS, preset_table
 from es_service.config.yaml_text import show
-from workers.environments import TASKS
+from es_service.protocol import TaskSpec
 
 
-def print_catalogue(console: Console) -> None:
+def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> None:
     """Tables of tasks, algorithms, and of the keys on which presets differ."""
     tasks = Table(title="tasks (task.environment)", title_justify="left")
     for name in ("name", "observation", "action", "steps", "descriptor", "options"):
         tasks.add_column(name)
-    for task in TASKS.values():
+    for task in known_tasks.values():
         bounds = zip(task.descriptor_names, task.descriptor_bounds, strict=True)
         tasks.add_row(
             task.name,

@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from rich.console import Console, Group
@@ -14,6 +15,8 @@ from rich.table import Table
 from rich.text import Text
 
 Row = Mapping[str, Any]
+ShowRow = Callable[[Row], None]
+ShowNotice = Callable[[str], None]
 TABLE_ROWS = 12
 RATE_WINDOW = 20
 """Generations over which steps per second are averaged for display."""
@@ -21,10 +24,10 @@ _PARTS = ("rollout", "gradient", "evaluation", "driver", "store")
 
 
 @contextmanager
-def show_progress(console: Console, title: str) -> Iterator[Callable[[Row], None]]:
-    """Yield a function to call with every history row."""
+def show_progress(console: Console, errors: Console, title: str) -> Iterator[tuple[ShowRow, ShowNotice]]:
+    """Yield two functions: one to call with every history row, one with every notice."""
     if not console.is_terminal:
-        yield _plain_lines(console)
+        yield _plain_lines(console), partial(_print_notice, errors)
         return
     recent: deque[Row] = deque(maxlen=RATE_WINDOW)
     with Live(Text(f"{title}: starting workers"), console=console, refresh_per_second=5) as live:
@@ -33,7 +36,11 @@ def show_progress(console: Console, title: str) -> Iterator[Callable[[Row], None
             recent.append(row)
             live.update(live_table(title, recent))
 
-        yield show
+        yield show, partial(_print_notice, live.console)  # above the table
+
+
+def _print_notice(console: Console, notice: str) -> None:
+    console.print(f"note: {notice}", highlight=False, markup=False, soft_wrap=True)
 
 
 def live_table(title: str, recent: deque[Row]) -> Group:
@@ -74,7 +81,7 @@ def plain_line(row: Row) -> str:
     )
 
 
-def _plain_lines(console: Console) -> Callable[[Row], None]:
+def _plain_lines(console: Console) -> ShowRow:
     last_s = float("-inf")
 
     def show(row: Row) -> None:

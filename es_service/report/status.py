@@ -65,12 +65,15 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
 
 def _progress(rows: list[dict[str, Any]]) -> dict[str, str]:
     last = rows[-1]
+    goal = {}
+    if "goal_distance" in last:
+        goal["goal distance"] = f"{last['goal_distance']:.3f} at the end, {last['goal_distance_min']:.3f} at its least"
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
     return {
         "generation": str(last["generation"]),
         "best fitness": f"{last['best_fitness']:.2f}",
         "centre fitness": f"{last['centre_fitness_mean']:.2f} ± {last['centre_fitness_std']:.2f}",
-        "goal distance": f"{last['goal_distance']:.3f} at the end, {last['goal_distance_min']:.3f} at its least",
+        **goal,
         "environment steps": f"{last['env_steps']:,} in {last['episodes']:,} episodes",
         "time": f"{last['wall_clock_s']:.1f} s, {rate:,.0f} steps/s overall",
     }

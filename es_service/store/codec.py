@@ -149,6 +149,14 @@ def row_sha256(columns: bytes, row: Row, state: str) -> str:
     return hashlib.sha256(b"".join((columns, row_bytes(row), state.encode()))).hexdigest()
 
 
+def history_row(
+    columns: Sequence[Column], generation: int, history: Mapping[str, int | float | None], state: str
+) -> tuple[int | float | str | None, ...]:
+    """A history row as it is stored, `state` being the `state_sha256` of its generation. Raises as `row_values`."""
+    values = row_values(columns, generation, history)
+    return (*values, state, row_sha256(column_bytes(columns), values, state))
+
+
 def row_dict(columns: Sequence[Column], row: Row) -> dict[str, int | float]:
     """A stored row for its readers: NaN where there is no value."""
     return {column.name: math.nan if value is None else value for column, value in zip(columns, row, strict=True)}

@@ -9,6 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 from es_service.errors import StoreError
+from es_service.store.beginning import Beginning, store_beginning
 from es_service.store.folder import (
     CONFIG,
     COPY,
@@ -17,31 +18,31 @@ from es_service.store.folder import (
     explained,
     is_disk_full,
     remove_database,
-    sync_file,
     sync_folder,
+    write_config,
 )
 from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.repair import connect
-from es_service.store.schema import create_tables
+from es_service.store.schema import RunMeta, create_tables, meta_text
 
 _NEW_DATABASE = "run.db.new"
-_LEFT_BEHIND = {LOCK, CONFIG, _NEW_DATABASE, f"{_NEW_DATABASE}-journal"}
+_LEFT_BEHIND = {LOCK, CONFIG, f"{CONFIG}.new", _NEW_DATABASE, f"{_NEW_DATABASE}-journal"}
 """What a creation in place may leave when it is killed, and the next one may overwrite."""
 
 
-def create_run_folder(folder: Path, config_yaml: str, meta_text: str) -> RunLock:
-    """Make `folder` that of a run without a generation, and hold its lock.
+def create_run_folder(folder: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -> RunLock:
+    """Make `folder` that of a run that has computed nothing yet, and hold its lock.
 
     It is built beside its final place and renamed; in an existing empty folder, `run.db` is renamed into place last.
     Raises StoreError if the folder is taken or cannot be written.
     """
     try:
-        return _create(folder, config_yaml, meta_text)
+        return _create(folder, config_yaml, meta, beginning)
     except (sqlite3.Error, OSError) as error:
         raise explained(error, folder, "creating the run", "give the same command again") from error
 
 
-def _create(folder: Path, config_yaml: str, meta_text: str) -> RunLock:
+def _create(folder: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -> RunLock:
     _refuse_taken(folder)
     parent = folder.absolute().parent
     if not parent.is_dir():
@@ -62,7 +63,7 @@ def _create(folder: Path, config_yaml: str, meta_text: str) -> RunLock:
         if not beside:
             # Another creation may have been at work until the lock was ours.
             _refuse_taken(folder)
-        _build(place, config_yaml, meta_text)
+        _build(place, config_yaml, meta, beginning)
         if beside:
             _move(place, folder)
     except BaseException:
@@ -72,14 +73,14 @@ def _create(folder: Path, config_yaml: str, meta_text: str) -> RunLock:
     return lock
 
 
-def _build(place: Path, config_yaml: str, meta_text: str) -> None:
+def _build(place: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -> None:
     new = place / _NEW_DATABASE
     remove_database(new)
     remove_database(place / DATABASE)
-    (place / CONFIG).write_text(config_yaml, encoding="utf-8")
-    sync_file(place / CONFIG)
+    write_config(place, config_yaml)
     with closing(connect(new)) as connection:
-        create_tables(connection, meta_text)
+        create_tables(connection, meta_text(meta))
+        store_beginning(connection, meta, beginning)
     os.replace(new, place / DATABASE)
     sync_folder(place)
 
@@ -103,7 +104,7 @@ def _clear(place: Path, beside: bool) -> None:
             remove_database(place / DATABASE)
         elif (place / DATABASE).exists():
             return
-        for name in (CONFIG, LOCK):
+        for name in (CONFIG, f"{CONFIG}.new", LOCK):
             (place / name).unlink(missing_ok=True)
         if beside:
             place.rmdir()

@@ -78,6 +78,15 @@ def sync_file(path: Path) -> None:
         os.close(descriptor)
 
 
+def write_config(folder: Path, text: str) -> None:
+    """Write the run's `config.yaml`, replacing a former one in one step."""
+    new = folder / f"{CONFIG}.new"
+    new.write_text(text, encoding="utf-8")
+    sync_file(new)
+    os.replace(new, folder / CONFIG)
+    sync_folder(folder)
+
+
 def remove_database(path: Path) -> None:
     """Delete a database file and whatever SQLite may have left beside it."""
     for suffix in ("", "-journal", "-wal", "-shm"):

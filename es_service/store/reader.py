@@ -108,6 +108,10 @@ def read_history(folder: Path, since_generation: int | None = None) -> list[dict
             if not sound or named["generation"] != first + len(rows):
                 raise Damaged(f"the history row of generation {first + len(rows)} is damaged or missing")
             rows.append(named)
+        # Damage can hide the end of a table from SQLite itself; every generation has state rows, too.
+        newest = connection.execute("SELECT max(generation) FROM state").fetchone()[0]
+        if newest is not None and newest >= first + len(rows):
+            raise Damaged(f"the history after generation {first + len(rows) - 1} is missing; the state is of {newest}")
         return rows
 
 

@@ -18,7 +18,8 @@ APPLICATION_ID = 0x45535256
 """In the file's header, for tools that tell database files apart."""
 PAGE_BYTES = 8192
 GENERATION_TABLES = ("state", "history", "platform")
-"""Tables whose rows carry a generation: falling back deletes the newer rows of each. Later tables go here."""
+"""Tables whose rows carry a generation: falling back deletes the newer rows of each. Later tables go here; what they
+gain in a generation must be hashed into its history row, as the state is, or a lost row goes unnoticed."""
 
 _META = "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, sha256 TEXT NOT NULL) WITHOUT ROWID"
 _STATE = (
@@ -44,10 +45,12 @@ class RunMeta:
     """The resolved config, JSON-able."""
     constants: dict[str, Any]
     """What may not change on resume, JSON-able."""
+    task: dict[str, Any]
+    """The task's `TaskSpec` as a dict, so that a run can be read where its task is not installed."""
     columns: tuple[Column, ...]
     """Of the history, `generation` among them."""
     parent: dict[str, Any] | None = None
-    """A fork's parent: run id, folder, generation, digest."""
+    """The run this one was forked from, or took its first centre from: run id, folder, generation, digest."""
 
 
 def meta_text(meta: RunMeta) -> str:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sqlite3
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -19,22 +19,21 @@ from typing import Any, Self
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
+from es_service.store.beginning import Beginning, load_start
 from es_service.store.codec import (
     Part,
-    column_bytes,
     decode_part,
     encode_part,
+    history_row,
     part_sha256,
     row_dict,
-    row_sha256,
-    row_values,
     text_sha256,
 )
 from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.lock import RunLock, acquire_lock, lock_holder
 from es_service.store.repair import open_sound
-from es_service.store.schema import PAGE_BYTES, RunMeta, history_insert, history_select, meta_text
+from es_service.store.schema import PAGE_BYTES, RunMeta, history_insert, history_select
 from es_service.store.upkeep import Upkeep
 from es_service.store.verify import rows_in_force, state_in_force
 
@@ -42,6 +41,9 @@ __all__ = ["Part", "RunMeta", "RunStore", "Values", "is_network_filesystem", "lo
 
 Values = Mapping[str, int | float | None]
 """One history row by column name; NaN or None for no value."""
+
+
+NOTHING = Beginning()
 
 
 def no_hook(name: str) -> None:
@@ -56,6 +58,8 @@ class RunStore:
     """What opening had to repair, and what later went wrong without ending the run; for the user to read."""
     generation: int | None
     """Newest committed generation; None before the first."""
+    start: Part | None
+    """What generation 0 is to start from, if the run was created with that."""
 
     def __init__(self, folder: Path, lock: RunLock, hook: Callable[[str], None]) -> None:
         """Open the run in `folder`, whose lock is held; `create` and `open` are the ways in."""
@@ -68,10 +72,10 @@ class RunStore:
         self.meta = verdict.meta
         self.generation = verdict.good
         self._kept = verdict.kept
-        self._columns = column_bytes(self.meta.columns)
         self._insert_history = history_insert(self.meta.columns)
         try:
             with self._explaining(f"opening {DATABASE}"):
+                self.start = load_start(self._connection)
                 self.upkeep = Upkeep(self._connection, folder, is_network_filesystem(folder), hook, self.notices)
             hook("opened")
         except BaseException:
@@ -80,14 +84,22 @@ class RunStore:
 
     @classmethod
     def create(
-        cls, folder: Path, config_yaml: str, meta: RunMeta, *, hook: Callable[[str], None] = no_hook
+        cls,
+        folder: Path,
+        config_yaml: str,
+        meta: RunMeta,
+        beginning: Beginning = NOTHING,
+        *,
+        hook: Callable[[str], None] = no_hook,
     ) -> RunStore:
         """Start a run in `folder`, which must not exist or be empty; its parent must exist.
+
+        `beginning` is there from the first instant that the run is.
 
         Raises StoreError if the folder is taken, cannot be written, or the columns of `meta` cannot be stored.
         """
         folder = Path(folder)
-        lock = create_run_folder(folder, config_yaml, meta_text(meta))
+        lock = create_run_folder(folder, config_yaml, meta, beginning)
         return cls._holding(lock, folder, hook)
 
     @classmethod
@@ -141,50 +153,33 @@ class RunStore:
         Raises StoreError for another generation, a row that does not fit the columns, a full disk. After it the store
         is as before and may still be used.
         """
-        self._store(generation, [history], parts)
-
-    def adopt(self, history: Sequence[Values], parts: Mapping[str, Part]) -> None:
-        """Start a run where another one stands: its rows of generations 0, 1, ..., and its state after the last one.
-
-        One transaction, so that a fork that is killed has begun or has not. Raises StoreError as `commit` does.
-        """
-        self._store(0, history, parts)
-
-    def _store(self, first: int, history: Sequence[Values], parts: Mapping[str, Part]) -> None:
-        """Store the rows of generations `first`, `first` + 1, ... and the parts that the last of them changed."""
         expected = 0 if self.generation is None else self.generation + 1
-        if first != expected or not history:
-            raise StoreError(f"{self.folder}: generation {first} cannot be stored, the next one is {expected}")
-        newest = first + len(history) - 1
+        if generation != expected:
+            raise StoreError(f"{self.folder}: generation {generation} cannot be stored, the next one is {expected}")
         payloads = {part: encode_part(arrays) for part, arrays in parts.items()}
         kept = {part: dict(rows) for part, rows in self._kept.items()}
         for part, payload in payloads.items():
-            kept.setdefault(part, {})[newest] = part_sha256(part, newest, payload)
-        rows = [self._history_row(at, row, state_in_force(kept, at)) for at, row in enumerate(history, first)]
+            kept.setdefault(part, {})[generation] = part_sha256(part, generation, payload)
+        history_values = history_row(self.meta.columns, generation, history, state_in_force(kept, generation))
         # Enough stays to put together the newest generation and the one before it.
-        fallback = rows_in_force(kept, newest - 1)
+        fallback = rows_in_force(kept, generation - 1)
         outdated = [(part, at) for part, (oldest, _) in fallback.items() for at in kept[part] if at < oldest]
         for part, at in outdated:
             del kept[part][at]
         self._hook("before_begin")
-        with self._transaction(f"storing generation {newest}") as execute:
+        with self._transaction(f"storing generation {generation}") as execute:
             # First, so that the new rows take the pages of the old ones.
             for part, at in outdated:
                 execute("DELETE FROM state WHERE part = ? AND generation = ?", (part, at))
             for part, payload in payloads.items():
-                row = (part, newest, kept[part][newest], payload)
+                row = (part, generation, kept[part][generation], payload)
                 execute("INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)", row)
             self._hook("mid_transaction")
-            for row in rows:
-                execute(self._insert_history, row)
+            execute(self._insert_history, history_values)
             self._hook("before_commit")
-        self.generation, self._kept = newest, kept
+        self.generation, self._kept = generation, kept
         self._hook("after_commit")
-        self.upkeep.after_commit(sum(map(len, payloads.values())) + (len(rows) + 3) * PAGE_BYTES)
-
-    def _history_row(self, generation: int, history: Values, state: str) -> tuple[int | float | str | None, ...]:
-        values = row_values(self.meta.columns, generation, history)
-        return (*values, state, row_sha256(self._columns, values, state))
+        self.upkeep.after_commit(sum(map(len, payloads.values())) + 4 * PAGE_BYTES)
 
     def last_history(self) -> dict[str, int | float] | None:
         """The newest generation's history row, NaN where it has no value; None before the first commit."""

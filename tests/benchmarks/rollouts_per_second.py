@@ -16,15 +16,15 @@ from pathlib import Path
 
 from es_service import api
 from es_service.config.model import worker_spec
-from es_service.dispatch.inline_engine import InlineEngine
+from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy
-from es_service.protocol import EpisodesResult, TrainingChunk
+from es_service.protocol import EpisodesResult, Evaluator, TrainingChunk
 from tests.helpers import centre
 from workers.environments import TASKS
-from workers.policy import initial_parameters, policy_shape
+from workers.policy import initial_parameters
 
 
-def measure(engine: InlineEngine, point, seconds: float) -> float:
+def measure(engine: Evaluator, point, seconds: float) -> float:
     """Steps per second over whole populations for about `seconds`."""
     steps, start = 0, time.perf_counter()
     while time.perf_counter() - start < seconds:
@@ -49,17 +49,16 @@ def main() -> None:
             "budget": {"generations": 1},
         }
     )
-    task = TASKS["point_maze"]
-    shape = policy_shape(task.observation_size, config.policy.hidden, task.action_size)
-    point = centre(initial_parameters(shape, "unit_columns", 0), sigma=0.02)
+    spec = worker_spec(config, TASKS["point_maze"])
+    point = centre(initial_parameters(spec.policy, "unit_columns", 0), sigma=0.02)
     rates: dict[int, list[float]] = {1: [], 2: []}
-    with InlineEngine(worker_spec(config), Policy(1)) as one, InlineEngine(worker_spec(config), Policy(2)) as two:
+    with inline_engine(spec, Policy(1)) as one, inline_engine(spec, Policy(2)) as two:
         for engine in (one, two):
             measure(engine, point, 1.0)  # compiles
         for _ in range(3):
             for workers, engine in ((1, one), (2, two)):
                 rates[workers].append(measure(engine, point, seconds))
-        memory = max(resident_mib(pid) for pid in two.process_ids().values())
+        memory = max(resident_mib(pid) for pid in two.transport.process_ids().values())
     one_rate, two_rate = (statistics.median(rates[workers]) for workers in (1, 2))
     row = {
         "task": "point_maze",

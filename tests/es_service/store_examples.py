@@ -29,6 +29,7 @@ def meta(**changes):
         "created": "2025-01-01T00:00:00+00:00",
         "config": {"seed": 0, "search": {"pairs": 8}},
         "constants": {"search.pairs": 8},
+        "task": {"name": "point_maze"},
         "columns": COLUMNS,
         "parent": None,
     }

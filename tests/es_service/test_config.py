@@ -23,18 +23,9 @@ from es_service.config.resolution import (
 )
 from es_service.config.yaml_text import dump_yaml, parse_value
 from es_service.errors import ConfigError
-from es_service.protocol import TaskSpec
+from workers import environments
 
-POINT_MAZE = TaskSpec(
-    name="point_maze",
-    observation_size=2,
-    action_size=2,
-    episode_steps=200,
-    descriptor_names=("x", "y"),
-    descriptor_bounds=((-1.0, 1.0), (-1.0, 1.0)),
-    final_fitness=True,
-    options={"start": ("default", "corner")},
-)
+POINT_MAZE = environments.TASKS["point_maze"]
 TASKS = {"point_maze": POINT_MAZE}
 CONFIGS = Path(__file__).parents[2] / "configs"
 MINIMAL = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 3}}
@@ -108,7 +99,7 @@ def test_default_chunk_pairs(pairs, chunk):
 @given(st.integers(1, 100_000))
 def test_default_shapes_fit_together(pairs):
     chunk = default_chunk_pairs(pairs)
-    rollout, gradient = default_rollout_block_pairs(chunk), default_gradient_block_pairs(pairs, chunk)
+    rollout, gradient = default_rollout_block_pairs(chunk, 4482), default_gradient_block_pairs(pairs, chunk)
     assert pairs % chunk == 0
     assert chunk % rollout == 0
     assert chunk <= 64
@@ -116,6 +107,14 @@ def test_default_shapes_fit_together(pairs):
     assert gradient % chunk == 0
     assert gradient <= pairs
     assert -(-pairs // gradient) <= 32
+
+
+@pytest.mark.parametrize(
+    ("chunk", "parameters", "block"), [(64, 4482, 32), (40, 75_528, 8), (40, 4482, 20), (7, 10**9, 1)]
+)
+def test_default_rollout_block_pairs(chunk, parameters, block):
+    """Thirty-two pairs at most, and no more than five megabytes of weights."""
+    assert default_rollout_block_pairs(chunk, parameters) == block
 
 
 def test_awkward_populations_load_with_a_warning():
@@ -284,11 +283,11 @@ def test_a_run_outlives_the_run_it_started_from(tmp_path):
 
 def test_worker_spec_says_what_the_config_says():
     config = load(MINIMAL, "policy.hidden=[8, 4]", "task.options.start=corner", "task.fitness=final", "seed=5")
-    spec = worker_spec(config)
+    spec = worker_spec(config, POINT_MAZE)
     assert pickle.loads(pickle.dumps(spec)) == spec
     assert (spec.seed, spec.environment, spec.environment_options) == (5, "point_maze", {"start": "corner"})
     assert (spec.episode_steps, spec.fitness, spec.episodes_per_member) == (200, "final", 1)
-    assert (spec.hidden, spec.observation_clip, spec.action_noise) == ((8, 4), 5.0, 0.01)
+    assert (spec.policy.widths, spec.observation_clip, spec.action_noise) == ((2, 8, 4, 2), 5.0, 0.01)
     assert (spec.chunk_pairs, spec.rollout_block_pairs, spec.gradient_block_pairs) == (64, 32, 64)
     assert spec.common_random_numbers is True
 

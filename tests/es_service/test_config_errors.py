@@ -14,18 +14,10 @@ from es_service.config.loading import load_config
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
 from es_service.protocol import TaskSpec
+from workers import environments
 
-POINT_MAZE = TaskSpec(
-    name="point_maze",
-    observation_size=2,
-    action_size=2,
-    episode_steps=200,
-    descriptor_names=("x", "y"),
-    descriptor_bounds=((-1.0, 1.0), (-1.0, 1.0)),
-    final_fitness=True,
-    options={"start": ("default", "corner")},
-)
-NO_FINAL = TaskSpec("no_final", 2, 2, 50, ("x",), ((0.0, 1.0),), final_fitness=False)
+POINT_MAZE = environments.TASKS["point_maze"]
+NO_FINAL = TaskSpec("no_final", 2, 2, 50, ("x",), ((0.0, 1.0),), final_fitness=False, has_goal=False)
 TASKS = {"point_maze": POINT_MAZE, "no_final": NO_FINAL}
 MINIMAL = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 3}}
 MINIMAL_TEXT = "task: {environment: point_maze}\nsearch: {algorithm: es}\nbudget: {generations: 3}\n"

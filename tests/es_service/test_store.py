@@ -1,17 +1,20 @@
 """Creating a run and committing to it."""
 
 import contextlib
+import math
 import os
 import sqlite3
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from es_service.errors import StoreError
 from es_service.history import Column
 from es_service.store import create as store_create
 from es_service.store import upkeep as store_upkeep
+from es_service.store.beginning import Beginning
 from es_service.store.reader import read_generation, read_history, read_meta, read_parts, read_platforms
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
@@ -87,12 +90,12 @@ def test_a_missing_or_unwritable_parent_is_named(tmp_path):
 
 
 def test_a_failed_creation_leaves_nothing_and_says_why(tmp_path, monkeypatch):
-    def full(path):
+    def full(folder, text):
         raise OSError(28, "No space left on device")
 
     for folder in (tmp_path / "new", tmp_path / "existing"):
         with monkeypatch.context() as patch:
-            patch.setattr(store_create, "sync_file", full)
+            patch.setattr(store_create, "write_config", full)
             if folder.name == "existing":
                 folder.mkdir()
             with pytest.raises(StoreError, match=r"disk full .* free space, then give the same command again"):
@@ -218,19 +221,42 @@ def test_the_log_is_emptied_by_bytes_and_by_time(tmp_path, monkeypatch):
         assert called.count("after_checkpoint") == 2
 
 
-def test_a_fork_adopts_history_and_state_in_one_transaction(tmp_path):
-    called = []
-    with create(tmp_path / "run", hook=called.append) as run:
-        run.adopt([history_row(generation) for generation in range(4)], state_at(3))
-        assert called.count("before_commit") == 1
+def test_a_fork_begins_with_its_parent_s_history_and_state(tmp_path):
+    history = [history_row(generation) for generation in range(4)]
+    platforms = [(0, {"jax": "1"}), (2, {"jax": "2"})]
+    beginning = Beginning(history, state_at(3), platforms)
+    with RunStore.create(tmp_path / "run", CONFIG_YAML, meta(), beginning) as run:
         assert run.generation == 3
-        with pytest.raises(StoreError, match="generation 0 cannot be stored, the next one is 4"):
-            run.adopt([history_row(0)], {})
+        assert run.start is None
+        assert run.record_platform(4, {"jax": "2"}) is False
+        assert_same_state(run.load(), state_at(3))
         advance(run, 5)
+    assert read_platforms(tmp_path / "run") == platforms
     assert_same_history(read_history(tmp_path / "run"), 6)
     with RunStore.open(tmp_path / "run") as run:
         assert run.notices == []
         assert_same_state(run.load(), state_at(5))
+
+
+def test_a_fork_s_columns_are_its_own(tmp_path):
+    """A newer version may have more columns than the parent's run, or fewer."""
+    history = [{**history_row(0), "gone": 1.0}]
+    del history[0]["goal_distance"]
+    with RunStore.create(tmp_path / "run", CONFIG_YAML, meta(), Beginning(history, state_at(0))) as run:
+        advance(run, 2)
+    first = read_history(tmp_path / "run")[0]
+    assert math.isnan(first["goal_distance"])
+    assert "gone" not in first
+
+
+def test_a_start_is_kept_with_the_run(tmp_path):
+    start = {"centre_D": np.arange(5, dtype=np.float32), "count": np.asarray(3.0)}
+    with RunStore.create(tmp_path / "run", CONFIG_YAML, meta(), Beginning(start=start)) as run:
+        assert run.generation is None
+        assert_same_state({"start": run.start}, {"start": start})
+        advance(run, 2)
+    with RunStore.open(tmp_path / "run") as run:
+        assert_same_state({"start": run.start}, {"start": start})
 
 
 def test_a_closed_store_says_so(tmp_path):

@@ -71,3 +71,14 @@ def test_a_newer_schema_version_names_both_and_says_upgrade(tmp_path, monkeypatc
     for use in (RunStore.open, read_meta, read_history):
         with pytest.raises(StoreError, match=r"schema version 7; .* versions up to 1\. Upgrade"):
             use(folder)
+
+
+def test_history_that_ends_before_the_state_is_noticed(tmp_path):
+    """Damage to a page can make SQLite see fewer rows without an error."""
+    folder = finished(tmp_path / "run", 6)
+    with contextlib.closing(sqlite3.connect(folder / "run.db")) as connection:
+        connection.execute("DELETE FROM history WHERE generation >= 4")
+        connection.commit()
+    for since in (None, 3, 4):
+        with pytest.raises(StoreError, match="the history after generation 3 is missing"):
+            read_history(folder, since)

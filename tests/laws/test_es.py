@@ -17,14 +17,22 @@ from es_service.errors import EvaluationError
 from es_service.generation import estimate_gradient, tree_sum
 from es_service.noise import Domain, normals, stream_keys
 from es_service.optimizer import adam_ascent, fresh_adam
-from es_service.protocol import DispatchCounts, EpisodesResult, GradientChunk, GradientResult, TrainingChunk
+from es_service.protocol import (
+    DispatchCounts,
+    EpisodesResult,
+    GradientChunk,
+    GradientResult,
+    PolicyShape,
+    TrainingChunk,
+)
 from es_service.shaping import centred_ranks, pair_weights
 from es_service.statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore, centre
 from tests.twins import es as twin
-from workers.policy import initial_parameters, policy_shape
+from workers.environments import TASKS
+from workers.policy import initial_parameters
 
-SHAPE = policy_shape(2, (8, 8), 2)
+SHAPE = PolicyShape((2, 8, 8, 2))
 fitness_arrays = hnp.arrays(
     np.float64, st.tuples(st.integers(1, 12), st.just(2)), elements=st.integers(-5, 5).map(float) | st.floats(-1e6, 1e6)
 )
@@ -42,13 +50,13 @@ def small_config(**changes):
 
 
 def run_in_memory(config, evaluator=None):
-    evaluator = evaluator or DirectEvaluator(worker_spec(config))
+    evaluator = evaluator or DirectEvaluator(worker_spec(config, TASKS["point_maze"]))
     first = initial_parameters(SHAPE, config.policy.init, config.seed)
     search = driver.Search(
         config,
         ALGORITHMS["es"](config.search),
         lambda: (first, no_observations(2)),
-        ("x", "y"),
+        TASKS["point_maze"],
     )
     store = MemoryStore()
     state, reason = driver.run(search, evaluator, store, lambda row: None)
@@ -177,7 +185,7 @@ def test_invalid_members_rank_last_are_counted_and_do_not_stop_the_run():
         return result
 
     config = small_config()
-    state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config), spoil))
+    state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config, TASKS["point_maze"]), spoil))
     assert [row.get("invalid_members") for row in store.rows[1:]] == [2] * 20
     assert np.isfinite(state.search.members[0].centre_D).all()
     assert all(np.isfinite(row["population_fitness_min"]) for row in store.rows[1:])
@@ -193,7 +201,7 @@ def test_too_many_invalid_members_stop_the_run_with_a_named_error():
     with pytest.raises(
         EvaluationError, match=r"generation 3: 54 of 96 members .* search.max_invalid_fraction \(0.25\)"
     ):
-        run_in_memory(config, Tampering(worker_spec(config), spoil))
+        run_in_memory(config, Tampering(worker_spec(config, TASKS["point_maze"]), spoil))
 
 
 def test_an_invalid_centre_is_never_the_best():
@@ -203,7 +211,7 @@ def test_an_invalid_centre_is_never_the_best():
         return result
 
     config = small_config()
-    state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config), spoil))
+    state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config, TASKS["point_maze"]), spoil))
     assert state.best.generation == 4
     assert store.rows[3]["best_fitness"] == -np.inf
 
@@ -222,21 +230,23 @@ class Inventing:
 
     def answer(self, chunk):
         if isinstance(chunk, GradientChunk):
-            return GradientResult(self.sum_D, 0.0)
+            return GradientResult(self.sum_D)
         axes = (64, 2) if isinstance(chunk, TrainingChunk) else (16,)
         fitness = self.rng.normal(size=axes).astype(np.float32)
         steps = np.full(axes, 200, np.int32)
         descriptor = np.zeros((*axes, 2), np.float32)
-        return EpisodesResult(fitness, fitness, descriptor, steps, descriptor, no_observations(2), 0.0)
+        return EpisodesResult(fitness, fitness, descriptor, steps, descriptor, no_observations(2))
 
 
 def test_the_driver_holds_no_population_times_parameters_array():
     """2,048 pairs of 4,482 parameters would be 37 MB; the driver gets by with a few vectors of parameters."""
     mapping = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es", "pairs": 2048}}
     config = load_config(mapping | {"budget": {"generations": 3}})
-    shape = policy_shape(2, (64, 64), 2)
+    shape = PolicyShape((2, 64, 64, 2))
     first = initial_parameters(shape, "unit_columns", 0)
-    search = driver.Search(config, ALGORITHMS["es"](config.search), lambda: (first, no_observations(2)), ("x", "y"))
+    search = driver.Search(
+        config, ALGORITHMS["es"](config.search), lambda: (first, no_observations(2)), TASKS["point_maze"]
+    )
     evaluator = Inventing(shape.parameters)
     tracemalloc.start()
     driver.run(search, evaluator, MemoryStore(), lambda row: None)
@@ -270,7 +280,7 @@ def test_an_increasing_map_of_the_fitness_changes_nothing(fitness):
 
 def test_swapping_signs_negates_the_gradient_estimate_exactly():
     config = small_config()
-    evaluator = DirectEvaluator(worker_spec(config))
+    evaluator = DirectEvaluator(worker_spec(config, TASKS["point_maze"]))
     fitness = np.random.default_rng(0).normal(size=(48, 2))
     point = centre(np.zeros(SHAPE.parameters))
     estimates = [
@@ -288,7 +298,9 @@ def test_gradient_by_hand_three_pairs():
         | {"search": {"algorithm": "es", "pairs": 3}, "compute": {"gradient_block_pairs": 2}}
     )
     weights = np.float32([1.0, -0.5, 0.25])
-    found = estimate_gradient(DirectEvaluator(worker_spec(config)), centre(np.zeros(SHAPE.parameters)), weights, 2)
+    found = estimate_gradient(
+        DirectEvaluator(worker_spec(config, TASKS["point_maze"])), centre(np.zeros(SHAPE.parameters)), weights, 2
+    )
     noise = [normals(key, SHAPE.parameters) for key in stream_keys(0, Domain.PARAMETER_NOISE, 1, np.arange(3))]
     np.testing.assert_allclose(found, (noise[0] - 0.5 * noise[1] + 0.25 * noise[2]) / 3, rtol=1e-5, atol=1e-6)
 

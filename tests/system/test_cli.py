@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -16,9 +17,10 @@ import yaml
 
 from es_service import open_run
 from es_service.store.reader import read_generation
-from tests.system.session import ROOT, SMALL
+from tests.system.session import ROOT, SMALL, finish
 
-COMMAND = [sys.executable, "-c", "from es_service.cli import main; main()"]
+PROGRAM = Path(sys.executable).with_name("es-service")
+COMMAND = [str(PROGRAM)]
 
 
 def es(*arguments, cwd=ROOT, **environment):
@@ -64,7 +66,7 @@ def test_run_ends_in_a_summary_with_the_next_commands(finished):
     folder, printed = finished
     assert "Done: 30 generations are done." in printed
     for command in ("status", "digest", "resume", "fork"):
-        assert f"es-service {command} {folder}" in printed
+        assert f"{PROGRAM} {command} {folder}" in printed
     assert {path.name for path in folder.iterdir()} == {"config.yaml", "run.db", "run.lock"}
 
 
@@ -100,6 +102,21 @@ def test_resume_in_pieces_equals_one_run_and_another_seed_does_not(config, finis
     assert digest(tmp_path / "other") != digest(finished[0])
 
 
+def test_a_longer_budget_stays_with_the_run(config, finished, tmp_path):
+    """`resume` with a budget, killed: a plain `resume` then goes on to that budget, not to the first one."""
+    folder = tmp_path / "run"
+    assert es("run", config, "--out", folder, "--set", "budget.generations=3")[0] == 0
+    process = subprocess.Popen(
+        [*COMMAND, "resume", str(folder), "--set", "budget.generations=30"], cwd=ROOT, stdout=subprocess.DEVNULL
+    )
+    while (read_generation(folder) or 0) < 4:
+        time.sleep(0.005)
+    process.kill()
+    process.wait()
+    assert es("resume", folder)[0] == 0
+    assert digest(folder) == digest(finished[0])
+
+
 def test_resume_of_a_finished_run_does_nothing(finished):
     before = digest(finished[0])
     code, printed = es("resume", finished[0])
@@ -112,7 +129,9 @@ def test_fork_without_changes_goes_on_as_its_parent_would(config, finished, tmp_
     parent, child = tmp_path / "parent", tmp_path / "child"
     assert es("run", config, "--out", parent, "--set", "budget.generations=10")[0] == 0
     for generation in ([], ["--generation", 9]):
-        assert es("fork", parent, *generation, "--out", child, "--set", "budget.generations=30")[0] == 0
+        code, printed = es("fork", parent, *generation, "--out", child, "--set", "budget.generations=30")
+        assert code == 0
+        assert "note:" not in printed  # the same machine: no other platform to tell of
         assert digest(child) == digest(finished[0])
         origin = open_run(child).meta.parent
         assert origin is not None
@@ -143,22 +162,60 @@ def test_init_from_starts_at_the_other_run_s_centre(config, finished, tmp_path):
     assert code == 0, printed
     child, parent = open_run(tmp_path / "r"), open_run(finished[0])
     assert child.generation == 0
-    assert (child.centre() == parent.centre()).all()
-    assert child.observations().count == parent.observations().count
+    for part, name in (("member_0", "centre_D"), ("observations", "m2_O")):
+        assert (child.parts()[1][part][name] == parent.parts()[1][part][name]).all()
     assert child.meta.parent is not None
     assert child.meta.parent["digest"] == digest(finished[0])
     code, printed = es("run", config, "--out", tmp_path / "s", "--set", f"search.init_from={finished[0]}",
                        "--set", "policy.hidden=[16]")  # fmt: skip
     assert code == 2
     assert "has layers [2, 8, 2], this run's has [2, 16, 2]" in printed
+    assert not (tmp_path / "s").exists()
+
+
+def test_init_from_keeps_what_it_started_from(config, finished, tmp_path):
+    """The other run goes on, or away; a run that began from it and died at once is resumed to the same digest."""
+    origin, whole, killed = tmp_path / "origin", tmp_path / "whole", tmp_path / "killed"
+    shutil.copytree(finished[0], origin)
+    mapping = yaml.safe_load(config.read_text())
+    mapping["search"]["init_from"] = str(origin)
+    mapping["budget"]["generations"] = 5
+    assert finish(whole, config=mapping) == 0
+    assert finish(killed, config=mapping, kill={"at": "opened"}) == -signal.SIGKILL
+    assert read_generation(killed) is None
+    shutil.rmtree(origin)
+    assert es("resume", killed)[0] == 0
+    assert digest(killed) == digest(whole)
+
+
+def test_a_fork_killed_at_once_is_its_parent_s_state_already(config, finished, tmp_path):
+    parent, child = tmp_path / "parent", tmp_path / "child"
+    assert es("run", config, "--out", parent, "--set", "budget.generations=10")[0] == 0
+    process = subprocess.run(
+        [sys.executable, "-c", "import os, signal; from es_service import api\n"
+         f"api.fork({str(parent)!r}, ['budget.generations=30'], out={str(child)!r}, "
+         "hook=lambda name: os.kill(os.getpid(), signal.SIGKILL))"],
+        cwd=ROOT, timeout=60, check=False,
+    )  # fmt: skip
+    assert process.returncode == -signal.SIGKILL
+    assert read_generation(child) == 10
+    assert es("resume", child)[0] == 0
+    assert digest(child) == digest(finished[0])
+
+
+def test_a_fork_with_another_fitness_forgets_the_best_of_before(finished, tmp_path):
+    more = ("--set", "budget.generations=32")
+    assert es("fork", finished[0], "--out", tmp_path / "a", "--set", "task.fitness=final", *more)[0] == 0
+    history = open_run(tmp_path / "a").history
+    assert history["best_fitness"].iloc[-1] == history["centre_fitness_mean"].iloc[31:].max()
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_signals_stop_promptly_and_resume_equals_uninterrupted(config, finished, tmp_path, number, code):
     folder = tmp_path / "run"
-    slow = ["--set", "search.pairs=16", "--set", "budget.generations=3000"]
+    long = ["--set", "budget.generations=400"]
     process = subprocess.Popen(
-        [*COMMAND, "run", str(config), "--out", str(folder), *slow], cwd=ROOT, stderr=subprocess.PIPE, text=True
+        [*COMMAND, "run", str(config), "--out", str(folder), *long], cwd=ROOT, stderr=subprocess.PIPE, text=True
     )
     while not (folder / "run.db").exists() or (read_generation(folder) or 0) < 5:
         time.sleep(0.01)
@@ -167,13 +224,24 @@ def test_signals_stop_promptly_and_resume_equals_uninterrupted(config, finished,
     _, errors = process.communicate(timeout=20)
     assert time.monotonic() - sent < 2.0
     assert process.returncode == code
-    assert f"es-service resume {folder}" in errors.replace("\n", " ")
-    reached = read_generation(folder)
-    assert reached is not None
-    last = max(30, reached + 1)
-    assert es("resume", folder, "--set", f"budget.generations={last}")[0] == 0
-    assert es("run", config, "--out", tmp_path / "whole", "--set", f"budget.generations={last}")[0] == 0
+    assert 5 <= (read_generation(folder) or 0) < 400
+    way_back = re.search(r"es-service (resume .*)", errors)
+    assert way_back is not None
+    assert es(*way_back[1].split())[0] == 0
+    assert es("run", config, "--out", tmp_path / "whole", *long)[0] == 0
     assert digest(folder) == digest(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("delay_s", [0.1, 0.25, 0.4, 0.6, 1.0, 1.6])
+def test_a_signal_during_start_up_ends_quietly(config, tmp_path, delay_s):
+    process = subprocess.Popen(
+        [*COMMAND, "run", str(config), "--out", str(tmp_path / "run")], cwd=ROOT, stderr=subprocess.PIPE, text=True
+    )
+    time.sleep(delay_s)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
 
 
 def test_a_second_driver_is_refused_and_told_who_holds_the_run(config, tmp_path):
@@ -231,7 +299,7 @@ def test_damage_gives_the_same_digest_or_a_named_error(config, finished, tmp_pat
     folder = tmp_path / "run"
     assert es("run", config, "--out", folder, "--set", "budget.generations=20")[0] == 0
     sound = (folder / "run.db").read_bytes()
-    newest = open_run(folder).centre().tobytes()
+    newest = open_run(folder).parts()[1]["member_0"]["centre_D"].tobytes()
     last = ["--set", "budget.generations=30"]
 
     damage(folder / "run.db", sound.rindex(newest) + 8)
@@ -259,8 +327,9 @@ def test_other_versions_on_resume_are_told_and_make_the_digest_mixed(config, tmp
     assert es("run", config, "--out", folder, "--set", "budget.generations=3")[0] == 0
     assert "mixed" not in digest(folder)
     monkeypatch.setattr(api, "platform_info", lambda: {"jax": "99.0"})
-    outcome = api.resume(folder, ["budget.generations=4"])
-    assert any("from generation 4 on" in notice for notice in outcome.notices)
+    notices: list[str] = []
+    api.resume(folder, ["budget.generations=4"], on_notice=notices.append)
+    assert any("from generation 4 on" in notice for notice in notices)
     assert digest(folder).endswith("mixed")
 
 
@@ -321,6 +390,13 @@ def test_resume_with_an_edited_config_lists_every_changed_constant(config, tmp_p
     assert code == 2
     for change in ("search.sigma: 0.02 -> 0.5", "seed: 0 -> 9", "es-service fork"):
         assert change in printed
+
+
+def test_a_folder_where_no_runs_folder_can_be_made(config, tmp_path):
+    (tmp_path / "runs").write_text("in the way")
+    code, printed = es("run", config, cwd=tmp_path)
+    assert code == 1
+    assert "choose another --out" in printed
 
 
 def test_unwritable_home_does_not_matter(config, tmp_path):

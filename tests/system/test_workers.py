@@ -16,6 +16,7 @@ import pytest
 from es_service import api
 from es_service.digest import digest_parts
 from es_service.dispatch import inline_engine
+from es_service.dispatch.engine import Engine
 from es_service.errors import EvaluationError
 from es_service.protocol import TrainingChunk
 from tests.system.session import ROOT
@@ -64,14 +65,14 @@ def test_number_of_workers(tmp_path, reference, workers):
 def test_order_of_chunks(tmp_path, reference, monkeypatch):
     """Chunks go out in random order, so answers come back in random order too."""
     rng = random.Random(0)
-    evaluate = inline_engine.InlineEngine.evaluate
+    evaluate = Engine.evaluate
 
     def shuffled(self, centre, chunks):
         order = rng.sample(range(len(chunks)), len(chunks))
         results = evaluate(self, centre, [chunks[i] for i in order])
         return [result for _, result in sorted(zip(order, results, strict=True), key=lambda item: item[0])]
 
-    monkeypatch.setattr(inline_engine.InlineEngine, "evaluate", shuffled)
+    monkeypatch.setattr(Engine, "evaluate", shuffled)
     run(tmp_path / "run")
     assert digest_parts(tmp_path / "run") == reference
 
@@ -115,14 +116,14 @@ run(load_config({CONFIG!r}), {str(tmp_path / "run")!r})
 
 def test_a_chunk_that_fails_everywhere_ends_the_run_with_its_error(tmp_path, monkeypatch):
     """A poison chunk: the message names it and carries the worker's own traceback; what is committed stays."""
-    evaluate = inline_engine.InlineEngine.evaluate
+    evaluate = Engine.evaluate
 
     def poisoned(self, centre, chunks):
         if centre.generation == 3 and isinstance(chunks[0], TrainingChunk):
             chunks = [type(chunk)(chunk.generation, "two") if chunk.chunk_id == 2 else chunk for chunk in chunks]
         return evaluate(self, centre, chunks)
 
-    monkeypatch.setattr(inline_engine.InlineEngine, "evaluate", poisoned)
+    monkeypatch.setattr(Engine, "evaluate", poisoned)
     with pytest.raises(EvaluationError, match=r"(?s)TrainingChunk two of generation 3 failed in 4 attempts.*ufunc"):
         run(tmp_path / "run")
     assert api.open_run(tmp_path / "run").generation == 2

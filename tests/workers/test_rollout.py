@@ -9,18 +9,25 @@ import pytest
 
 import workers.worker
 from es_service.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys
-from es_service.protocol import EpisodesResult, EvaluationChunk, GradientChunk, GradientResult, TrainingChunk
+from es_service.protocol import (
+    EpisodesResult,
+    EvaluationChunk,
+    GradientChunk,
+    GradientResult,
+    PolicyShape,
+    TrainingChunk,
+)
 from es_service.run_view import Policy
 from es_service.statistics import merge_moments, no_observations
 from tests.helpers import PARAMETERS, centre, random_parameters, spec
 from tests.twins import noise as noise_twin
 from tests.twins import point_maze as maze_twin
 from workers.environments import Environment, make_environment
-from workers.policy import initial_parameters, policy_shape
+from workers.policy import initial_parameters
 from workers.rollout import make_training_rollout
 from workers.worker import episode_keys, make_worker
 
-SHAPE = policy_shape(2, (8, 8), 2)
+SHAPE = PolicyShape((2, 8, 8, 2))
 MEAN, STD = np.float32([0.1, -0.4]), np.float32([0.3, 0.6])
 
 
@@ -202,7 +209,7 @@ def test_memory_does_not_grow_with_the_length_of_episodes():
     sizes = []
     for steps in (200, 20_000):
         worker_spec = spec(episode_steps=steps)
-        rollout = make_training_rollout(make_environment("point_maze", {}), SHAPE, worker_spec)
+        rollout = make_training_rollout(make_environment("point_maze", {}), worker_spec)
         pairs = np.arange(8)
         keys = stream_keys(0, Domain.PARAMETER_NOISE, 1, pairs)
         episodes = episode_keys(worker_spec, Domain.TRAINING_RESET, 1, pairs)
@@ -271,7 +278,7 @@ def test_numpy_policy_equals_the_rollout_s(monkeypatch):
 
 
 def test_initial_columns_have_their_norms_and_layers_differ():
-    shape = policy_shape(8, (8, 8), 8)  # equal shapes on purpose: one key for all layers would make them equal
+    shape = PolicyShape((8, 8, 8, 8))  # equal shapes on purpose: one key for all layers would make them equal
     for init, norms in (("unit_columns", (1.0, 1.0, 0.01)), ("small_columns", (0.01, 0.01, 0.01))):
         flat = initial_parameters(shape, init, seed=0)
         layers = [flat[start : start + 64].reshape(8, 8) for start in (0, 72, 144)]

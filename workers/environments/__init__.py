@@ -18,6 +18,7 @@ TASKS: Mapping[str, TaskSpec] = {
         descriptor_names=("x", "y"),
         descriptor_bounds=((-1.0, 1.0), (-1.0, 1.0)),
         final_fitness=True,
+        has_goal=True,
         options={"start": ("default", "corner")},
         summary="a point crosses a square behind two walls; the straight way to the goal is blocked twice",
     ),

@@ -1,0 +1,153 @@
+"""The engine: carries scheduler commands to workers and their messages back, over whatever transport.
+
+Dispatch station, between the driver and a transport. The scheduler decides, the transport moves bytes; this loop only
+introduces them to each other and puts the results in order.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import Generic, Protocol, Self, TypeVar
+
+from es_service.dispatch import messages, scheduler
+from es_service.errors import EvaluationError, Interrupted
+from es_service.protocol import Centre, Chunk, ChunkKey, ChunkResult, DispatchCounts
+
+POLL_S = 0.1
+"""Longest wait before a request to stop is noticed."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A worker has run a chunk: the event `Result` with what it stands for."""
+
+    worker: int
+    key: Hashable
+    attempt: int
+    result: ChunkResult
+
+
+Message = messages.WorkerUp | messages.WorkerLost | messages.Failure | Answer
+"""What a transport reports: the scheduler's own events, and answers."""
+
+
+class Transport(Protocol):
+    """Workers somewhere, by id. Called from one thread; no call waits for what a worker is doing.
+
+    No call raises because of a worker: whatever goes wrong with one, starting it included, is a `WorkerLost`.
+    """
+
+    def start(self, worker: int) -> None:
+        """Begin to start a worker; `WorkerUp` or `WorkerLost` follows."""
+        ...
+
+    def kill(self, worker: int) -> None:
+        """Kill a worker for good and free what it held; nothing happens if it is gone.
+
+        Messages of a killed worker may still be received (that it is lost, too): the scheduler has forgotten it and
+        drops them, so a transport need not look for them.
+        """
+        ...
+
+    def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunk: Chunk) -> None:
+        """Have a worker that is up run the chunk around the centre, behind those it was sent before."""
+        ...
+
+    def receive(self, timeout_s: float) -> Message | None:
+        """The next message, each worker's in order; None if none comes in `timeout_s` (0: if none is there).
+
+        A worker reported lost is gone for good: no `kill` need follow.
+        """
+        ...
+
+    def close(self) -> None:
+        """Kill all workers and wait for them to end."""
+        ...
+
+
+AnyTransport = TypeVar("AnyTransport", bound=Transport)
+
+
+class Engine(Generic[AnyTransport]):
+    """An Evaluator. Use as a context manager: leaving it kills the workers, who hold nothing."""
+
+    def __init__(
+        self, transport: AnyTransport, policy: messages.Policy, should_stop: Callable[[], int | None] = lambda: None
+    ) -> None:
+        """Start `policy.workers` workers.
+
+        Args:
+            transport: belongs to the engine from now on, which closes it.
+            should_stop: asked at least every POLL_S while waiting; a signal number makes `evaluate` raise Interrupted.
+        """
+        self.transport = transport
+        self._should_stop = should_stop
+        self._state = scheduler.initial_state(policy)
+        self._centre: Centre | None = None
+        self._phase = 0
+        self._chunks: dict[Hashable, Chunk] = {}
+        self._results: dict[Hashable, ChunkResult] = {}
+        self._step(messages.Tick())
+
+    @property
+    def counts(self) -> DispatchCounts:
+        """Faults survived so far."""
+        state = self._state
+        return DispatchCounts(retries=state.retries, lost_workers=state.lost_workers, workers=state.wanted)
+
+    def evaluate(self, centre: Centre, chunks: Sequence[Chunk]) -> list[ChunkResult]:
+        """Results in the order of `chunks`, however many workers there are and whatever happens to them.
+
+        Raises:
+            EvaluationError: a chunk that fails everywhere, workers that do not start. Interrupted: asked to stop.
+                After either, `close` is all that is left to do.
+        """
+        while (message := self.transport.receive(0.0)) is not None:
+            self._handle(message)  # a worker lost since the last call gets no chunk, so no chunk is blamed for it
+        self._phase += 1
+        keys = [ChunkKey(self._phase, type(chunk).__name__, chunk.generation, chunk.chunk_id) for chunk in chunks]
+        self._centre, self._chunks, self._results = centre, dict(zip(keys, chunks, strict=True)), {}
+        self._step(messages.Submit(tuple(messages.Task(key, key.kind) for key in keys)))
+        while scheduler.pending(self._state):
+            if (number := self._should_stop()) is not None:
+                raise Interrupted(number)
+            wait_s = min(POLL_S, max(0.0, scheduler.next_deadline(self._state) - time.monotonic()))
+            if (message := self.transport.receive(wait_s)) is not None:
+                self._handle(message)
+            else:  # only now: a late look at the clock must not kill workers whose answers were waiting
+                self._step(messages.Tick())
+        return [self._results.pop(key) for key in keys]
+
+    def close(self) -> None:
+        """Kill all workers and wait for them."""
+        self.transport.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _handle(self, message: Message) -> None:
+        if not isinstance(message, Answer):
+            self._step(message)
+        elif self._step(messages.Result(message.worker, message.key, message.attempt)):
+            self._results[message.key] = message.result
+
+    def _step(self, event: messages.Event) -> bool:
+        """Feed the scheduler and do as it says; whether it accepted a result."""
+        self._state, commands = scheduler.step(self._state, event, time.monotonic())
+        for command in commands:
+            match command:
+                case messages.StartWorker(worker):
+                    self.transport.start(worker)
+                case messages.StopWorker(worker, _):
+                    self.transport.kill(worker)
+                case messages.Assign(worker, key, attempt):
+                    assert self._centre is not None
+                    self.transport.send(worker, self._centre, key, attempt, self._chunks[key])
+        if self._state.failed is not None:
+            raise EvaluationError(self._state.failed)
+        return any(isinstance(command, messages.Deliver) for command in commands)

@@ -1,0 +1,338 @@
+"""The engine on a scripted transport in memory, and on real child processes that are killed and stopped."""
+
+from __future__ import annotations
+
+import os
+import queue
+import random
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from multiprocessing import Pipe
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from es_service.dispatch import engine as engine_module
+from es_service.dispatch import inline_engine as inline_module
+from es_service.dispatch.engine import POLL_S, Answer, Engine
+from es_service.dispatch.inline_engine import inline_engine
+from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
+from es_service.errors import EvaluationError, Interrupted
+from es_service.protocol import EvaluationChunk, PolicyShape, TrainingChunk
+from tests.helpers import SPEC, centre, random_parameters, spec
+
+FIRST, SECOND = centre(random_parameters(0)), centre(random_parameters(1))
+CHUNKS = [TrainingChunk(3, chunk_id) for chunk_id in range(8)]
+
+
+@dataclass(frozen=True)
+class Sent:
+    """One chunk sent to a worker, and what the worker might say about it."""
+
+    worker: int
+    centre: Any
+    key: Any
+    attempt: int
+    chunk: Any
+
+    def answer(self) -> Answer:
+        return Answer(self.worker, self.key, self.attempt, expected(self.centre, self.chunk))
+
+    def failure(self) -> Failure:
+        return Failure(self.worker, self.key, self.attempt, "no")
+
+
+def expected(point, chunk) -> Any:
+    """Stands for a result: names what it is the result of."""
+    return (id(point), chunk)
+
+
+class Scripted:
+    """A Transport in memory. Workers come up at once; the hooks, which tests replace, say what they do after that."""
+
+    def __init__(self) -> None:
+        self.inbox: deque = deque()
+        self.sent: list[Sent] = []
+        self.killed: list[int] = []
+        self.waits: list[float] = []
+        self.closed = False
+        self.on_send: Callable[[Sent], Any] = lambda sent: self.inbox.append(sent.answer())
+        self.on_wait: Callable[[], Any] = lambda: None
+
+    def start(self, worker):
+        self.inbox.append(WorkerUp(worker))
+
+    def kill(self, worker):
+        self.killed.append(worker)
+
+    def send(self, worker, centre, key, attempt, chunk):
+        self.sent.append(Sent(worker, centre, key, attempt, chunk))
+        self.on_send(self.sent[-1])
+
+    def receive(self, timeout_s):
+        """Nothing is there: `on_wait` may change that if the engine is willing to wait."""
+        self.waits.append(timeout_s)
+        if not self.inbox and timeout_s:
+            self.on_wait()
+        return self.inbox.popleft() if self.inbox else None
+
+    def close(self):
+        self.closed = True
+
+
+def scripted_with_clock(monkeypatch, now: list[float]) -> Scripted:
+    """A transport under a clock that shows `now[0]` and goes on only while the engine waits."""
+    transport = Scripted()
+    transport.on_wait = lambda: now.__setitem__(0, now[0] + transport.waits[-1])
+    monkeypatch.setattr(engine_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    return transport
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_results_come_in_chunk_order_whatever_the_order_of_the_answers(seed):
+    rng, transport, held = random.Random(seed), Scripted(), []
+
+    def answer_some():
+        rng.shuffle(held)
+        for _ in range(rng.randint(1, len(held))):
+            transport.inbox.append(held.pop().answer())
+
+    transport.on_send, transport.on_wait = held.append, answer_some
+    with Engine(transport, Policy(workers=3)) as engine:
+        for point in (FIRST, SECOND, FIRST):
+            chunks = rng.sample(CHUNKS, len(CHUNKS))
+            assert engine.evaluate(point, chunks) == [expected(point, chunk) for chunk in chunks]
+        assert (engine.counts.retries, engine.counts.lost_workers, engine.counts.workers) == (0, 0, 3)
+    assert transport.closed
+
+
+@pytest.mark.parametrize("already_there", [True, False])
+def test_a_late_answer_of_an_earlier_call_is_not_taken_for_one_of_this(already_there):
+    """The same chunks around another centre: only the number of the call tells the two answers apart."""
+    transport = Scripted()
+    late = []
+
+    def contradict(sent: Sent):
+        """The first chunk is reported failed, runs elsewhere, and its first worker answers after all, much later."""
+        if not late:
+            late.append(sent.answer())
+            transport.inbox.append(sent.failure())
+        else:
+            transport.inbox.append(sent.answer())
+
+    transport.on_send = contradict
+    with Engine(transport, Policy(workers=2)) as engine:
+        assert engine.evaluate(FIRST, CHUNKS) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        if already_there:
+            transport.inbox.append(late[0])
+        transport.on_send = lambda sent: transport.inbox.extend([*late, sent.answer()])
+        assert engine.evaluate(SECOND, CHUNKS) == [expected(SECOND, chunk) for chunk in CHUNKS]
+        assert transport.killed == []
+
+
+def test_a_worker_lost_between_two_calls_gets_no_chunk_and_no_chunk_is_blamed():
+    transport = Scripted()
+    with Engine(transport, Policy(workers=2)) as engine:
+        engine.evaluate(FIRST, CHUNKS)
+        transport.inbox.append(WorkerLost(0, "gone"))
+        transport.sent.clear()
+        assert engine.evaluate(SECOND, CHUNKS) == [expected(SECOND, chunk) for chunk in CHUNKS]
+        assert {sent.worker for sent in transport.sent} == {1, 2}
+        assert {sent.attempt for sent in transport.sent} == {1}
+        assert (engine.counts.retries, engine.counts.lost_workers) == (0, 1)
+
+
+def test_the_chunk_of_a_worker_lost_in_mid_call_runs_elsewhere():
+    transport = Scripted()
+
+    def die_once(sent: Sent):
+        transport.inbox.append(WorkerLost(0, "gone") if sent.worker == 0 else sent.answer())
+
+    transport.on_send = die_once
+    with Engine(transport, Policy(workers=2)) as engine:
+        assert engine.evaluate(FIRST, CHUNKS) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        assert (engine.counts.retries, engine.counts.lost_workers) == (2, 1)
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_what_a_lost_worker_still_says_is_dropped(before):
+    """Whether its chunks still wait or have been answered by another."""
+    transport = Scripted()
+
+    def contradict(sent: Sent):
+        last_words = Answer(0, sent.key, sent.attempt, "not to be trusted")  # pyright: ignore[reportArgumentType]
+        if sent.worker == 0:
+            transport.inbox.extend([WorkerLost(0, "gone"), WorkerUp(0), sent.failure()])
+        else:
+            transport.inbox.extend([last_words, sent.answer()] if before else [sent.answer(), last_words])
+
+    transport.on_send = contradict
+    with Engine(transport, Policy(workers=2)) as engine:
+        assert engine.evaluate(FIRST, CHUNKS) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        assert engine.counts.lost_workers == 1
+
+
+def test_a_chunk_that_fails_everywhere_is_named_and_ends_the_engine():
+    transport = Scripted()
+    transport.on_send = lambda sent: transport.inbox.append(
+        sent.failure() if sent.chunk.chunk_id == 2 else sent.answer()
+    )
+    with Engine(transport, Policy(workers=2, restart_backoff_s=0.0)) as engine:
+        for _ in range(2):  # and again, rather than wait for ever, if it is asked again
+            with pytest.raises(EvaluationError, match=r"TrainingChunk 2 of generation 3 failed in 4 attempts.*: no"):
+                engine.evaluate(FIRST, CHUNKS)
+        assert sorted(transport.killed) == [0, 1]
+
+
+@pytest.mark.parametrize("flood", [False, True])
+def test_a_request_to_stop_is_noticed_at_the_next_message_or_poll(flood):
+    """Workers that say nothing, and one that never stops talking."""
+    transport, asked = Scripted(), []
+
+    def should_stop():
+        asked.append(len(transport.waits))
+        return signal.SIGTERM if len(asked) == 4 else None
+
+    transport.on_send = lambda sent: None
+    if flood:
+        transport.on_wait = lambda: transport.inbox.extend([WorkerUp(0)] * 1000)
+    with Engine(transport, Policy(workers=2), should_stop) as engine:
+        with pytest.raises(Interrupted) as caught:
+            engine.evaluate(FIRST, CHUNKS)
+        assert caught.value.signal_number == signal.SIGTERM
+    assert len(asked) == 4
+    assert len(transport.waits) - asked[0] == 3
+    assert max(transport.waits) == POLL_S == 0.1
+
+
+@pytest.mark.parametrize("answered", [True, False])
+def test_answers_that_wait_are_read_before_the_clock(monkeypatch, answered):
+    """A driver busy elsewhere (the clock leaps while it sends) must not kill workers that answered in time."""
+    now = [0.0]
+    transport = scripted_with_clock(monkeypatch, now)
+
+    def leap(sent: Sent):
+        now[0] += 100.0
+        if answered or sent.worker > 1:
+            transport.inbox.append(sent.answer())
+
+    transport.on_send = leap
+    with Engine(transport, Policy(workers=2, first_deadline_s=1.0, min_deadline_s=1.0)) as engine:
+        assert engine.evaluate(FIRST, CHUNKS) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        assert transport.killed == ([] if answered else [0, 1])
+        assert engine.counts.lost_workers == (0 if answered else 2)
+
+
+def test_the_next_deadline_bounds_the_wait(monkeypatch):
+    """Late by no more than one message, not by a whole poll."""
+    now = [0.0]
+    transport = scripted_with_clock(monkeypatch, now)
+    transport.on_send = lambda sent: transport.inbox.append(sent.answer()) if sent.worker else None
+    with Engine(transport, Policy(workers=1, first_deadline_s=0.25)) as engine:
+        engine.evaluate(FIRST, CHUNKS)
+    assert transport.killed == [0]
+    assert now[0] == pytest.approx(0.25)
+
+
+# Child processes.
+
+
+def footprint() -> tuple[int, int, int]:
+    """What this process holds: open file descriptors, threads, child processes."""
+    tasks = Path("/proc/self/task").iterdir()
+    children = sum(len((task / "children").read_text().split()) for task in tasks)
+    return len(os.listdir("/proc/self/fd")), threading.active_count(), children
+
+
+def assert_same(results, others) -> None:
+    np.testing.assert_equal([asdict(result) for result in results], [asdict(other) for other in others])
+
+
+def test_killed_children_change_no_result_and_leave_nothing_behind(monkeypatch):
+    """Eight in a row, by turns between two calls and in the middle of one. Slow threads are waited for."""
+    read = inline_module._read
+    monkeypatch.setattr(inline_module, "_read", lambda *arguments: (read(*arguments), time.sleep(0.05)))
+    before = footprint()
+    chunks = [EvaluationChunk(1, chunk_id) for chunk_id in range(8)]
+    countdown, victim = 0, 0
+
+    def kill_in_the_middle():
+        nonlocal countdown
+        countdown -= 1
+        if countdown == 0:
+            os.kill(victim, signal.SIGKILL)
+
+    with inline_engine(SPEC, Policy(workers=1, restart_backoff_s=0.01), kill_in_the_middle) as engine:
+        first = engine.evaluate(FIRST, chunks)
+        settled = footprint()
+        for kill in range(1, 9):
+            (victim,) = engine.transport.process_ids().values()
+            if kill % 2:
+                os.kill(victim, signal.SIGKILL)
+            else:
+                countdown = 3  # asked once before each message, so two of the eight have been answered
+            assert_same(engine.evaluate(FIRST, chunks), first)
+            assert engine.counts.lost_workers == kill
+        assert footprint() == settled
+    assert footprint() == before
+    engine.close()  # again: nothing happens
+
+
+@pytest.mark.timeout(60)
+def test_a_child_stopped_in_mid_message_blocks_nobody():
+    """Its pipe holds a fraction of a 5 MB centre. The deadline passes, it is replaced, the result is right."""
+    wide = spec(policy=PolicyShape((2, 1120, 1120, 2)), episode_steps=2)
+    one, other = (centre(random_parameters(seed, wide.policy.parameters, 0.03)) for seed in (0, 1))
+    assert one.parameters_D.nbytes > 5_000_000
+    chunks = [EvaluationChunk(1, chunk_id) for chunk_id in range(3)]
+    before = footprint()
+    with inline_engine(wide, Policy(workers=1, min_deadline_s=0.5)) as engine:
+        result = engine.evaluate(one, chunks)
+        with pytest.raises(AssertionError):
+            assert_same(engine.evaluate(other, chunks), result)
+        (victim,) = engine.transport.process_ids().values()
+        os.kill(victim, signal.SIGSTOP)
+        assert_same(engine.evaluate(one, chunks), result)
+        assert engine.counts.lost_workers == 1
+        assert victim not in engine.transport.process_ids().values()
+    assert footprint() == before
+
+
+def test_a_loss_is_reported_while_the_writer_is_still_blocked():
+    """A child that says no more and reads no more, but lives: it is killed only because of this message."""
+    ours, theirs = Pipe()
+    with theirs, socket.socket(fileno=os.dup(theirs.fileno())) as end:
+        end.shutdown(socket.SHUT_WR)
+        outbox, inbox = queue.SimpleQueue(), queue.SimpleQueue()
+        outbox.put(bytes(5_000_000))
+        reader = threading.Thread(target=inline_module._read, args=(7, ours, outbox, inbox), daemon=True)
+        reader.start()
+        assert inbox.get(timeout=5.0) == (7, ("lost",))
+        time.sleep(0.05)
+        assert not ours.closed
+    reader.join(5.0)
+    assert not reader.is_alive()
+    assert ours.closed
+
+
+def test_children_that_cannot_be_started_are_lost_workers_and_leave_nothing_behind(monkeypatch):
+    def no_more(*_, **__):
+        raise OSError(24, "Too many open files")
+
+    before = footprint()
+    monkeypatch.setattr(subprocess, "Popen", no_more)
+    with (
+        inline_engine(SPEC, Policy(workers=1, restart_backoff_s=0.0)) as engine,
+        pytest.raises(EvaluationError, match=r"(?s)3 workers in a row.*cannot be started.*Too many open files"),
+    ):
+        engine.evaluate(FIRST, CHUNKS)
+    assert footprint() == before
