@@ -129,6 +129,8 @@ def main() -> None:
     """Run the command; turn errors into one readable message and an exit code. `__main__` is the way in."""
     try:
         app()
+    except Interrupted:
+        raise
     except ConfigError as error:
         _print_error(str(error))
         sys.exit(2)
