@@ -167,7 +167,7 @@ def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -
         ConfigError: as `load_config`, or the parent's state does not fit the changes.
     """
     origin = open_run(parent)
-    overrides = list(overrides)
+    overrides = [overrides] if isinstance(overrides, str) else list(overrides)
     keys = [override.partition("=")[0].strip() for override in overrides]
     if "search.preset" in keys:
         raise ConfigError(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +19,7 @@ from es_service import api, digest
 from es_service.config.resolution import config_warnings
 from es_service.errors import ConfigError, EvaluationError, Interrupted, ServiceError
 from es_service.report.catalogue import print_catalogue
-from es_service.report.progress import show_progress
+from es_service.report.progress import Row, show_progress
 from es_service.report.status import follow_status, print_status, print_summary
 from es_service.store.folder import DATABASE
 from workers.environments import TASKS
@@ -27,7 +28,6 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Evolution strategies for neuro-evolution on hard-exploration control tasks.",
 )
 console = Console()
 errors = Console(stderr=True)
@@ -38,8 +38,23 @@ SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one key, e.g. search.sigma=0.05.")
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the new run; default: a name under runs/.")]
-WorkersOption = Annotated[int | None, typer.Option("--workers", help="Worker processes; default: one per core.")]
+WorkersOption = Annotated[int | None, typer.Option("--workers", help="Worker processes; default: as configured.")]
 EngineOption = Annotated[str | None, typer.Option("--engine", help="What runs the workers: inline.")]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(metadata.version("es-service"))
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Evolution strategies for neuro-evolution on hard-exploration control tasks."""
 
 
 @app.command()
@@ -137,19 +152,31 @@ def main() -> None:
     except ServiceError as error:
         _print_error(str(error))
         sys.exit(1)
+    except MemoryError as error:
+        _print_error(f"not enough memory: {error}. A smaller policy.hidden or search.pairs needs less.")
+        sys.exit(1)
 
 
 def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
     """Show a run while it works, and at its end what came of it."""
+    began = False
+
+    def show_and_note(show: Callable[[Row], None], row: Row) -> None:
+        nonlocal began
+        began = True  # whatever has become of the folder's name since
+        show(row)
+
     try:
         with show_progress(console, errors, str(folder)) as (show, note):
-            outcome = work(on_generation=show, on_notice=note)
-    except (Interrupted, EvaluationError) as stop:
-        what = "interrupted" if isinstance(stop, Interrupted) else "stopped by an error"
-        if (folder / DATABASE).exists():
-            _print_note(f"{what}; every finished generation is saved. Go on with: es-service resume {folder}")
+            outcome = work(on_generation=partial(show_and_note, show), on_notice=note)
+    except Interrupted:
+        if began or (folder / DATABASE).exists():
+            _print_note(f"interrupted; every finished generation is saved. Go on with: es-service resume {folder}")
         else:
-            _print_note(f"{what} before the run began; nothing was written")
+            _print_note("interrupted before the run began; nothing was written")
+        raise
+    except EvaluationError:
+        _print_note(f"every finished generation is saved. Once the cause is gone: es-service resume {folder}")
         raise
     print_summary(console, outcome.run, outcome.reason)
 

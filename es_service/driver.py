@@ -16,6 +16,7 @@ import numpy as np
 
 from es_service.algorithms.base import Algorithm
 from es_service.config.model import BudgetConfig, RunConfig
+from es_service.errors import EvaluationError
 from es_service.generation import estimate_gradient, evaluate_centre, evaluate_population, invalidate, valid_members
 from es_service.history import evaluation_columns, population_columns
 from es_service.protocol import Centre, DispatchCounts, EpisodesResult, Evaluator, FloatArray, Moments, TaskSpec
@@ -80,11 +81,11 @@ def run(
 def spent(budget: BudgetConfig, state: RunState) -> str | None:
     """Why the run is over, or None if it is not. Budgets are checked between generations, so steps may overshoot."""
     if budget.generations is not None and state.generation >= budget.generations:
-        return f"{state.generation} generations are done"
+        return f"the budget of {budget.generations:,} generations is spent"
     if budget.env_steps is not None and state.env_steps >= budget.env_steps:
-        return f"{state.env_steps:,} environment steps are done"
+        return f"the budget of {budget.env_steps:,} environment steps is spent"
     if budget.wall_clock_s is not None and state.wall_clock_s >= budget.wall_clock_s:
-        return f"{state.wall_clock_s:.0f} s are spent"
+        return f"the budget of {budget.wall_clock_s:g} s is spent"
     if budget.target_fitness is not None and state.best.fitness >= budget.target_fitness:
         return f"the target fitness {budget.target_fitness:g} is reached"
     return None
@@ -137,6 +138,12 @@ def _next_generation(
     clock.lap("seconds_gradient")
     moved = algorithm.step(state.search, plan, gradient_D)
     new_centre_D = moved.members[plan.member].centre_D
+    if not np.isfinite(new_centre_D).all():
+        raise EvaluationError(
+            f"generation {generation}: the centre is not finite after its update, so it is not kept. Everything up to "
+            f"generation {generation - 1} is saved; go on from there with a smaller search.learning_rate "
+            f"({settings.learning_rate:g} now): es-service fork RUN --set search.learning_rate=..."
+        )
     clock.lap("seconds_driver")
     new_centre = replace(centre, parameters_D=new_centre_D)  # evaluated with the statistics of the generation's start
     evaluation = evaluate_centre(evaluator, new_centre, settings.evaluation_episodes)

@@ -41,11 +41,12 @@ def adam_ascent(
     Source: released code of deep-neuroevolution and ME-ES (optimizers.py); constants 0.9, 0.999, 1e-8.
     """
     step = adam.step + 1
-    descent_D = centre_D * np.float32(l2) - gradient_D
-    m_D = adam.m_D * np.float32(BETA_1) + descent_D * np.float32(1.0 - BETA_1)
-    v_D = adam.v_D * np.float32(BETA_2) + np.square(descent_D) * np.float32(1.0 - BETA_2)
-    rate = np.float32(learning_rate * math.sqrt(1.0 - BETA_2**step) / (1.0 - BETA_1**step))
-    new_centre_D = centre_D - m_D * rate / (np.sqrt(v_D) + np.float32(EPSILON))
+    with np.errstate(over="ignore", invalid="ignore"):  # the driver says so if the centre is not finite
+        descent_D = centre_D * np.float32(l2) - gradient_D
+        m_D = adam.m_D * np.float32(BETA_1) + descent_D * np.float32(1.0 - BETA_1)
+        v_D = adam.v_D * np.float32(BETA_2) + np.square(descent_D) * np.float32(1.0 - BETA_2)
+        rate = np.float32(learning_rate * math.sqrt(1.0 - BETA_2**step) / (1.0 - BETA_1**step))
+        new_centre_D = centre_D - m_D * rate / (np.sqrt(v_D) + np.float32(EPSILON))
     return Adam(_float32(m_D), _float32(v_D), step), _float32(new_centre_D)
 
 

@@ -37,8 +37,13 @@ class Policy:
     observation_clip: float | None
 
     def __call__(self, observation: Any) -> FloatArray:
-        """Action for a raw (not normalised) observation; no action noise."""
+        """Action for a raw (not normalised) observation; no action noise. Raises ValueError for another size."""
         observation = np.asarray(observation, np.float32)
+        size = self.shape.widths[0]
+        if observation.shape[-1:] != (size,):
+            raise ValueError(
+                f"this policy takes observations of {size} numbers, [..., {size}]; got {observation.shape}"
+            )
         x = normalise(np, observation, self.observation_mean_O, self.observation_std_O, self.observation_clip)
         return act(np, split_layers(self.shape, self.parameters_D), x)
 

@@ -161,7 +161,7 @@ def _parse_overrides(overrides: Iterable[str]) -> tuple[dict[str, Any], list[str
     """Values by dotted key, and a problem for each override that has none to give."""
     values: dict[str, Any] = {}
     problems: list[str] = []
-    for override in overrides:
+    for override in [overrides] if isinstance(overrides, str) else overrides:
         name, equals, text = (part.strip() for part in override.partition("="))
         where = f"override {override}"
         if not equals or not name or not text:

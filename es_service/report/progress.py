@@ -18,6 +18,8 @@ Row = Mapping[str, Any]
 ShowRow = Callable[[Row], None]
 ShowNotice = Callable[[str], None]
 TABLE_ROWS = 12
+ROWS_AROUND = 9
+"""Lines of a screen that the table's own frame, its title and the line below need."""
 RATE_WINDOW = 20
 """Generations over which steps per second are averaged for display."""
 _PARTS = ("rollout", "gradient", "evaluation", "driver", "store")
@@ -34,7 +36,7 @@ def show_progress(console: Console, errors: Console, title: str) -> Iterator[tup
 
         def show(row: Row) -> None:
             recent.append(row)
-            live.update(live_table(title, recent))
+            live.update(live_table(title, recent, console.width, console.height))
 
         yield show, partial(_print_notice, live.console)  # above the table
 
@@ -43,21 +45,23 @@ def _print_notice(console: Console, notice: str) -> None:
     console.print(f"note: {notice}", highlight=False, markup=False, soft_wrap=True)
 
 
-def live_table(title: str, recent: deque[Row]) -> Group:
-    """The last generations, and where their time went."""
+def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group:
+    """The last generations, and where their time went; fewer columns and rows on a small screen."""
+    columns: dict[str, Callable[[Row], str]] = {
+        "generation": lambda row: str(row["generation"]),
+        "centre fitness": lambda row: f"{row['centre_fitness_mean']:.2f} ± {row['centre_fitness_std']:.2f}",
+        "best so far": lambda row: f"{row['best_fitness']:.2f}",
+        "env steps": lambda row: _short(row["env_steps"]),
+        "steps/s": lambda row: _short(row["steps_per_second"]),
+        "population median": lambda row: _number(row["population_fitness_median"]),
+        "invalid": lambda row: str(row["invalid_members"]),
+    }
+    shown = [name for name, least in zip(columns, (0, 0, 45, 60, 75, 100, 110), strict=True) if width >= least]
     table = Table(title=title, title_justify="left", header_style="bold")
-    for name in ("generation", "centre fitness", "best so far", "population median", "env steps", "steps/s", "invalid"):
-        table.add_column(name, justify="right")
-    for row in list(recent)[-TABLE_ROWS:]:
-        table.add_row(
-            str(row["generation"]),
-            f"{row['centre_fitness_mean']:.2f} ± {row['centre_fitness_std']:.2f}",
-            f"{row['best_fitness']:.2f}",
-            _number(row["population_fitness_median"]),
-            f"{row['env_steps']:,}",
-            f"{row['steps_per_second']:,.0f}",
-            str(row.get("invalid_members") or 0),
-        )
+    for name in shown:
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in list(recent)[-max(1, min(TABLE_ROWS, height - ROWS_AROUND)) :]:
+        table.add_row(*(columns[name](row) for name in shown))
     return Group(table, Text(time_by_part(recent)))
 
 
@@ -82,17 +86,27 @@ def plain_line(row: Row) -> str:
 
 
 def _plain_lines(console: Console) -> ShowRow:
-    last_s = float("-inf")
+    last_s, lost = float("-inf"), 0
 
     def show(row: Row) -> None:
-        nonlocal last_s
+        nonlocal last_s, lost
+        lost += row["lost_workers"]
         now = time.monotonic()
         if now - last_s >= 1.0:
-            last_s = now
-            console.print(plain_line(row), highlight=False, soft_wrap=True)
+            faults = f"  workers replaced {lost}" if lost else ""
+            console.print(plain_line(row) + faults, highlight=False, soft_wrap=True)
+            last_s, lost = now, 0
 
     return show
 
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
+
+
+def _short(value: float) -> str:
+    """A count with three digits: 850, 12.3 k, 4.56 M."""
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if value >= size:
+            return f"{value / size:.3g} {unit}"
+    return f"{value:.0f}"

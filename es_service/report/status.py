@@ -58,7 +58,7 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
         f"status {folder}",
         f"digest {folder}",
         f"resume {folder} {twice}",
-        f"fork {folder} --set search.sigma=0.05 {twice}",
+        f"fork {folder} --set search.sigma={run.constants['search.sigma'] * 2:g} {twice}",
     ):
         _print_line(console, f"  {program} {command}")
 
@@ -69,6 +69,8 @@ def _progress(rows: list[dict[str, Any]]) -> dict[str, str]:
     if "goal_distance" in last:
         goal["goal distance"] = f"{last['goal_distance']:.3f} at the end, {last['goal_distance_min']:.3f} at its least"
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
+    lost, retries = (sum(row[name] for row in rows) for name in ("lost_workers", "retries"))
+    faults = {"faults survived": f"{lost} workers replaced, {retries} chunks run again"} if lost or retries else {}
     return {
         "generation": str(last["generation"]),
         "best fitness": f"{last['best_fitness']:.2f}",
@@ -76,6 +78,7 @@ def _progress(rows: list[dict[str, Any]]) -> dict[str, str]:
         **goal,
         "environment steps": f"{last['env_steps']:,} in {last['episodes']:,} episodes",
         "time": f"{last['wall_clock_s']:.1f} s, {rate:,.0f} steps/s overall",
+        **faults,
     }
 
 

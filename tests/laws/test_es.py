@@ -87,7 +87,7 @@ def test_twenty_generations_equal_the_twin(finished):
 
 def test_history_counts_what_the_workers_did(finished):
     _, state, store, evaluator, reason = finished
-    assert reason == "20 generations are done"
+    assert reason == "the budget of 20 generations is spent"
     assert [row["generation"] for row in store.rows] == list(range(21))
     trained = [r for _, chunk, r in evaluator.recorded if isinstance(chunk, TrainingChunk)]
     evaluated = [r for _, chunk, r in evaluator.recorded if type(chunk).__name__ == "EvaluationChunk"]
@@ -152,10 +152,10 @@ def test_same_config_same_bits_other_seed_other_bits(finished):
 @pytest.mark.parametrize(
     ("budget", "generations", "reason"),
     [
-        ({"generations": 2}, 2, "2 generations are done"),
-        ({"env_steps": 30_000}, 2, "environment steps are done"),
+        ({"generations": 2}, 2, "the budget of 2 generations is spent"),
+        ({"env_steps": 30_000}, 2, "the budget of 30,000 environment steps is spent"),
         ({"target_fitness": -1e9}, 0, "the target fitness -1e+09 is reached"),
-        ({"wall_clock_s": 1e-6, "generations": 50}, 0, "s are spent"),
+        ({"wall_clock_s": 1e-6, "generations": 50}, 0, "the budget of 1e-06 s is spent"),
     ],
 )
 def test_the_first_spent_budget_ends_the_run(budget, generations, reason):
@@ -202,6 +202,18 @@ def test_too_many_invalid_members_stop_the_run_with_a_named_error():
         EvaluationError, match=r"generation 3: 54 of 96 members .* search.max_invalid_fraction \(0.25\)"
     ):
         run_in_memory(config, Tampering(worker_spec(config, TASKS["point_maze"]), spoil))
+
+
+def test_a_centre_that_is_not_finite_stops_the_run_before_it_is_kept():
+    config = small_config(learning_rate=1e300)
+    evaluator, store = DirectEvaluator(worker_spec(config, TASKS["point_maze"])), MemoryStore()
+    first = initial_parameters(SHAPE, config.policy.init, config.seed)
+    search = driver.Search(
+        config, ALGORITHMS["es"](config.search), lambda: (first, no_observations(2)), TASKS["point_maze"]
+    )
+    with pytest.raises(EvaluationError, match=r"generation 1: the centre is not finite.*learning_rate \(1e\+300 now\)"):
+        driver.run(search, evaluator, store, lambda row: None)
+    assert store.generation == 0
 
 
 def test_an_invalid_centre_is_never_the_best():

@@ -64,7 +64,7 @@ def digest(folder):
 
 def test_run_ends_in_a_summary_with_the_next_commands(finished):
     folder, printed = finished
-    assert "Done: 30 generations are done." in printed
+    assert "Done: the budget of 30 generations is spent." in printed
     for command in ("status", "digest", "resume", "fork"):
         assert f"{PROGRAM} {command} {folder}" in printed
     assert {path.name for path in folder.iterdir()} == {"config.yaml", "run.db", "run.lock"}
@@ -121,7 +121,7 @@ def test_resume_of_a_finished_run_does_nothing(finished):
     before = digest(finished[0])
     code, printed = es("resume", finished[0])
     assert code == 0
-    assert "30 generations are done" in printed
+    assert "the budget of 30 generations is spent" in printed
     assert digest(finished[0]) == before
 
 

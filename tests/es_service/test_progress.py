@@ -1,0 +1,36 @@
+"""The live table fits the screen it is shown on."""
+
+from collections import deque
+
+import pytest
+from rich.console import Console
+
+from es_service.report.progress import live_table
+
+ROW = {
+    "generation": 123456,
+    "centre_fitness_mean": -1234.56,
+    "centre_fitness_std": 123.45,
+    "best_fitness": -1234.56,
+    "population_fitness_median": None,
+    "env_steps": 123_456_789_012,
+    "steps_per_second": 4_567_890.0,
+    "invalid_members": 0,
+    "lost_workers": 1,
+    **{f"seconds_{part}": 0.1 for part in ("rollout", "gradient", "evaluation", "driver", "store")},
+}
+
+
+@pytest.mark.parametrize(("width", "height"), [(40, 24), (60, 24), (80, 24), (100, 12), (120, 50), (200, 60)])
+def test_the_live_table_fits_the_screen(width, height):
+    console = Console(width=width, height=height, force_terminal=False)
+    with console.capture() as capture:
+        console.print(live_table("runs/a", deque([ROW] * 20), width, height))
+    lines = capture.get().splitlines()
+    assert len(lines) <= height
+    assert all(len(line) <= width for line in lines)
+    table = [line for line in lines if "123456" in line]
+    assert 1 <= len(table) <= 12
+    assert all("…" not in line for line in table)
+    assert ("4.57 M" in table[0]) == (width >= 75)
+    assert "workers replaced: 20" in " ".join(" ".join(lines).split())
