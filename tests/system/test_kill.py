@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import signal
@@ -25,14 +26,12 @@ def reference(tmp_path_factory):
     return digest_parts(folder)
 
 
-HOOKS = ["opened", "before_begin", "mid_transaction", "before_commit", "after_commit", "before_checkpoint"]
+AROUND_A_COMMIT = ["before_begin", "mid_transaction", "before_commit", "after_commit"]
+ONCE = [("opened", 1), ("before_checkpoint", 1)]  # in so short a session: at its start, at its end
 
 
-@pytest.mark.parametrize("nth", [1, 7])
-@pytest.mark.parametrize("at", HOOKS)
+@pytest.mark.parametrize(("at", "nth"), [*ONCE, *itertools.product(AROUND_A_COMMIT, (1, 7))])
 def test_killed_at_a_hook(tmp_path, reference, at, nth):
-    if at in ("opened", "before_checkpoint"):
-        nth = 1  # once in so short a session: at its start, at its end
     folder = tmp_path / "run"
     assert finish(folder, config=SMALL, kill={"at": at, "nth": nth}) == -signal.SIGKILL
     expected = {"opened": None, "before_checkpoint": 30, "after_commit": nth - 1}.get(at, nth - 2)
