@@ -31,7 +31,8 @@ from es_service.statistics import no_observations
 from es_service.store import reader
 from es_service.store.beginning import Beginning
 from es_service.store.folder import explained, write_config
-from es_service.store.writer import RunMeta, RunStore, no_hook
+from es_service.store.schema import RunMeta
+from es_service.store.writer import RunStore, no_hook
 from workers.environments import TASKS
 from workers.policy import initial_parameters
 

@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 from es_service.optimizer import Adam
 from es_service.protocol import EpisodesResult, FloatArray
 
-Parts = Mapping[str, Mapping[str, np.ndarray]]
-"""State as the store keeps it: named parts of named arrays. Only parts that changed need be written."""
-
 
 @dataclass(frozen=True)
 class Member:

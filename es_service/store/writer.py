@@ -31,19 +31,16 @@ from es_service.store.codec import (
 )
 from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
-from es_service.store.lock import RunLock, acquire_lock, lock_holder
+from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.repair import open_sound
 from es_service.store.schema import PAGE_BYTES, RunMeta, history_insert, history_select
 from es_service.store.upkeep import Upkeep
 from es_service.store.verify import rows_in_force, state_in_force
 
-__all__ = ["Part", "RunMeta", "RunStore", "Values", "is_network_filesystem", "lock_holder", "no_hook"]
-
 Values = Mapping[str, int | float | None]
 """One history row by column name; NaN or None for no value."""
-
-
 NOTHING = Beginning()
+"""The beginning of an ordinary run."""
 
 
 def no_hook(name: str) -> None:
