@@ -1,7 +1,7 @@
 # Two commands: `make run` and `make test`. Both prepare .venv first; nothing but Python 3.11 or newer is needed.
 PYTHON ?= python3
 BIN := .venv/bin
-CONFIG ?= configs/point_maze_es.yaml
+CONFIG ?= configs/point_maze_nsra_es.yaml
 
 .PHONY: run test lint clean
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from es_service import driver
 from es_service.algorithms import ALGORITHMS
-from es_service.algorithms.base import member_from_arrays, member_part
 from es_service.config import loading
 from es_service.config.model import RunConfig, changed_constants, describe_changes, policy_shape, worker_spec
 from es_service.dispatch.inline_engine import inline_engine
@@ -181,7 +180,7 @@ def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -
         for shape in ("chunk_pairs", "rollout_block_pairs", "gradient_block_pairs"):
             mapping["compute"][shape] = "auto"
     config = loading.load_config(mapping, overrides, tasks=TASKS, algorithms=ALGORITHMS)
-    fixed = ("task.environment", "policy.hidden", "search.algorithm")
+    fixed = ("task.environment", "policy.hidden", "search.algorithm", "search.members")
     if unfit := [change for change in changed_constants(origin.constants, config.constants()) if change[0] in fixed]:
         listed = "\n".join(f"  {name}: {old} -> {new}" for name, old, new in unfit)
         raise ConfigError(
@@ -268,7 +267,7 @@ def _work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_no
     )
     search = driver.Search(
         config=config,
-        algorithm=ALGORITHMS[config.search.algorithm](config.search),
+        algorithm=ALGORITHMS[config.search.algorithm](config),
         initial=lambda: _initial(config, store),
         task=task,
     )
@@ -281,13 +280,15 @@ def _task(config: RunConfig) -> TaskSpec:
     return TASKS[config.task.environment]
 
 
-def _initial(config: RunConfig, store: RunStore) -> tuple[FloatArray, Moments]:
-    """The first centre with its observation statistics: random with none, or those the run was created with."""
-    task = _task(config)
+def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Moments]:
+    """Each member's first centre, and the observation statistics: random ones with none, or all of them the one that
+    the run was created with."""
+    task, members = _task(config), range(config.search.members)
     if store.start is not None:
-        return store.start["centre_D"], moments_from_arrays(store.start)
-    centre_D = initial_parameters(policy_shape(config, task), config.policy.init, config.seed)
-    return centre_D, no_observations(task.observation_size)
+        return [store.start["centre_D"] for _ in members], moments_from_arrays(store.start)
+    shape = policy_shape(config, task)
+    centres = [initial_parameters(shape, config.policy.init, config.seed, member) for member in members]
+    return centres, no_observations(task.observation_size)
 
 
 def _start_from(config: RunConfig, folder: str) -> tuple[dict[str, Any], Beginning]:
@@ -299,8 +300,10 @@ def _start_from(config: RunConfig, folder: str) -> tuple[dict[str, Any], Beginni
             f"this run's has {list(shape.widths)}; use the same task and policy.hidden"
         )
     at, parts = origin.parts()
-    member = member_from_arrays(parts[member_part(0)])
-    start = {"centre_D": member.centre_D, **moments_to_arrays(moments_from_arrays(parts["observations"]))}
+    start = {
+        "centre_D": origin.newest_centre(at, parts),
+        **moments_to_arrays(moments_from_arrays(parts["observations"])),
+    }
     return _lineage(origin, at), Beginning(start=start)
 
 

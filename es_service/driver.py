@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 
-from es_service.algorithms.base import Algorithm
+from es_service.algorithms.base import Algorithm, Judgement, SearchState
+from es_service.algorithms.steps import first_state
 from es_service.config.model import BudgetConfig, RunConfig
 from es_service.errors import EvaluationError
 from es_service.generation import estimate_gradient, evaluate_centre, evaluate_population, invalidate, valid_members
 from es_service.history import evaluation_columns, population_columns
+from es_service.novelty import novelty
 from es_service.protocol import Centre, DispatchCounts, EpisodesResult, Evaluator, FloatArray, Moments, TaskSpec
 from es_service.run_state import Arrays, Best, RunState, state_from_parts, state_parts
 from es_service.statistics import merge_moments, normalisation
@@ -43,8 +45,9 @@ class Search:
 
     config: RunConfig
     algorithm: Algorithm
-    initial: Callable[[], tuple[FloatArray, Moments]]
-    """First centre and the observation statistics it comes with (none counted unless it is another run's)."""
+    initial: Callable[[], tuple[Sequence[FloatArray], Moments]]
+    """First centre of each member, and the observation statistics they come with (none counted unless they are
+    another run's)."""
     task: TaskSpec
 
 
@@ -71,7 +74,8 @@ def run(
         state = _keep(store, report, clock, None, *_first_generation(search, evaluator, clock))
     else:
         last = store.last_history() or {}
-        state = state_from_parts(store.load(), store.generation, float(last.get("wall_clock_s") or 0.0))
+        seconds, dimensions = float(last.get("wall_clock_s") or 0.0), len(search.task.descriptor_names)
+        state = state_from_parts(store.load(), store.generation, seconds, dimensions)
         clock = _Clock(state.wall_clock_s)
     while (reason := spent(budget, state)) is None:
         state = _keep(store, report, clock, state, *_next_generation(search, evaluator, clock, state))
@@ -92,27 +96,35 @@ def spent(budget: BudgetConfig, state: RunState) -> str | None:
 
 
 def _first_generation(search: Search, evaluator: Evaluator, clock: _Clock) -> tuple[RunState, HistoryRow]:
-    """Generation 0: the initial centre, evaluated."""
-    centre_D, observations = search.initial()
-    centre = _centre(search, 0, centre_D, observations)
-    evaluation = evaluate_centre(evaluator, centre, search.config.search.evaluation_episodes)
+    """Generation 0: the initial centres, evaluated. The history shows the fittest of them."""
+    centres, observations = search.initial()
+    moved = first_state(centres, len(search.task.descriptor_names), search.algorithm.fitness_weight)
+    points = [_centre(search, 0, centre_D, observations) for centre_D in centres]
+    episodes = search.config.search.evaluation_episodes
+    evaluations = [evaluate_centre(evaluator, point, episodes, index) for index, point in enumerate(points)]
     clock.lap("seconds_evaluation")
-    worst = Best(0, -math.inf, centre_D, centre.observation_mean_O, centre.observation_std_O)
+    fittest = 0
+    best = Best(0, -math.inf, centres[0], points[0].observation_mean_O, points[0].observation_std_O)
+    for member, (point, evaluation) in enumerate(zip(points, evaluations, strict=True)):
+        moved = search.algorithm.absorb(moved, judge(0, member, evaluation))
+        better = _better(best, point, evaluation)
+        best, fittest = better, fittest if better is best else member
     state = RunState(
         generation=0,
-        search=search.algorithm.start(centre_D),
+        search=moved,
         observations=observations,
-        best=_better(worst, centre, evaluation),
-        env_steps=_steps(evaluation),
-        episodes=evaluation.fitness.size,
+        best=best,
+        env_steps=sum(map(_steps, evaluations)),
+        episodes=sum(evaluation.fitness.size for evaluation in evaluations),
         wall_clock_s=clock.total(),
     )
     row: HistoryRow = {
+        **_search_columns(fittest, search.algorithm.fitness_weight, None, moved),
         "update_norm": None,
-        "parameter_norm": _norm(centre_D),
+        "parameter_norm": _norm(centres[fittest]),
         "invalid_members": 0,
         **population_columns(None),
-        **evaluation_columns(evaluation, search.task),
+        **evaluation_columns(evaluations[fittest], search.task),
         **_faults(evaluator, DispatchCounts()),
     }
     return state, row
@@ -126,7 +138,7 @@ def _next_generation(
     generation = state.generation + 1
     counts = evaluator.counts
 
-    plan = algorithm.plan(state.search)
+    plan = algorithm.plan(state.search, generation)
     centre = _centre(search, generation, plan.centre_D, state.observations)
     clock.lap("seconds_driver")
     population, observed = evaluate_population(evaluator, centre, pairs=settings.pairs, chunk_pairs=sizes.chunk_pairs)
@@ -148,10 +160,25 @@ def _next_generation(
     new_centre = replace(centre, parameters_D=new_centre_D)  # evaluated with the statistics of the generation's start
     evaluation = evaluate_centre(evaluator, new_centre, settings.evaluation_episodes)
     clock.lap("seconds_evaluation")
+    judgement = judge(generation, plan.member, evaluation)
+    learned = algorithm.absorb(moved, judgement)
+    nearest = search.config.novelty
+    centre_novelty = novelty(
+        moved.archive, judgement.descriptor_B, neighbours=nearest.neighbours, distance=nearest.distance
+    )
 
+    row: HistoryRow = {
+        **_search_columns(plan.member, state.search.weight.value, float(centre_novelty), learned),
+        "update_norm": _norm(new_centre_D - plan.centre_D),
+        "parameter_norm": _norm(new_centre_D),
+        "invalid_members": invalid,
+        **population_columns(population),
+        **evaluation_columns(evaluation, search.task),
+        **_faults(evaluator, counts),
+    }
     state = RunState(
         generation=generation,
-        search=moved,
+        search=learned,
         observations=merge_moments(state.observations, observed),
         best=_better(state.best, new_centre, evaluation),
         env_steps=state.env_steps + _steps(population) + _steps(evaluation),
@@ -160,14 +187,6 @@ def _next_generation(
         + evaluation.fitness.size,
         wall_clock_s=clock.total(),
     )
-    row: HistoryRow = {
-        "update_norm": _norm(new_centre_D - plan.centre_D),
-        "parameter_norm": _norm(new_centre_D),
-        "invalid_members": invalid,
-        **population_columns(population),
-        **evaluation_columns(evaluation, search.task),
-        **_faults(evaluator, counts),
-    }
     return state, row
 
 
@@ -203,6 +222,26 @@ def _centre(search: Search, generation: int, centre_D: FloatArray, observations:
     """The point to send out, with the statistics in force."""
     mean_O, std_O = normalisation(observations, search.config.policy.observation_normalization)
     return Centre(generation, centre_D, search.config.search.sigma, mean_O, std_O)
+
+
+def judge(generation: int, member: int, evaluation: EpisodesResult) -> Judgement:
+    """What a centre's evaluation episodes say of it."""
+    return Judgement(
+        generation,
+        member,
+        bool(valid_members(evaluation).all()),
+        float(np.mean(evaluation.fitness, dtype=np.float64)),
+        evaluation.descriptor.astype(np.float64).mean(axis=0),
+    )
+
+
+def _search_columns(member: int, fitness_weight: float, novelty: float | None, after: SearchState) -> HistoryRow:
+    return {
+        "member": member,
+        "fitness_weight": fitness_weight,
+        "centre_novelty": novelty,
+        "archive_size": after.archive.size,
+    }
 
 
 def _better(best: Best, centre: Centre, evaluation: EpisodesResult) -> Best:

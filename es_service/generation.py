@@ -38,10 +38,15 @@ def evaluate_population(
     return _concatenate(results, pairs), [result.moments for result in results if result.moments is not None]
 
 
-def evaluate_centre(evaluator: Evaluator, centre: Centre, episodes: int) -> EpisodesResult:
-    """Roll out the unperturbed centre: results with axis [E]. Episodes past the wanted number are discarded."""
-    chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
-    results = evaluator.evaluate(centre, [EvaluationChunk(centre.generation, chunk_id) for chunk_id in range(chunks)])
+def evaluate_centre(evaluator: Evaluator, centre: Centre, episodes: int, index: int = 0) -> EpisodesResult:
+    """Roll out the unperturbed centre: results with axis [E]. Episodes past the wanted number are discarded.
+
+    Args:
+        index: of this centre among those evaluated in the same generation; each has resets of its own.
+    """
+    count = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
+    chunks = [EvaluationChunk(centre.generation, chunk_id) for chunk_id in range(index * count, (index + 1) * count)]
+    results = evaluator.evaluate(centre, chunks)
     return _concatenate(_all_of(EpisodesResult, results), episodes)
 
 

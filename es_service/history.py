@@ -45,6 +45,10 @@ _GOAL = (
     Column("goal_distance_min", "REAL", True, "least distance to the goal along any evaluation episode"),
 )
 _SEARCH_AND_TIMES = (
+    Column("member", "INTEGER", True, "member whose centre this row is about; of the initial ones, the fittest"),
+    Column("fitness_weight", "REAL", True, "weight of fitness beside novelty in this generation's utilities"),
+    Column("centre_novelty", "REAL", True, "novelty of the mean descriptor in the archive before it entered"),
+    Column("archive_size", "INTEGER", True, "entries of the novelty archive after this generation"),
     Column("update_norm", "REAL", True, "Euclidean norm of the step from the old centre to the new one"),
     Column("parameter_norm", "REAL", True, "Euclidean norm of the new centre"),
     Column("invalid_members", "INTEGER", True, "members with a non-finite fitness or descriptor"),
@@ -64,8 +68,12 @@ _SEARCH_AND_TIMES = (
 def history_columns(task: TaskSpec) -> tuple[Column, ...]:
     """All columns of a run: one `centre_<name>` per descriptor dimension, goal distances if the task has a goal."""
     descriptor = tuple(
-        Column(f"centre_{name}", "REAL", True, f"mean descriptor of the evaluation episodes: {name}")
+        column
         for name in task.descriptor_names
+        for column in (
+            Column(f"centre_{name}", "REAL", True, f"mean descriptor of the evaluation episodes: {name}"),
+            Column(f"centre_{name}_std", "REAL", True, f"standard deviation of {name} over the same episodes"),
+        )
     )
     return (*_FITNESS, *descriptor, *(_GOAL if task.has_goal else ()), *_SEARCH_AND_TIMES)
 
@@ -87,13 +95,15 @@ def population_columns(population: EpisodesResult | None) -> dict[str, float | N
 
 def evaluation_columns(evaluation: EpisodesResult, task: TaskSpec) -> dict[str, float]:
     """What the new centre's evaluation episodes say: fitness, return, where they end, how near the goal."""
-    descriptor_B = evaluation.descriptor.mean(axis=0, dtype=np.float64).tolist()
+    mean_B = evaluation.descriptor.mean(axis=0, dtype=np.float64).tolist()
+    std_B = evaluation.descriptor.std(axis=0, dtype=np.float64).tolist()
     columns = {
         "centre_fitness_mean": float(evaluation.fitness.mean(dtype=np.float64)),
         "centre_fitness_std": float(evaluation.fitness.std(dtype=np.float64)),
         "centre_return_mean": float(evaluation.returns.mean(dtype=np.float64)),
         "centre_return_std": float(evaluation.returns.std(dtype=np.float64)),
-        **{f"centre_{name}": value for name, value in zip(task.descriptor_names, descriptor_B, strict=True)},
+        **{f"centre_{name}": value for name, value in zip(task.descriptor_names, mean_B, strict=True)},
+        **{f"centre_{name}_std": value for name, value in zip(task.descriptor_names, std_B, strict=True)},
     }
     if task.has_goal:
         columns["goal_distance"] = float(evaluation.goal_distance[:, 0].mean(dtype=np.float64))

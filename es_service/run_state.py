@@ -7,7 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from es_service.algorithms.base import SearchState, member_from_arrays, member_part, member_to_arrays
+from es_service.algorithms.base import (
+    SearchState,
+    member_from_arrays,
+    member_part,
+    member_to_arrays,
+    weight_from_arrays,
+    weight_to_arrays,
+)
+from es_service.novelty import archive_from_parts, archive_to_parts
 from es_service.protocol import FloatArray, Moments
 
 Arrays = dict[str, np.ndarray]
@@ -51,20 +59,27 @@ def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
     for index, member in enumerate(state.search.members):
         if before is None or member is not before.search.members[index]:
             parts[member_part(index)] = member_to_arrays(member)
+    if before is None or state.search.weight != before.search.weight:
+        parts["weight"] = weight_to_arrays(state.search.weight)
+    archive, stored = state.search.archive, before.search.archive.size if before is not None else 0
+    if before is None or archive is not before.search.archive:
+        parts |= archive_to_parts(archive, stored)
     if before is None or state.best is not before.best:
         parts["best"] = _best_to_arrays(state.best)
     return parts
 
 
-def state_from_parts(parts: Mapping[str, Mapping[str, np.ndarray]], generation: int, wall_clock_s: float) -> RunState:
-    """Inverse of `state_parts(state, None)`."""
+def state_from_parts(
+    parts: Mapping[str, Mapping[str, np.ndarray]], generation: int, wall_clock_s: float, dimensions: int
+) -> RunState:
+    """Inverse of `state_parts(state, None)`; `dimensions` of a descriptor, as long as the archive has no entry."""
     members = []
     while member_part(len(members)) in parts:
         members.append(member_from_arrays(parts[member_part(len(members))]))
     counters = parts["counters"]
     return RunState(
         generation=generation,
-        search=SearchState(tuple(members)),
+        search=SearchState(tuple(members), archive_from_parts(parts, dimensions), weight_from_arrays(parts["weight"])),
         observations=moments_from_arrays(parts["observations"]),
         best=best_from_arrays(parts["best"]),
         env_steps=int(counters["env_steps"]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 
 from es_service import digest as run_digest
 from es_service.algorithms.base import member_from_arrays, member_part
+from es_service.novelty import archive_from_parts
 from es_service.protocol import FloatArray, PolicyShape
 from es_service.run_state import best_from_arrays, moments_from_arrays
 from es_service.statistics import normalisation
@@ -91,6 +93,16 @@ class Run:
         return reader.read_parts(self.folder, generation)
 
     @property
+    def novelty(self) -> pd.DataFrame:
+        """The novelty archive, one row per evaluated valid centre in order: generation, member, descriptor."""
+        import pandas as pd
+
+        names = self.meta.task["descriptor_names"]
+        archive = archive_from_parts(self.parts()[1], len(names))
+        columns = {"generation": archive.generation_N, "member": archive.member_N}
+        return pd.DataFrame(columns | dict(zip(names, archive.descriptor_N_B.T, strict=True)))
+
+    @property
     def generation(self) -> int | None:
         """Newest committed generation; None before the first."""
         return reader.read_generation(self.folder)
@@ -107,7 +119,7 @@ class Run:
 
     def policy(self, which: Literal["best", "centre"] = "best") -> Policy:
         """The best centre so far with the statistics it was evaluated with, or the newest centre with the newest."""
-        _, parts = self.parts()
+        at, parts = self.parts()
         clip = self.constants["policy.observation_clip"]
         if which == "best":
             best = best_from_arrays(parts["best"])
@@ -116,7 +128,12 @@ class Run:
             raise ValueError(f"policy({which!r}): choose 'best' or 'centre'")
         enabled = self.constants["policy.observation_normalization"]
         mean_O, std_O = normalisation(moments_from_arrays(parts["observations"]), enabled)
-        return Policy(self.policy_shape, member_from_arrays(parts[member_part(0)]).centre_D, mean_O, std_O, clip)
+        return Policy(self.policy_shape, self.newest_centre(at, parts), mean_O, std_O, clip)
+
+    def newest_centre(self, generation: int, parts: Mapping[str, Mapping[str, np.ndarray]]) -> FloatArray:
+        """The centre that the history row of `generation` is about, `parts` being the state of that generation."""
+        member = int(self.history_rows(generation)[0]["member"])
+        return member_from_arrays(parts[member_part(member)]).centre_D
 
 
 def open_run(folder: str | os.PathLike[str]) -> Run:

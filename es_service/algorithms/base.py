@@ -8,8 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.novelty import NoveltyArchive
 from es_service.optimizer import Adam
 from es_service.protocol import EpisodesResult, FloatArray
+
+NO_ENTRY = -1
+"""`Member.entry` of a member none of whose centres was valid so far."""
 
 
 @dataclass(frozen=True)
@@ -18,6 +22,19 @@ class Member:
 
     centre_D: FloatArray
     adam: Adam
+    entry: int = NO_ENTRY
+    """Index of its newest entry in the novelty archive."""
+
+
+@dataclass(frozen=True)
+class FitnessWeight:
+    """How much fitness counts beside novelty, from 0 to 1, and what an adaptive rule remembers to change it."""
+
+    value: float
+    record: float = -np.inf
+    """The fitness to beat: mean evaluation fitness of the centre that last counted as an improvement."""
+    stagnant: int = 0
+    """Generations since then, or since the weight was last lowered."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +42,8 @@ class SearchState:
     """All that a search remembers between generations."""
 
     members: tuple[Member, ...]
+    archive: NoveltyArchive
+    weight: FitnessWeight
 
 
 @dataclass(frozen=True)
@@ -36,16 +55,34 @@ class Plan:
 
 
 @dataclass(frozen=True)
+class Judgement:
+    """What the evaluation episodes say of a centre."""
+
+    generation: int
+    """0 for an initial centre."""
+    member: int
+    valid: bool
+    """Whether fitness and descriptor of every episode are finite."""
+    fitness: float
+    """Mean over the episodes."""
+    descriptor_B: NDArray[np.float64]
+    """Mean over the episodes."""
+
+
+@dataclass(frozen=True)
 class Algorithm:
     """The functions of one method. All are pure."""
 
-    start: Callable[[FloatArray], SearchState]
-    """Initial centre -> state before the first generation."""
-    plan: Callable[[SearchState], Plan]
+    plan: Callable[[SearchState, int], Plan]
+    """(state, generation) -> what to evaluate in that generation."""
     weights: Callable[[SearchState, EpisodesResult], NDArray[np.float32]]
     """The whole population's results (axes P, S) -> weight of each pair's noise [P]."""
     step: Callable[[SearchState, Plan, FloatArray], SearchState]
     """(state, plan, gradient estimate [D]) -> state with the planned member moved."""
+    absorb: Callable[[SearchState, Judgement], SearchState]
+    """(state, a centre's evaluation) -> state that has learned from it; initial centres come first, in order."""
+    fitness_weight: float
+    """What the state's `weight` starts with."""
 
 
 def member_part(index: int) -> str:
@@ -61,10 +98,25 @@ def member_to_arrays(member: Member) -> dict[str, np.ndarray]:
         "adam_m_D": adam.m_D,
         "adam_v_D": adam.v_D,
         "adam_step": np.asarray(adam.step, np.int64),
+        "entry": np.asarray(member.entry, np.int64),
     }
 
 
 def member_from_arrays(arrays: Mapping[str, np.ndarray]) -> Member:
     """Inverse of `member_to_arrays`."""
     adam = Adam(arrays["adam_m_D"], arrays["adam_v_D"], int(arrays["adam_step"]))
-    return Member(arrays["centre_D"], adam)
+    return Member(arrays["centre_D"], adam, int(arrays["entry"]))
+
+
+def weight_to_arrays(weight: FitnessWeight) -> dict[str, np.ndarray]:
+    """The fitness weight as the store keeps it."""
+    return {
+        "value": np.asarray(weight.value, np.float64),
+        "record": np.asarray(weight.record, np.float64),
+        "stagnant": np.asarray(weight.stagnant, np.int64),
+    }
+
+
+def weight_from_arrays(arrays: Mapping[str, np.ndarray]) -> FitnessWeight:
+    """Inverse of `weight_to_arrays`."""
+    return FitnessWeight(float(arrays["value"]), float(arrays["record"]), int(arrays["stagnant"]))

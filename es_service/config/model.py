@@ -90,6 +90,28 @@ class SearchConfig(_Section):
     l2: NotNegative = Field(
         0.005, description="Weight decay, added to the gradient before Adam: lambda in -g + lambda x."
     )
+    members: Count = Field(
+        description="Centres of the meta-population, each with its own optimiser; one is updated per generation. "
+        "auto: 1 for es, which allows no other, else 5."
+    )
+    member_choice: Literal["novelty", "round_robin", "uniform"] = Field(
+        "novelty",
+        description="How the member to update is chosen: with probability proportional to its novelty, in turn, or all "
+        "alike.",
+    )
+    fitness_weight_start: Fraction = Field(
+        description="nsra_es: weight of fitness beside novelty at the start. Set by the preset."
+    )
+    fitness_weight_step: Fraction = Field(
+        0.05, description="nsra_es: how much the weight of fitness rises after an improvement or falls in stagnation."
+    )
+    fitness_weight_patience: Count = Field(
+        description="nsra_es: generations without improvement before the weight of fitness falls. Set by the preset."
+    )
+    fitness_weight_min_gain: NotNegative = Field(
+        description="nsra_es: an improvement beats the record by more than this fraction of its size. Set by the "
+        "preset."
+    )
     evaluation_episodes: Count = Field(
         30,
         description="Episodes without noise on which each new centre is judged; counted as environment steps.",
@@ -102,6 +124,17 @@ class SearchConfig(_Section):
     )
     init_from: Text | None = Field(
         None, description="Folder of another run whose centre this one starts from; null for a random centre."
+    )
+
+
+class NoveltyConfig(_Section):
+    """What is novel. Constants of the run."""
+
+    neighbours: Count = Field(
+        10, description="Novelty is the mean distance to this many nearest entries of the novelty archive."
+    )
+    distance: Literal["euclidean", "squared_euclidean"] = Field(
+        description="Distance between descriptors. Set by the preset."
     )
 
 
@@ -158,6 +191,7 @@ class RunConfig(_Section):
     task: TaskConfig
     policy: PolicyConfig
     search: SearchConfig
+    novelty: NoveltyConfig
     budget: BudgetConfig
     compute: ComputeConfig
     seed: Seed = Field(0, description="Address of all random numbers of the run.")
@@ -200,7 +234,7 @@ def describe_changes(changes: Sequence[tuple[str, Any, Any]], run: str = "RUN") 
     settings = " ".join(f"--set {shlex.quote(f'{name}={show(new)}')}" for name, _, new in changes if new != ABSENT)
     return "\n".join(
         [
-            "a run keeps its task, policy, search, seed and chunk shapes for life; this would change:",
+            "a run keeps its task, policy, search, novelty, seed and chunk shapes for life; this would change:",
             *(f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes),
             f"to go on from its state with other settings: es-service fork {run} {settings}".rstrip(),
         ]

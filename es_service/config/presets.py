@@ -63,6 +63,32 @@ _ROWS = (
         "uber: ME-ES, where the two members of a pair start from different resets. literature: ours; sharing reset and "
         "action noise inside a pair takes their luck out of its difference.",
     ),
+    PresetRow(
+        "search.fitness_weight_start",
+        1.0,
+        0.5,
+        "NSRA-ES. uber: ME-ES. literature: independent implementations (estorch, MEMES), which follow the paper as far "
+        "as we know.",
+    ),
+    PresetRow(
+        "search.fitness_weight_patience",
+        50,
+        20,
+        "NSRA-ES. uber: ME-ES. literature: the same implementations as for its start.",
+    ),
+    PresetRow(
+        "search.fitness_weight_min_gain",
+        0.0,
+        0.1,
+        "NSRA-ES. uber: ME-ES, where an improvement must beat the record by a tenth of its absolute value. literature: "
+        "any gain counts.",
+    ),
+    PresetRow(
+        "novelty.distance",
+        "euclidean",
+        "squared_euclidean",
+        "literature: DNE and QDax. uber: ME-ES, which averages squared distances.",
+    ),
 )
 
 

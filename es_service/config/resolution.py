@@ -19,6 +19,7 @@ from es_service.protocol import PolicyShape, TaskSpec
 
 LEFT_OPEN: dict[str, str | None] = {
     "task.episode_steps": None,
+    "search.members": "auto",
     "compute.rollout": "auto",
     "compute.chunk_pairs": "auto",
     "compute.rollout_block_pairs": "auto",
@@ -26,6 +27,10 @@ LEFT_OPEN: dict[str, str | None] = {
 }
 """Keys that this module resolves -> the value that asks for it, in a file the same as leaving the key out."""
 OPTIONS = "task.options."
+SINGLE_MEMBER = ("es",)
+"""Algorithms without a meta-population."""
+MEMBERS = 5
+"""Of a meta-population: deep-neuroevolution's Humanoid settings and the released ME-ES code."""
 
 MOST_CHUNK_PAIRS = 64
 """Enough to fill vector units and hide a message's cost; few enough that a lost chunk is cheap."""
@@ -74,6 +79,8 @@ def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpe
             values["task.episode_steps"] = task.episode_steps
         for option, allowed in task.options.items():
             values.setdefault(f"{OPTIONS}{option}", allowed[0])
+    if "search.members" in left_open and "search.algorithm" in values:
+        values["search.members"] = 1 if values["search.algorithm"] in SINGLE_MEMBER else MEMBERS
     if "compute.rollout" in left_open:
         values["compute.rollout"] = "xla"
     pairs = values.get("search.pairs")
@@ -114,6 +121,14 @@ def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
                 f"{did_you_mean(values[key], allowed)}"
             )
     return problems
+
+
+def member_problems(values: Mapping[str, Any]) -> list[str]:
+    """Where the algorithm cannot have as many members."""
+    algorithm, members = values.get("search.algorithm"), values.get("search.members")
+    if algorithm not in SINGLE_MEMBER or members in (None, 1):
+        return []
+    return [f"search.members: {members} is not allowed for {algorithm}, which has one centre; must be 1 or auto"]
 
 
 def shape_problems(values: Mapping[str, Any]) -> list[str]:

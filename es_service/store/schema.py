@@ -13,7 +13,7 @@ from es_service.errors import StoreError
 from es_service.history import Column
 from es_service.store.codec import text_sha256
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 APPLICATION_ID = 0x45535256
 """In the file's header, for tools that tell database files apart."""
 PAGE_BYTES = 8192
@@ -100,7 +100,7 @@ def create_tables(connection: sqlite3.Connection, text: str) -> None:
 
 
 def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
-    """What the run is, checked. Raises Damaged, or StoreError if a newer version of this package wrote `file`."""
+    """What the run is, checked. Raises Damaged, or StoreError if another version of this package wrote `file`."""
     rows = connection.execute("SELECT key, value, sha256 FROM meta").fetchall()
     for key, value, sha256 in rows:
         if text_sha256(str(key), str(value)) != sha256:
@@ -114,6 +114,11 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
         )
     if version < 1 or "run" not in found:
         raise Damaged("the record of what the run is is missing")
+    if version < SCHEMA_VERSION:
+        raise StoreError(
+            f"{file} has schema version {version}; this es-service reads version {SCHEMA_VERSION}. Use the es-service "
+            f"that wrote it."
+        )
     return meta_from_text(found["run"])
 
 

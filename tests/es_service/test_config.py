@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from es_service.algorithms import ALGORITHMS
 from es_service.config.loading import load_config, resume_config
 from es_service.config.model import RunConfig, changed_constants, describe_changes, worker_spec
 from es_service.config.presets import PRESETS, preset_table, preset_values
@@ -33,7 +34,7 @@ MINIMAL_TEXT = "task: {environment: point_maze}\nsearch: {algorithm: es}\nbudget
 
 
 def load(source=MINIMAL, *overrides: str) -> RunConfig:
-    return load_config(source, overrides, tasks=TASKS, algorithms=("es",))
+    return load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
 
 
 @pytest.fixture
@@ -158,6 +159,14 @@ def test_init_from_is_made_absolute(tmp_path, monkeypatch):
     assert load(MINIMAL, "search.init_from=old").search.init_from == str(tmp_path / "old")
 
 
+def test_members_follow_from_the_algorithm():
+    assert load().search.members == 1
+    assert load(MINIMAL, "search.algorithm=ns_es").search.members == 5
+    assert load(MINIMAL, "search.algorithm=nsra_es", "search.members=3").search.members == 3
+    with pytest.raises(ConfigError, match=r"search\.members: 3 is not allowed for es, which has one centre"):
+        load(MINIMAL, "search.members=3")
+
+
 def test_config_is_frozen():
     with pytest.raises(ValidationError):
         load().search.sigma = 0.1  # pyright: ignore[reportAttributeAccessIssue]
@@ -170,9 +179,9 @@ def test_shipped_configs_load_and_are_named_after_task_and_algorithm(path):
     assert config_warnings(config) == []
 
 
-def test_shipped_config_hides_no_preset_key():
-    """Its commented "by preset" keys stay commented, or `--set search.preset=uber` would do nothing."""
-    path = CONFIGS / "point_maze_es.yaml"
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
+def test_shipped_configs_hide_no_preset_key(path):
+    """Their commented "by preset" keys stay commented, or `--set search.preset=uber` would do nothing."""
     assert load(path, "search.preset=uber").constants().items() >= preset_values("uber").items()
 
 

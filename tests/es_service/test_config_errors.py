@@ -102,7 +102,7 @@ def test_a_bad_value_is_one_line_with_field_value_and_what_is_allowed(override, 
         ("sigma=1", "override sigma=1: sigma: unknown key; did you mean search.sigma?"),
         ("search.hidden=[4]", "did you mean policy.hidden?"),
         ("seeed=3", "did you mean seed?"),
-        ("qqq.zzz=3", "unknown key; the sections are task, policy, search, budget, compute"),
+        ("qqq.zzz=3", "unknown key; the sections are task, policy, search, novelty, budget, compute"),
         ("budget.qqq=3", "unknown key; budget has generations, env_steps, wall_clock_s, target_fitness"),
         ("search.sigma", "override search.sigma: write a.b=c, such as search.sigma=0.05"),
         ("=3", "override =3: write a.b=c"),
@@ -123,7 +123,7 @@ def test_a_problem_elsewhere_is_one_line_with_a_hint(override, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (MINIMAL_TEXT + "novelty: {neighbours: 10}\n", "novelty: unknown key; the top level has task, policy, search"),
+        (MINIMAL_TEXT + "weather: {rain: 10}\n", "weather: unknown key; the top level has task, policy, search"),
         (MINIMAL_TEXT + "policy:\n", "policy: null where keys belong; indent them below `policy:`, or delete"),
         (MINIMAL_TEXT + "compute: 3\n", "compute: 3 where keys belong"),
         (MINIMAL_TEXT + "seed: 1\nseed: 2\n", "seed: written twice, on lines 4 and 5; keep one"),

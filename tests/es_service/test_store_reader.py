@@ -64,12 +64,21 @@ def test_what_is_no_run_folder_is_called_that(tmp_path):
     assert not (tmp_path / "other" / "run.lock").exists()
 
 
+def test_an_older_schema_version_names_both(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(store_schema, "SCHEMA_VERSION", 1)
+        folder = finished(tmp_path / "run", 1)
+    for use in (RunStore.open, read_meta, read_history):
+        with pytest.raises(StoreError, match=r"schema version 1; this es-service reads version 2\. Use the"):
+            use(folder)
+
+
 def test_a_newer_schema_version_names_both_and_says_upgrade(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(store_schema, "SCHEMA_VERSION", 7)
         folder = finished(tmp_path / "run", 1)
     for use in (RunStore.open, read_meta, read_history):
-        with pytest.raises(StoreError, match=r"schema version 7; .* versions up to 1\. Upgrade"):
+        with pytest.raises(StoreError, match=r"schema version 7; .* versions up to 2\. Upgrade"):
             use(folder)
 
 

@@ -54,8 +54,8 @@ def run_in_memory(config, evaluator=None):
     first = initial_parameters(SHAPE, config.policy.init, config.seed)
     search = driver.Search(
         config,
-        ALGORITHMS["es"](config.search),
-        lambda: (first, no_observations(2)),
+        ALGORITHMS["es"](config),
+        lambda: ([first], no_observations(2)),
         TASKS["point_maze"],
     )
     store = MemoryStore()
@@ -208,9 +208,7 @@ def test_a_centre_that_is_not_finite_stops_the_run_before_it_is_kept():
     config = small_config(learning_rate=1e300)
     evaluator, store = DirectEvaluator(worker_spec(config, TASKS["point_maze"])), MemoryStore()
     first = initial_parameters(SHAPE, config.policy.init, config.seed)
-    search = driver.Search(
-        config, ALGORITHMS["es"](config.search), lambda: (first, no_observations(2)), TASKS["point_maze"]
-    )
+    search = driver.Search(config, ALGORITHMS["es"](config), lambda: ([first], no_observations(2)), TASKS["point_maze"])
     with pytest.raises(EvaluationError, match=r"generation 1: the centre is not finite.*learning_rate \(1e\+300 now\)"):
         driver.run(search, evaluator, store, lambda row: None)
     assert store.generation == 0
@@ -256,9 +254,7 @@ def test_the_driver_holds_no_population_times_parameters_array():
     config = load_config(mapping | {"budget": {"generations": 3}})
     shape = PolicyShape((2, 64, 64, 2))
     first = initial_parameters(shape, "unit_columns", 0)
-    search = driver.Search(
-        config, ALGORITHMS["es"](config.search), lambda: (first, no_observations(2)), TASKS["point_maze"]
-    )
+    search = driver.Search(config, ALGORITHMS["es"](config), lambda: ([first], no_observations(2)), TASKS["point_maze"])
     evaluator = Inventing(shape.parameters)
     tracemalloc.start()
     driver.run(search, evaluator, MemoryStore(), lambda row: None)

@@ -21,11 +21,11 @@ ROOT = Path(__file__).parents[2]
 SMALL = {
     "task": {"environment": "point_maze", "episode_steps": 30},
     "policy": {"hidden": [8]},
-    "search": {"algorithm": "es", "pairs": 16, "evaluation_episodes": 4},
+    "search": {"algorithm": "nsra_es", "pairs": 16, "evaluation_episodes": 4, "fitness_weight_patience": 2},
     "budget": {"generations": 30},
     "compute": {"chunk_pairs": 8, "workers": 1},
 }
-"""A run of some milliseconds a generation."""
+"""A run of some milliseconds a generation: five members, archive, adaptive weight."""
 
 
 def start(folder: Path, *, config: dict | None = None, kill: dict | None = None) -> subprocess.Popen[str]:

@@ -163,8 +163,10 @@ def test_init_from_starts_at_the_other_run_s_centre(config, finished, tmp_path):
     assert code == 0, printed
     child, parent = open_run(tmp_path / "r"), open_run(finished[0])
     assert child.generation == 0
-    for part, name in (("member_0", "centre_D"), ("observations", "m2_O")):
-        assert (child.parts()[1][part][name] == parent.parts()[1][part][name]).all()
+    _, parts = child.parts()
+    assert (parts["observations"]["m2_O"] == parent.parts()[1]["observations"]["m2_O"]).all()
+    for member in range(5):
+        assert (parts[f"member_{member}"]["centre_D"] == parent.policy("centre").parameters_D).all()
     assert child.meta.parent is not None
     assert child.meta.parent["digest"] == digest(finished[0])
     code, printed = es("run", config, "--out", tmp_path / "s", "--set", f"search.init_from={finished[0]}",
@@ -300,7 +302,7 @@ def test_damage_gives_the_same_digest_or_a_named_error(config, finished, tmp_pat
     folder = tmp_path / "run"
     assert es("run", config, "--out", folder, "--set", "budget.generations=20")[0] == 0
     sound = (folder / "run.db").read_bytes()
-    newest = open_run(folder).parts()[1]["member_0"]["centre_D"].tobytes()
+    newest = open_run(folder).policy("centre").parameters_D.tobytes()
     last = ["--set", "budget.generations=30"]
 
     damage(folder / "run.db", sound.rindex(newest) + 8)

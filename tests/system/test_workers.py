@@ -23,7 +23,7 @@ from tests.system.session import ROOT
 
 CONFIG = {
     "task": {"environment": "point_maze"},
-    "search": {"algorithm": "es", "pairs": 256, "evaluation_episodes": 20},
+    "search": {"algorithm": "nsra_es", "pairs": 256, "evaluation_episodes": 20, "fitness_weight_patience": 2},
     "budget": {"generations": 12},
     "compute": {"workers": 2, "chunk_pairs": 32, "gradient_block_pairs": 32, "chunk_timeout_s": 1.0},
 }

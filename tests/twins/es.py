@@ -22,8 +22,11 @@ class ES:
 
     def generation(self, noise_P_D, fitness_P_S):
         """noise: standard normal, one row per pair; fitness: of centre + sigma noise and centre - sigma noise."""
+        return self.climb(noise_P_D, averaged_centred_ranks(np.ravel(fitness_P_S)).reshape(len(noise_P_D), 2))
+
+    def climb(self, noise_P_D, utility_P_S):
+        """One step of Adam up the gradient estimate."""
         pairs = len(noise_P_D)
-        utility_P_S = averaged_centred_ranks(np.ravel(fitness_P_S)).reshape(pairs, 2)
         gradient = np.zeros_like(self.centre)
         for i in range(pairs):
             gradient += (utility_P_S[i, 0] - utility_P_S[i, 1]) * np.asarray(noise_P_D[i], np.float64)

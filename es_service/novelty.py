@@ -1,0 +1,201 @@
+"""Novelty: how far a descriptor lies from those of all centres evaluated before it. Conti et al. 2018.
+
+Update station. The archive only grows: one entry per evaluated valid centre, in order. A k-d tree proposes neighbours
+where the archive is large; what counts is always computed by one float64 expression, so the tree changes no bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
+
+Distance = Literal["euclidean", "squared_euclidean"]
+
+TREE_STEP = 512
+"""Entries between two trees. Those after the newest tree are compared one by one."""
+SPARE_CANDIDATES = 6
+"""Neighbours asked of the tree beyond those wanted, so that rounding inside it can be noticed."""
+TREE_ROUNDING = 1e-9
+"""Relative bound, generous, on how much the tree's distances differ from ours."""
+BLOCK_ENTRIES = 256
+"""Entries in one part of the run store: a generation rewrites the last part and no other."""
+
+
+@dataclass(frozen=True)
+class NoveltyArchive:
+    """Descriptors of all centres evaluated so far, in order. N: entries; B: descriptor dimensions."""
+
+    descriptor_N_B: NDArray[np.float64]
+    generation_N: NDArray[np.int64]
+    """When each was evaluated; 0 for initial centres."""
+    member_N: NDArray[np.int64]
+    """Of which member each was the centre."""
+    tree: KDTree | None = None
+    """Over the first entries, a multiple of TREE_STEP of them; follows from `descriptor_N_B`."""
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        return self.generation_N.size
+
+
+def empty_archive(dimensions: int) -> NoveltyArchive:
+    """An archive without entries: nothing is near anything, so every novelty is 0."""
+    return NoveltyArchive(np.zeros((0, dimensions)), np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+def extended(archive: NoveltyArchive, descriptor_B: ArrayLike, generation: int, member: int) -> NoveltyArchive:
+    """The archive with one entry more; the old one stays as it is."""
+    entry_B = np.asarray(descriptor_B, np.float64)
+    return _with_tree(
+        np.concatenate([archive.descriptor_N_B, entry_B[None]]),
+        np.append(archive.generation_N, np.int64(generation)),
+        np.append(archive.member_N, np.int64(member)),
+        archive.tree,
+    )
+
+
+def novelty(
+    archive: NoveltyArchive,
+    descriptor_Q_B: ArrayLike,
+    *,
+    neighbours: int,
+    distance: Distance,
+    exclude_Q: ArrayLike | None = None,
+) -> NDArray[np.float64]:
+    """Mean distance of each query to its `neighbours` nearest entries; to all of them if there are fewer.
+
+    Distances are computed in float64, sorted ascending and added in that order. A query without any neighbour has
+    novelty 0; one that is not finite has novelty NaN.
+
+    Args:
+        descriptor_Q_B: queries, any number of leading axes before the descriptor's.
+        distance: squared_euclidean is the mean of squared distances, as in the released ME-ES code.
+        exclude_Q: for each query the index of the entry that is the query itself, or -1; with one leading axis.
+
+    Returns:
+        float64, the leading axes of the queries.
+    """
+    shape = np.shape(descriptor_Q_B)[:-1]
+    query_Q_B = np.asarray(descriptor_Q_B, np.float64).reshape(-1, archive.descriptor_N_B.shape[1])
+    excluded_Q = np.full(len(query_Q_B), -1) if exclude_Q is None else np.asarray(exclude_Q)
+    finite_Q = np.isfinite(query_Q_B).all(axis=1)
+    novelty_Q = np.full(len(query_Q_B), np.nan)
+    novelty_Q[finite_Q] = _mean_nearest(archive, query_Q_B[finite_Q], excluded_Q[finite_Q], neighbours, distance)
+    return novelty_Q.reshape(shape)
+
+
+def block_part(block: int) -> str:
+    """Name of a block of entries in the run store."""
+    return f"novelty_{block:05d}"
+
+
+def archive_to_parts(archive: NoveltyArchive, stored: int) -> dict[str, dict[str, np.ndarray]]:
+    """The blocks that differ from those of the archive's first `stored` entries, as the store keeps them."""
+    parts = {}
+    for block in range(stored // BLOCK_ENTRIES, -(-archive.size // BLOCK_ENTRIES)):
+        entries = slice(block * BLOCK_ENTRIES, (block + 1) * BLOCK_ENTRIES)
+        parts[block_part(block)] = {
+            "descriptor_N_B": archive.descriptor_N_B[entries],
+            "generation_N": archive.generation_N[entries],
+            "member_N": archive.member_N[entries],
+        }
+    return parts
+
+
+def archive_from_parts(parts: Mapping[str, Mapping[str, np.ndarray]], dimensions: int) -> NoveltyArchive:
+    """Inverse of `archive_to_parts(archive, 0)`, among any other parts."""
+    blocks = []
+    while block_part(len(blocks)) in parts:
+        blocks.append(parts[block_part(len(blocks))])
+    if not blocks:
+        return empty_archive(dimensions)
+    descriptor_N_B, generation_N, member_N = (
+        np.concatenate([block[name] for block in blocks]) for name in ("descriptor_N_B", "generation_N", "member_N")
+    )
+    return _with_tree(descriptor_N_B, generation_N, member_N, None)
+
+
+def _with_tree(
+    descriptor_N_B: NDArray[np.float64],
+    generation_N: NDArray[np.int64],
+    member_N: NDArray[np.int64],
+    tree: KDTree | None,
+) -> NoveltyArchive:
+    """An archive with a tree over as many entries as its size asks for: `tree` if it is that one, else a new one."""
+    covered = len(descriptor_N_B) // TREE_STEP * TREE_STEP
+    if covered and (tree is None or tree.n != covered):
+        from scipy.spatial import KDTree  # a quarter of a second that most runs need not spend
+
+        tree = KDTree(descriptor_N_B[:covered])
+    return NoveltyArchive(descriptor_N_B, generation_N, member_N, tree)
+
+
+def _mean_nearest(
+    archive: NoveltyArchive,
+    query_Q_B: NDArray[np.float64],
+    excluded_Q: NDArray[np.int64],
+    neighbours: int,
+    distance: Distance,
+) -> NDArray[np.float64]:
+    """Mean distance to the nearest entries for finite queries: candidates of the tree where that is enough."""
+    tree = archive.tree
+    asked = neighbours + 1 + SPARE_CANDIDATES  # one more in case the excluded entry is among them
+    if tree is None or asked >= tree.n:
+        return _mean_smallest(_squared(archive, query_Q_B, excluded_Q), neighbours, distance)
+    reach_Q_K, candidate_Q_K = tree.query(query_Q_B, asked)
+    near_Q_K = _squared_to(query_Q_B, archive.descriptor_N_B[candidate_Q_K])
+    near_Q_K[candidate_Q_K == excluded_Q[:, None]] = np.inf
+    tail_Q_N = _squared(archive, query_Q_B, excluded_Q, tree.n)
+    squared_Q_K = _smallest(np.concatenate([near_Q_K, tail_Q_N], axis=1), neighbours)
+    # Sure unless an entry that the tree left out could, after rounding, be among the nearest.
+    sure_Q = np.sqrt(squared_Q_K[:, -1]) <= reach_Q_K[:, -1] * (1.0 - TREE_ROUNDING)
+    mean_Q = _mean_smallest(squared_Q_K, neighbours, distance)
+    for index in np.flatnonzero(~sure_Q):
+        one = slice(index, index + 1)
+        mean_Q[one] = _mean_smallest(_squared(archive, query_Q_B[one], excluded_Q[one]), neighbours, distance)
+    return mean_Q
+
+
+def _squared(
+    archive: NoveltyArchive, query_Q_B: NDArray[np.float64], excluded_Q: NDArray[np.int64], first: int = 0
+) -> NDArray[np.float64]:
+    """Squared distances [Q, N - first] to the entries from `first` on, infinite to the excluded one."""
+    squared_Q_N = _squared_to(query_Q_B, archive.descriptor_N_B[None, first:])
+    rows = np.flatnonzero(excluded_Q >= first)
+    squared_Q_N[rows, excluded_Q[rows] - first] = np.inf
+    return squared_Q_N
+
+
+def _squared_to(query_Q_B: NDArray[np.float64], entry_Q_N_B: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The one expression for a squared distance: (x0 - y0)^2 + (x1 - y1)^2 + ..., in this order."""
+    total_Q_N = np.zeros(np.broadcast_shapes((len(query_Q_B), 1), entry_Q_N_B.shape[:2]))
+    for b in range(query_Q_B.shape[1]):
+        difference_Q_N = query_Q_B[:, None, b] - entry_Q_N_B[..., b]
+        total_Q_N += difference_Q_N * difference_Q_N
+    return total_Q_N
+
+
+def _smallest(squared_Q_N: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """The smallest of each row, ascending, as many as there are up to `count`."""
+    if count < squared_Q_N.shape[1]:
+        squared_Q_N = np.partition(squared_Q_N, count - 1, axis=1)[:, :count]
+    return np.sort(squared_Q_N, axis=1)
+
+
+def _mean_smallest(squared_Q_N: NDArray[np.float64], count: int, distance: Distance) -> NDArray[np.float64]:
+    """Mean of the smallest finite distances of each row; 0 where there is none."""
+    squared_Q_K = _smallest(squared_Q_N, count)
+    distance_Q_K = np.sqrt(squared_Q_K) if distance == "euclidean" else squared_Q_K
+    there_Q_K = np.isfinite(distance_Q_K)
+    total_Q = np.zeros(len(squared_Q_K))
+    for k in range(distance_Q_K.shape[1]):  # one by one: np.sum may add in another order
+        total_Q += np.where(there_Q_K[:, k], distance_Q_K[:, k], 0.0)
+    return total_Q / np.maximum(there_Q_K.sum(axis=1), 1)

@@ -1,0 +1,51 @@
+"""What the novelty archive costs the driver: milliseconds a generation, on one core.
+
+    python -m tests.benchmarks.novelty_time
+
+A generation adds one entry, judges 1,024 descriptors and five members. The mean over TREE_STEP generations includes one
+new tree; the brute-force row judges the same queries against every entry.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+
+import numpy as np
+
+from es_service.novelty import TREE_STEP, NoveltyArchive, extended, novelty
+
+QUERIES = 1024
+MEMBERS = 5
+
+
+def main() -> None:
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    rng = np.random.default_rng(0)
+    print(f"{'entries':>8} {'tree ms':>8} {'slowest ms':>10} {'brute ms':>9}")
+    for entries in (1_000, 10_000, 100_000):
+        descriptors = rng.uniform(-1, 1, (entries, 2))
+        archive = NoveltyArchive(descriptors[:-1], np.arange(entries - 1), np.zeros(entries - 1, np.int64))
+        archive = extended(archive, descriptors[-1], entries, 0)  # plants the tree
+        queries = rng.uniform(-1, 1, (QUERIES, 2)).astype(np.float32)
+        newest = np.arange(entries - MEMBERS, entries)
+        seconds = []
+        for generation in range(TREE_STEP):
+            start = time.perf_counter()
+            archive = extended(archive, rng.uniform(-1, 1, 2), entries + generation, 0)
+            members = archive.descriptor_N_B[newest]
+            novelty(archive, members, neighbours=10, distance="euclidean", exclude_Q=newest)
+            with_tree = novelty(archive, queries, neighbours=10, distance="euclidean")
+            seconds.append(time.perf_counter() - start)
+        without = NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.member_N)
+        start = time.perf_counter()
+        brute = np.concatenate(
+            [novelty(without, some, neighbours=10, distance="euclidean") for some in np.array_split(queries, 16)]
+        )
+        brute_s = time.perf_counter() - start
+        assert np.array_equal(brute, with_tree)
+        print(f"{entries:8,} {1e3 * np.mean(seconds):8.2f} {1e3 * max(seconds):10.2f} {1e3 * brute_s:9.1f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

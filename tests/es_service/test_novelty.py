@@ -1,0 +1,148 @@
+"""The novelty archive against a brute-force twin and by hand; the tree changes no bit, nor does the store."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from es_service import novelty as module
+from es_service.novelty import (
+    BLOCK_ENTRIES,
+    TREE_STEP,
+    NoveltyArchive,
+    archive_from_parts,
+    archive_to_parts,
+    block_part,
+    empty_archive,
+    extended,
+    novelty,
+)
+from tests.twins import novelty_search as twin
+
+coordinates = st.integers(-3, 3).map(float) | st.floats(-1e3, 1e3, allow_subnormal=False)
+points = st.tuples(coordinates, coordinates)
+
+
+def archive_of(descriptors, dimensions=2) -> NoveltyArchive:
+    archive = empty_archive(dimensions)
+    for index, descriptor in enumerate(descriptors):
+        archive = extended(archive, descriptor, index, 0)
+    return archive
+
+
+def many(descriptor_N_B) -> NoveltyArchive:
+    """An archive made in one go, as a resumed run makes it."""
+    entries = np.asarray(descriptor_N_B, np.float64)
+    blocks = range(0, len(entries), BLOCK_ENTRIES)
+    parts = {
+        block_part(i): {
+            "descriptor_N_B": entries[first : first + BLOCK_ENTRIES],
+            "generation_N": np.arange(first, min(first + BLOCK_ENTRIES, len(entries))),
+            "member_N": np.zeros(min(BLOCK_ENTRIES, len(entries) - first), np.int64),
+        }
+        for i, first in enumerate(blocks)
+    }
+    return archive_from_parts(parts, entries.shape[1])
+
+
+def of(archive, queries, neighbours=2, distance="euclidean", exclude=None):
+    return novelty(archive, queries, neighbours=neighbours, distance=distance, exclude_Q=exclude).tolist()
+
+
+def test_by_hand():
+    archive = archive_of([(0, 0), (3, 4), (0, 1), (0, 1)])
+    assert of(archive, [(0, 0)], 3) == [2 / 3]  # 0, 1, 1
+    assert of(archive, [(0, 0)], 4) == [7 / 4]
+    assert of(archive, [(0, 0)], 10) == [7 / 4]  # fewer than asked for: all of them
+    assert of(archive, [(0, 0)], 4, "squared_euclidean") == [27 / 4]
+    assert of(archive, [(0, 0)], 3, exclude=[0]) == [7 / 3]
+    assert of(archive, [(0, 1)], 1, exclude=[2]) == [0.0]  # only that entry is left out, not its duplicate
+    assert of(archive, [(0, 1)], 2, exclude=[-1]) == [0.0]
+
+
+def test_nothing_is_near_in_an_empty_archive():
+    """In particular no entry of zeros that was never made."""
+    assert of(empty_archive(2), [(5.0, 5.0), (0.0, 0.0)]) == [0.0, 0.0]
+    one = archive_of([(5.0, 5.0)])
+    assert of(one, [(5.0, 5.0), (5.0, 6.0)], 10) == [0.0, 1.0]
+    assert of(one, [(5.0, 5.0)], 10, exclude=[0]) == [0.0]
+
+
+def test_axes_and_queries_that_are_not_finite():
+    archive = archive_of([(0, 0)])
+    result = novelty(
+        archive, np.array([[[0, 1], [np.nan, 0]], [[0, 2], [0, np.inf]]]), neighbours=1, distance="euclidean"
+    )
+    np.testing.assert_array_equal(result, [[1, np.nan], [2, np.nan]])
+    assert novelty(archive, np.array([3.0, 4.0]), neighbours=1, distance="euclidean") == 5.0
+
+
+def test_an_archive_never_changes():
+    first = archive_of([(0, 0)])
+    second = extended(first, (1, 1), 7, 3)
+    assert first.size == 1
+    assert second.size == 2
+    assert second.generation_N.tolist() == [0, 7]
+    assert second.member_N.tolist() == [0, 3]
+
+
+@given(st.lists(points, max_size=40), st.lists(points, min_size=1, max_size=5), st.integers(1, 12))
+def test_equals_the_twin_bit_by_bit(entries, queries, neighbours):
+    archive = archive_of(entries)
+    for distance in ("euclidean", "squared_euclidean"):
+        expected = [twin.novelty(entries, query, neighbours, distance != "euclidean") for query in queries]
+        assert of(archive, queries, neighbours, distance) == expected
+
+
+@pytest.mark.parametrize("dimensions", [1, 2, 4])
+@pytest.mark.parametrize("scatter", ["uniform", "grid", "one point", "line"])
+def test_the_tree_changes_no_bit(dimensions, scatter, monkeypatch):
+    """Ties and duplicates, where a tree may choose other neighbours than we would, included."""
+    rng = np.random.default_rng(0)
+    entries = {
+        "uniform": lambda n: rng.uniform(-1, 1, (n, dimensions)),
+        "grid": lambda n: rng.integers(0, 4, (n, dimensions)) / 3.0,
+        "one point": lambda n: np.full((n, dimensions), 0.3),
+        "line": lambda n: np.repeat(rng.uniform(-1, 1, (n, 1)) / 3, dimensions, axis=1),
+    }[scatter]
+    archive = many(entries(2 * TREE_STEP + 100))
+    assert archive.tree is not None
+    assert archive.tree.n == 2 * TREE_STEP
+    queries = np.concatenate([entries(40), archive.descriptor_N_B[:10], archive.descriptor_N_B[-10:]])
+    exclude = np.concatenate([np.full(40, -1), np.arange(10), np.arange(archive.size - 10, archive.size)])
+    with_tree = of(archive, queries, 10, exclude=exclude)
+    brute = NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.member_N)
+    assert with_tree == of(brute, queries, 10, exclude=exclude)
+    some = [twin.novelty(archive.descriptor_N_B, queries[i], 10, without=int(exclude[i])) for i in (0, 41, 59)]
+    assert [with_tree[i] for i in (0, 41, 59)] == some
+
+
+def test_a_tree_that_rounds_otherwise_changes_no_bit(monkeypatch):
+    """Were the tree's distances off in their last bits, queries it cannot decide are compared with every entry."""
+    archive = many(np.random.default_rng(1).integers(0, 6, (TREE_STEP, 2)) / 7.0)
+    queries = archive.descriptor_N_B[:50] + 1 / 3
+    expected = of(NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.member_N), queries, 3)
+    compared = []
+    squared = module._squared
+    monkeypatch.setattr(module, "_squared", lambda a, q, e, first=0: compared.append(first) or squared(a, q, e, first))
+    assert of(archive, queries, 3) == expected
+    assert compared.count(0) > 10  # a grid is full of ties
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 3 * BLOCK_ENTRIES), st.integers(0, BLOCK_ENTRIES + 20))
+def test_parts_hold_all_of_it_and_only_changed_blocks_are_written(before, more):
+    rng = np.random.default_rng(before)
+    old = many(rng.normal(size=(before, 2)))
+    new = old
+    for index in range(more):
+        new = extended(new, rng.normal(size=2), before + index, index % 5)
+    changed = archive_to_parts(new, before)
+    assert len(changed) <= 1 + math.ceil(more / BLOCK_ENTRIES)
+    again = archive_from_parts(archive_to_parts(old, 0) | changed, 2)
+    for name in ("descriptor_N_B", "generation_N", "member_N"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(new, name))
+    queries = rng.normal(size=(20, 2))
+    assert of(again, queries, 10) == of(new, queries, 10)

@@ -1,0 +1,272 @@
+"""NS-ES, NSR-ES and NSRA-ES against their twin; choice of members, weight rule, invalid centres."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from es_service import driver
+from es_service.algorithms import ALGORITHMS
+from es_service.algorithms.base import FitnessWeight, Judgement, Member
+from es_service.algorithms.nsra_es import adapted_weight
+from es_service.algorithms.steps import MEMBER_CHOICE, archived, choose_member, first_state, member_novelty
+from es_service.api import load_config
+from es_service.config.model import worker_spec
+from es_service.noise import Domain, normals, stream_keys, uniforms
+from es_service.protocol import EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.run_state import state_from_parts
+from es_service.statistics import no_observations
+from tests.helpers import DirectEvaluator, MemoryStore
+from tests.twins import novelty_search as twin
+from workers.environments import TASKS
+from workers.policy import initial_parameters
+
+SHAPE = PolicyShape((2, 8, 8, 2))
+RULE = {"fitness_weight_start": 0.6, "fitness_weight_step": 0.15, "fitness_weight_patience": 2}
+STARTS = {"es": 1.0, "ns_es": 0.0, "nsr_es": 0.5, "nsra_es": 0.6}
+
+
+def config_of(algorithm, **search):
+    return load_config(
+        {
+            "task": {"environment": "point_maze"},
+            "policy": {"hidden": [8, 8]},
+            "search": {
+                "algorithm": algorithm,
+                "pairs": 32,
+                "sigma": 0.1,
+                "learning_rate": 0.05,
+                "evaluation_episodes": 20,
+                **RULE,
+                **search,
+            },
+            "novelty": {"neighbours": 3},
+            "budget": {"generations": 20},
+            "compute": {"chunk_pairs": 16},
+        }
+    )
+
+
+def run_in_memory(config, evaluator=None, store=None):
+    evaluator = evaluator or DirectEvaluator(worker_spec(config, TASKS["point_maze"]))
+    centres = [initial_parameters(SHAPE, config.policy.init, config.seed, m) for m in range(config.search.members)]
+    search = driver.Search(
+        config,
+        ALGORITHMS[config.search.algorithm](config),
+        lambda: (centres, no_observations(2)),
+        TASKS["point_maze"],
+    )
+    store = store or MemoryStore()
+    state, _ = driver.run(search, evaluator, store, lambda row: None)
+    return state, store, evaluator
+
+
+def episodes(evaluator, kind, generation, centre=None):
+    """Fitness and descriptors of all chunks of a kind, in the order of their ids."""
+    found = [
+        (chunk.chunk_id, result)
+        for point, chunk, result in evaluator.recorded
+        if isinstance(chunk, kind) and chunk.generation == generation
+        if centre is None or np.array_equal(point.parameters_D, centre)
+    ]
+    results = [result for _, result in sorted(found, key=lambda item: item[0])]
+    return np.concatenate([r.fitness for r in results]), np.concatenate([r.descriptor for r in results])
+
+
+@pytest.mark.parametrize("algorithm", ["ns_es", "nsr_es", "nsra_es"])
+def test_twenty_generations_equal_the_twin(algorithm):
+    config = config_of(algorithm)
+    state, store, evaluator = run_in_memory(config)
+    search = config.search
+    rule = (search.fitness_weight_step, search.fitness_weight_patience, 0.0) if algorithm == "nsra_es" else None
+    centres = [initial_parameters(SHAPE, config.policy.init, 0, member) for member in range(5)]
+    other = twin.NoveltySearch(
+        centres, search.learning_rate, search.l2, neighbours=3, weight=STARTS[algorithm], rule=rule
+    )
+    for member, centre in enumerate(centres):
+        _, descriptor = episodes(evaluator, EvaluationChunk, 0, centre)
+        other.initial(member, descriptor[:20].astype(float).mean(axis=0))
+    for generation in range(1, 21):
+        row = store.rows[generation]
+        drawn = uniforms(stream_keys(0, Domain.SELECTION, generation, MEMBER_CHOICE), np.zeros(1, np.uint32))[0]
+        member = other.chosen(float(drawn))
+        assert row["member"] == member
+        assert row["fitness_weight"] == other.weight
+        noise = [
+            normals(key, SHAPE.parameters) for key in stream_keys(0, Domain.PARAMETER_NOISE, generation, np.arange(32))
+        ]
+        other.generation(member, noise, *episodes(evaluator, TrainingChunk, generation))
+        fitness, descriptor = (x[:20] for x in episodes(evaluator, EvaluationChunk, generation))
+        mean = descriptor.astype(float).mean(axis=0)
+        assert row["centre_novelty"] == pytest.approx(twin.novelty(other.archive, mean, 3), rel=1e-12)
+        other.evaluated(member, fitness.astype(float).mean(), mean)
+        assert row["archive_size"] == len(other.archive) == 5 + generation
+    for ours, theirs in zip(state.search.members, other.members, strict=True):
+        assert np.linalg.norm(ours.centre_D - theirs.centre) < 1e-6 * np.linalg.norm(theirs.centre)
+    assert len({row["member"] for row in store.rows}) >= 3
+    assert len({row["fitness_weight"] for row in store.rows}) >= (4 if algorithm == "nsra_es" else 1)
+    np.testing.assert_allclose(state.search.archive.descriptor_N_B, other.archive, rtol=1e-12)
+
+
+def test_a_state_put_together_again_is_the_same_and_only_the_moved_member_is_written():
+    config = config_of("nsra_es")
+
+    class Recording(MemoryStore):
+        def commit(self, generation, parts, history):
+            super().commit(generation, parts, history)
+            members = {name for name in parts if name.startswith("member_")}
+            wanted = range(5) if generation == 0 else [history["member"]]
+            assert members == {f"member_{member}" for member in wanted}
+
+    state, store, _ = run_in_memory(config, store=Recording())
+    again = state_from_parts(store.load(), 20, state.wall_clock_s, 2)
+    assert again.search.weight == state.search.weight
+    for name in ("descriptor_N_B", "generation_N", "member_N"):
+        np.testing.assert_array_equal(getattr(again.search.archive, name), getattr(state.search.archive, name))
+    for ours, theirs in zip(state.search.members, again.search.members, strict=True):
+        assert ours.entry == theirs.entry
+        assert ours.adam.step == theirs.adam.step
+        np.testing.assert_array_equal(ours.centre_D, theirs.centre_D)
+        np.testing.assert_array_equal(ours.adam.m_D, theirs.adam.m_D)
+        np.testing.assert_array_equal(ours.adam.v_D, theirs.adam.v_D)
+    assert sum(member.adam.step for member in again.search.members) == 20  # each has an optimiser of its own
+
+
+def test_initial_members_differ_and_are_evaluated_on_resets_of_their_own():
+    _, store, evaluator = run_in_memory(config_of("ns_es").model_copy(update={"budget": config_of("es").budget}))
+    first = [(point.parameters_D, chunk.chunk_id) for point, chunk, _ in evaluator.recorded if chunk.generation == 0]
+    assert len({centre.tobytes() for centre, _ in first}) == 5
+    assert sorted(chunk_id for _, chunk_id in first) == list(range(10))  # two chunks for each
+    assert store.rows[0]["episodes"] == 100
+
+
+# Choice of the member to update
+
+
+def state_with(descriptors, dimensions=2):
+    """A state whose members' newest entries are these; None for a member without one."""
+    state = first_state([np.zeros(3, np.float32)] * len(descriptors), dimensions, 0.0)
+    for member, descriptor in enumerate(descriptors):
+        if descriptor is not None:
+            state = archived(state, Judgement(0, member, True, 0.0, np.array(descriptor, float)))
+    return state
+
+
+def choices(state, generations=4000, **search):
+    config = config_of("ns_es", members=len(state.members), **search)
+    picked = [choose_member(state, generation, config) for generation in range(1, generations + 1)]
+    return np.bincount(picked, minlength=len(state.members)) / generations, picked
+
+
+def test_members_are_chosen_in_proportion_to_their_novelty():
+    state = state_with([(0, 0), (1, 0), (7, 0)])
+    novelty_M = member_novelty(state, config_of("ns_es").novelty)
+    assert novelty_M.tolist() == [4.0, 3.5, 6.5]  # itself is no neighbour
+    share, _ = choices(state)
+    np.testing.assert_allclose(share, novelty_M / 14.0, atol=4 * np.sqrt(0.25 / 4000))
+
+
+def test_novelty_is_that_of_today_s_archive_and_of_the_member_s_newest_entry():
+    state = state_with([(0, 0), (10, 0)])
+    for _ in range(3):  # others crowd around the first member
+        state = archived(state, Judgement(1, 1, True, 0.0, np.array([0.0, 0.0])))
+    state = archived(state, Judgement(2, 1, True, 0.0, np.array([5.0, 0.0])))
+    assert member_novelty(state, config_of("ns_es").novelty).tolist() == [0.0, 5.0]
+    share, _ = choices(state, 200)
+    assert share.tolist() == [0.0, 1.0]
+
+
+def test_all_novelties_zero_is_a_uniform_choice():
+    for state in (state_with([(1, 1)] * 4), state_with([None] * 4)):
+        share, _ = choices(state)
+        np.testing.assert_allclose(share, 0.25, atol=0.03)
+
+
+def test_a_member_without_a_valid_centre_has_no_novelty():
+    assert member_novelty(state_with([(0, 0), None, (2, 0)]), config_of("ns_es").novelty).tolist() == [2.0, 0.0, 2.0]
+
+
+def test_other_choices():
+    state = state_with([(0, 0), (0, 0), (9, 9)])
+    share, _ = choices(state, member_choice="uniform")
+    np.testing.assert_allclose(share, 1 / 3, atol=0.03)
+    _, picked = choices(state, 7, member_choice="round_robin")
+    assert picked == [0, 1, 2, 0, 1, 2, 0]
+
+
+# The adaptive weight
+
+
+def weights_of(fitnesses, start, **rule):
+    search = config_of("nsra_es", fitness_weight_start=start, **rule).search
+    weight, values = FitnessWeight(start), []
+    for generation, fitness in enumerate(fitnesses, 1):
+        valid = fitness is not None
+        weight = adapted_weight(search, weight, Judgement(generation, 0, valid, fitness or 0.0, np.zeros(2)))
+        values.append(round(weight.value, 10))
+    return values, weight
+
+
+def test_weight_by_hand():
+    rule = {"fitness_weight_step": 0.25, "fitness_weight_patience": 2, "fitness_weight_min_gain": 0.0}
+    values, weight = weights_of([-9, -9, -10, -11, None, -8, -8], 0.5, **rule)
+    #     first always; equal is no gain; 2nd: down; 1; invalid: 2nd, down; gain: up; 1
+    assert values == [0.75, 0.75, 0.5, 0.5, 0.25, 0.5, 0.5]
+    assert (weight.record, weight.stagnant) == (-8, 1)
+    assert weights_of(range(9), 0.5, **rule)[0][-1] == 1.0
+    assert weights_of([0] * 20, 0.5, **rule)[0][-1] == 0.0
+
+
+def test_the_least_gain_is_relative_to_the_record_s_size():
+    rule = {"fitness_weight_step": 0.125, "fitness_weight_patience": 9, "fitness_weight_min_gain": 0.1}
+    assert weights_of([-100, -91, -90, -89.9, -81, -80.9], 0.0, **rule)[0] == [0.125, 0.125, 0.125, 0.25, 0.25, 0.375]
+
+
+def test_presets_are_the_published_rules():
+    """literature: w0 1, patience 50, any gain; uber: w0 0.5, patience 20, a tenth; 0.05 in both."""
+    for preset, expected in (("literature", (1.0, 0.05, 50, 0.0)), ("uber", (0.5, 0.05, 20, 0.1))):
+        search = load_config(
+            {
+                "task": {"environment": "point_maze"},
+                "search": {"algorithm": "nsra_es", "preset": preset},
+                "budget": {"generations": 1},
+            }
+        ).search
+        assert expected == (
+            search.fitness_weight_start,
+            search.fitness_weight_step,
+            search.fitness_weight_patience,
+            search.fitness_weight_min_gain,
+        )
+
+
+# Invalid results
+
+
+class Spoiling(DirectEvaluator):
+    """Evaluations of some generations end nowhere."""
+
+    def evaluate(self, centre, chunks):
+        results = super().evaluate(centre, chunks)
+        for chunk, result in zip(chunks, results, strict=True):
+            if isinstance(chunk, EvaluationChunk) and chunk.generation in (0, 3):
+                result.descriptor[1] = np.nan
+            if isinstance(chunk, TrainingChunk):
+                result.descriptor[0, 0] = np.inf
+        return results
+
+
+def test_an_invalid_centre_never_enters_the_archive():
+    config = config_of("nsra_es")
+    state, store, _ = run_in_memory(config, Spoiling(worker_spec(config, TASKS["point_maze"])))
+    assert [row["archive_size"] for row in store.rows[:6]] == [0, 1, 2, 2, 3, 4]
+    assert np.isnan(store.rows[3]["centre_novelty"])
+    assert 3 not in state.search.archive.generation_N
+    assert all(row["invalid_members"] == 2 for row in store.rows[1:])
+    assert all(np.isfinite(member.centre_D).all() for member in state.search.members)
+
+
+def test_members_are_frozen():
+    member = Member(np.zeros(2, np.float32), None)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        member.entry = 3  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,0 +1,69 @@
+"""NS-ES, NSR-ES and NSRA-ES once more, slowly and in float64: written for reading, one number at a time."""
+
+from __future__ import annotations
+
+import math
+
+from tests.twins.es import ES, averaged_centred_ranks
+
+
+def novelty(archive, descriptor, neighbours, squared=False, without=None):
+    """Mean distance to the nearest entries of a list of descriptors, adding the smallest first."""
+    distances = []
+    for index, entry in enumerate(archive):
+        if index != without:
+            square = 0.0
+            for x, y in zip(descriptor, entry, strict=True):
+                square += (float(x) - float(y)) * (float(x) - float(y))
+            distances.append(square)
+    nearest = sorted(distances)[:neighbours]
+    total = 0.0
+    for square in nearest:
+        total += square if squared else math.sqrt(square)
+    return total / len(nearest) if nearest else 0.0
+
+
+class NoveltySearch:
+    def __init__(self, centres, learning_rate, l2, *, neighbours, weight, rule=None):
+        """rule: None, or (step, patience, minimum relative gain) of the adaptive weight."""
+        self.members = [ES(centre, learning_rate, l2) for centre in centres]
+        self.archive, self.newest_entry = [], [None] * len(centres)
+        self.neighbours, self.weight, self.rule = neighbours, weight, rule
+        self.record, self.stagnant = None, 0
+
+    def chosen(self, uniform):
+        """Roulette over the members' novelties, for a number drawn from [0, 1)."""
+        shares = [novelty(self.archive, self.archive[i], self.neighbours, without=i) for i in self.newest_entry]
+        if sum(shares) == 0.0:
+            shares = [1.0] * len(shares)
+        below = 0.0
+        for index, share in enumerate(shares):
+            below += share
+            if uniform * sum(shares) < below:
+                return index
+        raise AssertionError
+
+    def generation(self, member, noise_P_D, fitness_P_S, descriptor_P_S_B):
+        pairs = len(noise_P_D)
+        reward = averaged_centred_ranks(fitness_P_S.ravel())
+        novel = averaged_centred_ranks(
+            [novelty(self.archive, x, self.neighbours) for x in descriptor_P_S_B.reshape(2 * pairs, -1)]
+        )
+        mixed = self.weight * reward + (1 - self.weight) * novel
+        self.members[member].climb(noise_P_D, mixed.reshape(pairs, 2))
+
+    def initial(self, member, descriptor):
+        self.newest_entry[member] = len(self.archive)
+        self.archive.append(descriptor)
+
+    def evaluated(self, member, fitness, descriptor):
+        self.initial(member, descriptor)
+        if self.rule is None:
+            return
+        step, patience, gain = self.rule
+        if self.record is None or fitness > self.record + gain * abs(self.record):
+            self.record, self.stagnant, self.weight = fitness, 0, min(1.0, self.weight + step)
+        else:
+            self.stagnant += 1
+            if self.stagnant == patience:
+                self.stagnant, self.weight = 0, max(0.0, self.weight - step)
