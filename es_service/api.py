@@ -17,6 +17,7 @@ from es_service import driver
 from es_service.algorithms import ALGORITHMS
 from es_service.config import loading
 from es_service.config.model import RunConfig, changed_constants, describe_changes, policy_shape, worker_spec
+from es_service.dispatch.engine import Engine
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy as SchedulingPolicy
 from es_service.errors import ConfigError, StoreError
@@ -32,6 +33,7 @@ from es_service.store.beginning import Beginning
 from es_service.store.folder import explained, write_config
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook
+from workers.actor import WorkerActor
 from workers.environments import TASKS
 from workers.policy import initial_parameters
 
@@ -237,7 +239,7 @@ def _create_and_work(
 
 
 def _work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_notice: OnNotice) -> Outcome:
-    """Run the loop on the inline engine until the budget is spent."""
+    """Run the loop until the budget is spent."""
     task = _task(config)
     told = 0
 
@@ -271,9 +273,20 @@ def _work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_no
         initial=lambda: _initial(config, store),
         task=task,
     )
-    with stop_on_signals() as should_stop, inline_engine(worker_spec(config, task), scheduling, should_stop) as engine:
+    with stop_on_signals() as should_stop, _engine(config, scheduling, should_stop) as engine:
         _, reason = driver.run(search, engine, store, after_generation)
     return Outcome(open_run(store.folder), reason)
+
+
+def _engine(config: RunConfig, scheduling: SchedulingPolicy, should_stop: Callable[[], int | None]) -> Engine[Any]:
+    """What runs the workers, as configured; they are starting."""
+    spec, compute = worker_spec(config, _task(config)), config.compute
+    if compute.engine == "inline":
+        return inline_engine(spec, scheduling, should_stop)
+    from es_service.dispatch.ray_engine import ray_engine
+
+    all_cpus = compute.workers == "auto"
+    return ray_engine(spec, scheduling, should_stop, actor=WorkerActor, address=compute.address, all_cpus=all_cpus)
 
 
 def _task(config: RunConfig) -> TaskSpec:

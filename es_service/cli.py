@@ -39,7 +39,10 @@ SetOption = Annotated[
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the new run; default: a name under runs/.")]
 WorkersOption = Annotated[int | None, typer.Option("--workers", help="Worker processes; default: as configured.")]
-EngineOption = Annotated[str | None, typer.Option("--engine", help="What runs the workers: inline.")]
+EngineOption = Annotated[str | None, typer.Option("--engine", help="What runs the workers: inline or ray.")]
+AddressOption = Annotated[
+    str | None, typer.Option("--address", help="Ray cluster to join: HOST:PORT, or auto. Implies --engine ray.")
+]
 
 
 def _print_version(wanted: bool) -> None:
@@ -65,9 +68,10 @@ def run(
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of all random numbers.")] = None,
     workers: WorkersOption = None,
     engine: EngineOption = None,
+    address: AddressOption = None,
 ) -> None:
     """Start a run from a config file."""
-    overrides = _overrides(set_, seed=seed, **{"compute.workers": workers, "compute.engine": engine})
+    overrides = _overrides(set_, seed=seed, **_compute(workers, engine, address))
     loaded = api.load_config(config, overrides)
     for warning in config_warnings(loaded):
         _print_note(f"note: {warning}")
@@ -77,10 +81,14 @@ def run(
 
 @app.command()
 def resume(
-    folder: RunArgument, set_: SetOption = None, workers: WorkersOption = None, engine: EngineOption = None
+    folder: RunArgument,
+    set_: SetOption = None,
+    workers: WorkersOption = None,
+    engine: EngineOption = None,
+    address: AddressOption = None,
 ) -> None:
     """Go on with a run; only budget, engine, workers and time limits may change."""
-    overrides = _overrides(set_, **{"compute.workers": workers, "compute.engine": engine})
+    overrides = _overrides(set_, **_compute(workers, engine, address))
     _session(folder, partial(api.resume, folder, overrides))
 
 
@@ -94,9 +102,10 @@ def fork(
     out: OutOption = None,
     workers: WorkersOption = None,
     engine: EngineOption = None,
+    address: AddressOption = None,
 ) -> None:
     """Start a new run from another run's state, with changed settings."""
-    overrides = _overrides(set_, **{"compute.workers": workers, "compute.engine": engine})
+    overrides = _overrides(set_, **_compute(workers, engine, address))
     folder = out if out is not None else api.default_folder(api.fork_config(parent, overrides))
     _session(folder, partial(api.fork, parent, overrides, generation=generation, out=folder))
 
@@ -179,6 +188,13 @@ def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
         _print_note(f"every finished generation is saved. Once the cause is gone: es-service resume {folder}")
         raise
     print_summary(console, outcome.run, outcome.reason)
+
+
+def _compute(workers: int | None, engine: str | None, address: str | None) -> dict[str, object]:
+    """The options that say where a run runs, by config key. A cluster to join is a Ray cluster."""
+    if address is not None and engine is None:
+        engine = "ray"
+    return {"compute.workers": workers, "compute.engine": engine, "compute.address": address}
 
 
 def _overrides(set_: list[str] | None, **options: object) -> list[str]:

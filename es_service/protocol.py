@@ -6,7 +6,7 @@ of one chunk, S sign [+, -], E episodes of one evaluation chunk, O observation, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol
 
@@ -78,6 +78,17 @@ class WorkerSpec:
     """Pairs that step together inside a chunk; divides `chunk_pairs`. Few enough for their weights to stay in cache."""
     gradient_block_pairs: int
     """Pairs whose weighted noise is summed into one partial gradient."""
+
+
+def worker_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """Environment variables for a worker process, made from those of whoever starts it.
+
+    One thread, on the CPU, and none of the other settings of JAX and XLA, so that nothing set elsewhere can change the
+    bits of a rollout. In force only where JAX has not been imported yet.
+    """
+    kept = {name: value for name, value in environment.items() if not name.startswith(("JAX_", "XLA_", "PJRT_"))}
+    threads = dict.fromkeys(("PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    return kept | threads | {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": ""}
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from es_service.config.resolution import (
     LEFT_OPEN,
     OPTIONS,
     did_you_mean,
+    engine_problems,
     folder_problems,
     member_problems,
     one_of,
@@ -121,7 +122,8 @@ def _load(
             problems.append(f"{key}: missing; must be {one_of(known)}")
     task = tasks.get(values.get("task.environment", ""))
     values = resolve(values, left_open, task)
-    problems += (task_problems(values, task) if task else []) + member_problems(values) + shape_problems(values)
+    problems += task_problems(values, task) if task else []
+    problems += member_problems(values) + shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & _BUDGET and all(values.get(key) is None for key in _BUDGET):
         problems.append(f"budget: nothing ends this run; set at least one of {one_of(_BUDGET)}")

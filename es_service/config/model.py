@@ -150,9 +150,18 @@ class BudgetConfig(_Section):
 class ComputeConfig(_Section):
     """How the work is cut and where it runs. Only `rollout` and the three `*_pairs` are constants of the run."""
 
-    engine: Literal["inline"] = Field("inline", description="What runs the workers: child processes of this program.")
+    engine: Literal["inline", "ray"] = Field(
+        "inline",
+        description="What runs the workers. inline: this program's child processes. ray: actors, here or in a cluster.",
+    )
+    address: Text | None = Field(
+        None,
+        description="With engine ray: a cluster to join, HOST:PORT, or auto for the one on this machine; null starts a "
+        "Ray of its own.",
+    )
     workers: Literal["auto"] | Count = Field(
-        "auto", description="Worker processes. auto: one per core of the machine at hand. Never changes results."
+        "auto",
+        description="Worker processes. auto: one per core of the machine or cluster at hand. Never changes results.",
     )
     rollout: Literal["xla"] = Field(description="What computes episodes. auto: xla.")
     chunk_pairs: Count = Field(

@@ -157,6 +157,14 @@ def shape_problems(values: Mapping[str, Any]) -> list[str]:
     return problems
 
 
+def engine_problems(values: Mapping[str, Any]) -> list[str]:
+    """Where the config asks for a cluster without Ray."""
+    address, engine = values.get("compute.address"), values.get("compute.engine", "inline")
+    if address is None or engine == "ray":
+        return []
+    return [f"compute.address: {show(address)} needs compute.engine = ray, which is {engine}"]
+
+
 def folder_problems(values: Mapping[str, Any]) -> list[str]:
     """Where the config names a run that is not there."""
     folder = values.get("search.init_from")

@@ -23,19 +23,8 @@ from typing import IO, Any
 
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
-from es_service.protocol import Centre, Chunk, WorkerSpec
+from es_service.protocol import Centre, Chunk, WorkerSpec, worker_environment
 
-FIXED_ENVIRONMENT = {
-    "PJRT_NPROC": "1",
-    "JAX_PLATFORMS": "cpu",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "PYTHONSAFEPATH": "1",
-}
-"""One thread, on the CPU. Children start with these, and without any other setting named below, so that nothing the
-caller has set can change the bits of a rollout."""
-NOT_INHERITED = ("JAX_", "XLA_", "PJRT_")
-"""Beginnings of the names of environment variables that children do not inherit."""
 JOIN_S = 1.0
 """Longest wait for the threads of a child that is dead; they end at once unless a stray process holds its pipe."""
 
@@ -139,8 +128,9 @@ class ChildProcesses:
 
 
 def _start_child(worker: int, inbox: queue.SimpleQueue[tuple[int, Any]]) -> _Child:
-    environment = {name: value for name, value in os.environ.items() if not name.startswith(NOT_INHERITED)}
-    environment |= FIXED_ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+    environment = worker_environment(os.environ)
+    environment["PYTHONSAFEPATH"] = "1"
+    environment["PYTHONPATH"] = os.pathsep.join(path or os.getcwd() for path in sys.path)
     with ExitStack() as undo:
         log = undo.enter_context(tempfile.TemporaryFile())
         ours, theirs = Pipe(duplex=True)

@@ -131,7 +131,8 @@ def test_a_chunk_that_fails_everywhere_ends_the_run_with_its_error(tmp_path, mon
 
 
 def test_workers_that_cannot_start_end_the_run_with_their_last_words(tmp_path, monkeypatch):
-    monkeypatch.setitem(inline_engine.FIXED_ENVIRONMENT, "JAX_PLATFORMS", "no_such_platform")
+    broken = {**os.environ, "JAX_PLATFORMS": "no_such_platform"}
+    monkeypatch.setattr(inline_engine, "worker_environment", lambda environment: broken.copy())
     with pytest.raises(EvaluationError, match="no_such_platform"):
         run(tmp_path / "run")
     assert children() == []
