@@ -76,6 +76,8 @@ def _progress(rows: list[dict[str, Any]]) -> dict[str, str]:
         "best fitness": f"{last['best_fitness']:.2f}",
         "centre fitness": f"{last['centre_fitness_mean']:.2f} ± {last['centre_fitness_std']:.2f}",
         **goal,
+        "novelty archive": f"{last['archive_size']:,} centres",
+        "weight of fitness": f"{last['fitness_weight']:g} (novelty: {1.0 - last['fitness_weight']:g})",
         "environment steps": f"{last['env_steps']:,} in {last['episodes']:,} episodes",
         "time": f"{last['wall_clock_s']:.1f} s, {rate:,.0f} steps/s overall",
         **faults,

@@ -1,49 +1,73 @@
 """Where does a generation's time go, and what memory does a run take?
 
-    python -m tests.benchmarks.generation_time
+    python -m tests.benchmarks.generation_time [--algorithm es] [--engine inline ray]
 
-Plain ES on PointMaze with two workers at 512 and 4,096 pairs, medians over the generations after the first ten.
+PointMaze with two workers at 512 and 4,096 pairs, medians over the generations after the first ten; the engines take
+turns. Memory is that of this process and everything it started, shared pages divided among those who share them.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import resource
+import os
 import tempfile
 import time
 from pathlib import Path
 
 from es_service import api
-from tests.benchmarks.rollouts_per_second import resident_mib
-from tests.system.test_workers import children
 
 PARTS = ("rollout", "gradient", "evaluation", "driver", "store")
 
 
-def measure(pairs: int, generations: int, folder: Path) -> dict[str, object]:
+def family_mib() -> dict[str, float]:
+    """Memory (PSS) by process, this one and its descendants: "name pid" -> MiB."""
+    parents = {}
+    for pid in filter(str.isdigit, os.listdir("/proc")):
+        try:
+            parents[int(pid)] = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+    family = {os.getpid()}
+    while more := {pid for pid, parent in parents.items() if parent in family} - family:
+        family |= more
+    mib = {}
+    for pid in family:
+        try:
+            name = Path(f"/proc/{pid}/comm").read_text().strip()
+            lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+        except OSError:
+            continue
+        mib[f"{name} {pid}"] = next(int(line.split()[1]) / 1024 for line in lines if line.startswith("Pss:"))
+    return mib
+
+
+def measure(algorithm: str, engine: str, pairs: int, generations: int, folder: Path) -> dict[str, object]:
     """One run; milliseconds by part, rates, memory of driver and workers."""
     config = api.load_config(
         {
             "task": {"environment": "point_maze"},
-            "search": {"algorithm": "es", "pairs": pairs},
+            "search": {"algorithm": algorithm, "pairs": pairs},
             "budget": {"generations": generations},
-            "compute": {"workers": 2},
+            "compute": {"workers": 2, "engine": engine},
         }
     )
     started = time.perf_counter()
-    first_generation_s, worker_mib = 0.0, 0.0
+    first_generation_s, mib = 0.0, {}
 
     def look(row) -> None:
-        nonlocal first_generation_s, worker_mib
+        nonlocal first_generation_s, mib
         if row["generation"] == 1:
             first_generation_s = time.perf_counter() - started
         if row["generation"] == generations - 1:
-            worker_mib = max(resident_mib(pid) for pid in children())
+            mib = family_mib()
 
     history = api.run(config, folder, on_generation=look).run.history.iloc[10:]
     parts = {part: float(history[f"seconds_{part}"].median() * 1000) for part in PARTS}
     whole = sum(parts.values())
     return {
+        "algorithm": algorithm,
+        "engine": engine,
         "pairs": pairs,
         **{f"{part}_ms": round(value, 2) for part, value in parts.items()},
         "generation_ms": round(whole, 1),
@@ -51,15 +75,21 @@ def measure(pairs: int, generations: int, folder: Path) -> dict[str, object]:
         "outside_rollouts_percent": round(100 * (whole - parts["rollout"] - parts["evaluation"]) / whole, 1),
         "steps_per_second": round(float(history["steps_per_second"].median())),
         "first_generation_s": round(first_generation_s, 1),
-        "worker_peak_mib": round(worker_mib),
-        "driver_peak_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        "processes": len(mib),
+        "all_processes_mib": round(sum(mib.values())),
     }
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--algorithm", default="es")
+    parser.add_argument("--engine", nargs="+", default=["inline", "ray"])
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        rows = [measure(512, 150, Path(folder) / "512"), measure(4096, 40, Path(folder) / "4096")]
-    print(json.dumps(rows, indent=1))
+        for pairs, generations in ((512, 150), (4096, 40)):
+            for engine in arguments.engine:
+                row = measure(arguments.algorithm, engine, pairs, generations, Path(folder) / f"{engine}{pairs}")
+                print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":
