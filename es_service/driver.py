@@ -106,8 +106,9 @@ def _first_generation(search: Search, evaluator: Evaluator, clock: _Clock) -> tu
     fittest = 0
     best = Best(0, -math.inf, centres[0], points[0].observation_mean_O, points[0].observation_std_O)
     for member, (point, evaluation) in enumerate(zip(points, evaluations, strict=True)):
-        moved = search.algorithm.absorb(moved, judge(0, member, evaluation))
-        better = _better(best, point, evaluation)
+        judgement = judge(0, member, evaluation)
+        moved = search.algorithm.absorb(moved, judgement)
+        better = _better(best, point, judgement)
         best, fittest = better, fittest if better is best else member
     state = RunState(
         generation=0,
@@ -180,7 +181,7 @@ def _next_generation(
         generation=generation,
         search=learned,
         observations=merge_moments(state.observations, observed),
-        best=_better(state.best, new_centre, evaluation),
+        best=_better(state.best, new_centre, judgement),
         env_steps=state.env_steps + _steps(population) + _steps(evaluation),
         episodes=state.episodes
         + population.fitness.size * search.config.task.episodes_per_member
@@ -235,22 +236,21 @@ def judge(generation: int, member: int, evaluation: EpisodesResult) -> Judgement
     )
 
 
-def _search_columns(member: int, fitness_weight: float, novelty: float | None, after: SearchState) -> HistoryRow:
+def _search_columns(member: int, fitness_weight: float, centre_novelty: float | None, after: SearchState) -> HistoryRow:
     return {
         "member": member,
         "fitness_weight": fitness_weight,
-        "centre_novelty": novelty,
+        "centre_novelty": centre_novelty,
         "archive_size": after.archive.size,
     }
 
 
-def _better(best: Best, centre: Centre, evaluation: EpisodesResult) -> Best:
+def _better(best: Best, centre: Centre, judgement: Judgement) -> Best:
     """The better of the best so far and a centre just evaluated; an invalid centre (not finite) is no improvement."""
-    fitness = float(np.mean(evaluation.fitness, dtype=np.float64))
-    if not valid_members(evaluation).all() or fitness <= best.fitness:
+    if not judgement.valid or judgement.fitness <= best.fitness:
         return best
     mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
-    return Best(centre.generation, fitness, centre.parameters_D, mean_O, std_O)
+    return Best(centre.generation, judgement.fitness, centre.parameters_D, mean_O, std_O)
 
 
 def _steps(result: EpisodesResult) -> int:

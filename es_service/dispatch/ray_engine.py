@@ -122,6 +122,8 @@ class Actors:
 
     def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunk: Chunk) -> None:
         """Call the actor. A centre is stored once, however many chunks share it, and dropped with the next one."""
+        if worker not in self._handles:
+            return  # lost a moment ago, when it was sent another chunk; that is on its way to the scheduler
         try:
             if self._centre is None or self._centre[0] is not centre:
                 self._centre = centre, self._ray.put(centre)

@@ -64,21 +64,19 @@ def test_what_is_no_run_folder_is_called_that(tmp_path):
     assert not (tmp_path / "other" / "run.lock").exists()
 
 
-def test_an_older_schema_version_names_both(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("version", "message"),
+    [
+        (7, r"schema version 7; .* versions up to 2\. Upgrade"),
+        (1, r"schema version 1; this es-service reads version 2\. Use the"),
+    ],
+)
+def test_another_schema_version_names_both_and_says_what_to_use(tmp_path, monkeypatch, version, message):
     with monkeypatch.context() as patch:
-        patch.setattr(store_schema, "SCHEMA_VERSION", 1)
+        patch.setattr(store_schema, "SCHEMA_VERSION", version)
         folder = finished(tmp_path / "run", 1)
     for use in (RunStore.open, read_meta, read_history):
-        with pytest.raises(StoreError, match=r"schema version 1; this es-service reads version 2\. Use the"):
-            use(folder)
-
-
-def test_a_newer_schema_version_names_both_and_says_upgrade(tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(store_schema, "SCHEMA_VERSION", 7)
-        folder = finished(tmp_path / "run", 1)
-    for use in (RunStore.open, read_meta, read_history):
-        with pytest.raises(StoreError, match=r"schema version 7; .* versions up to 2\. Upgrade"):
+        with pytest.raises(StoreError, match=message):
             use(folder)
 
 
