@@ -237,8 +237,12 @@ def test_signals_stop_promptly_and_resume_equals_uninterrupted(config, finished,
 
 @pytest.mark.parametrize("delay_s", [0.1, 0.25, 0.4, 0.6, 1.0, 1.6])
 def test_a_signal_during_start_up_ends_quietly(config, tmp_path, delay_s):
+    long = ["--set", "budget.generations=100000"]  # a fast machine finishes the 30 of the config before the signal
     process = subprocess.Popen(
-        [*COMMAND, "run", str(config), "--out", str(tmp_path / "run")], cwd=ROOT, stderr=subprocess.PIPE, text=True
+        [*COMMAND, "run", str(config), "--out", str(tmp_path / "run"), *long],
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     time.sleep(delay_s)
     process.send_signal(signal.SIGINT)
