@@ -17,6 +17,7 @@ from es_service import driver
 from es_service.algorithms import ALGORITHMS
 from es_service.config import loading
 from es_service.config.model import RunConfig, changed_constants, describe_changes, policy_shape, worker_spec
+from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy as SchedulingPolicy
@@ -30,7 +31,7 @@ from es_service.signals import stop_on_signals
 from es_service.statistics import no_observations
 from es_service.store import reader
 from es_service.store.beginning import Beginning
-from es_service.store.folder import explained, write_config
+from es_service.store.folder import DATABASE, explained, write_config
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook
 from workers.actor import WorkerActor
@@ -113,11 +114,44 @@ def resume(
     Raises:
         ConfigError: a constant of the run would change (all are listed). Otherwise as `run`.
     """
-    folder = Path(folder)
-    with RunStore.open(folder, hook=hook) as store:
-        recorded = folder / "config.yaml"
+
+    def changed(store: RunStore) -> RunConfig:
+        recorded = store.folder / "config.yaml"
         source = recorded if recorded.exists() else store.meta.config
-        config = loading.resume_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+        return loading.resume_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+
+    return _go_on(Path(folder), changed, on_generation, on_notice, hook)
+
+
+def run_or_resume(
+    config: RunConfig | loading.Source,
+    out: str | os.PathLike[str],
+    *,
+    on_generation: OnGeneration = _ignore,
+    on_notice: OnNotice = _warn,
+    hook: Callable[[str], None] = no_hook,
+) -> Outcome:
+    """Start a run, or go on with it if the folder holds it already: the same call again after whatever happened.
+
+    Raises:
+        ConfigError: the folder's run has other constants than `config` (all are listed). Otherwise as `run`.
+    """
+    wanted = config if isinstance(config, RunConfig) else load_config(config)
+    if not (Path(out) / DATABASE).exists():
+        return run(wanted, out, on_generation=on_generation, on_notice=on_notice, hook=hook)
+    return _go_on(Path(out), lambda store: wanted, on_generation, on_notice, hook)
+
+
+def _go_on(
+    folder: Path,
+    make_config: Callable[[RunStore], RunConfig],
+    on_generation: OnGeneration,
+    on_notice: OnNotice,
+    hook: Callable[[str], None],
+) -> Outcome:
+    """Open a run, make sure that the config for this session is its own, and work."""
+    with RunStore.open(folder, hook=hook) as store:
+        config = make_config(store)
         if changes := changed_constants(store.meta.constants, config.constants()):
             raise ConfigError(f"{folder}: {describe_changes(changes, str(folder))}")
         if store.meta.columns != history_columns(_task(config)):
@@ -249,10 +283,6 @@ def _work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_no
             on_notice(notice)
         told = len(store.notices)
 
-    def after_generation(row: Mapping[str, Any]) -> None:
-        tell_notices()
-        on_generation(row)
-
     tell_notices()
     platform = platform_info()
     first = 0 if store.generation is None else store.generation + 1
@@ -273,20 +303,44 @@ def _work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_no
         initial=lambda: _initial(config, store),
         task=task,
     )
-    with stop_on_signals() as should_stop, _engine(config, scheduling, should_stop) as engine:
+    with (
+        dispatch_log(store.folder, store.generation, enabled=compute.dispatch_log) as log,
+        stop_on_signals() as should_stop,
+        _engine(config, scheduling, should_stop, log) as engine,
+    ):
+
+        def after_generation(row: Mapping[str, Any]) -> None:
+            log(Committed(row["generation"]))
+            tell_notices()
+            if lost := row["lost_workers"]:
+                who = "a worker" if lost == 1 else f"{lost} workers"
+                on_notice(f"generation {row['generation']}: lost {who}; {engine.last_loss}")
+            on_generation(row)
+
         _, reason = driver.run(search, engine, store, after_generation)
     return Outcome(open_run(store.folder), reason)
 
 
-def _engine(config: RunConfig, scheduling: SchedulingPolicy, should_stop: Callable[[], int | None]) -> Engine[Any]:
+def _engine(
+    config: RunConfig, scheduling: SchedulingPolicy, should_stop: Callable[[], int | None], log: Log
+) -> Engine[Any]:
     """What runs the workers, as configured; they are starting."""
     spec, compute = worker_spec(config, _task(config)), config.compute
     if compute.engine == "inline":
-        return inline_engine(spec, scheduling, should_stop)
+        return inline_engine(spec, scheduling, should_stop, log=log)
+    from es_service.dispatch.ray_cluster import Claim
     from es_service.dispatch.ray_engine import ray_engine
 
-    all_cpus = compute.workers == "auto"
-    return ray_engine(spec, scheduling, should_stop, actor=WorkerActor, address=compute.address, all_cpus=all_cpus)
+    return ray_engine(
+        spec,
+        scheduling,
+        should_stop,
+        actor=WorkerActor,
+        address=compute.address,
+        claim=Claim(compute.worker_resources.cpu, compute.worker_resources.gpu),
+        elastic=compute.workers == "auto",
+        log=log,
+    )
 
 
 def _task(config: RunConfig) -> TaskSpec:

@@ -1,4 +1,4 @@
-"""The command line: `es-service run | resume | fork | status | digest | list | doctor`.
+"""The command line: `es-service run | resume | fork | status | digest | list | submit | jobs | logs | stop | doctor`.
 
 Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by SIGINT or SIGTERM.
 """
@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from es_service import api, digest
+from es_service import api, digest, jobs
 from es_service.config.resolution import config_warnings
 from es_service.errors import ConfigError, EvaluationError, Interrupted, ServiceError
 from es_service.report.catalogue import print_catalogue
@@ -43,6 +43,10 @@ EngineOption = Annotated[str | None, typer.Option("--engine", help="What runs th
 AddressOption = Annotated[
     str | None, typer.Option("--address", help="Ray cluster to join: HOST:PORT, or auto. Implies --engine ray.")
 ]
+JobsOption = Annotated[
+    str, typer.Option("--address", help="The cluster's dashboard, such as http://127.0.0.1:8265.", show_default=False)
+]
+JobArgument = Annotated[str, typer.Argument(help="Id of a job, as `submit` printed it.", show_default=False)]
 
 
 def _print_version(wanted: bool) -> None:
@@ -69,14 +73,19 @@ def run(
     workers: WorkersOption = None,
     engine: EngineOption = None,
     address: AddressOption = None,
+    or_resume: Annotated[
+        bool, typer.Option("--or-resume", help="Go on with the run if --out holds it already.")
+    ] = False,
 ) -> None:
     """Start a run from a config file."""
     overrides = _overrides(set_, seed=seed, **_compute(workers, engine, address))
+    if or_resume and out is None:
+        raise ConfigError("--or-resume needs --out: without it every run has a folder of its own")
     loaded = api.load_config(config, overrides)
     for warning in config_warnings(loaded):
         _print_note(f"note: {warning}")
     folder = out if out is not None else api.default_folder(loaded)
-    _session(folder, partial(api.run, loaded, folder))
+    _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder))
 
 
 @app.command()
@@ -139,6 +148,51 @@ def digest_(
 def list_() -> None:
     """Show tasks, algorithms and presets."""
     print_catalogue(console, TASKS)
+
+
+@app.command()
+def submit(
+    config: ConfigArgument,
+    address: JobsOption,
+    out: Annotated[str, typer.Option("--out", help="Folder of the run on the cluster's head, or a disk it shares.")],
+    set_: SetOption = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of all random numbers.")] = None,
+    workers: WorkersOption = None,
+) -> None:
+    """Send a run to a Ray cluster as a job. The same command again goes on with it, after whatever happened."""
+    overrides = _overrides(set_, seed=seed, **_compute(workers, None, "auto"))
+    loaded = api.load_config(config, overrides)
+    job = jobs.submit(loaded, address, out)
+    print(job)
+    _print_note(f"submitted; watch it with: es-service logs {job} --address {address} --follow")
+
+
+@app.command(name="jobs")
+def jobs_(address: JobsOption) -> None:
+    """List the cluster's jobs, newest first: id, state, run folder."""
+    for job in jobs.list_jobs(address):
+        print(f"{job.id}  {job.state:<9}  {job.folder}")
+
+
+@app.command()
+def logs(
+    job: JobArgument,
+    address: JobsOption,
+    follow: Annotated[bool, typer.Option("--follow", help="Keep printing until the job ends.")] = False,
+) -> None:
+    """Print what a job has printed."""
+    for text in jobs.logs(job, address, follow=follow):
+        print(text, end="", flush=True)
+    if follow:
+        state = jobs.state(job, address)
+        _print_note(f"{job} {state.lower()}")
+        raise typer.Exit(0 if state == "SUCCEEDED" else 1)
+
+
+@app.command()
+def stop(job: JobArgument, address: JobsOption) -> None:
+    """Stop a job; what is committed stays, and submitting it again goes on from there."""
+    _print_note(f"{job} {jobs.stop(job, address).lower()}")
 
 
 @app.command()

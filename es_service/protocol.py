@@ -80,15 +80,42 @@ class WorkerSpec:
     """Pairs whose weighted noise is summed into one partial gradient."""
 
 
-def worker_environment(environment: Mapping[str, str]) -> dict[str, str]:
+class WorkerPlace(NamedTuple):
+    """Where a worker lives."""
+
+    host: str
+    pid: int
+    node: str
+    """Id of the node in its cluster."""
+
+    def __str__(self) -> str:
+        return f"{self.host} (pid {self.pid})"
+
+
+GPU_MEMORY_FRACTION = 0.9
+"""Of a whole GPU; workers that share one divide this among them."""
+GPU_SETTINGS = {
+    "JAX_PLATFORMS": "cuda",
+    "JAX_DEFAULT_MATMUL_PRECISION": "highest",
+    "XLA_FLAGS": "--xla_gpu_deterministic_ops=true --xla_gpu_autotune_level=0",
+}
+"""So that a GPU repeats its own bits; they are not those of a CPU."""
+
+
+def worker_environment(environment: Mapping[str, str], gpus: float = 0.0) -> dict[str, str]:
     """Environment variables for a worker process, made from those of whoever starts it.
 
-    One thread, on the CPU, and none of the other settings of JAX and XLA, so that nothing set elsewhere can change the
-    bits of a rollout. In force only where JAX has not been imported yet.
+    One thread, one kind of device, and none of the other settings of JAX and XLA, so that nothing set elsewhere can
+    change the bits of a rollout. In force only where JAX has not been imported yet.
+
+    Args:
+        gpus: the worker's share of a GPU, which CUDA_VISIBLE_DEVICES names already; with 0 no GPU is touched.
     """
     kept = {name: value for name, value in environment.items() if not name.startswith(("JAX_", "XLA_", "PJRT_"))}
     threads = dict.fromkeys(("PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    return kept | threads | {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": ""}
+    if not gpus:
+        return kept | threads | {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": ""}
+    return kept | threads | GPU_SETTINGS | {"XLA_CLIENT_MEM_FRACTION": f"{GPU_MEMORY_FRACTION * min(gpus, 1.0):g}"}
 
 
 @dataclass(frozen=True)

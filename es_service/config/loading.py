@@ -15,11 +15,12 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from es_service.config.model import RunConfig, changed_constants, describe_changes
+from es_service.config.model import RunConfig, WorkerResources, changed_constants, describe_changes
 from es_service.config.presets import PRESETS, preset_values
 from es_service.config.resolution import (
     LEFT_OPEN,
     OPTIONS,
+    RESOURCES,
     did_you_mean,
     engine_problems,
     folder_problems,
@@ -43,11 +44,11 @@ _SECTIONS = {
 }
 _FIELDS = {name: field for name, field in RunConfig.model_fields.items() if name not in _SECTIONS} | {
     f"{section}.{name}": field
-    for section, model in _SECTIONS.items()
+    for section, model in {**_SECTIONS, RESOURCES.removesuffix("."): WorkerResources}.items()
     for name, field in model.model_fields.items()
-    if f"{section}.{name}." != OPTIONS
+    if f"{section}.{name}." not in (OPTIONS, RESOURCES)
 }
-_GROUPS = (*_SECTIONS, OPTIONS.removesuffix("."))
+_GROUPS = (*_SECTIONS, OPTIONS.removesuffix("."), RESOURCES.removesuffix("."))
 """What holds keys and is no value itself."""
 _BUDGET = [name for name in _FIELDS if name.startswith("budget.")]
 
@@ -254,7 +255,7 @@ def _bad_value(name: str, value: object) -> str:
         hint = "; leave the key out for its default"
     elif isinstance(value, str) and "number" in allowed and _is_number(value):
         hint = f"; remove the quotes around {value}"
-    elif isinstance(value, float) and "whole number" in allowed and value.is_integer() and value >= 1:
+    elif isinstance(value, float) and "whole number" in allowed and value.is_integer() and 1 <= value < 2**53:
         hint = f"; write {int(value)}"
     elif isinstance(value, str) and get_origin(field.annotation) is Literal:
         hint = did_you_mean(value, get_args(field.annotation))

@@ -147,12 +147,21 @@ class BudgetConfig(_Section):
     target_fitness: Number | None = Field(None, description="Mean evaluation fitness of a centre that is good enough.")
 
 
+class WorkerResources(_Section):
+    """What one worker takes of a node, with engine ray."""
+
+    cpu: Count = Field(1, description="CPU cores that Ray sets aside for a worker; it uses one.")
+    gpu: NotNegative = Field(
+        0.0, description="GPUs of a worker, 1 or a fraction that it shares; 0 runs episodes on the CPU."
+    )
+
+
 class ComputeConfig(_Section):
     """How the work is cut and where it runs. Only `rollout` and the three `*_pairs` are constants of the run."""
 
-    engine: Literal["inline", "ray"] = Field(
-        "inline",
-        description="What runs the workers. inline: this program's child processes. ray: actors, here or in a cluster.",
+    engine: Literal["ray", "inline"] = Field(
+        "ray",
+        description="What runs the workers. ray: actors, here or in a cluster. inline: this program's child processes.",
     )
     address: Text | None = Field(
         None,
@@ -162,6 +171,10 @@ class ComputeConfig(_Section):
     workers: Literal["auto"] | Count = Field(
         "auto",
         description="Worker processes. auto: one per core of the machine or cluster at hand. Never changes results.",
+    )
+    worker_resources: WorkerResources = Field(
+        default_factory=lambda: WorkerResources(cpu=1, gpu=0.0),
+        description="What one worker takes of a node, with engine ray.",
     )
     rollout: Literal["xla"] = Field(description="What computes episodes. auto: xla.")
     chunk_pairs: Count = Field(
@@ -187,6 +200,9 @@ class ComputeConfig(_Section):
         120.0,
         description="Seconds without any live worker after which the run stops; a worker that takes half as long to "
         "start is replaced.",
+    )
+    dispatch_log: Switch = Field(
+        False, description="Whether the run folder gets a dispatch.jsonl: what each worker was sent, answered, died of."
     )
 
 

@@ -27,6 +27,7 @@ LEFT_OPEN: dict[str, str | None] = {
 }
 """Keys that this module resolves -> the value that asks for it, in a file the same as leaving the key out."""
 OPTIONS = "task.options."
+RESOURCES = "compute.worker_resources."
 SINGLE_MEMBER = ("es",)
 """Algorithms without a meta-population."""
 MEMBERS = 5
@@ -40,6 +41,8 @@ MOST_ROLLOUT_BLOCK_BYTES = 5 * 2**20
 """Above this the weights of the pairs that step together fall out of a core's share of the cache."""
 MOST_GRADIENT_BLOCKS = 32
 """A partial gradient is as large as the policy, so a generation sends few of them."""
+LEAST_GRADIENT_BLOCK_NUMBERS = 4_000_000
+"""Noise numbers in a block, about two milliseconds of work; a smaller block would cost more to send than to sum."""
 FEW_CHUNK_PAIRS = 8
 """Below this a chunk is likely to cost more to send and start than to compute."""
 
@@ -59,10 +62,14 @@ def default_rollout_block_pairs(chunk_pairs: int, parameters: int) -> int:
     return max(size for size in range(1, most + 1) if chunk_pairs % size == 0)
 
 
-def default_gradient_block_pairs(pairs: int, chunk_pairs: int) -> int:
-    """As few whole chunks as make at most 32 blocks of `pairs`: (512, 64) -> 64, (5000, 40) -> 160."""
+def default_gradient_block_pairs(pairs: int, chunk_pairs: int, parameters: int) -> int:
+    """As few whole chunks as make at most 32 blocks of `pairs`, and blocks that are worth a message.
+
+    (512, 64, 4482) -> 512, all of them; (4096, 64, 4482) -> 896; (5000, 40, 75528) -> 160.
+    """
     chunks = -(-pairs // chunk_pairs)
-    return chunk_pairs * max(1, -(-chunks // MOST_GRADIENT_BLOCKS))
+    worth = -(-LEAST_GRADIENT_BLOCK_NUMBERS // (parameters * chunk_pairs))
+    return min(pairs, chunk_pairs * max(worth, -(-chunks // MOST_GRADIENT_BLOCKS)))
 
 
 def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpec | None) -> dict[str, Any]:
@@ -87,12 +94,13 @@ def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpe
     if pairs is not None and "compute.chunk_pairs" in left_open:
         values["compute.chunk_pairs"] = default_chunk_pairs(pairs)
     chunk_pairs = values.get("compute.chunk_pairs")
-    if "compute.rollout_block_pairs" in left_open and chunk_pairs is not None and task is not None:
+    if chunk_pairs is not None and task is not None:
         hidden = values.get("policy.hidden", PolicyConfig.model_fields["hidden"].default)
-        shape = PolicyShape((task.observation_size, *hidden, task.action_size))
-        values["compute.rollout_block_pairs"] = default_rollout_block_pairs(chunk_pairs, shape.parameters)
-    if pairs is not None and chunk_pairs is not None and "compute.gradient_block_pairs" in left_open:
-        values["compute.gradient_block_pairs"] = min(pairs, default_gradient_block_pairs(pairs, chunk_pairs))
+        parameters = PolicyShape((task.observation_size, *hidden, task.action_size)).parameters
+        if "compute.rollout_block_pairs" in left_open:
+            values["compute.rollout_block_pairs"] = default_rollout_block_pairs(chunk_pairs, parameters)
+        if "compute.gradient_block_pairs" in left_open and pairs is not None:
+            values["compute.gradient_block_pairs"] = default_gradient_block_pairs(pairs, chunk_pairs, parameters)
     if isinstance(values.get("search.init_from"), str):
         # Absolute, so that the record still says which run it was when read from another directory.
         values["search.init_from"] = os.path.abspath(os.path.expanduser(values["search.init_from"]))
@@ -158,11 +166,19 @@ def shape_problems(values: Mapping[str, Any]) -> list[str]:
 
 
 def engine_problems(values: Mapping[str, Any]) -> list[str]:
-    """Where the config asks for a cluster without Ray."""
-    address, engine = values.get("compute.address"), values.get("compute.engine", "inline")
-    if address is None or engine == "ray":
-        return []
-    return [f"compute.address: {show(address)} needs compute.engine = ray, which is {engine}"]
+    """Where the config asks for a cluster or a GPU without Ray, or for a share of a GPU that Ray cannot give."""
+    problems = []
+    if values.get("compute.engine", "ray") != "ray":
+        needy = {"compute.address": None, f"{RESOURCES}cpu": 1, f"{RESOURCES}gpu": 0.0}
+        problems = [
+            f"{name}: {show(values[name])} needs compute.engine = ray, which is {values['compute.engine']}"
+            for name, without in needy.items()
+            if values.get(name, without) != without
+        ]
+    gpus = values.get(f"{RESOURCES}gpu", 0.0)
+    if gpus > 1 and gpus != int(gpus):
+        problems.append(f"{RESOURCES}gpu: {show(gpus)} is not allowed; must be a whole number or a fraction below 1")
+    return problems
 
 
 def folder_problems(values: Mapping[str, Any]) -> list[str]:

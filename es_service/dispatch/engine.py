@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Generic, Protocol, Self, TypeVar
 
 from es_service.dispatch import messages, scheduler
+from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import Centre, Chunk, ChunkKey, ChunkResult, DispatchCounts
 
@@ -29,7 +30,7 @@ class Answer:
     result: ChunkResult
 
 
-Message = messages.WorkerUp | messages.WorkerLost | messages.Failure | Answer
+Message = messages.WorkerUp | messages.WorkerLost | messages.Failure | messages.Drain | messages.SetWorkers | Answer
 """What a transport reports: the scheduler's own events, and answers."""
 
 
@@ -74,22 +75,33 @@ class Engine(Generic[AnyTransport]):
     """An Evaluator. Use as a context manager: leaving it kills the workers, who hold nothing."""
 
     def __init__(
-        self, transport: AnyTransport, policy: messages.Policy, should_stop: Callable[[], int | None] = lambda: None
+        self,
+        transport: AnyTransport,
+        policy: messages.Policy,
+        should_stop: Callable[[], int | None] = lambda: None,
+        log: Log = no_log,
     ) -> None:
         """Start `policy.workers` workers.
 
         Args:
             transport: belongs to the engine from now on, which closes it.
             should_stop: asked at least every POLL_S while waiting; a signal number makes `evaluate` raise Interrupted.
+            log: told every event and every command, in the order in which they happen.
         """
         self.transport = transport
         self._should_stop = should_stop
+        self._log = log
         self._state = scheduler.initial_state(policy)
         self._centre: Centre | None = None
         self._phase = 0
         self._chunks: dict[Hashable, Chunk] = {}
         self._results: dict[Hashable, ChunkResult] = {}
         self._step(messages.Tick())
+
+    @property
+    def last_loss(self) -> str:
+        """Which worker was lost last, and why."""
+        return self._state.last_loss
 
     @property
     def counts(self) -> DispatchCounts:
@@ -139,7 +151,10 @@ class Engine(Generic[AnyTransport]):
     def _step(self, event: messages.Event) -> bool:
         """Feed the scheduler and do as it says; whether it accepted a result."""
         self._state, commands = scheduler.step(self._state, event, time.monotonic())
+        if commands or not isinstance(event, messages.Tick):
+            self._log(event)
         for command in commands:
+            self._log(command)
             match command:
                 case messages.StartWorker(worker):
                     self.transport.start(worker)

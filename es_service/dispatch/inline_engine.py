@@ -21,6 +21,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import IO, Any
 
+from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
 from es_service.protocol import Centre, Chunk, WorkerSpec, worker_environment
@@ -30,10 +31,10 @@ JOIN_S = 1.0
 
 
 def inline_engine(
-    spec: WorkerSpec, policy: Policy, should_stop: Callable[[], int | None] = lambda: None
+    spec: WorkerSpec, policy: Policy, should_stop: Callable[[], int | None] = lambda: None, *, log: Log = no_log
 ) -> Engine[ChildProcesses]:
     """An Evaluator on this machine, its `policy.workers` child processes starting."""
-    return Engine(ChildProcesses(spec), policy, should_stop)
+    return Engine(ChildProcesses(spec), policy, should_stop, log)
 
 
 @dataclass

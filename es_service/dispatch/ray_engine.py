@@ -1,44 +1,34 @@
-"""The Ray engine: workers are actors, on this machine or on a cluster. The only file that imports Ray, and only in use.
+"""The Ray engine: workers are actors, on this machine or on a cluster.
 
 Ray starts processes and moves messages. Retries, deadlines and replacements are the scheduler's: actors are never
 restarted by Ray and calls are never repeated by it, so each fault is seen here once, as what it was.
+
+Messages are pickled here, into one `bytes` each: Ray then has a single small object to move, and a centre that fits
+into a call needs no shared memory. Both together halve what Ray adds to a generation of short chunks.
 """
 
 from __future__ import annotations
 
 import contextlib
-import logging
-import os
-import platform
-import secrets
-import signal
-import socket
-import threading
+import pickle
 import time
 from collections import deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
+from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
+from es_service.dispatch.messages import Drain, Failure, Policy, SetWorkers, WorkerLost, WorkerUp
+from es_service.dispatch.ray_cluster import ONE_CORE, Claim, Watch, connect, disconnect, look
 from es_service.errors import EvaluationError
-from es_service.protocol import Centre, Chunk, WorkerSpec
+from es_service.protocol import Centre, Chunk, WorkerPlace, WorkerSpec
 
-OBJECT_STORE_BYTES = 200 * 2**20
-"""Shared memory of a local Ray: a few centres and gradient blocks. Ray would take a third of the machine's."""
 PLACEMENT_S = 30.0
 """Longest wait for the first actor to be given a place; Ray itself would wait for ever."""
-CONNECT_S = 5.0
-"""Longest wait for the port of a cluster to answer; Ray itself would try for more than a minute."""
-TOKEN = secrets.token_hex(32)
-"""For every Ray that this process starts: Ray reads the token of a process only once, and else writes one into HOME."""
-SETTINGS = {
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-}
-"""Nothing phones home; actors without a GPU hide the GPUs themselves."""
+IN_CALL_BYTES = 64 * 2**10
+"""A centre up to this size travels with every call; a larger one is stored once and fetched once per node."""
 
 
 def ray_engine(
@@ -48,7 +38,9 @@ def ray_engine(
     *,
     actor: type,
     address: str | None = None,
-    all_cpus: bool = False,
+    claim: Claim = ONE_CORE,
+    elastic: bool = False,
+    log: Log = no_log,
 ) -> Engine[Actors]:
     """An Evaluator whose workers are Ray actors, starting.
 
@@ -56,18 +48,22 @@ def ray_engine(
         actor: the worker's class, with the methods of `workers.actor.WorkerActor`.
         address: a cluster's "HOST:PORT", or "auto" for the one on this machine; None starts a Ray of our own here,
             whatever other Ray or RAY_ADDRESS there may be, and ends it with the engine.
-        all_cpus: with an address, want as many workers as the cluster has CPUs, instead of `policy.workers`.
+        claim: what one worker needs of a node.
+        elastic: with an address, keep as many workers as the cluster has room for, instead of `policy.workers`.
 
     Raises:
         EvaluationError: Ray is missing, does not start, or no cluster answers at the address.
     """
-    ray = _connect(address, policy.workers)
-    if address is not None and all_cpus:
-        policy = replace(policy, workers=max(1, int(ray.cluster_resources().get("CPU", 1))))
+    ray = connect(address, claim, policy.workers)
     try:
-        return Engine(Actors(ray, spec, actor), policy, should_stop)
+        elastic = elastic and address is not None
+        if elastic:
+            policy = replace(policy, workers=max(1, look(ray, claim).room))
+        watch = None if address is None else Watch(ray, claim)
+        transport = Actors(ray, spec, actor, claim, watch, policy.workers if elastic else None)
+        return Engine(transport, policy, should_stop, log)
     except BaseException:
-        _disconnect(ray)
+        disconnect(ray)
         raise
 
 
@@ -85,25 +81,41 @@ class _Call:
 class Actors:
     """A Transport whose workers are Ray actors."""
 
-    def __init__(self, ray: ModuleType, spec: WorkerSpec, actor: type) -> None:
+    def __init__(
+        self, ray: ModuleType, spec: WorkerSpec, actor: type, claim: Claim, watch: Watch | None, room: int | None
+    ) -> None:
+        """Start nobody yet.
+
+        Args:
+            watch: of the cluster that was joined; None in a Ray of our own, whose one node is this machine.
+            room: workers to ask for as the cluster is now; from then on follow its room. None: never ask.
+        """
         self._ray = ray
-        self._spec = ray.put(spec)
-        self._class = ray.remote(num_cpus=1, max_restarts=0, max_task_retries=0, scheduling_strategy="SPREAD")(actor)
+        self._spec, self._claim = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim
+        self._class = ray.remote(
+            num_cpus=claim.cpus,
+            num_gpus=claim.gpus,
+            max_restarts=0,
+            max_task_retries=0,
+            scheduling_strategy="SPREAD",
+        )(actor)
+        self._watch, self._room = watch, room
         self._handles: dict[int, Any] = {}
         self._calls: dict[Any, _Call] = {}
-        self._places: dict[int, str] = {}
+        self._places: dict[int, WorkerPlace] = {}
+        self._drained: set[int] = set()
         self._inbox: deque[Message] = deque()
         self._centre: tuple[Centre, Any] | None = None
         self._placed_by_s = time.monotonic() + PLACEMENT_S
 
-    def places(self) -> dict[int, str]:
-        """Worker id -> host and process id of those that have a place; for diagnosis and for tests that kill them."""
+    def places(self) -> dict[int, WorkerPlace]:
+        """Worker id -> where it is, of those that have a place."""
         return dict(self._places)
 
     def start(self, worker: int) -> None:
         """Ask Ray for an actor; it is up once it has a place and has built its functions."""
         try:
-            handle = self._class.remote(self._spec, worker)
+            handle = self._class.remote(self._spec, worker, self._claim.gpus)
             self._handles[worker] = handle
             self._calls[handle.place.remote()] = _Call(worker, "place")
             self._calls[handle.build.remote()] = _Call(worker, "build")
@@ -126,15 +138,22 @@ class Actors:
             return  # lost a moment ago, when it was sent another chunk; that is on its way to the scheduler
         try:
             if self._centre is None or self._centre[0] is not centre:
-                self._centre = centre, self._ray.put(centre)
-            ref = self._handles[worker].run.remote(self._centre[1], chunk)
+                pickled = pickle.dumps(centre, pickle.HIGHEST_PROTOCOL)
+                self._centre = centre, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
+            ref = self._handles[worker].run.remote(self._centre[1], pickle.dumps(chunk, pickle.HIGHEST_PROTOCOL))
         except self._ray.exceptions.RayError as error:
             self._lose(worker, _reason(error))
             return
         self._calls[ref] = _Call(worker, "run", key, attempt)
 
     def receive(self, timeout_s: float) -> Message | None:
-        """The next message. Raises EvaluationError if the cluster has had no place for any actor in PLACEMENT_S."""
+        """The next message.
+
+        Raises:
+            EvaluationError: the cluster has had no place for any actor in PLACEMENT_S, or does not answer any more.
+        """
+        if self._watch is not None:
+            self._follow(self._watch)
         if self._inbox:
             return self._inbox.popleft()
         if not self._calls:
@@ -146,7 +165,7 @@ class Actors:
             return self._message(ready[0], self._calls.pop(ready[0]))
         if not self._places and time.monotonic() > self._placed_by_s:
             raise EvaluationError(
-                f"no worker was given a place in {PLACEMENT_S:g} s. Each needs 1 CPU; the cluster has "
+                f"no worker was given a place in {PLACEMENT_S:g} s. Each needs {self._claim}; the cluster has "
                 f"{_resources(self._ray.cluster_resources())} in all, free are "
                 f"{_resources(self._ray.available_resources())}. Add nodes, or stop what else runs there."
             )
@@ -154,11 +173,13 @@ class Actors:
 
     def close(self) -> None:
         """Kill all actors and leave the cluster; a Ray of our own ends."""
+        if self._watch is not None:
+            self._watch.close()
         for worker in list(self._handles):
             self.kill(worker)
         self._calls.clear()
         self._centre = None
-        _disconnect(self._ray)
+        disconnect(self._ray)
 
     def _message(self, ref: Any, call: _Call) -> Message | None:
         errors = self._ray.exceptions
@@ -170,16 +191,27 @@ class Actors:
             self.kill(call.worker)
             return WorkerLost(call.worker, str(error))
         except errors.RayError as error:
-            where = self._places.get(call.worker, "before it had a place")
+            where = self._places.get(call.worker)
             self.kill(call.worker)
-            return WorkerLost(call.worker, f"{where}: {_reason(error)}")
+            return WorkerLost(call.worker, f"{where or 'before it had a place'}: {_reason(error)}")
         if call.what == "run":
-            return Answer(call.worker, call.key, call.attempt, value)
+            return Answer(call.worker, call.key, call.attempt, pickle.loads(value))
         if call.what == "build":
             return WorkerUp(call.worker)
-        self._places[call.worker] = value
+        self._places[call.worker] = WorkerPlace(*value)
         self._placed_by_s = float("inf")
         return None
+
+    def _follow(self, watch: Watch) -> None:
+        """Report what has changed in the cluster: drains first, so that a smaller number sends nobody else away."""
+        now = watch.latest()
+        for worker, place in self._places.items():
+            if place.node in now.leaving and worker not in self._drained:
+                self._drained.add(worker)
+                self._inbox.append(Drain(worker))
+        if self._room is not None and now.room and now.room != self._room:
+            self._room = now.room
+            self._inbox.append(SetWorkers(now.room))
 
     def _lose(self, worker: int, reason: str) -> None:
         self.kill(worker)
@@ -201,78 +233,3 @@ def _reason(error: Exception) -> str:
 def _resources(amounts: dict[str, float]) -> str:
     """The resources that matter here, as a user would name them."""
     return ", ".join(f"{amounts.get(name, 0.0):g} {name}" for name in ("CPU", "GPU"))
-
-
-def _connect(address: str | None, workers: int) -> ModuleType:
-    """Import Ray and join a cluster or start one; the caller's signal handlers and environment stay as they were."""
-    without = "`--engine inline` runs on this machine without Ray"
-    options: dict[str, Any] = {"address": address}
-    settings = dict(SETTINGS)
-    if address is None:
-        options = {
-            "address": "local",
-            "num_cpus": workers,
-            "num_gpus": 0,
-            "include_dashboard": False,
-            "object_store_memory": OBJECT_STORE_BYTES,
-        }
-        settings["RAY_AUTH_TOKEN"] = os.environ.get("RAY_AUTH_TOKEN", TOKEN)
-    with _signal_handlers_kept(), _environment_kept(settings):
-        try:
-            import ray
-        except ImportError as error:
-            raise EvaluationError(f"Ray cannot be imported ({error}); install it, or: {without}") from error
-        if ray.is_initialized():
-            raise EvaluationError(f"this process uses Ray already; call ray.shutdown() first, or: {without}")
-        try:
-            if address not in (None, "auto"):
-                _knock(address)
-            ray.init(**options, logging_level=logging.ERROR, log_to_driver=False)
-        except Exception as error:  # Ray raises many kinds: ConnectionError, RuntimeError, ValueError, TimeoutError ...
-            if address is None:
-                raise EvaluationError(f"Ray does not start on this machine: {error}. {without}") from error
-            raise EvaluationError(
-                f"no Ray cluster at {address} took us in: {error}. Check the address, that RAY_AUTH_TOKEN is the "
-                f"cluster's (with RAY_AUTH_MODE=token), and that it has this Ray ({ray.__version__}) and this Python "
-                f"({platform.python_version()}); {without}"
-            ) from error
-    return ray
-
-
-def _knock(address: str) -> None:
-    """Raise OSError or ValueError unless something listens at HOST:PORT."""
-    host, colon, port = address.rpartition(":")
-    if not colon or not port.isdigit():
-        raise ValueError(f"{address!r} is neither HOST:PORT nor auto")
-    socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
-
-
-def _disconnect(ray: ModuleType) -> None:
-    with _signal_handlers_kept():
-        ray.shutdown()
-
-
-@contextlib.contextmanager
-def _signal_handlers_kept() -> Iterator[None]:
-    """Ray replaces the SIGTERM handler; put back what was there. Elsewhere than in the main thread it cannot."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def _environment_kept(settings: dict[str, str]) -> Iterator[None]:
-    """Environment variables for the processes that Ray starts; afterwards ours are as before."""
-    before = dict(os.environ)
-    os.environ.update(settings)
-    try:
-        yield
-    finally:
-        os.environ.clear()
-        os.environ.update(before)

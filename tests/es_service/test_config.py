@@ -58,9 +58,9 @@ def test_minimal_config_resolves_every_value():
     assert (config.policy.init, config.policy.observation_clip) == ("unit_columns", 5.0)
     assert (config.search.pairs, config.search.common_random_numbers) == (512, True)
     assert (config.search.sigma, config.search.learning_rate, config.search.l2) == (0.02, 0.01, 0.005)
-    assert (config.compute.rollout, config.compute.workers, config.compute.engine) == ("xla", "auto", "inline")
+    assert (config.compute.rollout, config.compute.workers, config.compute.engine) == ("xla", "auto", "ray")
     assert (config.compute.chunk_pairs, config.compute.rollout_block_pairs) == (64, 32)
-    assert config.compute.gradient_block_pairs == 64
+    assert config.compute.gradient_block_pairs == 512
     assert config.seed == 0
 
 
@@ -68,7 +68,7 @@ def test_uber_preset_and_explicit_keys_over_it():
     config = load(MINIMAL, "search.preset=uber")
     assert (config.search.pairs, config.search.common_random_numbers) == (5000, False)
     assert (config.policy.init, config.policy.observation_clip) == ("small_columns", None)
-    assert (config.compute.chunk_pairs, config.compute.gradient_block_pairs) == (40, 160)
+    assert (config.compute.chunk_pairs, config.compute.gradient_block_pairs) == (40, 920)
     config = load(MINIMAL, "search.preset=uber", "search.pairs=64", "policy.observation_clip=10")
     assert (config.search.pairs, config.policy.observation_clip) == (64, 10.0)
     assert load(MINIMAL, "policy.observation_clip=null").policy.observation_clip is None
@@ -100,7 +100,7 @@ def test_default_chunk_pairs(pairs, chunk):
 @given(st.integers(1, 100_000))
 def test_default_shapes_fit_together(pairs):
     chunk = default_chunk_pairs(pairs)
-    rollout, gradient = default_rollout_block_pairs(chunk, 4482), default_gradient_block_pairs(pairs, chunk)
+    rollout, gradient = default_rollout_block_pairs(chunk, 4482), default_gradient_block_pairs(pairs, chunk, 4482)
     assert pairs % chunk == 0
     assert chunk % rollout == 0
     assert chunk <= 64
@@ -297,7 +297,7 @@ def test_worker_spec_says_what_the_config_says():
     assert (spec.seed, spec.environment, spec.environment_options) == (5, "point_maze", {"start": "corner"})
     assert (spec.episode_steps, spec.fitness, spec.episodes_per_member) == (200, "final", 1)
     assert (spec.policy.widths, spec.observation_clip, spec.action_noise) == ((2, 8, 4, 2), 5.0, 0.01)
-    assert (spec.chunk_pairs, spec.rollout_block_pairs, spec.gradient_block_pairs) == (64, 32, 64)
+    assert (spec.chunk_pairs, spec.rollout_block_pairs, spec.gradient_block_pairs) == (64, 32, 512)
     assert spec.common_random_numbers is True
 
 

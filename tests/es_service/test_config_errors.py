@@ -79,7 +79,7 @@ def file(tmp_path):
         ("policy.hidden=[64, 0]", "[64, 0] is not allowed"),
         ("policy.observation_normalization=1", "1 ... must be true or false"),
         ("policy.observation_clip=0", "0 ... must be a number above 0 or null"),
-        ("compute.engine=rey", "rey ... must be inline or ray; did you mean ray?"),
+        ("compute.engine=rey", "rey ... must be ray or inline; did you mean ray?"),
         ("compute.rollout=simd", "simd ... must be auto or xla"),
         ("compute.workers=0", "0 ... must be auto or a whole number, at least 1"),
         ("compute.chunk_pairs=half", "half ... must be auto or a whole number"),
@@ -112,13 +112,25 @@ def test_a_bad_value_is_one_line_with_field_value_and_what_is_allowed(override, 
         ("policy.hidden=[64,", "override policy.hidden=[64,: line 1, column 5: not YAML"),
         ("compute.chunk_pairs=48", "512 is not a multiple of compute.chunk_pairs (48); try pairs = 528 (or 480)"),
         ("compute.chunk_pairs=600", "512 is not a multiple of compute.chunk_pairs (600); try pairs = 600, or"),
-        ("compute.address=auto", "compute.address: auto needs compute.engine = ray, which is inline"),
+        ("budget.generations=1.5e300", "1.5e+300 is not allowed; must be a whole number, at least 1"),
+        ("compute.worker_resources.gpu=1.5", "gpu: 1.5 is not allowed; must be a whole number or a fraction below 1"),
+        ("compute.worker_resources.gpus=1", "did you mean compute.worker_resources.gpu?"),
+        ("compute.worker_resources=1", "is a section; set its keys one by one, such as compute.worker_resources.cpu="),
         ("budget.generations=null", "budget: nothing ends this run; set at least one of budget.generations, bud"),
     ],
 )  # fmt: skip
 def test_a_problem_elsewhere_is_one_line_with_a_hint(override, message):
     (line,) = problems(MINIMAL, override)
     assert message in line
+    assert len(line) < 400
+
+
+def test_a_cluster_or_a_gpu_without_ray_is_refused():
+    asked = ("compute.engine=inline", "compute.address=auto", "compute.worker_resources.gpu=0.5")
+    assert problems(MINIMAL, *asked) == [
+        "compute.address: auto needs compute.engine = ray, which is inline",
+        "compute.worker_resources.gpu: 0.5 needs compute.engine = ray, which is inline",
+    ]
 
 
 @pytest.mark.parametrize(

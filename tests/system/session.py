@@ -23,7 +23,7 @@ SMALL = {
     "policy": {"hidden": [8]},
     "search": {"algorithm": "nsra_es", "pairs": 16, "evaluation_episodes": 4, "fitness_weight_patience": 2},
     "budget": {"generations": 30},
-    "compute": {"chunk_pairs": 8, "workers": 1},
+    "compute": {"engine": "inline", "workers": 1, "chunk_pairs": 8, "gradient_block_pairs": 8},
 }
 """A run of some milliseconds a generation: five members, archive, adaptive weight."""
 

@@ -51,7 +51,9 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
     path = folder / "small.yaml"
     path.write_text(yaml.safe_dump(SMALL))
-    code, printed = es("run", path, "--out", folder / "run")
+    code, printed = es(
+        "run", path, "--out", folder / "run", PATH=os.defpath
+    )  # as in `make run`: es-service is not in it
     assert code == 0, printed
     return folder / "run", printed
 

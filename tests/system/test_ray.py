@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import re
+import pickle
 import signal
 import subprocess
 import sys
@@ -17,9 +17,11 @@ from es_service import api
 from es_service.digest import digest_parts
 from es_service.dispatch import ray_engine as module
 from es_service.dispatch.messages import Policy
+from es_service.dispatch.ray_cluster import Claim
 from es_service.dispatch.ray_engine import Actors, ray_engine
 from es_service.errors import EvaluationError
-from es_service.protocol import TrainingChunk
+from es_service.protocol import TrainingChunk, WorkerPlace, worker_environment
+from tests.dispatch_checker import check_dispatch
 from tests.helpers import centre, random_parameters, spec
 from tests.system.session import ROOT, SMALL
 from workers.actor import WorkerActor
@@ -28,12 +30,20 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::ResourceWarning"),  # Ray leaves files and processes to the garbage collector
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
-CONFIG = SMALL | {"compute": {"chunk_pairs": 4, "chunk_timeout_s": 1.0, "engine": "ray"}}
+CONFIG = SMALL | {
+    "compute": {
+        "engine": "ray",
+        "chunk_pairs": 4,
+        "gradient_block_pairs": 8,
+        "chunk_timeout_s": 1.0,
+        "dispatch_log": True,
+    }
+}
 
 
-def run(folder: Path, **compute):
+def run(folder: Path, on_notice=pytest.fail, **compute):
     config = api.load_config(CONFIG | {"compute": CONFIG["compute"] | compute})
-    return api.run(config, folder)
+    return api.run(config, folder, on_notice=on_notice)
 
 
 @pytest.fixture(scope="module")
@@ -64,13 +74,20 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
         send(self, worker, centre, key, attempt, chunk)
         number = faults.pop(chunk.generation, None) if isinstance(chunk, TrainingChunk) else None
         if number is not None:
-            os.kill(int(re.findall(r"pid (\d+)", self.places()[worker])[0]), number)
+            os.kill(self.places()[worker].pid, number)
 
     monkeypatch.setattr(Actors, "send", send_and_strike)
-    outcome = run(tmp_path / "run", workers=2)
+    notices = []
+    outcome = run(tmp_path / "run", on_notice=notices.append, workers=2)
     assert digest_parts(tmp_path / "run") == reference
     assert not faults
     assert outcome.run.history["lost_workers"].sum() == 2
+    assert [notice.partition(" lost ")[0] for notice in notices] == ["generation 4:", "generation 12:"]
+    assert "its process or its node died" in notices[0]
+    assert "no answer to task TrainingChunk" in notices[1]
+    counts = check_dispatch(tmp_path / "run")
+    assert (counts["sessions"], counts["generations"]) == (1, 31)
+    assert counts["repeated"] == outcome.run.history["retries"].sum() >= 2
 
 
 def test_a_run_that_began_inline_goes_on_with_ray_where_home_cannot_be_written(tmp_path, reference):
@@ -118,8 +135,8 @@ def test_a_chunk_that_raises_everywhere_stops_the_run_with_its_error():
 
 
 def test_a_cluster_without_room_is_named_with_what_it_has(monkeypatch):
-    connect = module._connect
-    monkeypatch.setattr(module, "_connect", lambda address, workers: connect(address, 0))
+    connect = module.connect
+    monkeypatch.setattr(module, "connect", lambda address, claim, workers: connect(address, claim, 0))
     monkeypatch.setattr(module, "PLACEMENT_S", 2.0)
     start = time.monotonic()
     with (
@@ -148,3 +165,62 @@ def test_it_works_in_a_thread_where_signals_cannot_be_set(tmp_path, reference):
     thread.start()
     thread.join()
     assert digest_parts(tmp_path / "run") == reference
+
+
+class Mirror:
+    """An actor that answers a chunk with the environment its worker would have, and Ray's name for its GPU."""
+
+    def __init__(self, spec: bytes, index: int, gpus: float) -> None:
+        self.gpus = gpus
+
+    def place(self) -> WorkerPlace:
+        return WorkerPlace("host", os.getpid(), "node")
+
+    def build(self) -> None:
+        pass
+
+    def run(self, centre: bytes, chunk: bytes) -> bytes:
+        import ray
+
+        ids = ray.get_runtime_context().get_accelerator_ids()["GPU"]
+        return pickle.dumps((os.getpid(), ids, worker_environment(os.environ, self.gpus)))
+
+
+def with_two_pretended_gpus(monkeypatch):
+    """Ray only counts GPUs: it takes our word for how many there are."""
+    import ray
+
+    start = ray.init
+    monkeypatch.setattr(ray, "init", lambda **options: start(**options | {"num_gpus": 2}))
+
+
+def mirrored(workers: int, claim: Claim) -> list[tuple[int, list[str], dict[str, str]]]:
+    with ray_engine(spec(), Policy(workers), actor=Mirror, claim=claim) as engine:
+        answers = engine.evaluate(centre(random_parameters()), [TrainingChunk(1, chunk) for chunk in range(16)])
+    return list({answer[0]: answer for answer in answers}.values())
+
+
+def test_workers_without_a_gpu_see_none_and_use_the_cpu(monkeypatch):
+    with_two_pretended_gpus(monkeypatch)
+    for _, ids, environment in mirrored(2, Claim(cpus=1)):
+        assert ids == []
+        assert (environment["CUDA_VISIBLE_DEVICES"], environment["JAX_PLATFORMS"]) == ("", "cpu")
+
+
+def test_two_workers_share_one_gpu_and_its_memory(monkeypatch):
+    with_two_pretended_gpus(monkeypatch)
+    found = mirrored(4, Claim(cpus=1, gpus=0.5))
+    assert found
+    for _, ids, environment in found:
+        assert ids == [environment["CUDA_VISIBLE_DEVICES"]]
+        assert environment["JAX_PLATFORMS"] == "cuda"
+        assert environment["XLA_CLIENT_MEM_FRACTION"] == "0.45"
+
+
+def test_a_gpu_that_is_not_there_is_named(monkeypatch):
+    monkeypatch.setattr(module, "PLACEMENT_S", 2.0)
+    with (
+        pytest.raises(EvaluationError, match=r"Each needs 1 CPU and 1 GPU; the cluster has 1 CPU, 0 GPU in all"),
+        ray_engine(spec(), Policy(1), actor=WorkerActor, claim=Claim(gpus=1)) as engine,
+    ):
+        engine.evaluate(centre(random_parameters()), [TrainingChunk(1, 0)])

@@ -25,14 +25,20 @@ CONFIG = {
     "task": {"environment": "point_maze"},
     "search": {"algorithm": "nsra_es", "pairs": 256, "evaluation_episodes": 20, "fitness_weight_patience": 2},
     "budget": {"generations": 12},
-    "compute": {"workers": 2, "chunk_pairs": 32, "gradient_block_pairs": 32, "chunk_timeout_s": 1.0},
+    "compute": {
+        "engine": "inline",
+        "workers": 2,
+        "chunk_pairs": 32,
+        "gradient_block_pairs": 32,
+        "chunk_timeout_s": 1.0,
+    },
 }
 """Some forty milliseconds a generation: time enough to hit one in the middle."""
 
 
-def run(folder: Path, on_generation=lambda row: None, **compute):
+def run(folder: Path, on_generation=lambda row: None, on_notice=pytest.fail, **compute):
     config = api.load_config(CONFIG | {"compute": CONFIG["compute"] | compute})
-    return api.run(config, folder, on_generation=on_generation)
+    return api.run(config, folder, on_generation=on_generation, on_notice=on_notice)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +85,7 @@ def test_order_of_chunks(tmp_path, reference, monkeypatch):
 
 @pytest.mark.parametrize(("number", "after"), [(signal.SIGKILL, (4, 8)), (signal.SIGSTOP, (4,))])
 def test_a_worker_killed_or_stopped_in_mid_generation(tmp_path, reference, number, after):
-    hit = []
+    hit, notices = [], []
 
     def strike(row):
         if row["generation"] in after:  # the next generation has begun when the timer fires
@@ -88,9 +94,10 @@ def test_a_worker_killed_or_stopped_in_mid_generation(tmp_path, reference, numbe
             timer = threading.Timer(0.01, os.kill, (victim, number))
             timer.start()
 
-    outcome = run(tmp_path / "run", strike)
+    outcome = run(tmp_path / "run", strike, notices.append)
     history = outcome.run.history
     assert len(hit) == len(after)
+    assert [notice.partition(";")[0] for notice in notices] == [f"generation {g + 1}: lost a worker" for g in after]
     assert history["lost_workers"].sum() == len(after)
     assert history["retries"].sum() >= 1
     assert digest_parts(tmp_path / "run") == reference

@@ -1,0 +1,76 @@
+"""The dispatch log: everything a run's scheduler was told and has ordered, for finding out what happened in a night.
+
+One JSON object per line in `dispatch.jsonl` of the run folder, appended by every session of the run. Written with
+`compute.dispatch_log: true` only; a short generation makes about a hundred lines.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from es_service.dispatch.messages import Command, Event, Task
+from es_service.store.folder import explained
+
+FILE = "dispatch.jsonl"
+
+
+@dataclass(frozen=True)
+class Session:
+    """A driver has begun to work on the run."""
+
+    after_generation: int | None
+    """Newest committed generation; None before the first."""
+    host: str
+    pid: int
+
+
+@dataclass(frozen=True)
+class Committed:
+    """A generation is safe in the store."""
+
+    generation: int
+
+
+Log = Callable[[Event | Command | Session | Committed], None]
+
+
+def no_log(entry: Event | Command | Session | Committed) -> None:
+    """Keep nothing."""
+
+
+@contextmanager
+def dispatch_log(folder: Path, after_generation: int | None, *, enabled: bool) -> Iterator[Log]:
+    """A log that appends to the run folder's file, beginning with a `Session`; or one that keeps nothing."""
+    if not enabled:
+        yield no_log
+        return
+    with (folder / FILE).open("ab", buffering=0) as file:
+
+        def write(entry: Event | Command | Session | Committed) -> None:
+            line = {"time": round(time.time(), 4), "is": type(entry).__name__, **vars(entry)}
+            try:
+                file.write(json.dumps(line, default=_plain).encode() + b"\n")
+            except OSError as error:
+                raise explained(error, folder, f"writing {FILE}") from error
+
+        write(Session(after_generation, socket.gethostname(), os.getpid()))
+        yield write
+
+
+def _plain(value: Any) -> Any:
+    """What JSON has no form for: a task is its key."""
+    return value.key if isinstance(value, Task) else str(value)
+
+
+def read_dispatch_log(folder: Path) -> list[dict[str, Any]]:
+    """All entries, oldest first; a last line cut short by a kill is left out."""
+    lines = (folder / FILE).read_text(encoding="utf-8").split("\n")
+    return [json.loads(line) for line in lines[:-1]]

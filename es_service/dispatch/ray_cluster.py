@@ -1,0 +1,210 @@
+"""Joining a Ray cluster or starting one, and watching who belongs to it.
+
+Nothing of the caller's changes: signal handlers and environment are as before once a call returns.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import platform
+import secrets
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+from es_service.errors import EvaluationError
+
+OBJECT_STORE_BYTES = 200 * 2**20
+"""Shared memory of a local Ray: a few centres and gradient blocks. Ray would take a third of the machine's."""
+CONNECT_S = 5.0
+"""Longest wait for the port of a cluster to answer; Ray itself would try for more than a minute."""
+MEMBERSHIP_S = 1.0
+"""Time between two looks at the nodes of a cluster."""
+SILENCE_S = 20.0
+"""A cluster that has not answered for so long has lost its head. Ray would end this process after a minute."""
+TOKEN = secrets.token_hex(32)
+"""For every Ray that this process starts: Ray reads the token of a process only once, and else writes one into HOME."""
+SETTINGS = {
+    "RAY_USAGE_STATS_ENABLED": "0",  # nothing phones home
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # actors without a GPU hide the GPUs themselves
+}
+LOCAL_SETTINGS = {
+    "RAY_task_events_report_interval_ms": "0",  # a record of each call for a dashboard that is not there
+    "RAY_enable_metrics_collection": "0",
+}
+"""Further ones for a Ray of our own; without them its own bookkeeping takes a tenth of a small generation."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What one worker needs of a node."""
+
+    cpus: int = 1
+    gpus: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.cpus} CPU" + (f" and {self.gpus:g} GPU" if self.gpus else "")
+
+
+ONE_CORE = Claim()
+
+
+@dataclass(frozen=True)
+class Membership:
+    """The nodes of a cluster at one moment."""
+
+    room: int
+    """Workers that the nodes which are alive, and stay, could hold together."""
+    leaving: frozenset[str]
+    """Ids of the nodes that are about to go and want no more work."""
+
+
+def connect(address: str | None, claim: Claim, workers: int) -> ModuleType:
+    """The `ray` module, in a cluster: that at `address`, or with None a new one on this machine for `workers` workers.
+
+    Raises:
+        EvaluationError: Ray is missing, in use by this process already, does not start, or no cluster takes us in.
+    """
+    without = "`--engine inline` runs on this machine without Ray"
+    options: dict[str, Any] = {"address": address}
+    settings = dict(SETTINGS)
+    if address is None:
+        options = {
+            "address": "local",
+            "num_cpus": workers * claim.cpus,
+            "num_gpus": None if claim.gpus else 0,  # None: as many as Ray finds
+            "include_dashboard": False,
+            "object_store_memory": OBJECT_STORE_BYTES,
+        }
+        settings |= LOCAL_SETTINGS | {"RAY_AUTH_TOKEN": os.environ.get("RAY_AUTH_TOKEN", TOKEN)}
+    with _signal_handlers_kept(), _environment_kept(settings):
+        try:
+            import ray
+        except ImportError as error:
+            raise EvaluationError(f"Ray cannot be imported ({error}); install it, or: {without}") from error
+        if ray.is_initialized():
+            raise EvaluationError(f"this process uses Ray already; call ray.shutdown() first, or: {without}")
+        try:
+            if address not in (None, "auto"):
+                _knock(address)
+            ray.init(**options, logging_level=logging.ERROR, log_to_driver=False)
+        except Exception as error:  # Ray raises many kinds: ConnectionError, RuntimeError, ValueError, TimeoutError ...
+            if address is None:
+                raise EvaluationError(f"Ray does not start on this machine: {error}. {without}") from error
+            raise EvaluationError(
+                f"no Ray cluster at {address} took us in: {error}. Check the address, that RAY_AUTH_TOKEN is the "
+                f"cluster's (with RAY_AUTH_MODE=token), and that it has this Ray ({ray.__version__}) and this Python "
+                f"({platform.python_version()}); {without}"
+            ) from error
+    _let_print(ray, False)
+    return ray
+
+
+def disconnect(ray: ModuleType) -> None:
+    """Leave the cluster; one of our own ends."""
+    _let_print(ray, True)
+    with _signal_handlers_kept():
+        ray.shutdown()
+
+
+def look(ray: ModuleType, claim: Claim) -> Membership:
+    """Who belongs to the cluster now. Blocks for as long as its head does not answer."""
+    leaving = frozenset(_draining(ray))
+    room = sum(
+        _room(node["Resources"], claim) for node in ray.nodes() if node["Alive"] and node["NodeID"] not in leaving
+    )
+    return Membership(room, leaving)
+
+
+class Watch:
+    """Looks at the cluster again and again in a thread of its own, since a look may block."""
+
+    def __init__(self, ray: ModuleType, claim: Claim) -> None:
+        self._ray, self._claim = ray, claim
+        self._latest = look(ray, claim)
+        self._answered_s = time.monotonic()
+        self._end = threading.Event()
+        threading.Thread(target=self._run, daemon=True, name="cluster-watch").start()
+
+    def latest(self) -> Membership:
+        """What was seen last. Raises EvaluationError if that was more than SILENCE_S ago."""
+        silent_s = time.monotonic() - self._answered_s
+        if silent_s > SILENCE_S:
+            raise EvaluationError(
+                f"the Ray cluster has not answered for {silent_s:.0f} s: its head node is gone or out of reach. "
+                "Start a cluster again and resume there, or resume on this machine alone with --engine inline"
+            )
+        return self._latest
+
+    def close(self) -> None:
+        """Look no more."""
+        self._end.set()
+
+    def _run(self) -> None:
+        while not self._end.wait(MEMBERSHIP_S):
+            with contextlib.suppress(Exception):  # of many kinds, all of them meaning: no answer
+                self._latest = look(self._ray, self._claim)
+                self._answered_s = time.monotonic()
+
+
+def _room(resources: dict[str, float], claim: Claim) -> int:
+    """Workers that a node with these resources can hold."""
+    by_cpu = int(resources.get("CPU", 0.0) / claim.cpus)
+    # Ray does not split one worker's share over two GPUs.
+    by_gpu = int(resources.get("GPU", 0.0)) * int(1 / claim.gpus) if 0 < claim.gpus < 1 else by_cpu
+    if claim.gpus >= 1:
+        by_gpu = int(resources.get("GPU", 0.0) / claim.gpus)
+    return min(by_cpu, by_gpu)
+
+
+def _draining(ray: ModuleType) -> dict[str, int]:
+    """Ids of nodes being drained. Ray has no public way to ask; if this one goes, a drained node is lost later."""
+    with contextlib.suppress(AttributeError):
+        return ray._private.state.state.get_draining_nodes()
+    return {}
+
+
+def _let_print(ray: ModuleType, allowed: bool) -> None:
+    """Whether Ray may print on our stdout: each loss of a worker, at length, which we report ourselves."""
+    ray._private.worker._worker_logs_enabled = allowed
+
+
+def _knock(address: str) -> None:
+    """Raise OSError or ValueError unless something listens at HOST:PORT."""
+    host, colon, port = address.rpartition(":")
+    if not colon or not port.isdigit():
+        raise ValueError(f"{address!r} is neither HOST:PORT nor auto")
+    socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
+
+
+@contextlib.contextmanager
+def _signal_handlers_kept() -> Iterator[None]:
+    """Ray replaces the SIGTERM handler; put back what was there. Elsewhere than in the main thread it cannot."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _environment_kept(settings: dict[str, str]) -> Iterator[None]:
+    """Environment variables for the processes that Ray starts; afterwards ours are as before."""
+    before = dict(os.environ)
+    os.environ.update(settings)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)

@@ -1,0 +1,156 @@
+"""Runs as jobs of a Ray cluster: send one, list them, read what they print, stop them.
+
+A job is `es-service run ... --or-resume` on the cluster's head, in a working directory that holds just the resolved
+config; es-service itself is installed there. The run's folder is a path on the head or on a disk that it shares. Ray
+forgets its jobs with their cluster, and nothing is lost: the same submission to another cluster goes on with the run.
+"""
+
+from __future__ import annotations
+
+import logging
+import shlex
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from es_service.config.model import RunConfig
+from es_service.errors import ConfigError, EvaluationError, ServiceError
+
+FOLDER = "es_service_run"
+"""Key of a job's metadata: the run folder."""
+POLL_S = 1.0
+ENDED = ("SUCCEEDED", "FAILED", "STOPPED")
+STOP_S = 15.0
+"""Longest wait for a stopped job to end; Ray kills it after three seconds."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A job of ours on a cluster."""
+
+    id: str
+    state: str
+    """Ray's word: PENDING, RUNNING, SUCCEEDED, FAILED or STOPPED."""
+    folder: str
+    started_ms: int
+
+
+def submit(config: RunConfig, address: str, out: str) -> str:
+    """Send a run to the cluster whose dashboard is at `address`; the id of its job.
+
+    Args:
+        config: with engine ray; its address is that of the cluster the job finds itself in, "auto".
+        out: absolute path of the run folder, as the cluster's head sees it. If it holds the run, the job goes on with
+            it; if it holds another run, the job fails and says what differs.
+
+    Raises:
+        ConfigError: `out` is relative. EvaluationError: no cluster answers, or it refuses us.
+    """
+    if not out.startswith("/"):
+        raise ConfigError(f"--out {out}: must be absolute, since a job's own directory is deleted; such as /runs/{out}")
+    client = _client(address)
+    name = f"es-{uuid4().hex[:8]}"
+    command = ["es-service", "run", "config.yaml", "--or-resume", "--out", out]
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "config.yaml").write_text(config.resolved_yaml())
+        with _explained(address):
+            return client.submit_job(
+                entrypoint=shlex.join(command),
+                submission_id=name,
+                runtime_env={"working_dir": folder},
+                metadata={FOLDER: out},
+            )
+
+
+def list_jobs(address: str) -> list[Job]:
+    """Our jobs on a cluster, newest first. Raises EvaluationError as `submit`."""
+    with _explained(address):
+        found = _client(address).list_jobs()
+    ours = [
+        Job(job.submission_id, str(job.status.value), job.metadata[FOLDER], job.start_time or 0)
+        for job in found
+        if job.submission_id and FOLDER in (job.metadata or {})
+    ]
+    return sorted(ours, key=lambda job: job.started_ms, reverse=True)
+
+
+def state(job: str, address: str) -> str:
+    """Ray's word for where a job stands. Raises EvaluationError as `submit`, or if there is no such job."""
+    with _explained(address, job):
+        return str(_client(address).get_job_status(job).value)
+
+
+def logs(job: str, address: str, *, follow: bool = False) -> Iterator[str]:
+    """What a job has printed, in pieces; with `follow`, until it ends. Raises EvaluationError as `state`."""
+    client = _client(address)
+    if not follow:
+        with _explained(address, job):
+            yield client.get_job_logs(job)
+        return
+    printed = 0
+    while True:
+        with _explained(address, job):
+            ended = client.get_job_status(job).value in ENDED  # asked first, so that nothing printed after is missed
+            text = client.get_job_logs(job)
+        yield text[printed:]
+        printed = len(text)
+        if ended:
+            return
+        time.sleep(POLL_S)
+
+
+def stop(job: str, address: str) -> str:
+    """Stop a job and wait for its end; its state then. Raises EvaluationError as `state`, or if it does not end."""
+    with _explained(address, job):
+        _client(address).stop_job(job)
+    until = time.monotonic() + STOP_S
+    while (now := state(job, address)) not in ENDED:
+        if time.monotonic() > until:
+            raise EvaluationError(f"{job} is still {now} {STOP_S:g} s after it was told to stop; see its logs")
+        time.sleep(0.2)
+    return now
+
+
+def _client(address: str) -> Any:
+    """Ray's client for jobs."""
+    if not address.startswith(("http://", "https://")):
+        raise ConfigError(
+            f"--address {address}: must be the URL of the cluster's dashboard, such as http://{address.split(':')[0]}:8265"
+        )
+    try:
+        import aiohttp  # noqa: F401  what Ray's client lacks without the extra
+        from ray.job_submission import JobSubmissionClient
+    except ImportError as error:
+        raise EvaluationError(
+            f"jobs need the extra `cluster` ({error}): pip install 'es-service[cluster]'; "
+            "`es-service run CONFIG --address HOST:PORT` does without"
+        ) from error
+    for name in ("ray.dashboard.modules.dashboard_sdk", "ray._private.runtime_env.packaging"):
+        logging.getLogger(name).setLevel(logging.WARNING)  # they would tell of each upload
+    with _explained(address):
+        return JobSubmissionClient(address)
+
+
+@contextmanager
+def _explained(address: str, job: str | None = None) -> Iterator[None]:
+    """Turn whatever Ray's client raises into one readable EvaluationError."""
+    try:
+        yield
+    except ServiceError:
+        raise
+    except Exception as error:  # RuntimeError and ConnectionError, mostly
+        text = str(error).strip()
+        if job is not None and "does not exist" in text:
+            raise EvaluationError(
+                f"there is no job {job} on {address}; `es-service jobs --address {address}` lists them"
+            ) from error
+        first = text.partition("\n")[0]
+        raise EvaluationError(
+            f"the cluster at {address} did not do it: {first}. Check the address, that its dashboard runs there, and "
+            "that RAY_AUTH_TOKEN is the cluster's (with RAY_AUTH_MODE=token)"
+        ) from error

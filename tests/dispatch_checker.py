@@ -1,0 +1,60 @@
+"""Reads a dispatch log as a stranger would and says whether the run it tells of was in order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from es_service.dispatch.dispatch_log import read_dispatch_log
+
+
+def check_dispatch(folder: Path) -> dict[str, int]:
+    """Assert that each chunk was delivered once, by a worker that was there and had it, and generations are contiguous.
+
+    Returns counts: sessions, generations committed, chunks delivered, chunks assigned more than once, workers lost.
+    """
+    entries = read_dispatch_log(folder)
+    assert entries[0]["is"] == "Session"
+    counts = dict.fromkeys(("sessions", "generations", "delivered", "repeated", "lost"), 0)
+    newest = None
+    up: set[int] = set()
+    holders: dict[tuple, set[int]] = {}
+    waiting: set[tuple] = set()
+    answered: tuple | None = None
+    for entry in entries:
+        key = tuple(entry["key"]) if "key" in entry else None
+        worker = entry.get("worker")
+        match entry["is"]:
+            case "Session":
+                if counts["sessions"]:  # a kill may come between a commit and its line here
+                    assert entry["after_generation"] in (newest, 0 if newest is None else newest + 1)
+                newest = entry["after_generation"]
+                up, holders, waiting = set(), {}, set()
+                counts["sessions"] += 1
+            case "Submit":
+                assert not waiting, f"{waiting} were never delivered"
+                waiting = {tuple(task) for task in entry["tasks"]}
+                assert len(waiting) == len(entry["tasks"])
+                assert not waiting & holders.keys(), "submitted twice in one session"
+            case "WorkerUp":
+                assert worker not in up
+                up.add(worker)
+            case "WorkerLost" | "StopWorker":
+                counts["lost"] += entry["is"] == "WorkerLost" and worker in up
+                up.discard(worker)
+            case "Assign":
+                assert worker in up
+                assert key in waiting
+                counts["repeated"] += key in holders
+                holders.setdefault(key, set()).add(worker)
+            case "Result":
+                answered = key if worker in up and worker in holders.get(key, ()) else None
+            case "Deliver":
+                assert key == answered, "delivered without an answer of a live worker that had it"
+                waiting.remove(key)
+                counts["delivered"] += 1
+            case "Committed":
+                assert not waiting, "committed before every chunk was there"
+                assert entry["generation"] == (0 if newest is None else newest + 1)
+                newest = entry["generation"]
+                counts["generations"] += 1
+    return counts

@@ -1,0 +1,36 @@
+"""What is refused before a job is sent. Jobs need a cluster: `tests/system/test_cluster.py`."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from es_service import jobs
+from es_service.api import load_config
+from es_service.errors import ConfigError, EvaluationError
+
+CONFIG = load_config(
+    {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
+)
+
+
+def test_without_the_extra_the_error_names_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "aiohttp", None)
+    with pytest.raises(EvaluationError, match=r"extra `cluster`.*pip install 'es-service\[cluster\]'"):
+        jobs.submit(CONFIG, "http://127.0.0.1:8265", "/runs/x")
+
+
+def test_the_address_is_that_of_the_dashboard():
+    with pytest.raises(ConfigError, match=r"--address node:6379: must be the URL .* such as http://node:8265"):
+        jobs.list_jobs("node:6379")
+
+
+def test_a_relative_folder_is_refused():
+    with pytest.raises(ConfigError, match=r"--out runs/x: must be absolute"):
+        jobs.submit(CONFIG, "http://127.0.0.1:8265", "runs/x")
+
+
+def test_where_nothing_answers_the_error_says_what_to_check():
+    with pytest.raises(EvaluationError, match=r"the cluster at http://127\.0\.0\.1:1 did not do it: .*RAY_AUTH_TOKEN"):
+        jobs.list_jobs("http://127.0.0.1:1")

@@ -1,0 +1,164 @@
+"""A Ray cluster of several hosts on one machine: each node in a network namespace of its own, joined by a bridge.
+
+Needs root and Debian's iproute2. The bridge lives in a namespace too, so nothing of this machine's network is touched.
+Each node has its own host name, /tmp/ray and /dev/shm. Processes are found by a variable in their environment, and are
+signalled one by one by process id.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+MARK = "ES_TEST_NODE"
+PORT = 6379
+TOKEN = "0123456789abcdef" * 4
+
+
+def missing() -> str | None:
+    """What this machine lacks for it; None if nothing."""
+    if os.geteuid():
+        return "needs root"
+    if shutil.which("ip") is None:
+        return "needs iproute2"
+    name = f"es{os.getpid()}try"
+    if subprocess.run(["ip", "netns", "add", name], capture_output=True, check=False).returncode:
+        return "cannot make network namespaces"
+    subprocess.run(["ip", "netns", "delete", name], check=True)
+    return None
+
+
+class Cluster:
+    """Nodes by name; the first is the head, with the dashboard and no CPU for workers. Use as a context manager."""
+
+    def __init__(self, log_folder: Path) -> None:
+        self.log_folder = log_folder
+        self.nodes: list[str] = []
+        self._entries: dict[str, subprocess.Popen[bytes]] = {}
+        self._id = f"es{os.getpid()}x{time.monotonic_ns() % 10**6}"
+        self._switch = f"{self._id}sw"
+
+    @property
+    def address(self) -> str:
+        """Where a driver joins."""
+        return f"{self._ip(0)}:{PORT}"
+
+    def __enter__(self) -> Cluster:
+        _ip("netns", "add", self._switch)
+        _ip("-n", self._switch, "link", "add", "bridge", "type", "bridge")
+        _ip("-n", self._switch, "link", "set", "bridge", "up")
+        self.start("head", 0)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for node in self.nodes:
+            self.end(node)
+        for name in (*map(self._namespace, self.nodes), self._switch):
+            _ip("netns", "delete", name)
+
+    def start(self, node: str, cpus: int, **environment: str) -> None:
+        """Start a node, and wait for it."""
+        number = len(self.nodes)
+        self.nodes.append(node)
+        namespace, ours, theirs = self._namespace(node), f"v{number}", "eth0"
+        _ip("netns", "add", namespace)
+        _ip("-n", self._switch, "link", "add", ours, "type", "veth", "peer", "name", theirs, "netns", namespace)
+        _ip("-n", self._switch, "link", "set", ours, "master", "bridge", "up")
+        _ip("-n", namespace, "address", "add", f"{self._ip(number)}/24", "dev", theirs)
+        for device in ("lo", theirs):
+            _ip("-n", namespace, "link", "set", device, "up")
+        role = (
+            ["--head", f"--port={PORT}", "--dashboard-host=127.0.0.1"] if number == 0 else [f"--address={self.address}"]
+        )
+        ray = [Path(sys.executable).parent / "ray", "start", "--block", f"--node-ip-address={self._ip(number)}"]
+        ray += [f"--num-cpus={cpus}", "--object-store-memory=100000000", "--disable-usage-stats", *role]
+        shell = (
+            f"mkdir -p /tmp/ray && mount -t tmpfs tmpfs /tmp/ray && mount -t tmpfs tmpfs /dev/shm && "
+            f'hostname {node} && exec "$@"'
+        )
+        enter = ["ip", "netns", "exec", namespace, "unshare", "--mount", "--uts", "sh", "-c", shell, "sh"]
+        with (self.log_folder / f"{node}.log").open("ab") as log:
+            self._entries[node] = subprocess.Popen(
+                [*enter, *ray],
+                env=self._environment(node) | environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+        self._wait_until_joined(node)
+
+    def popen(self, node: str, *command: object, **environment: str) -> subprocess.Popen[str]:
+        """Start a command on a node; what it prints is to be read."""
+        enter = ["nsenter", f"--target={self._entries[node].pid}", "--mount", "--net", "--uts", f"--wd={ROOT}"]
+        return subprocess.Popen(
+            [*enter, *map(str, command)],
+            env=self._environment(node) | environment,
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def run(self, node: str, *command: object, timeout: float = 60.0, **environment: str) -> tuple[int, str]:
+        """Run a command on a node to its end: exit code, and all it printed."""
+        process = self.popen(node, *command, **environment)
+        printed, _ = process.communicate(timeout=timeout)
+        return process.returncode, printed
+
+    def processes(self, node: str) -> dict[int, str]:
+        """Process id -> command line of what runs on a node."""
+        wanted = f"{MARK}={self._id}.{node}".encode()
+        found = {}
+        for entry in filter(str.isdigit, os.listdir("/proc")):
+            try:
+                if wanted in Path(f"/proc/{entry}/environ").read_bytes().split(b"\0"):
+                    command = Path(f"/proc/{entry}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+                    found[int(entry)] = command
+            except OSError:  # ended while we looked
+                continue
+        return found
+
+    def worker(self, node: str) -> int:
+        """Process id of a worker on a node."""
+        return next(pid for pid, command in self.processes(node).items() if "WorkerActor" in command)
+
+    def end(self, node: str) -> None:
+        """Kill everything on a node, and see it gone."""
+        while left := self.processes(node):
+            for pid in left:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            time.sleep(0.05)
+            self._entries[node].poll()  # a child of ours stays in the list until it is asked for
+        self._entries[node].wait()
+
+    def _wait_until_joined(self, node: str) -> None:
+        until = time.monotonic() + 60
+        while "Ray runtime started" not in (self.log_folder / f"{node}.log").read_text():
+            assert time.monotonic() < until, (self.log_folder / f"{node}.log").read_text()
+            time.sleep(0.1)
+
+    def _namespace(self, node: str) -> str:
+        return f"{self._id}{node}"
+
+    def _ip(self, number: int) -> str:
+        return f"10.77.0.{number + 1}"
+
+    def _environment(self, node: str) -> dict[str, str]:
+        kept = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "JAX_", "PJRT_"))}
+        path = f"{Path(sys.executable).parent}{os.pathsep}{kept.get('PATH', '')}"
+        mark = {MARK: f"{self._id}.{node}", "PATH": path, "PYTHONPATH": str(ROOT)}
+        return kept | mark | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN, "RAY_USAGE_STATS_ENABLED": "0"}
+
+
+def _ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True)

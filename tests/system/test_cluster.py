@@ -1,0 +1,270 @@
+"""A real cluster of hosts that come, go, hang and die, and a job on one that is lost whole.
+
+`pytest tests/system/test_cluster.py -s` prints recovery seconds and repeated episodes for each fault.
+"""
+
+import json
+import mmap
+import os
+import re
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from es_service import api
+from es_service.digest import digest_parts
+from es_service.dispatch.dispatch_log import FILE, read_dispatch_log
+from es_service.store.reader import read_generation
+from tests.dispatch_checker import check_dispatch
+from tests.system import cluster
+from tests.system.cluster import Cluster
+from tests.system.session import SMALL
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
+
+CONFIG = SMALL | {
+    "search": SMALL["search"] | {"pairs": 64},
+    "budget": {"generations": 1_000_000},
+    "compute": {"engine": "ray", "chunk_pairs": 8, "gradient_block_pairs": 16, "chunk_timeout_s": 2.0},
+}
+"""Eight training chunks, four gradient chunks and one evaluation chunk a generation."""
+EPISODES_PER_CHUNK = 16
+
+
+def entries(folder: Path, name: str, since: float) -> list[dict]:
+    """Entries of one kind in the dispatch log since a time; a last line that is being written is left out."""
+    if not (folder / FILE).exists():
+        return []
+    return [entry for entry in read_dispatch_log(folder) if entry["is"] == name and entry["time"] >= since]
+
+
+def wait_for(what, timeout_s: float = 60.0):
+    """The first true answer."""
+    until = time.monotonic() + timeout_s
+    while not (answer := what()):
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    return answer
+
+
+def inline_digest(folder: Path, config: dict, generations: int) -> dict[str, str]:
+    """Digest of the same run without Ray."""
+    compute = config["compute"] | {"engine": "inline", "workers": 1}
+    api.run(api.load_config(config | {"budget": {"generations": generations}, "compute": compute}), folder)
+    return digest_parts(folder)
+
+
+def repeated_episodes(folder: Path, since: float) -> int:
+    """Episodes that were begun a second time; a gradient chunk has none."""
+    seen: set[tuple] = set()
+    repeated = 0
+    for entry in entries(folder, "Assign", 0.0):
+        key = tuple(entry["key"])
+        repeated += entry["time"] >= since and key in seen and key[1] != "GradientChunk"
+        seen.add(key)
+    return repeated * EPISODES_PER_CHUNK
+
+
+def memory_in_use() -> tuple[int, int]:
+    """Bytes of this machine in use, and in all."""
+    fields = dict(re.findall(r"^(\w+):\s+(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE))
+    total = int(fields["MemTotal"]) * 1024
+    return total - int(fields["MemAvailable"]) * 1024, total
+
+
+def test_hosts_come_go_hang_and_die_and_the_digest_is_that_of_one_process(tmp_path):
+    config, run = tmp_path / "config.yaml", tmp_path / "run"
+    config.write_text(yaml.safe_dump(CONFIG | {"compute": CONFIG["compute"] | {"dispatch_log": True}}))
+    report = []
+
+    def strike(what, fault, healed, timeout_s=90.0):
+        """Do it, wait until the workers wanted are all up again, and note what it cost."""
+        since, lost = time.time(), len(entries(run, "WorkerLost", 0.0)) + len(entries(run, "StopWorker", 0.0))
+        reason = fault()
+        seconds = wait_for(lambda: healed(since), timeout_s) - since
+        lost = len(entries(run, "WorkerLost", 0.0)) + len(entries(run, "StopWorker", 0.0)) - lost
+        report.append(
+            {"fault": what, "seconds": round(seconds, 1), "lost": lost, "episodes": repeated_episodes(run, since)}
+        )
+        print(json.dumps(report[-1]), flush=True)
+        return reason
+
+    def replaced(since):
+        """When the first worker came up after one had been lost."""
+        gone = entries(run, "WorkerLost", since) + entries(run, "StopWorker", since)
+        up = entries(run, "WorkerUp", min((entry["time"] for entry in gone), default=float("inf")))
+        return up[0]["time"] if up else 0.0
+
+    def working_again(since):
+        """When the first generation was committed after a loss was noticed."""
+        gone = entries(run, "WorkerLost", since) + entries(run, "StopWorker", since)
+        done = entries(run, "Committed", min((entry["time"] for entry in gone), default=float("inf")))
+        return done[0]["time"] if done else 0.0
+
+    def joined(since):
+        up = entries(run, "WorkerUp", since)
+        return up[0]["time"] if up else 0.0
+
+    with Cluster(tmp_path) as hosts:
+        hosts.start("one", 1)
+        hosts.start("two", 1)
+        driver = hosts.popen("head", "es-service", "run", config, "--out", run, "--address", hosts.address)
+        wait_for(lambda: len(entries(run, "Committed", 0.0)) > 3)
+
+        strike("worker killed", lambda: os.kill(hosts.worker("one"), signal.SIGKILL), replaced)
+        strike("worker stopped", lambda: os.kill(hosts.worker("two"), signal.SIGSTOP), replaced)
+        used, total = memory_in_use()
+        tight = {"RAY_memory_usage_threshold": f"{(used + 3 * 2**30) / total:.3f}"}
+        hosts.start("late", 1, **tight)
+        strike("node joins", lambda: None, joined)
+        assert entries(run, "SetWorkers", 0.0)[-1]["workers"] == 3
+
+        since = time.time()
+        used, _ = memory_in_use()
+        ballast = mmap.mmap(-1, int(float(tight["RAY_memory_usage_threshold"]) * total) - used + 2**29)
+        for at in range(0, len(ballast), mmap.PAGESIZE):
+            ballast[at] = 1
+        gone = wait_for(lambda: entries(run, "WorkerLost", since))
+        ballast.close()
+        strike("out of memory", lambda: None, lambda _: replaced(since))
+        assert "its node ran out of memory" in gone[0]["reason"]
+
+        def kill_raylet():
+            raylet = next(pid for pid, line in hosts.processes("one").items() if "/raylet/raylet " in line)
+            os.kill(raylet, signal.SIGKILL)
+
+        strike("raylet killed", kill_raylet, working_again)
+        wait_for(lambda: entries(run, "SetWorkers", 0.0)[-1]["workers"] == 2)
+        strike("node dies whole", lambda: hosts.end("two"), working_again)
+
+        reached = read_generation(run)
+        wait_for(lambda: read_generation(run) > reached + 3)
+        for pid, line in hosts.processes("head").items():
+            if "es-service run" in line:
+                os.kill(pid, signal.SIGTERM)
+        printed, _ = driver.communicate(timeout=30)
+        assert driver.returncode == 143, printed
+
+    counts = check_dispatch(run)
+    reached = read_generation(run)
+    assert counts["generations"] == reached + 1
+    assert digest_parts(run) == inline_digest(tmp_path / "inline", CONFIG, reached)
+    assert "lost a worker" in printed
+
+
+def test_a_job_is_submitted_followed_stopped_and_goes_on_in_another_cluster(tmp_path):
+    """The second cluster knows nothing of the first; only the run folder is left of it."""
+    config, run = tmp_path / "config.yaml", tmp_path / "run"
+    config.write_text(yaml.safe_dump(CONFIG))
+    url = "http://127.0.0.1:8265"
+
+    def es(hosts, *arguments, **environment):
+        return hosts.run("head", "es-service", *arguments, "--address", url, **environment)
+
+    def submit(hosts, *more):
+        code, printed = es(hosts, "submit", config, "--out", run, *more)
+        assert code == 0, printed
+        return printed.split()[0]
+
+    with Cluster(tmp_path) as hosts:
+        hosts.start("one", 1)
+        wait_for(lambda: es(hosts, "jobs")[0] == 0)  # the dashboard takes its time
+        job = submit(hosts)
+        wait_for(lambda: (run / "run.db").exists() and (read_generation(run) or 0) > 3)
+        code, printed = es(hosts, "jobs")
+        assert (code, printed.split()) == (0, [job, "RUNNING", str(run)])
+        assert es(hosts, "stop", job) == (0, f"{job} stopped\n")
+        code, printed = es(hosts, "logs", job)
+        assert code == 0
+        assert "generation 0 " in printed
+        assert f"es-service resume {run}" in printed
+        for arguments, message in (
+            (("logs", "es-nothing"), "there is no job es-nothing on"),
+            (("stop", "es-nothing"), "there is no job es-nothing on"),
+            (("submit", config, "--out", "runs/x"), "--out runs/x: must be absolute"),
+        ):
+            code, printed = es(hosts, *arguments)
+            assert code in (1, 2)
+            assert message in printed
+        code, printed = es(hosts, "jobs", RAY_AUTH_TOKEN="f" * 64)
+        assert code == 1
+        assert "RAY_AUTH_TOKEN is the cluster's" in printed
+
+        refused = submit(hosts, "--seed", "1")
+        code, printed = es(hosts, "logs", refused, "--follow")
+        assert code == 1
+        assert "seed: 0 -> 1" in printed
+
+        stopped_at = read_generation(run)
+        submit(hosts)
+        wait_for(lambda: read_generation(run) > stopped_at + 3)
+        lost_at = time.time()
+        for node in reversed(hosts.nodes):  # the head with the driver last
+            hosts.end(node)
+    reached = read_generation(run)
+    with Cluster(tmp_path) as hosts:
+        hosts.start("one", 1)
+        wait_for(lambda: es(hosts, "jobs")[0] == 0)
+        job = submit(hosts, "--set", f"budget.generations={reached + 20}")
+        code, printed = es(hosts, "logs", job, "--follow")
+        assert code == 0, printed
+        print(f"head lost: {time.time() - lost_at:.1f} s to the end of the run in a new cluster")
+    assert digest_parts(run) == inline_digest(tmp_path / "inline", CONFIG, reached + 20)
+
+
+def test_what_cannot_be_joined_is_named(tmp_path):
+    config = tmp_path / "config.yaml"
+    config.write_text(yaml.safe_dump(CONFIG))
+    with Cluster(tmp_path) as hosts:
+        hosts.start("one", 1)
+
+        def run(*more, **environment):
+            command = ("es-service", "run", config, "--out", tmp_path / "run", "--address", hosts.address, *more)
+            code, printed = hosts.run("head", *command, timeout=90.0, **environment)
+            assert code == 1
+            assert "Traceback" not in printed
+            return printed
+
+        assert "RAY_AUTH_TOKEN is the cluster's" in run(RAY_AUTH_TOKEN="f" * 64)
+
+        started = time.monotonic()
+        printed = run("--or-resume", "--set", "compute.worker_resources.cpu=64")
+        assert "no worker was given a place in 30 s. Each needs 64 CPU; the cluster has 1 CPU" in printed
+        assert time.monotonic() - started < 60
+
+        # A cluster of other versions is one that says it has them.
+        pretend = (
+            "import json, ray; from ray.experimental import internal_kv as kv; ray.init(address='auto'); "
+            "versions = json.loads(kv._internal_kv_get('CLUSTER_METADATA', namespace='cluster')); "
+            "versions |= {'ray_version': '2.1.0', 'python_version': '3.9.1'}; "
+            "kv._internal_kv_put('CLUSTER_METADATA', json.dumps(versions), overwrite=True, namespace='cluster')"
+        )
+        code, printed = hosts.run("head", "python", "-c", pretend)
+        assert code == 0, printed
+        printed = run("--or-resume")
+        for version in ("2.1.0", "3.9.1", "2.60"):
+            assert version in printed
+
+
+def test_a_driver_whose_head_dies_says_so_and_goes_on_alone(tmp_path):
+    config, run = tmp_path / "config.yaml", tmp_path / "run"
+    config.write_text(yaml.safe_dump(CONFIG))
+    with Cluster(tmp_path) as hosts:
+        hosts.start("one", 1)
+        driver = hosts.popen("one", "es-service", "run", config, "--out", run, "--address", hosts.address)
+        wait_for(lambda: (run / "run.db").exists() and (read_generation(run) or 0) > 3)
+        died = time.monotonic()
+        hosts.end("head")
+        try:
+            printed, _ = driver.communicate(timeout=90)
+        except subprocess.TimeoutExpired:
+            pytest.fail("the driver waits for ever")
+        print(f"head dies under a driver elsewhere: it ends after {time.monotonic() - died:.1f} s")
+    assert driver.returncode == 1, printed
+    assert "its head node is gone or out of reach" in printed
+    reached = read_generation(run)
+    assert digest_parts(run) == inline_digest(tmp_path / "inline", CONFIG, reached)
