@@ -35,6 +35,10 @@ MEMBERS = 5
 
 MOST_CHUNK_PAIRS = 64
 """Enough to fill vector units and hide a message's cost; few enough that a lost chunk is cheap."""
+LEAST_CHUNK_PAIRS = 16
+"""Smaller ones cost more to send than they help to share out a small population."""
+CHUNKS = 8
+"""Wanted of a population of 128 to 512 pairs, so that several workers can share it."""
 MOST_ROLLOUT_BLOCK_PAIRS = 32
 """Enough to fill vector units."""
 MOST_ROLLOUT_BLOCK_BYTES = 5 * 2**20
@@ -48,8 +52,12 @@ FEW_CHUNK_PAIRS = 8
 
 
 def default_chunk_pairs(pairs: int) -> int:
-    """The largest divisor of `pairs` not above 64, a multiple of 8 if there is one: 512 -> 64, 5000 -> 40, 7 -> 7."""
-    divisors = [size for size in range(1, MOST_CHUNK_PAIRS + 1) if pairs % size == 0]
+    """The largest divisor of `pairs` not above an eighth of them, within 16 to 64; a multiple of 8 if there is one.
+
+    512 -> 64, 5000 -> 40, 64 -> 16, 7 -> 7.
+    """
+    most = min(MOST_CHUNK_PAIRS, max(LEAST_CHUNK_PAIRS, pairs // CHUNKS))
+    divisors = [size for size in range(1, most + 1) if pairs % size == 0]
     return max([size for size in divisors if size % 8 == 0] or divisors)
 
 
