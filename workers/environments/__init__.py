@@ -22,6 +22,28 @@ TASKS: Mapping[str, TaskSpec] = {
         options={"start": ("default", "corner")},
         summary="a point crosses a square behind two walls; the straight way to the goal is blocked twice",
     ),
+    "ant_maze": TaskSpec(
+        name="ant_maze",
+        observation_size=29,
+        action_size=8,
+        episode_steps=3000,
+        descriptor_names=("x", "y"),
+        descriptor_bounds=((-35.0, 40.0), (-35.0, 40.0)),
+        final_fitness=True,
+        has_goal=True,
+        summary="an ant must go round three walls to a goal 60 m away; the straight way ends in a pocket",
+    ),
+    "ant_trap": TaskSpec(
+        name="ant_trap",
+        observation_size=113,
+        action_size=8,
+        episode_steps=1000,
+        descriptor_names=("x", "y"),
+        descriptor_bounds=((0.0, 30.0), (-8.0, 8.0)),
+        final_fitness=False,
+        has_goal=False,
+        summary="an ant is rewarded for running straight into a trap; far ahead is only behind it",
+    ),
 }
 """Every task by name. A test holds each entry against what its module does."""
 

@@ -1,0 +1,200 @@
+"""The ant of AntMaze and AntTrap: Brax's, in its `spring` pipeline, with a torso that meets the floor, and walls.
+
+The substep is Brax's own, `brax.spring.pipeline.step`, told of more contacts than its floor's and asked for the
+impulses it gave. A control step is ten of them. What is kept between control steps is small: where the links are, how
+they move, and what was pressed on them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from etils import epath
+
+from es_service.noise import uniforms
+from workers.environments.brax_parts import (
+    Contact,
+    Motion,
+    State,
+    System,
+    Transform,
+    collisions,
+    com,
+    kinematics,
+    load,
+    pipeline,
+    quietly,
+)
+from workers.environments.walls import WALL_RADIUS, Segment, WallContact, nearest_wall
+
+SUBSTEPS = 10
+SUBSTEP_S = 0.005
+STEP_S = SUBSTEPS * SUBSTEP_S
+JOINTS = 8
+RESET_NOISE = 0.1
+"""Half the width of the uniform noise on joint angles (radians) and joint velocities (radians per second) at reset."""
+TORSO_RADIUS, LEG_RADIUS = 0.25, 0.08
+LEG_LENGTH = 0.4
+"""Of a lower leg along x and along y, in its own frame."""
+LOWER_LEGS = ((2, 1, 1), (4, -1, 1), (6, -1, -1), (8, 1, -1))
+"""(link, sign of x, sign of y) of the legs in Gym's order: front left, front right, back left, back right."""
+TORSO = 0
+BODIES = 14
+"""Of Gym's ant: world, torso, then (leg, aux, foot) of each leg. Only torso and feet ever touch anything."""
+BODY_OF_LINK = {TORSO: 1, **{link: 4 + 3 * leg for leg, (link, _, _) in enumerate(LOWER_LEGS)}}
+FORCE_LIMIT = 1.0
+
+
+class AntState(NamedTuple):
+    """One ant between two control steps; L = 9 links, 0 the torso, then (upper, lower) of each leg."""
+
+    centre: Transform
+    """[L] centres of mass in the world frame."""
+    motion: Motion
+    """[L] their velocities."""
+    q: Any
+    """[15] torso position, torso quaternion, joint angles."""
+    qd: Any
+    """[14] their velocities."""
+    push: Motion
+    """[L] sum of contact impulses of the last control step over its seconds: torque about the centre, force, in the
+    world frame. Masses and inertias are 1, so an impulse is a change of velocity."""
+
+
+class Ant(NamedTuple):
+    """An ant among walls, as functions of one ant's state."""
+
+    system: System
+    reset: Callable[[Any, tuple[float, float]], AntState]
+    """(stream key, start xy) -> state."""
+    step: Callable[[AntState, Any], AntState]
+    """(state, action [8]) -> state one control step later; actions are clipped to [-1, 1] by Brax."""
+
+
+def make_ant(walls: tuple[Segment, ...] = ()) -> Ant:
+    """Build the ant of a task. Walls are drawn in the model, for viewers, and met as `walls.py` says."""
+    system = load_system(walls)
+
+    def reset(key: Any, start: tuple[float, float]) -> AntState:
+        u = (2.0 * uniforms(key, jnp.arange(2 * JOINTS, dtype=jnp.uint32)) - 1.0) * RESET_NOISE
+        q = system.init_q.at[7:].add(u[:JOINTS]).at[:2].set(jnp.array(start, jnp.float32))
+        qd = jnp.zeros(6 + JOINTS, jnp.float32).at[6:].set(u[JOINTS:])
+        state = pipeline.init(system, q, qd)
+        return AntState(state.x_i, state.xd_i, q, qd, Motion.zero((system.num_links(),)))
+
+    def step(state: AntState, action: Any) -> AntState:
+        def substep(_, carry):
+            physics, push = carry
+            physics, impulse = physics_step(system, physics, action, walls)
+            return physics, push + impulse
+
+        none = Motion.zero((system.num_links(),))
+        physics, push = jax.lax.fori_loop(0, SUBSTEPS, substep, (expand(system, state), none))
+        return AntState(physics.x_i, physics.xd_i, physics.q, physics.qd, push / STEP_S)
+
+    return Ant(system, reset, step)
+
+
+def physics_step(system: System, state: State, action: Any, walls: tuple[Segment, ...]) -> tuple[State, Motion]:
+    """One substep of Brax, with walls: (state, impulse that contacts gave each link, [L], about its centre of mass)."""
+    given = []
+
+    def resolve(system: System, state: State) -> Motion:
+        with _replaced(collisions, "contact", SimpleNamespace(get=lambda system, x: _contacts(system, x, walls))):
+            given.append(brax_resolve(system, state))
+        return given[0]
+
+    brax_resolve = collisions.resolve
+    with quietly(), _replaced(pipeline, "collisions", SimpleNamespace(resolve=resolve)):
+        state = pipeline.step(system, state, action)
+    return state, given[0]
+
+
+def expand(system: System, state: AntState) -> State:
+    """Brax's full state of an ant, all of it derived from the small one."""
+    x, xd = com.to_world(system, state.centre, state.motion)
+    j, jd, a_p, a_c = kinematics.world_to_joint(system, x, xd)
+    i_inv = com.inv_inertia(system, x)
+    mass = system.link.inertia.mass ** (1 - system.spring_mass_scale)
+    return State(
+        q=state.q, qd=state.qd, x=x, xd=xd, contact=None, x_i=state.centre, xd_i=state.motion,
+        j=j, jd=jd, a_p=a_p, a_c=a_c, i_inv=i_inv, mass=mass,
+    )  # fmt: skip
+
+
+def observe(state: AntState) -> Any:
+    """[27] Gym's observation: torso height and quaternion, joint angles, all velocities."""
+    return jnp.concatenate([state.q[2:], state.qd])
+
+
+def contact_forces(state: AntState) -> Any:
+    """[84] Gym's: torque and force on each of 14 bodies, clipped to [-1, 1]; zero for bodies that touch nothing."""
+    zero_6 = jnp.zeros(6, jnp.float32)
+    by_body = dict.fromkeys(range(BODIES), zero_6)
+    for link, body in BODY_OF_LINK.items():
+        by_body[body] = jnp.concatenate([state.push.ang[link], state.push.vel[link]])
+    return jnp.clip(jnp.concatenate(list(by_body.values())), -FORCE_LIMIT, FORCE_LIMIT)
+
+
+def load_system(walls: tuple[Segment, ...]) -> System:
+    """Brax's ant.xml with a torso that meets the floor, and the walls as pictures without contacts."""
+    elem = ElementTree.fromstring((epath.resource_path("brax") / "envs" / "assets" / "ant.xml").read_text())
+    torso = elem.find(".//geom[@name='torso_geom']")
+    world = elem.find("worldbody")
+    assert torso is not None
+    assert world is not None
+    torso.set("contype", "1")
+    for number, ((x0, y0), (x1, y1)) in enumerate(walls):
+        size = f"{np.hypot(x1 - x0, y1 - y0) / 2 + WALL_RADIUS:g} {WALL_RADIUS:g} 0.5"
+        middle, angle = f"{(x0 + x1) / 2:g} {(y0 + y1) / 2:g} 0.5", f"0 0 {np.degrees(np.arctan2(y1 - y0, x1 - x0)):g}"
+        shape = {"type": "box", "size": size, "pos": middle, "euler": angle, "rgba": "0.5 0.5 0.55 1"}
+        ElementTree.SubElement(world, "geom", {"name": f"wall_{number}", "contype": "0", "conaffinity": "0", **shape})
+    system: Any = load(ElementTree.tostring(elem, encoding="unicode"))
+    return system.tree_replace({"opt.timestep": SUBSTEP_S})
+
+
+def _contacts(system: System, x: Transform, walls: tuple[Segment, ...]) -> Contact:
+    """The floor's contacts, as Brax finds them, and behind them one with a wall for each collider."""
+    floor = brax_contact.get(system, x)
+    assert floor is not None
+    if not walls:
+        return floor
+    links, met = [TORSO], [nearest_wall(walls, x.pos[TORSO], x.pos[TORSO], TORSO_RADIUS)]
+    for link, sign_x, sign_y in LOWER_LEGS:
+        end_3 = jnp.array([sign_x * LEG_LENGTH, sign_y * LEG_LENGTH, 0.0])
+        foot_3 = x.take(link).do(Transform.create(pos=end_3)).pos
+        links.append(link)
+        met.append(nearest_wall(walls, foot_3, x.pos[link], LEG_RADIUS))
+    contact: WallContact = jax.tree.map(lambda *rows: jnp.stack(rows), *met)
+    frame = jnp.zeros((len(met), 3, 3)).at[:, 0].set(contact.normal_3)  # Brax uses no more of it than the normal
+    like_floor = jax.tree.map(lambda rows: rows[: len(met)], floor.replace(link_idx=None))
+    wall = like_floor.replace(
+        dist=contact.distance, pos=contact.position_3, frame=frame, elasticity=jnp.zeros(len(met)),
+        friction=jnp.ones_like(like_floor.friction),
+    )  # fmt: skip
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), floor.replace(link_idx=None), wall)
+    # As with the floor, the first of the two bodies is the world, which Brax counts as link -1.
+    world, ant = floor.link_idx
+    no_link = jnp.full(len(met), -1)
+    return both.replace(link_idx=(jnp.concatenate([world, no_link]), jnp.concatenate([ant, jnp.array(links)])))
+
+
+@contextlib.contextmanager
+def _replaced(module: Any, name: str, value: Any) -> Iterator[None]:
+    """A name of a module means something else, while one substep is traced."""
+    before = getattr(module, name)
+    setattr(module, name, value)
+    try:
+        yield
+    finally:
+        setattr(module, name, before)
+
+
+brax_contact = collisions.contact

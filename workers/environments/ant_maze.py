@@ -1,0 +1,56 @@
+"""AntMaze: an ant must go round three walls to a goal 60 m away; the straight way ends in a pocket.
+
+The arena, length and descriptor of the benchmark paper (Chalumeau et al. 2022) with the inner walls, start and goal of
+the original ME-ES task (Colas et al. 2020).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from workers.environments import Environment
+from workers.environments.ant import AntState, make_ant, observe
+
+LOW, HIGH = -35.0, 40.0
+"""Of x and of y: the arena is a square."""
+BORDERS = (
+    ((LOW, LOW), (HIGH, LOW)),
+    ((LOW, HIGH), (HIGH, HIGH)),
+    ((LOW, LOW), (LOW, HIGH)),
+    ((HIGH, LOW), (HIGH, HIGH)),
+)
+INNER_WALLS = (
+    ((-15.0, 3.0), (-15.0, 37.0)),
+    ((-16.0, -15.0), (10.0, -15.0)),
+    ((10.0, -35.0), (10.0, 0.0)),
+)
+WALLS = BORDERS + INNER_WALLS
+START = (-25.0, -25.0)
+GOAL = (35.0, -25.0)
+MIDDLE, HALF = (LOW + HIGH) / 2.0, (HIGH - LOW) / 2.0
+
+
+def make() -> Environment:
+    """AntMaze; it has no options."""
+    ant = make_ant(WALLS)
+
+    def step(state: AntState, action: Any) -> tuple[AntState, Any, Any]:
+        state = ant.step(state, action)
+        return state, -_goal_distance(state), jnp.array(False)
+
+    return Environment(lambda key: ant.reset(key, START), _observe, step, _position, _goal_distance)
+
+
+def _position(state: AntState) -> Any:
+    return state.q[:2]
+
+
+def _observe(state: AntState) -> Any:
+    return jnp.concatenate([(_position(state) - MIDDLE) / HALF, observe(state)])
+
+
+def _goal_distance(state: AntState) -> Any:
+    dx, dy = state.q[0] - GOAL[0], state.q[1] - GOAL[1]
+    return jnp.sqrt(dx * dx + dy * dy)

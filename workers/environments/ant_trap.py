@@ -1,0 +1,57 @@
+"""AntTrap: an ant is rewarded for running along +x, straight into a trap open on the side it comes from.
+
+Numbers of the benchmark paper (Chalumeau et al. 2022) and of the QDax environment it used: reward of Gym's ant with
+contact cost, observation with contact forces, trap 5 m wide and deep.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from workers.environments import Environment
+from workers.environments.ant import STEP_S, AntState, contact_forces, make_ant, observe
+
+WALLS = (
+    ((12.0, -2.0), (12.0, 2.0)),
+    ((7.0, 3.0), (12.0, 3.0)),
+    ((7.0, -3.0), (12.0, -3.0)),
+)
+START = (0.0, 0.0)
+DESCRIPTOR_BOUNDS = ((0.0, 30.0), (-8.0, 8.0))
+HEALTHY_Z = (0.2, 1.0)
+SURVIVAL_REWARD = 1.0
+CONTROL_COST, CONTACT_COST = 0.5, 5e-4
+
+
+def make() -> Environment:
+    """AntTrap; it has no options."""
+    ant = make_ant(WALLS)
+
+    def step(state: AntState, action: Any) -> tuple[AntState, Any, Any]:
+        new = ant.step(state, action)
+        forward = (new.q[0] - state.q[0]) / STEP_S
+        # The action as the motors take it: exploration noise beyond the limits moves nothing and costs nothing.
+        control = CONTROL_COST * jnp.sum(jnp.clip(action, -1.0, 1.0) ** 2)
+        contact = CONTACT_COST * jnp.sum(contact_forces(new) ** 2)
+        done = (new.q[2] < HEALTHY_Z[0]) | (new.q[2] > HEALTHY_Z[1])
+        return new, forward + SURVIVAL_REWARD - control - contact, done
+
+    return Environment(lambda key: ant.reset(key, START), _observe, step, _descriptor, _no_goal)
+
+
+def _observe(state: AntState) -> Any:
+    (x_low, x_high), (_, y_high) = DESCRIPTOR_BOUNDS
+    half = (x_high - x_low) / 2.0
+    position = jnp.stack([(state.q[0] - x_low - half) / half, state.q[1] / y_high])
+    return jnp.concatenate([position, observe(state), contact_forces(state)])
+
+
+def _descriptor(state: AntState) -> Any:
+    low, high = (jnp.array(side, jnp.float32) for side in zip(*DESCRIPTOR_BOUNDS, strict=True))
+    return jnp.clip(state.q[:2], low, high)
+
+
+def _no_goal(state: AntState) -> Any:
+    return jnp.float32(jnp.nan)
