@@ -70,8 +70,7 @@ class Containers:
     def __enter__(self) -> Containers:
         for service in ADDRESSES:
             sh("ip", "netns", "add", self._name(service))
-            hosts = [f"--add-host={name}:{address}" for name, address in ADDRESSES.items()]
-            sh("buildah", "--storage-driver=vfs", "from", "--name", self._name(service), *hosts, IMAGE)
+            sh("buildah", "--storage-driver=vfs", "from", "--name", self._name(service), IMAGE)
         one, other = map(self._name, ADDRESSES)
         sh("ip", "-n", one, "link", "add", "eth0", "type", "veth", "peer", "name", "eth0", "netns", other)
         for service, address in ADDRESSES.items():
@@ -100,7 +99,8 @@ class Containers:
     def start(self, service: str) -> None:
         """Start what compose.yaml says this service runs."""
         with (self.log_folder / service).open("wb") as log:
-            command = self.command(service, *shlex.split(self.services[service]["command"]))
+            words = self.services[service]["command"].replace("head:", f"{ADDRESSES['head']}:")  # no name server here
+            command = self.command(service, *shlex.split(words))
             started = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         self._started.append(started)
 

@@ -1,0 +1,26 @@
+"""What is `brax:ant`, or `package.module:Class`? Asked of a process of its own, since finding out imports JAX.
+
+    python -m workers.describe NAME
+
+Prints one line of JSON: {"task": fields of a TaskSpec} or {"problem": text}.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+
+from workers.environments import TaskError, describe_environment
+
+
+def main(name: str) -> None:
+    try:
+        answer = {"task": dataclasses.asdict(describe_environment(name))}
+    except TaskError as error:
+        answer = {"problem": str(error)}
+    print(json.dumps(answer))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

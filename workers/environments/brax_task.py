@@ -1,0 +1,143 @@
+"""Any environment of the installed Brax as a task: `brax:halfcheetah`, with a named descriptor.
+
+The environment is Brax's own, without wrappers: no automatic reset, no time limit of its own. Actions are clipped to
+[-1, 1], which is what Brax's environments take.
+"""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from es_service.protocol import Bounds, TaskSpec
+from workers.environments import Environment, TaskError
+from workers.environments.brax_parts import Transform, brax_contact, quietly
+
+with quietly():
+    from brax import envs
+
+EPISODE_STEPS = 1000
+"""What Brax's own trainers use."""
+BACKENDS = ("spring", "generalized", "positional", "mjx")
+FAR = 30.0
+"""Metres, or whatever the joint is measured in: bounds of a descriptor whose reach nobody declares."""
+TOUCH = 0.005
+"""Metres above the floor that still count as touching it."""
+
+
+class _State(NamedTuple):
+    brax: Any
+    touched_F: Any
+    """Control steps in which each foot touched the floor."""
+    steps: Any
+
+
+def describe(name: str) -> TaskSpec:
+    """What the driver must know of Brax's environment `name`. Raises TaskError if there is none, or it does not fit."""
+    environment = _make_brax(name, BACKENDS[0])
+    sizes = environment.observation_size, environment.action_size
+    if not all(isinstance(size, int) for size in sizes):
+        raise TaskError(f"brax:{name} observes {sizes[0]}; only flat observations can be used")
+    descriptors = _descriptors(environment.sys)
+    names, bounds = next(iter(descriptors.values()))
+    return TaskSpec(
+        name=f"brax:{name}",
+        observation_size=int(sizes[0]),
+        action_size=int(sizes[1]),
+        episode_steps=EPISODE_STEPS,
+        descriptor_names=names,
+        descriptor_bounds=bounds,
+        final_fitness=False,
+        has_goal=False,
+        options={"descriptor": tuple(descriptors), "backend": BACKENDS},
+        descriptors=descriptors,
+        summary=f"{type(environment).__name__} of Brax",
+    )
+
+
+def make(name: str, descriptor: str | None = None, backend: str = BACKENDS[0]) -> Environment:
+    """The functions of Brax's environment `name`; the first descriptor it can give unless another is named."""
+    environment = _make_brax(name, backend)
+    system = environment.sys
+    descriptor = descriptor or next(iter(_descriptors(system)))
+    feet = _feet(system) if descriptor == "feet_contact" else []
+
+    def reset(key: Any) -> _State:
+        with quietly():
+            state = environment.reset(jax.random.wrap_key_data(key[:2], impl="threefry2x32"))
+        state = jax.tree.map(jnp.asarray, state)
+        return _State(state, jnp.zeros(len(feet), jnp.float32), jnp.float32(0.0))
+
+    def step(state: _State, action: Any) -> tuple[_State, Any, Any]:
+        with quietly():
+            after = environment.step(state.brax, jnp.clip(action, -1.0, 1.0))
+        after = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), after, state.brax)
+        touched_F = state.touched_F + _touching(system, after.pipeline_state.x, feet)
+        return _State(after, touched_F, state.steps + 1.0), after.reward, after.done > 0.5
+
+    def describe_state(state: _State) -> Any:
+        physics = state.brax.pipeline_state
+        match descriptor:
+            case "final_xy":
+                return physics.x.pos[0, :2]
+            case "final_x":
+                return physics.x.pos[0, :1]
+            case "final_joints":
+                return physics.q[:2]
+            case _:
+                return state.touched_F / jnp.maximum(state.steps, 1.0)
+
+    return Environment(reset, lambda state: state.brax.obs, step, describe_state, lambda state: jnp.float32(jnp.nan))
+
+
+def _make_brax(name: str, backend: str) -> Any:
+    known = sorted(envs._envs)  # Brax has no public list of its names
+    if name not in known:
+        near = get_close_matches(name, known, n=1)
+        hint = f"; did you mean brax:{near[0]}?" if near else ""
+        raise TaskError(f"brax:{name} is not in the installed Brax, which has {', '.join(known)}{hint}")
+    with quietly():
+        return envs.get_environment(name, backend=backend)
+
+
+def _descriptors(system: Any) -> dict[str, tuple[tuple[str, ...], Bounds]]:
+    """What can be said about an episode of this system: name -> (components, bounds). The first is the default."""
+    found: dict[str, tuple[tuple[str, ...], Bounds]] = {}
+    far = (-FAR, FAR)
+    moves_along_x = bool(np.asarray(system.dof.motion.vel)[:, 0].any())
+    if system.link_types[0] == "f":
+        found["final_xy"] = ("x", "y"), (far, far)
+    if system.link_types[0] == "f" or moves_along_x:
+        found["final_x"] = ("x",), (far,)
+    if feet := _feet(system):
+        found["feet_contact"] = tuple(f"foot_{number}" for number in range(1, len(feet) + 1)), ((0.0, 1.0),) * len(feet)
+    if system.q_size() >= 2:
+        found["final_joints"] = ("joint_1", "joint_2"), (far, far)
+    return found
+
+
+def _feet(system: Any) -> list[int]:
+    """Links without children of which a part can touch the floor, in the order of the model."""
+    links = range(system.num_links())
+    leaves = [link for link in links if link not in system.link_parents]
+    bodies, kinds = np.asarray(system.geom_bodyid), np.asarray(system.geom_contype)
+    touchable = set((bodies[(kinds | np.asarray(system.geom_conaffinity)) != 0] - 1).tolist())
+    has_floor = -1 in touchable
+    return [link for link in leaves if has_floor and link in touchable]
+
+
+def _touching(system: Any, x: Transform, feet: list[int]) -> Any:
+    """1.0 for each foot that touches the floor."""
+    if not feet:
+        return jnp.zeros(0, jnp.float32)
+    with quietly():
+        contact = brax_contact.get(system, x)
+    assert contact is not None
+    near = contact.dist < TOUCH
+    of_world, of_ant = (jnp.asarray(link) for link in contact.link_idx)
+    touches = [(near & (((of_world == -1) & (of_ant == foot)) | ((of_ant == -1) & (of_world == foot)))).any() for foot in feet]
+    return jnp.stack(touches).astype(jnp.float32)

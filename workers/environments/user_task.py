@@ -1,0 +1,97 @@
+"""A class of the user's own as a task: `package.module:Class`. This is what it must have.
+
+    class Class:
+        observation_size: int
+        action_size: int
+        episode_steps: int
+        descriptor_names: tuple[str, ...]
+        descriptor_bounds: tuple[tuple[float, float], ...]
+
+        def reset(self, key): ...          # stream key, uint32 [4] -> state, any pytree of arrays
+        def observe(self, state): ...      # -> observation [observation_size]
+        def step(self, state, action): ... # -> (state, reward, done)
+        def descriptor(self, state): ...   # -> descriptor [len(descriptor_names)] of an episode that ends here
+
+and may have: `goal_distance(self, state)`; `final_fitness = True` where the last reward says how well the whole episode
+went; `options = {"name": ("default", "other")}`, keywords of its constructor, which must not change any size; a
+docstring, whose first line `es-service` shows. All methods are pure functions that JAX can trace, of one state: they
+are batched and compiled for you. `es_service.noise.uniforms(key, counters)` makes random numbers.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+
+from es_service.protocol import TaskSpec
+from workers.environments import Environment, TaskError
+
+METHODS = ("reset", "observe", "step", "descriptor")
+ATTRIBUTES = {
+    "observation_size": int,
+    "action_size": int,
+    "episode_steps": int,
+    "descriptor_names": tuple,
+    "descriptor_bounds": tuple,
+}
+
+
+def describe(path: str) -> TaskSpec:
+    """What the driver must know of a user's class. Raises TaskError if it cannot be had or misses something."""
+    task = _import(path)
+    missing = [name for name in (*ATTRIBUTES, *METHODS) if not hasattr(task, name)]
+    if missing:
+        raise TaskError(f"{path} has no {', '.join(missing)}; workers/environments/user_task.py says what is needed")
+    wrong = [
+        f"{name} = {getattr(task, name)!r} is no {kind.__name__}"
+        for name, kind in ATTRIBUTES.items()
+        if not isinstance(getattr(task, name), kind)
+    ]
+    if len(task.descriptor_bounds) != len(task.descriptor_names):
+        names, bounds = len(task.descriptor_names), len(task.descriptor_bounds)
+        wrong.append(f"{names} descriptor_names but {bounds} descriptor_bounds")
+    wrong += [f"{name} = {getattr(task, name)} is not positive" for name in tuple(ATTRIBUTES)[:3] if getattr(task, name) < 1]
+    if wrong:
+        raise TaskError(f"{path}: {'; '.join(wrong)}")
+    return TaskSpec(
+        name=path,
+        observation_size=task.observation_size,
+        action_size=task.action_size,
+        episode_steps=task.episode_steps,
+        descriptor_names=tuple(map(str, task.descriptor_names)),
+        descriptor_bounds=tuple((float(low), float(high)) for low, high in task.descriptor_bounds),
+        final_fitness=bool(getattr(task, "final_fitness", False)),
+        has_goal=hasattr(task, "goal_distance"),
+        options={name: tuple(values) for name, values in getattr(task, "options", {}).items()},
+        summary=(task.__doc__ or "").strip().partition("\n")[0],
+    )
+
+
+def make(path: str, options: Mapping[str, str]) -> Environment:
+    """The functions of a user's class, constructed with the task's options."""
+    task = _import(path)(**options)
+    goal_distance = getattr(task, "goal_distance", lambda state: jnp.float32(jnp.nan))
+
+    def step(state: Any, action: Any) -> tuple[Any, Any, Any]:
+        state, reward, done = task.step(state, action)
+        return state, jnp.asarray(reward, jnp.float32), jnp.asarray(done, bool)
+
+    return Environment(task.reset, task.observe, step, task.descriptor, goal_distance)
+
+
+def _import(path: str) -> Any:
+    module, _, name = path.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # a console script does not look where it was started
+    try:
+        found = importlib.import_module(module)
+    except ImportError as error:
+        raise TaskError(f"{path}: cannot import {module} ({error}); start where it is, or install it") from error
+    if not hasattr(found, name):
+        raise TaskError(f"{path}: {module} has no {name}")
+    return getattr(found, name)
