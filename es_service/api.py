@@ -34,8 +34,8 @@ from es_service.store.beginning import Beginning
 from es_service.store.folder import DATABASE, explained, write_config
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook
+from es_service.tasks import Tasks, with_options
 from workers.actor import WorkerActor
-from workers.environments import TASKS
 from workers.policy import initial_parameters
 
 RUNS_FOLDER = Path("runs")
@@ -45,6 +45,9 @@ OnGeneration = Callable[[Mapping[str, Any]], None]
 """Called with each history row once it is safe."""
 OnNotice = Callable[[str], None]
 """Called with what had to be repaired, or what the user should know, as soon as it is known."""
+
+
+TASKS = Tasks()
 
 
 def _ignore(row: Mapping[str, Any]) -> None:
@@ -344,7 +347,7 @@ def _engine(
 
 
 def _task(config: RunConfig) -> TaskSpec:
-    return TASKS[config.task.environment]
+    return with_options(TASKS[config.task.environment], config.task.options)
 
 
 def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Moments]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float32]
+Bounds = tuple[tuple[float, float], ...]
 SIGNS = (1.0, -1.0)
 """The two members of a pair, in the order of axis S."""
 EVALUATION_EPISODES_PER_CHUNK = 16
@@ -30,7 +31,7 @@ class TaskSpec:
     episode_steps: int
     """Default length of an episode in control steps."""
     descriptor_names: tuple[str, ...]
-    descriptor_bounds: tuple[tuple[float, float], ...]
+    descriptor_bounds: Bounds
     """(low, high) per descriptor dimension, in the units of the task."""
     final_fitness: bool
     """Whether `task.fitness: final` (the reward of the last valid step) makes sense here."""
@@ -39,6 +40,8 @@ class TaskSpec:
     options: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Task options a config may set, each with its allowed values; the first is the default."""
     summary: str = ""
+    descriptors: dict[str, tuple[tuple[str, ...], Bounds]] = field(default_factory=dict)
+    """Where the task's option `descriptor` chooses: name -> (descriptor_names, descriptor_bounds)."""
 
 
 @dataclass(frozen=True)

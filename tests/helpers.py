@@ -32,8 +32,9 @@ def spec(**changes: object) -> WorkerSpec:
     return replace(SPEC, **changes)  # pyright: ignore[reportArgumentType]
 
 
-def centre(parameters_D: np.ndarray, generation: int = 1, sigma: float = 0.1) -> Centre:
-    return Centre(generation, parameters_D.astype(np.float32), sigma, np.zeros(2, np.float32), np.ones(2, np.float32))
+def centre(parameters_D: np.ndarray, generation: int = 1, sigma: float = 0.1, observation_size: int = 2) -> Centre:
+    mean_O, std_O = np.zeros(observation_size, np.float32), np.ones(observation_size, np.float32)
+    return Centre(generation, parameters_D.astype(np.float32), sigma, mean_O, std_O)
 
 
 def random_parameters(seed: int = 0, size: int = PARAMETERS, scale: float = 0.7) -> np.ndarray:

@@ -114,6 +114,8 @@ def _load(
     values = {key: value for key, value in values.items() if key not in bad}
 
     for key, what, known in (("task.environment", "task", tasks), ("search.algorithm", "algorithm", algorithms)):
+        if key == "task.environment" and ":" in str(values.get(key, "")):
+            continue  # looked up below: it is not in the list of known ones
         if key in values and values[key] not in known:
             problems.append(
                 f"{key}: {show(values[key])} is no known {what}; must be {one_of(known)}"
@@ -121,7 +123,11 @@ def _load(
             )
         elif key not in values and key not in bad and key.split(".")[0] not in unusable:
             problems.append(f"{key}: missing; must be {one_of(known)}")
-    task = tasks.get(values.get("task.environment", ""))
+    try:
+        task = tasks.get(values.get("task.environment", ""))
+    except ConfigError as error:
+        task = None
+        problems.append(f"task.environment: {error}")
     values = resolve(values, left_open, task)
     problems += task_problems(values, task) if task else []
     problems += member_problems(values) + shape_problems(values) + engine_problems(values)

@@ -24,10 +24,12 @@ from es_service.config.resolution import (
 )
 from es_service.config.yaml_text import dump_yaml, parse_value
 from es_service.errors import ConfigError
+from es_service.tasks import Tasks
 from workers import environments
 
 POINT_MAZE = environments.TASKS["point_maze"]
 TASKS = {"point_maze": POINT_MAZE}
+ALL_TASKS = Tasks()
 CONFIGS = Path(__file__).parents[2] / "configs"
 MINIMAL = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 3}}
 MINIMAL_TEXT = "task: {environment: point_maze}\nsearch: {algorithm: es}\nbudget: {generations: 3}\n"
@@ -175,8 +177,8 @@ def test_config_is_frozen():
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
 def test_shipped_configs_load_and_are_named_after_task_and_algorithm(path):
-    config = load(path)
-    assert path.stem == f"{config.task.environment}_{config.search.algorithm}"
+    config = load_config(path, tasks=ALL_TASKS, algorithms=ALGORITHMS)
+    assert path.stem == f"{config.task.environment.replace(':', '_')}_{config.search.algorithm}"
     assert config_warnings(config) == []
 
 
@@ -184,7 +186,8 @@ def test_shipped_configs_load_and_are_named_after_task_and_algorithm(path):
 def test_shipped_configs_hide_no_preset_key(path):
     """But the size of the population: or `--set search.preset=uber` would do nothing."""
     uber = preset_values("uber") | {"search.pairs": 64}
-    assert load(path, "search.preset=uber").constants().items() >= uber.items()
+    config = load_config(path, ["search.preset=uber"], tasks=ALL_TASKS, algorithms=ALGORITHMS)
+    assert config.constants().items() >= uber.items()
 
 
 # Round trip and constants

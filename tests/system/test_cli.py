@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -79,6 +80,22 @@ def test_resolved_config_is_complete_and_runs_to_the_same_digest(finished, tmp_p
     assert recorded["compute"]["gradient_block_pairs"] == 8
     assert es("run", folder / "config.yaml", "--out", tmp_path / "again")[0] == 0
     assert digest(tmp_path / "again") == digest(folder)
+
+
+def test_bench_rollouts_prints_a_row_per_policy_batch_and_number_of_cores():
+    code, printed = es("bench", "rollouts", "--task", "point_maze", "--batch", 8, "--seconds", 0, "--json")
+    assert code == 0, printed
+    rows = json.loads(printed)
+    assert {row["policy"] for row in rows} == {"on", "off"}
+    assert {(row["task"], row["rollout"], row["batch"]) for row in rows} == {("point_maze", "xla", 8)}
+    assert all(row["steps_per_second"] > 0 and row["compile_seconds"] > 0 for row in rows)
+    for wrong, message in (
+        (("--batch", 7), "must be even"),
+        (("--policy", "maybe"), "--policy maybe: must be on or off"),
+    ):
+        code, printed = es("bench", "rollouts", *wrong)
+        assert code == 2
+        assert message in printed
 
 
 def test_options_stand_for_keys(config, tmp_path):

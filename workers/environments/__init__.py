@@ -9,6 +9,11 @@ from typing import Any
 
 from es_service.protocol import TaskSpec
 
+
+class TaskError(Exception):
+    """A task that cannot be had; the message says why."""
+
+
 TASKS: Mapping[str, TaskSpec] = {
     "point_maze": TaskSpec(
         name="point_maze",
@@ -45,7 +50,7 @@ TASKS: Mapping[str, TaskSpec] = {
         summary="an ant is rewarded for running straight into a trap; far ahead is only behind it",
     ),
 }
-"""Every task by name. A test holds each entry against what its module does."""
+"""Our own tasks by name. A test holds each entry against what its module does."""
 
 
 @dataclass(frozen=True)
@@ -68,5 +73,33 @@ class Environment:
 
 
 def make_environment(name: str, options: Mapping[str, str]) -> Environment:
-    """The functions of a named task; imports its module, and with it JAX and any physics engine it needs."""
-    return importlib.import_module(f"workers.environments.{name}").make(**options)
+    """The functions of a named task; imports its module, and with it JAX and any physics engine it needs.
+
+    Args:
+        name: one of TASKS, `brax:NAME`, or `package.module:Class`. Raises TaskError if that cannot be had.
+    """
+    kind, colon, rest = name.partition(":")
+    if not colon:
+        return importlib.import_module(f"workers.environments.{name}").make(**options)
+    if kind == "brax":
+        from workers.environments import brax_task
+
+        return brax_task.make(rest, **options)
+    from workers.environments import user_task
+
+    return user_task.make(name, options)
+
+
+def describe_environment(name: str) -> TaskSpec:
+    """What the driver must know of `brax:NAME` or `package.module:Class`, which only its module can tell.
+
+    Imports JAX. Raises TaskError as `make_environment`.
+    """
+    kind, _, rest = name.partition(":")
+    if kind == "brax":
+        from workers.environments import brax_task
+
+        return brax_task.describe(rest)
+    from workers.environments import user_task
+
+    return user_task.describe(name)

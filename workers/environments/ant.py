@@ -25,6 +25,7 @@ from workers.environments.brax_parts import (
     State,
     System,
     Transform,
+    brax_contact,
     collisions,
     com,
     kinematics,
@@ -32,7 +33,7 @@ from workers.environments.brax_parts import (
     pipeline,
     quietly,
 )
-from workers.environments.walls import WALL_RADIUS, Segment, WallContact, nearest_wall
+from workers.environments.walls import WALL_RADIUS, Segment, nearest_wall
 
 SUBSTEPS = 10
 SUBSTEP_S = 0.005
@@ -166,23 +167,26 @@ def _contacts(system: System, x: Transform, walls: tuple[Segment, ...]) -> Conta
     assert floor is not None
     if not walls:
         return floor
-    links, met = [TORSO], [nearest_wall(walls, x.pos[TORSO], x.pos[TORSO], TORSO_RADIUS)]
+    feet_3 = [x.pos[TORSO]]
     for link, sign_x, sign_y in LOWER_LEGS:
         end_3 = jnp.array([sign_x * LEG_LENGTH, sign_y * LEG_LENGTH, 0.0])
-        foot_3 = x.take(link).do(Transform.create(pos=end_3)).pos
-        links.append(link)
-        met.append(nearest_wall(walls, foot_3, x.pos[link], LEG_RADIUS))
-    contact: WallContact = jax.tree.map(lambda *rows: jnp.stack(rows), *met)
-    frame = jnp.zeros((len(met), 3, 3)).at[:, 0].set(contact.normal_3)  # Brax uses no more of it than the normal
-    like_floor = jax.tree.map(lambda rows: rows[: len(met)], floor.replace(link_idx=None))
+        feet_3.append(x.take(link).do(Transform.create(pos=end_3)).pos)
+    links = [TORSO, *(link for link, _, _ in LOWER_LEGS)]
+    knees_3 = [x.pos[link] for link in links]
+    radii = jnp.array([TORSO_RADIUS] + [LEG_RADIUS] * len(LOWER_LEGS))
+    met = jax.vmap(lambda foot_3, knee_3, radius: nearest_wall(walls, foot_3, knee_3, radius))
+    contact = met(jnp.stack(feet_3), jnp.stack(knees_3), radii)
+    colliders = len(links)
+    frame = jnp.zeros((colliders, 3, 3)).at[:, 0].set(contact.normal_3)  # Brax uses no more of it than the normal
+    like_floor = jax.tree.map(lambda rows: rows[:colliders], floor.replace(link_idx=None))
     wall = like_floor.replace(
-        dist=contact.distance, pos=contact.position_3, frame=frame, elasticity=jnp.zeros(len(met)),
+        dist=contact.distance, pos=contact.position_3, frame=frame, elasticity=jnp.zeros(colliders),
         friction=jnp.ones_like(like_floor.friction),
     )  # fmt: skip
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), floor.replace(link_idx=None), wall)
     # As with the floor, the first of the two bodies is the world, which Brax counts as link -1.
     world, ant = floor.link_idx
-    no_link = jnp.full(len(met), -1)
+    no_link = jnp.full(colliders, -1)
     return both.replace(link_idx=(jnp.concatenate([world, no_link]), jnp.concatenate([ant, jnp.array(links)])))
 
 
@@ -195,6 +199,3 @@ def _replaced(module: Any, name: str, value: Any) -> Iterator[None]:
         yield
     finally:
         setattr(module, name, before)
-
-
-brax_contact = collisions.contact

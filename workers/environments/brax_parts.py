@@ -21,6 +21,7 @@ def quietly() -> Iterator[None]:
 
 with quietly():
     from brax import com, kinematics
+    from brax import contact as brax_contact
     from brax.base import Contact, Motion, System, Transform
     from brax.io import mjcf
     from brax.spring import collisions, pipeline
@@ -32,6 +33,7 @@ __all__ = [
     "State",
     "System",
     "Transform",
+    "brax_contact",
     "collisions",
     "com",
     "kinematics",

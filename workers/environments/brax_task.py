@@ -39,15 +39,16 @@ class _State(NamedTuple):
 def describe(name: str) -> TaskSpec:
     """What the driver must know of Brax's environment `name`. Raises TaskError if there is none, or it does not fit."""
     environment = _make_brax(name, BACKENDS[0])
-    sizes = environment.observation_size, environment.action_size
-    if not all(isinstance(size, int) for size in sizes):
-        raise TaskError(f"brax:{name} observes {sizes[0]}; only flat observations can be used")
+    with quietly():  # Brax's own `observation_size` would run a whole reset to see
+        observation = jax.eval_shape(environment.reset, jax.random.key(0)).obs
+    if len(getattr(observation, "shape", ())) != 1:
+        raise TaskError(f"brax:{name} observes {observation}; only flat observations can be used")
     descriptors = _descriptors(environment.sys)
     names, bounds = next(iter(descriptors.values()))
     return TaskSpec(
         name=f"brax:{name}",
-        observation_size=int(sizes[0]),
-        action_size=int(sizes[1]),
+        observation_size=observation.shape[0],
+        action_size=environment.action_size,
         episode_steps=EPISODE_STEPS,
         descriptor_names=names,
         descriptor_bounds=bounds,
@@ -73,8 +74,9 @@ def make(name: str, descriptor: str | None = None, backend: str = BACKENDS[0]) -
         return _State(state, jnp.zeros(len(feet), jnp.float32), jnp.float32(0.0))
 
     def step(state: _State, action: Any) -> tuple[_State, Any, Any]:
+        own = jax.tree.map(lambda x: x, state.brax)  # Brax writes into the metrics it is given
         with quietly():
-            after = environment.step(state.brax, jnp.clip(action, -1.0, 1.0))
+            after = environment.step(own, jnp.clip(action, -1.0, 1.0))
         after = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), after, state.brax)
         touched_F = state.touched_F + _touching(system, after.pipeline_state.x, feet)
         return _State(after, touched_F, state.steps + 1.0), after.reward, after.done > 0.5
@@ -108,10 +110,10 @@ def _descriptors(system: Any) -> dict[str, tuple[tuple[str, ...], Bounds]]:
     """What can be said about an episode of this system: name -> (components, bounds). The first is the default."""
     found: dict[str, tuple[tuple[str, ...], Bounds]] = {}
     far = (-FAR, FAR)
-    moves_along_x = bool(np.asarray(system.dof.motion.vel)[:, 0].any())
-    if system.link_types[0] == "f":
+    root = system.link_types[0]
+    if root == "f":
         found["final_xy"] = ("x", "y"), (far, far)
-    if system.link_types[0] == "f" or moves_along_x:
+    if root == "f" or np.asarray(system.dof.motion.vel)[: int(root), 0].any():
         found["final_x"] = ("x",), (far,)
     if feet := _feet(system):
         found["feet_contact"] = tuple(f"foot_{number}" for number in range(1, len(feet) + 1)), ((0.0, 1.0),) * len(feet)
@@ -139,5 +141,7 @@ def _touching(system: Any, x: Transform, feet: list[int]) -> Any:
     assert contact is not None
     near = contact.dist < TOUCH
     of_world, of_ant = (jnp.asarray(link) for link in contact.link_idx)
-    touches = [(near & (((of_world == -1) & (of_ant == foot)) | ((of_ant == -1) & (of_world == foot)))).any() for foot in feet]
+    touches = [
+        (near & (((of_world == -1) & (of_ant == foot)) | ((of_ant == -1) & (of_world == foot)))).any() for foot in feet
+    ]
     return jnp.stack(touches).astype(jnp.float32)

@@ -55,7 +55,9 @@ def describe(path: str) -> TaskSpec:
     if len(task.descriptor_bounds) != len(task.descriptor_names):
         names, bounds = len(task.descriptor_names), len(task.descriptor_bounds)
         wrong.append(f"{names} descriptor_names but {bounds} descriptor_bounds")
-    wrong += [f"{name} = {getattr(task, name)} is not positive" for name in tuple(ATTRIBUTES)[:3] if getattr(task, name) < 1]
+    wrong += [
+        f"{name} = {getattr(task, name)} is not positive" for name in tuple(ATTRIBUTES)[:3] if getattr(task, name) < 1
+    ]
     if wrong:
         raise TaskError(f"{path}: {'; '.join(wrong)}")
     return TaskSpec(

@@ -1,0 +1,88 @@
+"""Tasks by name, as the driver needs them: ours from a table, `brax:NAME` and `package.module:Class` by asking.
+
+Asking starts a process, since it imports JAX and Brax; each name is asked for once.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import cache
+
+from es_service.errors import ConfigError
+from es_service.protocol import TaskSpec, worker_environment
+from workers.environments import TASKS
+
+DESCRIBE_S = 120.0
+"""Longest wait for a description; the first import of Brax on a slow disk takes a while."""
+
+
+class Tasks(Mapping[str, TaskSpec]):
+    """Iterates over our own tasks; looks up any."""
+
+    def __getitem__(self, name: str) -> TaskSpec:
+        """Raises KeyError for a plain name that is none of ours, ConfigError for another that cannot be had."""
+        return _described(name) if ":" in name else TASKS[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(TASKS)
+
+    def __len__(self) -> int:
+        return len(TASKS)
+
+
+def with_options(task: TaskSpec, options: Mapping[str, str]) -> TaskSpec:
+    """The task as these options make it: with the descriptor they choose."""
+    chosen = options.get("descriptor")
+    if chosen not in task.descriptors:
+        return task
+    names, bounds = task.descriptors[chosen]
+    return replace(task, descriptor_names=names, descriptor_bounds=bounds)
+
+
+@cache
+def _described(name: str) -> TaskSpec:
+    environment = worker_environment(os.environ) | {
+        "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)
+    }
+    try:
+        process = subprocess.run(
+            [sys.executable, "-m", "workers.describe", name],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=DESCRIBE_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise ConfigError(f"{name} could not be described in {DESCRIBE_S:g} s") from None
+    lines = process.stdout.splitlines()
+    if process.returncode or not lines:
+        raise ConfigError(f"{name} raised while it was imported:\n{process.stderr.strip()}")
+    answer = json.loads(lines[-1])
+    if "problem" in answer:
+        raise ConfigError(answer["problem"])
+    return _task_spec(answer["task"])
+
+
+def _task_spec(fields: dict) -> TaskSpec:
+    """JSON has lists where a TaskSpec has tuples."""
+
+    def bounds(pairs: list) -> tuple[tuple[float, float], ...]:
+        return tuple((float(low), float(high)) for low, high in pairs)
+
+    return TaskSpec(
+        **fields
+        | {
+            "descriptor_names": tuple(fields["descriptor_names"]),
+            "descriptor_bounds": bounds(fields["descriptor_bounds"]),
+            "options": {name: tuple(values) for name, values in fields["options"].items()},
+            "descriptors": {
+                name: (tuple(names), bounds(pairs)) for name, (names, pairs) in fields["descriptors"].items()
+            },
+        }
+    )

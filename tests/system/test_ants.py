@@ -1,0 +1,51 @@
+"""The trunk's promises on physics: any number of workers and a lost one give the same bits on both ant tasks."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+
+from es_service import api
+from es_service.digest import digest_parts
+from tests.system.test_workers import children
+
+pytestmark = pytest.mark.slow
+
+
+def run(folder: Path, environment: str, workers: int, on_generation=lambda row: None, on_notice=pytest.fail):
+    config = {
+        "task": {"environment": environment, "episode_steps": 25},
+        "policy": {"hidden": [8]},
+        "search": {"algorithm": "nsra_es", "pairs": 8, "evaluation_episodes": 4, "members": 2},
+        "budget": {"generations": 6},
+        "compute": {
+            "engine": "inline",
+            "workers": workers,
+            "chunk_pairs": 2,
+            "gradient_block_pairs": 4,
+            "chunk_timeout_s": 10,
+        },
+    }
+    return api.run(api.load_config(config), folder, on_generation=on_generation, on_notice=on_notice)
+
+
+@pytest.mark.parametrize("environment", ["ant_maze", "ant_trap"])
+def test_one_worker_and_two_of_which_one_is_killed(tmp_path, environment):
+    run(tmp_path / "one", environment, 1)
+    notices = []
+
+    def strike(row):
+        if row["generation"] == 2:
+            threading.Timer(0.02, os.kill, (children()[-1], signal.SIGKILL)).start()
+
+    outcome = run(tmp_path / "two", environment, 2, strike, notices.append)
+    assert len(notices) == 1
+    history = outcome.run.history
+    assert history["lost_workers"].sum() == 1
+    assert history["centre_return_mean"].notna().all()
+    assert ("goal_distance" in history) == (environment == "ant_maze")
+    assert digest_parts(tmp_path / "two") == digest_parts(tmp_path / "one")

@@ -1,0 +1,118 @@
+"""Brax's environments as tasks, against Brax itself; classes of users; what cannot be had is named."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from es_service.errors import ConfigError
+from es_service.noise import Domain, stream_keys
+from es_service.protocol import PolicyShape
+from es_service.tasks import Tasks, with_options
+from tests.helpers import centre, random_parameters, spec
+from workers.environments import TaskError, brax_task, describe_environment, make_environment, user_task
+from workers.worker import make_worker
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:Accessing .* directly from .Data. is deprecated"),
+]
+EXAMPLE = "tests.examples.ant_slalom:AntSlalom"
+KEYS = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(3))
+
+
+def test_rewards_and_observations_are_brax_s():
+    name = "hopper"
+    task, environment = brax_task.describe(name), brax_task.make(name)
+    theirs = brax_task._make_brax(name, "spring")
+    state = jax.jit(jax.vmap(environment.reset))(KEYS)
+    raw = jax.jit(jax.vmap(lambda key: theirs.reset(jax.random.wrap_key_data(key[:2], impl="threefry2x32"))))(KEYS)
+    step, raw_step = jax.jit(jax.vmap(environment.step)), jax.jit(jax.vmap(theirs.step))
+    rng = np.random.default_rng(0)
+    assert environment.observe(jax.tree.map(lambda x: x[0], state)).shape == (task.observation_size,)
+    for _ in range(10):
+        action = jnp.asarray(rng.uniform(-1.5, 1.5, (3, task.action_size)), jnp.float32)
+        state, reward, done = step(state, action)
+        raw = raw_step(raw, jnp.clip(action, -1, 1))
+        np.testing.assert_allclose(reward, raw.reward, rtol=1e-4, atol=1e-4)
+        np.testing.assert_array_equal(done, raw.done > 0.5)
+        np.testing.assert_allclose(jax.vmap(environment.observe)(state), raw.obs, rtol=1e-3, atol=1e-4)
+    assert jax.vmap(environment.descriptor)(state).shape == (3, len(task.descriptor_names))
+
+
+def test_feet_that_touch_the_floor():
+    """Four feet of an ant that stands, none of one in the air."""
+    environment = brax_task.make("ant", descriptor="feet_contact")
+    state = jax.jit(jax.vmap(environment.reset))(KEYS)
+    step = jax.jit(jax.vmap(environment.step))
+    physics = state.brax.pipeline_state
+    above = physics.replace(x_i=physics.x_i.replace(pos=physics.x_i.pos + jnp.array([0.0, 0.0, 1.0])))
+    in_the_air, _, _ = step(state._replace(brax=state.brax.replace(pipeline_state=above)), jnp.zeros((3, 8)))
+    assert not np.asarray(jax.vmap(environment.descriptor)(in_the_air)).any()
+    for _ in range(80):
+        state, _, _ = step(state, jnp.zeros((3, 8)))
+    share = np.asarray(jax.vmap(environment.descriptor)(state))
+    assert share.shape == (3, 4)
+    assert (share > 0.5).all()
+
+
+def test_what_each_environment_can_tell_of_an_episode():
+    assert tuple(brax_task.describe("ant").descriptors) == ("final_xy", "final_x", "feet_contact", "final_joints")
+    assert tuple(brax_task.describe("halfcheetah").descriptors) == ("final_x", "feet_contact", "final_joints")
+    assert tuple(brax_task.describe("reacher").descriptors) == ("final_joints",)
+    ant = with_options(brax_task.describe("ant"), {"descriptor": "feet_contact"})
+    assert ant.descriptor_names == ("foot_1", "foot_2", "foot_3", "foot_4")
+    assert ant.descriptor_bounds == ((0.0, 1.0),) * 4
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("brax:ants", r"brax:ants is not in the installed Brax, which has ant, .*; did you mean brax:ant\?"),
+        ("no_such_module:Class", r"cannot import no_such_module .*start where it is, or install it"),
+        ("tests.examples.ant_slalom:Slalom", r"tests\.examples\.ant_slalom has no Slalom"),
+        ("pathlib:Path", r"pathlib:Path has no observation_size, .* reset, observe, step, descriptor"),
+    ],
+)
+def test_what_cannot_be_had_is_named(name, message):
+    with pytest.raises(TaskError, match=message):
+        describe_environment(name)
+
+
+def test_a_class_with_contradictions_is_refused(monkeypatch):
+    from tests.examples.ant_slalom import AntSlalom
+
+    monkeypatch.setattr(AntSlalom, "descriptor_bounds", ((0.0, 1.0),))
+    monkeypatch.setattr(AntSlalom, "episode_steps", 0)
+    with pytest.raises(
+        TaskError, match=r"2 descriptor_names but 1 descriptor_bounds; episode_steps = 0 is not positive"
+    ):
+        user_task.describe(EXAMPLE)
+
+
+def test_the_driver_asks_a_process_and_gets_the_same_answer():
+    tasks = Tasks()
+    assert tasks["brax:ant"] == brax_task.describe("ant")
+    assert tasks[EXAMPLE] == user_task.describe(EXAMPLE)
+    assert tasks.get("no_such_task") is None
+    with pytest.raises(ConfigError, match=r"brax:nope is not in the installed Brax"):
+        tasks.get("brax:nope")
+
+
+def test_a_worker_runs_the_example():
+    task = user_task.describe(EXAMPLE)
+    shape = PolicyShape((task.observation_size, 8, task.action_size))
+    worker_spec = spec(
+        environment=EXAMPLE, environment_options={"walls": "first"}, policy=shape, episode_steps=20,
+        chunk_pairs=2, rollout_block_pairs=2, gradient_block_pairs=2,
+    )  # fmt: skip
+    from es_service.protocol import TrainingChunk
+
+    point = centre(random_parameters(size=shape.parameters), observation_size=task.observation_size)
+    result = make_worker(worker_spec)(point, TrainingChunk(1, 0))
+    assert result.descriptor.shape == (2, 2, 2)
+    assert np.isfinite(result.fitness).all()
+    environment = make_environment(EXAMPLE, {})
+    assert np.isnan(environment.goal_distance(None))

@@ -1,0 +1,115 @@
+"""How fast is a task on one core? Asked of a process of its own, by `es-service bench rollouts`.
+
+    python -m workers.measure JSON      # the arguments of `measure`
+
+Prints one line of JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from es_service.noise import NORMAL_STD, Domain, normal_integers, stream_keys
+from es_service.protocol import PolicyShape, WorkerSpec
+from workers.environments import TASKS, Environment, describe_environment, make_environment
+from workers.policy import initial_parameters
+from workers.rollout import make_training_rollout
+
+STEPS = 50
+"""Control steps of one call."""
+
+
+def measure(task: str, options: Mapping[str, str], hidden: list[int], policy: bool, batch: int, seconds: float) -> dict:
+    """Environment steps a second of one process, after compiling.
+
+    Args:
+        task, options: as in a config's `task`.
+        hidden: widths of the policy.
+        policy: with a policy of its own weights for each member, noise and statistics; else random actions alone.
+        batch: episodes that step together; with a policy, both members of batch / 2 pairs.
+        seconds: to measure for.
+    """
+    size = TASKS[task] if task in TASKS else describe_environment(task)
+    environment = make_environment(task, options)
+    shape = PolicyShape((size.observation_size, *hidden, size.action_size))
+    call = (_with_policy if policy else _without_policy)(environment, shape, task, batch)
+    started = time.perf_counter()
+    call(0)
+    ready = time.perf_counter()
+    steps = calls = 0
+    while (now := time.perf_counter()) - ready < seconds or calls == 0:
+        steps += call(calls := calls + 1)
+    return {
+        "steps_per_second": round(steps / (now - ready)),
+        "compile_seconds": round(ready - started, 1),
+        "peak_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+    }
+
+
+def _with_policy(environment: Environment, shape: PolicyShape, task: str, batch: int) -> Any:
+    pairs = batch // 2
+    spec = WorkerSpec(
+        seed=0,
+        environment=task,
+        environment_options={},
+        episode_steps=STEPS,
+        fitness="sum",
+        episodes_per_member=1,
+        policy=shape,
+        observation_clip=5.0,
+        action_noise=0.01,
+        common_random_numbers=True,
+        chunk_pairs=pairs,
+        rollout_block_pairs=pairs,
+        gradient_block_pairs=pairs,
+    )
+    rollout = make_training_rollout(environment, spec)
+    centre_D = initial_parameters(shape, "unit_columns", 0)
+    mean_O, std_O = np.zeros(shape.widths[0], np.float32), np.ones(shape.widths[0], np.float32)
+
+    def call(number: int) -> int:
+        noise_keys_P = stream_keys(0, Domain.PARAMETER_NOISE, number, np.arange(pairs))
+        keys_P_S_E = np.broadcast_to(noise_keys_P[:, None, None], (pairs, 2, 1, 4))
+        unit = np.float32(0.02 / NORMAL_STD)
+        return int(np.sum(rollout(centre_D, unit, mean_O, std_O, noise_keys_P, keys_P_S_E, keys_P_S_E).steps))
+
+    return call
+
+
+def _without_policy(environment: Environment, shape: PolicyShape, task: str, batch: int) -> Any:
+    coordinates_A = jnp.arange(shape.widths[-1], dtype=jnp.uint32)
+
+    def episode(key: Any) -> Any:
+        def step(number: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+            state, total = carry
+            noise_A = normal_integers(jnp, key, number.astype(jnp.uint32) * 1024 + coordinates_A)
+            state, reward, _ = environment.step(state, jnp.clip(noise_A.astype(jnp.float32) / NORMAL_STD, -1.0, 1.0))
+            return state, total + reward + environment.observe(state).sum()
+
+        return lax.fori_loop(0, STEPS, step, (environment.reset(key), jnp.float32(0.0)))[1]
+
+    episodes = jax.jit(jax.vmap(episode))
+
+    def call(number: int) -> int:
+        jax.block_until_ready(episodes(stream_keys(0, Domain.TRAINING_RESET, number, np.arange(batch))))
+        return batch * STEPS
+
+    return call
+
+
+def main(arguments: str) -> None:
+    print(json.dumps(measure(**json.loads(arguments))))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
