@@ -67,13 +67,16 @@ class Outcome:
     """Which budget was spent, in words."""
 
 
-def load_config(source: loading.Source, overrides: Iterable[str] = ()) -> RunConfig:
+def load_config(source: loading.Source, overrides: Iterable[str] = (), *, new: bool = True) -> RunConfig:
     """Read a YAML file (or a mapping like one), apply overrides such as "search.sigma=0.05", resolve and check it all.
+
+    Args:
+        new: whether a run is to be started with it here and now, so that the run it starts from must be there.
 
     Raises:
         ConfigError: lists every problem found.
     """
-    return loading.load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+    return loading.load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, new=new)
 
 
 def run(
@@ -139,8 +142,9 @@ def run_or_resume(
     Raises:
         ConfigError: the folder's run has other constants than `config` (all are listed). Otherwise as `run`.
     """
-    wanted = config if isinstance(config, RunConfig) else load_config(config)
-    if not (Path(out) / DATABASE).exists():
+    begun = (Path(out) / DATABASE).exists()
+    wanted = config if isinstance(config, RunConfig) else load_config(config, new=not begun)
+    if not begun:
         return run(wanted, out, on_generation=on_generation, on_notice=on_notice, hook=hook)
     return _go_on(Path(out), lambda store: wanted, on_generation, on_notice, hook)
 
@@ -288,6 +292,8 @@ def _work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_no
 
     tell_notices()
     platform = platform_info()
+    if config.compute.worker_resources.gpu:
+        platform |= {"device": "gpu"}  # whose bits are others
     first = 0 if store.generation is None else store.generation + 1
     if store.record_platform(first, platform) and first:
         on_notice(f"from generation {first} on this run has another platform: {platform}. Its digest now says `mixed`.")

@@ -9,14 +9,16 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from es_service.errors import EvaluationError
+from es_service.config.resolution import did_you_mean, one_of
+from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol import worker_environment
+from es_service.tasks import Tasks
 from workers.environments import TASKS
 
 BATCHES = {"point_maze": (64,)}
 ANT_BATCHES = (8, 16, 64)
 PAPER = {"point_maze": 1_520_000, "ant_maze": 4_480, "ant_trap": 7_470}
-"""Steps a second on one CPU, without a policy (Chalumeau et al. 2022, table 5): other physics, another machine."""
+"""Steps a second on one CPU, without a policy (Chalumeau et al. 2022): other physics, another machine."""
 HIDDEN = {"point_maze": [64, 64]}
 ANT_HIDDEN = [256, 256]
 
@@ -31,11 +33,18 @@ def bench_rollouts(
     """One row per task, with and without policy, batch, and on one core and on all: as each is measured.
 
     The hidden layers are the paper's: 64x64 for PointMaze, else 256x256. Each core has a process like a worker's; rates
-    on several are measured at the same time and added.
+    on several, measured side by side, are added.
 
     Raises:
-        EvaluationError: a task cannot be had.
+        ConfigError: a task cannot be had. EvaluationError: it cannot be run.
     """
+    known = Tasks()
+    for task in tasks:
+        if task not in known:
+            raise ConfigError(
+                f"--task {task}: no known task; must be {one_of(known)}, or brax:NAME, or module:Class"
+                f"{did_you_mean(task, known)}"
+            )
     every = sorted({1, len(os.sched_getaffinity(0))})
     for task in tasks or TASKS:
         for policy in policies:

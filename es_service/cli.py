@@ -1,4 +1,5 @@
-"""The command line: `es-service run | resume | fork | status | digest | list | submit | jobs | logs | stop | doctor`.
+"""The command line: `es-service run | resume | fork | status | digest | list | submit | jobs | logs | stop
+| bench | doctor`.
 
 Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by SIGINT or SIGTERM.
 """
@@ -82,7 +83,8 @@ def run(
     overrides = _overrides(set_, seed=seed, **_compute(workers, engine, address))
     if or_resume and out is None:
         raise ConfigError("--or-resume needs --out: without it every run has a folder of its own")
-    loaded = api.load_config(config, overrides)
+    begun = or_resume and out is not None and (out / DATABASE).exists()
+    loaded = api.load_config(config, overrides, new=not begun)
     for warning in config_warnings(loaded):
         _print_note(f"note: {warning}")
     folder = out if out is not None else api.default_folder(loaded)
@@ -162,7 +164,7 @@ def submit(
 ) -> None:
     """Send a run to a Ray cluster as a job. The same command again goes on with it, after whatever happened."""
     overrides = _overrides(set_, seed=seed, **_compute(workers, None, "auto"))
-    loaded = api.load_config(config, overrides)
+    loaded = api.load_config(config, overrides, new=False)  # paths are those of the cluster's head, which checks them
     job = jobs.submit(loaded, address, out)
     print(job)
     _print_note(f"submitted; watch it with: es-service logs {job} --address {address} --follow")
@@ -286,7 +288,10 @@ def _compute(workers: int | None, engine: str | None, address: str | None) -> di
     """The options that say where a run runs, by config key. A cluster to join is a Ray cluster."""
     if address is not None and engine is None:
         engine = "ray"
-    return {"compute.workers": workers, "compute.engine": engine, "compute.address": address}
+    chosen: dict[str, object] = {"compute.workers": workers, "compute.engine": engine, "compute.address": address}
+    if engine == "inline" and address is None:  # what the file, or the run's record, says of a cluster is moot then
+        chosen |= {"compute.address": "null", "compute.worker_resources.cpu": 1, "compute.worker_resources.gpu": 0}
+    return chosen
 
 
 def _overrides(set_: list[str] | None, **options: object) -> list[str]:

@@ -8,6 +8,8 @@ import sqlite3
 import sys
 import time
 from collections.abc import Callable, Iterator
+from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +37,7 @@ MIN_MEMORY_BYTES = 2 << 30
 def examine(console: Console) -> bool:
     """Print every finding; whether nothing failed."""
     healthy = True
-    for check in (_software, _machine, _disk, _noise, _rollout):
+    for check in (_software, _ray, _machine, _disk, _noise, _rollout):
         for level, text in _guarded(check):
             healthy &= level != "FAIL"
             colour = {"ok": "green", "note": "yellow", "FAIL": "red"}[level]
@@ -57,6 +59,16 @@ def _software() -> Iterator[Finding]:
     yield "ok", ", ".join(f"{name} {version}" for name, version in versions.items())
     yield "ok", f"processor {cpu}: results repeat bit for bit on this kind and these versions"
     yield "ok", f"SQLite {sqlite3.sqlite_version}, {sys.platform}"
+
+
+def _ray() -> Iterator[Finding]:
+    try:
+        version = metadata.version("ray")
+    except metadata.PackageNotFoundError:
+        yield "note", "Ray is not installed: only --engine inline runs here"
+        return
+    jobs = "with" if find_spec("aiohttp") else "without"
+    yield "ok", f"ray {version}, {jobs} what `ray start` with a dashboard and `submit` need (the extra `cluster`)"
 
 
 def _machine() -> Iterator[Finding]:

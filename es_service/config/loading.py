@@ -54,7 +54,12 @@ _BUDGET = [name for name in _FIELDS if name.startswith("budget.")]
 
 
 def load_config(
-    source: Source, overrides: Iterable[str] = (), *, tasks: Mapping[str, TaskSpec], algorithms: Collection[str]
+    source: Source,
+    overrides: Iterable[str] = (),
+    *,
+    tasks: Mapping[str, TaskSpec],
+    algorithms: Collection[str],
+    new: bool = True,
 ) -> RunConfig:
     """The config of a new run.
 
@@ -63,11 +68,12 @@ def load_config(
         overrides: "search.sigma=0.05" and the like, values in YAML; a later one wins.
         tasks: what `task.environment` may name.
         algorithms: what `search.algorithm` may name.
+        new: whether the run that it starts from, if any, must be there.
 
     Raises:
         ConfigError: names the file, then lists every problem on a line of its own.
     """
-    return _load(source, overrides, tasks, algorithms, new=True)
+    return _load(source, overrides, tasks, algorithms, new=new)
 
 
 def resume_config(
@@ -117,8 +123,9 @@ def _load(
         if key == "task.environment" and ":" in str(values.get(key, "")):
             continue  # looked up below: it is not in the list of known ones
         if key in values and values[key] not in known:
+            besides = ", or brax:NAME, or module:Class" if what == "task" else ""
             problems.append(
-                f"{key}: {show(values[key])} is no known {what}; must be {one_of(known)}"
+                f"{key}: {show(values[key])} is no known {what}; must be {one_of(known)}{besides}"
                 f"{did_you_mean(values[key], known)}"
             )
         elif key not in values and key not in bad and key.split(".")[0] not in unusable:

@@ -178,16 +178,16 @@ class ComputeConfig(_Section):
     )
     rollout: Literal["xla"] = Field(description="What computes episodes. auto: xla.")
     chunk_pairs: Count = Field(
-        description="Pairs in one unit of work; divides search.pairs. auto: the largest divisor of it not above 64, a "
-        "multiple of 8 if there is one."
+        description="Pairs in one unit of work; divides search.pairs. auto: the largest divisor of it not above "
+        "an eighth of it, within 16 to 64, a multiple of 8 if there is one."
     )
     rollout_block_pairs: Count = Field(
         description="Pairs that step together, so that their weights stay in cache; divides chunk_pairs. auto: the "
         "largest divisor of it not above 32 whose weights take at most 5 MiB."
     )
     gradient_block_pairs: Count = Field(
-        description="Pairs summed into one partial gradient; not above search.pairs. auto: as many whole chunks as "
-        "make at most 32 blocks."
+        description="Pairs summed into one partial gradient; not above search.pairs. auto: as few whole chunks as "
+        "make at most 32 blocks, and blocks that are worth a message."
     )
     chunk_timeout_s: Positive = Field(
         30.0, description="Least deadline of a chunk in seconds; slow chunks raise it for those that follow."

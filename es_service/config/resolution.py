@@ -205,7 +205,11 @@ def config_warnings(config: RunConfig) -> list[str]:
     if chunk < FEW_CHUNK_PAIRS and pairs > MOST_CHUNK_PAIRS:
         near = round(pairs / MOST_CHUNK_PAIRS) * MOST_CHUNK_PAIRS
         auto = default_chunk_pairs(pairs)
-        hint = f"auto would be {auto}" if auto >= FEW_CHUNK_PAIRS else f"search.pairs = {near} has chunks of 64"
+        hint = (
+            f"auto would be {auto}"
+            if auto >= FEW_CHUNK_PAIRS
+            else f"search.pairs = {near} has chunks of {default_chunk_pairs(near)}"
+        )
         warnings.append(f"compute.chunk_pairs: {chunk} makes {pairs // chunk} small chunks a generation, slow; {hint}")
     budget = config.budget
     if budget.generations is None and budget.env_steps is None and budget.wall_clock_s is None:

@@ -11,7 +11,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,6 +61,8 @@ def dispatch_log(folder: Path, after_generation: int | None, *, enabled: bool) -
             except OSError as error:
                 raise explained(error, folder, f"writing {FILE}") from error
 
+        if file.tell():
+            file.write(b"\n")  # ends a line that a full disk or a kill cut short
         write(Session(after_generation, socket.gethostname(), os.getpid()))
         yield write
 
@@ -71,6 +73,9 @@ def _plain(value: Any) -> Any:
 
 
 def read_dispatch_log(folder: Path) -> list[dict[str, Any]]:
-    """All entries, oldest first; a last line cut short by a kill is left out."""
-    lines = (folder / FILE).read_text(encoding="utf-8").split("\n")
-    return [json.loads(line) for line in lines[:-1]]
+    """All entries, oldest first; lines cut short by a kill or a full disk are left out."""
+    entries = []
+    for line in (folder / FILE).read_text(encoding="utf-8").split("\n"):
+        with suppress(ValueError):
+            entries.append(json.loads(line))
+    return entries

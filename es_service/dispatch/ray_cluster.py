@@ -29,6 +29,8 @@ MEMBERSHIP_S = 1.0
 """Time between two looks at the nodes of a cluster."""
 SILENCE_S = 20.0
 """A cluster that has not answered for so long has lost its head. Ray would end this process after a minute."""
+PAUSE_S = 5.0
+"""Between two questions of whether the cluster answers, after which its silence is counted anew."""
 TOKEN = secrets.token_hex(32)
 """For every Ray that this process starts: Ray reads the token of a process only once, and else writes one into HOME."""
 SETTINGS = {
@@ -66,8 +68,8 @@ class Membership:
     """Ids of the nodes that are about to go and want no more work."""
 
 
-def connect(address: str | None, claim: Claim, workers: int) -> ModuleType:
-    """The `ray` module, in a cluster: that at `address`, or with None a new one on this machine for `workers` workers.
+def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
+    """The `ray` module, in a cluster: that at `address`, or with None a new one here that counts `cpus` CPUs.
 
     Raises:
         EvaluationError: Ray is missing, in use by this process already, does not start, or no cluster takes us in.
@@ -78,7 +80,7 @@ def connect(address: str | None, claim: Claim, workers: int) -> ModuleType:
     if address is None:
         options = {
             "address": "local",
-            "num_cpus": workers * claim.cpus,
+            "num_cpus": cpus,
             "num_gpus": None if claim.gpus else 0,  # None: as many as Ray finds
             "include_dashboard": False,
             "object_store_memory": OBJECT_STORE_BYTES,
@@ -129,13 +131,17 @@ class Watch:
     def __init__(self, ray: ModuleType, claim: Claim) -> None:
         self._ray, self._claim = ray, claim
         self._latest = look(ray, claim)
-        self._answered_s = time.monotonic()
+        self._answered_s = self._asked_s = time.monotonic()
         self._end = threading.Event()
         threading.Thread(target=self._run, daemon=True, name="cluster-watch").start()
 
     def latest(self) -> Membership:
         """What was seen last. Raises EvaluationError if that was more than SILENCE_S ago."""
-        silent_s = time.monotonic() - self._answered_s
+        now = time.monotonic()
+        if now - self._asked_s > PAUSE_S:  # this process was stopped, or busy: no silence of the cluster's
+            self._answered_s = now
+        self._asked_s = now
+        silent_s = now - self._answered_s
         if silent_s > SILENCE_S:
             raise EvaluationError(
                 f"the Ray cluster has not answered for {silent_s:.0f} s: its head node is gone or out of reach. "

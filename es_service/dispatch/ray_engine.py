@@ -49,14 +49,13 @@ def ray_engine(
         address: a cluster's "HOST:PORT", or "auto" for the one on this machine; None starts a Ray of our own here,
             whatever other Ray or RAY_ADDRESS there may be, and ends it with the engine.
         claim: what one worker needs of a node.
-        elastic: with an address, keep as many workers as the cluster has room for, instead of `policy.workers`.
+        elastic: as many workers as there is room for, instead of `policy.workers`; in a cluster, also when it changes.
 
     Raises:
         EvaluationError: Ray is missing, does not start, or no cluster answers at the address.
     """
-    ray = connect(address, claim, policy.workers)
+    ray = connect(address, claim, policy.workers if elastic else policy.workers * claim.cpus)
     try:
-        elastic = elastic and address is not None
         if elastic:
             policy = replace(policy, workers=max(1, look(ray, claim).room))
         watch = None if address is None else Watch(ray, claim)
@@ -159,10 +158,14 @@ class Actors:
         if not self._calls:
             time.sleep(timeout_s)
             return None
-        # Oldest first, so that the answers of one worker stay in order.
-        ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=timeout_s)
-        if ready:
-            return self._message(ready[0], self._calls.pop(ready[0]))
+        while self._calls:
+            # Oldest first, so that the answers of one worker stay in order.
+            ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=timeout_s)
+            if not ready:
+                break
+            if (message := self._message(ready[0], self._calls.pop(ready[0]))) is not None:
+                return message
+            timeout_s = 0.0  # that was where a worker is; None would say that no answer waits behind it
         if not self._places and time.monotonic() > self._placed_by_s:
             raise EvaluationError(
                 f"no worker was given a place in {PLACEMENT_S:g} s. Each needs {self._claim}; the cluster has "

@@ -69,7 +69,7 @@ def file(tmp_path):
         ("search.max_invalid_fraction=1.5", "1.5 ... must be a number from 0 to 1"),
         ("search.preset=litrature", "litrature ... must be literature or uber; did you mean literature?"),
         ("search.algorithm=ess", "ess is no known algorithm; must be es; did you mean es?"),
-        ("task.environment=pointmaze", "pointmaze is no known task; must be point_maze or no_final; did you mean"),
+        ("task.environment=pointmaze", "pointmaze is no known task; must be point_maze or no_final, or brax:NAME, or"),
         ("task.episode_steps=auto", "auto ... must be null or a whole number, at least 1"),
         ("task.fitness=finl", "finl ... must be sum or final; did you mean final?"),
         ("task.options.start=cornr", "cornr ... must be default or corner; did you mean corner?"),

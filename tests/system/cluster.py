@@ -54,7 +54,11 @@ class Cluster:
         _ip("netns", "add", self._switch)
         _ip("-n", self._switch, "link", "add", "bridge", "type", "bridge")
         _ip("-n", self._switch, "link", "set", "bridge", "up")
-        self.start("head", 0)
+        try:
+            self.start("head", 0)
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -66,7 +70,6 @@ class Cluster:
     def start(self, node: str, cpus: int, **environment: str) -> None:
         """Start a node, and wait for it."""
         number = len(self.nodes)
-        self.nodes.append(node)
         namespace, ours, theirs = self._namespace(node), f"v{number}", "eth0"
         _ip("netns", "add", namespace)
         _ip("-n", self._switch, "link", "add", ours, "type", "veth", "peer", "name", theirs, "netns", namespace)
@@ -84,7 +87,7 @@ class Cluster:
             f'hostname {node} && exec "$@"'
         )
         enter = ["ip", "netns", "exec", namespace, "unshare", "--mount", "--uts", "sh", "-c", shell, "sh"]
-        with (self.log_folder / f"{node}.log").open("ab") as log:
+        with (self.log_folder / f"{node}.log").open("wb") as log:
             self._entries[node] = subprocess.Popen(
                 [*enter, *ray],
                 env=self._environment(node) | environment,
@@ -93,6 +96,7 @@ class Cluster:
                 stderr=log,
                 start_new_session=True,
             )
+        self.nodes.append(node)
         self._wait_until_joined(node)
 
     def popen(self, node: str, *command: object, **environment: str) -> subprocess.Popen[str]:

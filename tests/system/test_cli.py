@@ -92,6 +92,7 @@ def test_bench_rollouts_prints_a_row_per_policy_batch_and_number_of_cores():
     for wrong, message in (
         (("--batch", 7), "must be even"),
         (("--policy", "maybe"), "--policy maybe: must be on or off"),
+        (("--task", "ant_maz"), "did you mean ant_maze?"),
     ):
         code, printed = es("bench", "rollouts", *wrong)
         assert code == 2

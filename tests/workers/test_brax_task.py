@@ -11,8 +11,9 @@ from es_service.errors import ConfigError
 from es_service.noise import Domain, stream_keys
 from es_service.protocol import PolicyShape
 from es_service.tasks import Tasks, with_options
+from tests.examples.ant_slalom import AntSlalom
 from tests.helpers import centre, random_parameters, spec
-from workers.environments import TaskError, brax_task, describe_environment, make_environment, user_task
+from workers.environments import TaskError, brax_parts, brax_task, describe_environment, make_environment, user_task
 from workers.worker import make_worker
 
 pytestmark = [
@@ -62,6 +63,7 @@ def test_what_each_environment_can_tell_of_an_episode():
     assert tuple(brax_task.describe("ant").descriptors) == ("final_xy", "final_x", "feet_contact", "final_joints")
     assert tuple(brax_task.describe("halfcheetah").descriptors) == ("final_x", "feet_contact", "final_joints")
     assert tuple(brax_task.describe("reacher").descriptors) == ("final_joints",)
+    assert brax_task.describe("swimmer").options["backend"] == ("generalized",)
     ant = with_options(brax_task.describe("ant"), {"descriptor": "feet_contact"})
     assert ant.descriptor_names == ("foot_1", "foot_2", "foot_3", "foot_4")
     assert ant.descriptor_bounds == ((0.0, 1.0),) * 4
@@ -82,13 +84,36 @@ def test_what_cannot_be_had_is_named(name, message):
 
 
 def test_a_class_with_contradictions_is_refused(monkeypatch):
-    from tests.examples.ant_slalom import AntSlalom
-
     monkeypatch.setattr(AntSlalom, "descriptor_bounds", ((0.0, 1.0),))
     monkeypatch.setattr(AntSlalom, "episode_steps", 0)
     with pytest.raises(
         TaskError, match=r"2 descriptor_names but 1 descriptor_bounds; episode_steps = 0 is not positive"
     ):
+        user_task.describe(EXAMPLE)
+    monkeypatch.setattr(AntSlalom, "descriptor_bounds", 3)
+    with pytest.raises(TaskError, match=r"descriptor_bounds = 3 is no tuple"):
+        user_task.describe(EXAMPLE)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("observation_size", 30, r"observe has the shape \(29,\), not \(30,\)"),
+        ("descriptor_names", ("x", "y", "z"), r"descriptor has the shape \(2,\), not \(3,\)"),
+        ("action_size", 7, r"cannot be traced: "),
+        ("options", {"walls": "both"}, r"option walls = 'both' is no tuple of text"),
+        (
+            "step",
+            lambda self, state, action: (0, jnp.zeros(2), True),
+            r"the reward of step .*; step returns a state of",
+        ),
+    ],
+)
+def test_methods_that_do_not_fit_what_is_declared_are_named(monkeypatch, name, value, message):
+    if name == "descriptor_names":
+        monkeypatch.setattr(AntSlalom, "descriptor_bounds", ((0.0, 1.0),) * 3)
+    monkeypatch.setattr(AntSlalom, name, value)
+    with pytest.raises(TaskError, match=message):
         user_task.describe(EXAMPLE)
 
 
@@ -116,3 +141,13 @@ def test_a_worker_runs_the_example():
     assert np.isfinite(result.fitness).all()
     environment = make_environment(EXAMPLE, {})
     assert np.isnan(environment.goal_distance(None))
+
+
+def test_versions_that_do_not_work_are_named(monkeypatch):
+    monkeypatch.setitem(brax_parts.WORKS_WITH, "mujoco", "3.2.")
+    with pytest.raises(TaskError, match=r"mujoco 4\.0\.0 is installed, and mujoco 3\.2\.\* is what works: pip install"):
+        brax_parts.check_versions()
+    monkeypatch.setitem(brax_parts.WORKS_WITH, "no-such-package", "1.")
+    monkeypatch.delitem(brax_parts.WORKS_WITH, "mujoco")
+    with pytest.raises(TaskError, match=r"no-such-package none is installed"):
+        brax_parts.check_versions()

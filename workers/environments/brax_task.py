@@ -38,7 +38,8 @@ class _State(NamedTuple):
 
 def describe(name: str) -> TaskSpec:
     """What the driver must know of Brax's environment `name`. Raises TaskError if there is none, or it does not fit."""
-    environment = _make_brax(name, BACKENDS[0])
+    backends = _backends(name)
+    environment = _make_brax(name, backends[0])
     with quietly():  # Brax's own `observation_size` would run a whole reset to see
         observation = jax.eval_shape(environment.reset, jax.random.key(0)).obs
     if len(getattr(observation, "shape", ())) != 1:
@@ -54,15 +55,15 @@ def describe(name: str) -> TaskSpec:
         descriptor_bounds=bounds,
         final_fitness=False,
         has_goal=False,
-        options={"descriptor": tuple(descriptors), "backend": BACKENDS},
+        options={"descriptor": tuple(descriptors), "backend": backends},
         descriptors=descriptors,
         summary=f"{type(environment).__name__} of Brax",
     )
 
 
-def make(name: str, descriptor: str | None = None, backend: str = BACKENDS[0]) -> Environment:
-    """The functions of Brax's environment `name`; the first descriptor it can give unless another is named."""
-    environment = _make_brax(name, backend)
+def make(name: str, descriptor: str | None = None, backend: str | None = None) -> Environment:
+    """The functions of Brax's environment `name`; its first descriptor and backend unless others are named."""
+    environment = _make_brax(name, backend or _backends(name)[0])
     system = environment.sys
     descriptor = descriptor or next(iter(_descriptors(system)))
     feet = _feet(system) if descriptor == "feet_contact" else []
@@ -97,13 +98,28 @@ def make(name: str, descriptor: str | None = None, backend: str = BACKENDS[0]) -
 
 
 def _make_brax(name: str, backend: str) -> Any:
-    known = sorted(envs._envs)  # Brax has no public list of its names
+    with quietly():
+        return envs.get_environment(name, backend=backend)
+
+
+def _backends(name: str) -> tuple[str, ...]:
+    """The backends that Brax can build an environment with. Raises TaskError where there is none."""
+    known = sorted(set(envs._envs) - {"fast"})  # Brax has no public list of its names; that one is without physics
     if name not in known:
         near = get_close_matches(name, known, n=1)
         hint = f"; did you mean brax:{near[0]}?" if near else ""
         raise TaskError(f"brax:{name} is not in the installed Brax, which has {', '.join(known)}{hint}")
-    with quietly():
-        return envs.get_environment(name, backend=backend)
+    found, reasons = [], []
+    for backend in BACKENDS:
+        try:
+            _make_brax(name, backend)
+        except (ValueError, NotImplementedError) as error:
+            reasons.append(f"{backend}: {error}")
+        else:
+            found.append(backend)
+    if not found:
+        raise TaskError(f"brax:{name} cannot be built with any backend: {'; '.join(reasons)}")
+    return tuple(found)
 
 
 def _descriptors(system: Any) -> dict[str, tuple[tuple[str, ...], Bounds]]:

@@ -26,6 +26,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from es_service.protocol import TaskSpec
@@ -52,14 +53,19 @@ def describe(path: str) -> TaskSpec:
         for name, kind in ATTRIBUTES.items()
         if not isinstance(getattr(task, name), kind)
     ]
-    if len(task.descriptor_bounds) != len(task.descriptor_names):
+    options = getattr(task, "options", {})
+    for name, values in options.items() if isinstance(options, dict) else [("options", options)]:
+        if not isinstance(values, tuple) or not values or not all(isinstance(value, str) for value in values):
+            wrong.append(f"option {name} = {values!r} is no tuple of text, the default first")
+    if not wrong:
         names, bounds = len(task.descriptor_names), len(task.descriptor_bounds)
-        wrong.append(f"{names} descriptor_names but {bounds} descriptor_bounds")
-    wrong += [
-        f"{name} = {getattr(task, name)} is not positive" for name in tuple(ATTRIBUTES)[:3] if getattr(task, name) < 1
-    ]
+        if names != bounds or not names:
+            wrong.append(f"{names} descriptor_names but {bounds} descriptor_bounds")
+        sizes = {name: getattr(task, name) for name, kind in ATTRIBUTES.items() if kind is int}
+        wrong += [f"{name} = {size} is not positive" for name, size in sizes.items() if size < 1]
     if wrong:
         raise TaskError(f"{path}: {'; '.join(wrong)}")
+    _check_shapes(path)
     return TaskSpec(
         name=path,
         observation_size=task.observation_size,
@@ -72,6 +78,30 @@ def describe(path: str) -> TaskSpec:
         options={name: tuple(values) for name, values in getattr(task, "options", {}).items()},
         summary=(task.__doc__ or "").strip().partition("\n")[0],
     )
+
+
+def _check_shapes(path: str) -> None:
+    """Raise TaskError where the methods return other shapes than the class declares, or cannot be traced."""
+    task = _import(path)
+    try:
+        environment = make(path, {name: values[0] for name, values in getattr(task, "options", {}).items()})
+        state = jax.eval_shape(environment.reset, jax.ShapeDtypeStruct((4,), jnp.uint32))
+        action = jax.ShapeDtypeStruct((task.action_size,), jnp.float32)
+        after, reward, done = jax.eval_shape(environment.step, state, action)
+        found = {
+            "observe": (jax.eval_shape(environment.observe, state).shape, (task.observation_size,)),
+            "descriptor": (jax.eval_shape(environment.descriptor, state).shape, (len(task.descriptor_names),)),
+            "the reward of step": (reward.shape, ()),
+            "done of step": (done.shape, ()),
+        }
+    except Exception as error:  # the user's code can raise anything
+        raise TaskError(f"{path} cannot be traced: {type(error).__name__}: {error}") from error
+    wrong = [f"{what} has the shape {is_}, not {should}" for what, (is_, should) in found.items() if is_ != should]
+    kinds = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), one) for one in (state, after)]
+    if jax.tree.structure(state) != jax.tree.structure(after) or kinds[0] != kinds[1]:
+        wrong.append(f"step returns a state of other arrays than reset: {after} after {state}")
+    if wrong:
+        raise TaskError(f"{path}: {'; '.join(wrong)}")
 
 
 def make(path: str, options: Mapping[str, str]) -> Environment:
@@ -92,7 +122,7 @@ def _import(path: str) -> Any:
         sys.path.append(os.getcwd())  # a console script does not look where it was started
     try:
         found = importlib.import_module(module)
-    except ImportError as error:
+    except (ImportError, ValueError, TypeError) as error:  # the latter two of a name that is none
         raise TaskError(f"{path}: cannot import {module} ({error}); start where it is, or install it") from error
     if not hasattr(found, name):
         raise TaskError(f"{path}: {module} has no {name}")

@@ -1,0 +1,22 @@
+"""The dispatch log survives what cuts its lines short."""
+
+from es_service.dispatch.dispatch_log import FILE, Committed, dispatch_log, read_dispatch_log
+
+
+def test_sessions_append_and_torn_lines_are_left_out(tmp_path):
+    with dispatch_log(tmp_path, None, enabled=True) as log:
+        log(Committed(0))
+    whole = (tmp_path / FILE).read_bytes()
+    (tmp_path / FILE).write_bytes(whole[:-9])  # as a full disk or a kill leaves it
+    with dispatch_log(tmp_path, 0, enabled=True) as log:
+        log(Committed(1))
+    entries = read_dispatch_log(tmp_path)
+    assert [entry["is"] for entry in entries] == ["Session", "Session", "Committed"]
+    assert entries[1]["after_generation"] == 0
+    assert entries[2]["generation"] == 1
+
+
+def test_without_it_nothing_is_written(tmp_path):
+    with dispatch_log(tmp_path, None, enabled=False) as log:
+        log(Committed(0))
+    assert not list(tmp_path.iterdir())
