@@ -65,8 +65,8 @@ def test_a_control_step_is_ten_of_brax_s(ant):
         for _ in range(10):
             full = brax_step(full, action)
         state = step(state, action)
-        np.testing.assert_allclose(state.q, full.q, atol=2e-6)
-        np.testing.assert_allclose(state.qd, full.qd, atol=2e-4)
+        np.testing.assert_allclose(state.q, full.q, atol=1e-6)
+        np.testing.assert_allclose(state.qd, full.qd, atol=2e-6 * np.abs(full.qd).max())
 
 
 def test_ten_thousand_steps_of_random_actions_stay_sane(ant):
@@ -145,18 +145,18 @@ def crossings(before, after, walls) -> jax.Array:
 
 @pytest.mark.parametrize("name", ["ant_maze", "ant_trap"])
 def test_walls_hold(name):
-    """Ants start beside walls and corners and are driven by random, full-torque and alternating actions."""
+    """Two thousand ants start beside walls and corners and are driven by random and by full-torque actions."""
     walls = {"ant_maze": ant_maze, "ant_trap": ant_trap}[name].WALLS
     ant = make_ant(walls)
-    count, steps = 256, 200
+    count, steps = 2000, 100
     rng = np.random.default_rng(1)
-    places = []
-    while len(places) < count:
-        a, b = (np.array(end) for end in walls[rng.integers(len(walls))])
-        place = a + rng.uniform() * (b - a) + rng.uniform(-3, 3, 2)
-        inside = name == "ant_trap" or (np.abs(place - ant_maze.MIDDLE) < ant_maze.HALF - 1.6).all()
-        if inside and float(depth(jnp.array([place] * 9), walls)) < -1.0:
-            places.append(place)
+    ends = np.array(walls)[rng.integers(len(walls), size=20 * count)]
+    tries = ends[:, 0] + rng.uniform(size=(20 * count, 1)) * (ends[:, 1] - ends[:, 0])
+    tries += rng.uniform(-3, 3, tries.shape)
+    inside = np.abs(tries - ant_maze.MIDDLE).max(1) < ant_maze.HALF - 1.6 if name == "ant_maze" else True
+    free = np.asarray(jax.jit(jax.vmap(lambda xy: depth(jnp.tile(xy, (9, 1)), walls)))(tries)) < -1.0
+    places = tries[free & inside][:count]
+    assert len(places) == count
     keys = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(count))
     state = jax.vmap(lambda key, xy: ant.reset(key, (xy[0], xy[1])))(keys, jnp.array(places, jnp.float32))
     kinds = rng.uniform(-1, 1, (steps, count, 8))
