@@ -11,8 +11,7 @@ from typing import Any
 
 from es_service.config.resolution import did_you_mean, one_of
 from es_service.errors import ConfigError, EvaluationError
-from es_service.protocol import worker_environment
-from es_service.tasks import Tasks
+from es_service.tasks import Tasks, child_environment
 from workers.environments import TASKS
 
 BATCHES = {"point_maze": (64,)}
@@ -63,9 +62,7 @@ def bench_rollouts(
 
 def _row(arguments: Mapping[str, Any], cores: int) -> dict[str, Any]:
     command = [sys.executable, "-m", "workers.measure", json.dumps(arguments)]
-    environment = worker_environment(os.environ) | {
-        "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)
-    }
+    environment = child_environment()
     started = [
         subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         for _ in range(cores)

@@ -44,15 +44,18 @@ def with_options(task: TaskSpec, options: Mapping[str, str]) -> TaskSpec:
     return replace(task, descriptor_names=names, descriptor_bounds=bounds)
 
 
+def child_environment() -> dict[str, str]:
+    """Environment variables for a process like a worker's that imports what this one can import."""
+    path = os.pathsep.join(path or os.getcwd() for path in sys.path)
+    return worker_environment(os.environ) | {"PYTHONPATH": path}
+
+
 @cache
 def _described(name: str) -> TaskSpec:
-    environment = worker_environment(os.environ) | {
-        "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)
-    }
     try:
         process = subprocess.run(
             [sys.executable, "-m", "workers.describe", name],
-            env=environment,
+            env=child_environment(),
             capture_output=True,
             text=True,
             timeout=DESCRIBE_S,
