@@ -1,0 +1,75 @@
+"""What tests and benchmarks watch of ants among walls: how deep they are in one, whether their way crosses one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from workers.environments import ant_maze, ant_trap
+from workers.environments.ant import LEG_LENGTH, LEG_RADIUS, LOWER_LEGS, TORSO_RADIUS, AntState, expand
+from workers.environments.brax_parts import Transform
+from workers.environments.walls import WALL_RADIUS
+
+Walls = tuple[tuple[tuple[float, float], tuple[float, float]], ...]
+WALLS: dict[str, Walls] = {"ant_maze": ant_maze.WALLS, "ant_trap": ant_trap.WALLS}
+CLEAR_M = 1.0
+"""Between a start and the nearest wall's surface: no leg of an ant reaches further from its torso's surface."""
+
+
+def colliders(system: Any, state: AntState) -> jax.Array:
+    """Torso and both ends of every lower leg in the plane, [9, 2]."""
+    x = expand(system, state).x
+    points = [x.pos[0]]
+    for link, sign_x, sign_y in LOWER_LEGS:
+        end = jnp.array([sign_x * LEG_LENGTH, sign_y * LEG_LENGTH, 0.0])
+        points += [x.pos[link], x.take(link).do(Transform.create(pos=end)).pos]
+    return jnp.stack(points)[:, :2]
+
+
+def depth(points: jax.Array, walls: Walls) -> jax.Array:
+    """Metres by which the deepest of nine collider points is inside a wall; negative outside."""
+    radii = jnp.array([TORSO_RADIUS] + [LEG_RADIUS] * 8)
+    deepest = jnp.array(-jnp.inf)
+    for start, end in walls:
+        a, b = jnp.array(start), jnp.array(end)
+        along = jnp.clip((points - a) @ (b - a) / jnp.sum((b - a) ** 2), 0, 1)
+        gap = jnp.linalg.norm(points - a - along[:, None] * (b - a), axis=-1)
+        deepest = jnp.maximum(deepest, (WALL_RADIUS + radii - gap).max())
+    return deepest
+
+
+def crosses(before_2: Any, after_2: Any, walls: Walls) -> jax.Array:
+    """Whether a way crosses the middle of a wall."""
+
+    def side(p, q, r):
+        return (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
+
+    crossed = jnp.array(False)
+    for start, end in walls:
+        a, b = jnp.array(start), jnp.array(end)
+        apart = side(a, b, before_2) * side(a, b, after_2) < 0
+        crossed |= apart & (side(before_2, after_2, a) * side(before_2, after_2, b) < 0)
+    return crossed
+
+
+def inside_the_maze(place_2: Any) -> np.ndarray:
+    """Whether a place is in the arena, clear of its borders."""
+    reach = ant_maze.HALF - WALL_RADIUS - TORSO_RADIUS - CLEAR_M
+    return np.abs(np.asarray(place_2) - ant_maze.MIDDLE).max(-1) < reach
+
+
+def places_beside_walls(name: str, count: int, seed: int) -> np.ndarray:
+    """Starts within three metres of some wall of a task, clear of all of them: [count, 2]."""
+    rng, walls = np.random.default_rng(seed), WALLS[name]
+    ends = np.array(walls)[rng.integers(len(walls), size=20 * count)]
+    tries = ends[:, 0] + rng.uniform(size=(20 * count, 1)) * (ends[:, 1] - ends[:, 0])
+    tries += rng.uniform(-3, 3, tries.shape)
+    free = np.asarray(jax.jit(jax.vmap(lambda xy: depth(jnp.tile(xy, (9, 1)), walls)))(tries)) < -CLEAR_M
+    if name == "ant_maze":
+        free &= inside_the_maze(tries)
+    chosen = tries[free][:count].astype(np.float32)
+    assert len(chosen) == count
+    return chosen
