@@ -3,8 +3,8 @@
     python -m tests.benchmarks.walls_hold            # 11 minutes on two cores; rewrites results/walls_hold.csv
 
 Half of the ants take a random action every step, half turn every motor fully one way or the other for half a second.
-Not a benchmark of speed: it lives here because it takes too long for a test. `tests/workers/test_ant_walls.py` drives fewer
-steps, with forces from outside.
+Not a benchmark of speed: it lives here because it takes too long for a test. `tests/workers/test_ant_walls.py` drives
+fewer steps, with forces from outside.
 """
 
 from __future__ import annotations
