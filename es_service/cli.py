@@ -1,5 +1,5 @@
-"""The command line: `es-service run | resume | fork | status | digest | list | submit | jobs | logs | stop
-| bench | doctor`.
+"""The command line: `es-service run | resume | fork | status | digest | list | evaluate | export | submit | jobs | logs
+| stop | bench | doctor`.
 
 Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by SIGINT or SIGTERM.
 """
@@ -19,7 +19,7 @@ from rich.console import Console
 
 from es_service import api, digest, jobs
 from es_service.config.resolution import config_warnings
-from es_service.errors import ConfigError, EvaluationError, Interrupted, ServiceError
+from es_service.errors import ConfigError, EvaluationError, Interrupted, NotInRunError, ServiceError
 from es_service.report.catalogue import print_catalogue
 from es_service.report.progress import Row, show_progress
 from es_service.report.status import follow_status, print_status, print_summary
@@ -154,6 +154,47 @@ def list_() -> None:
 
 
 @app.command()
+def evaluate(
+    folder: RunArgument,
+    best: Annotated[bool, typer.Option("--best", help="The best centre; so too if nothing is named.")] = False,
+    centre: Annotated[bool, typer.Option("--centre", help="The newest centre.")] = False,
+    cell: Annotated[
+        list[str] | None, typer.Option("--cell", metavar="I,J", help="A cell's elite; may be given several times.")
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="Every elite of the map.")] = False,
+    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Fresh episodes of each.")] = 100,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Also write the rows to this CSV file.")] = None,
+) -> None:
+    """Run fresh episodes of what a run has found, beside what it believed of it."""
+    from es_service import evaluation
+    from es_service.report.evaluations import print_evaluations
+
+    found = api.open_run(folder)
+    chosen = evaluation.candidates(
+        found,
+        best=best or not (centre or cell or every),
+        centre=centre,
+        cells=[_place(text) for text in cell or ()],
+        every=every,
+    )
+    print_evaluations(console, found, evaluation.evaluate(found, chosen, episodes, workers), out)
+
+
+@app.command()
+def export(
+    folder: RunArgument,
+    to: Annotated[str, typer.Option("--to", help="csv, parquet, npz or ribs.", show_default=False)],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write into; default: RUN/export.")] = None,
+) -> None:
+    """Write history, novelty archive and map as tables, or policies as arrays."""
+    from es_service.export import export as write
+
+    for file in write(api.open_run(folder), to, out if out is not None else folder / "export"):
+        print(file)
+
+
+@app.command()
 def submit(
     config: ConfigArgument,
     address: JobsOption,
@@ -249,7 +290,7 @@ def main() -> None:
         app()
     except Interrupted:
         raise
-    except ConfigError as error:
+    except (ConfigError, NotInRunError) as error:
         _print_error(str(error))
         sys.exit(2)
     except ServiceError as error:
@@ -292,6 +333,14 @@ def _compute(workers: int | None, engine: str | None, address: str | None) -> di
     if engine == "inline" and address is None:  # what the file, or the run's record, says of a cluster is moot then
         chosen |= {"compute.address": "null", "compute.worker_resources.cpu": 1, "compute.worker_resources.gpu": 0}
     return chosen
+
+
+def _place(text: str) -> tuple[int, ...]:
+    """A cell as it is typed: 3,17."""
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--cell {text}: must be whole numbers with commas between them, such as 3,17") from None
 
 
 def _overrides(set_: list[str] | None, **options: object) -> list[str]:

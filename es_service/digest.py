@@ -18,6 +18,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
+from es_service.maps.behaviour_map import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.store.codec import decode_part, row_bytes
 from es_service.store.reader import read_platforms, reading, state_payload
 from es_service.store.schema import RunMeta, history_select
@@ -32,7 +33,8 @@ def digest(folder: Path) -> str:
 
 
 def digest_parts(folder: Path) -> dict[str, str]:
-    """SHA-256 by name: `state/<part>` of each part's newest value, then one for each of `TABLES`.
+    """SHA-256 by name: `state/<part>` of each part's newest value, `map` of all its cells and elites together, then one
+    for each of `TABLES`.
 
     Raises StoreError if the run cannot be read.
     """
@@ -54,7 +56,10 @@ def is_mixed(folder: Path) -> bool:
 
 def _state(connection: Connection) -> dict[str, str]:
     newest = connection.execute("SELECT part, max(generation) FROM state GROUP BY part ORDER BY part").fetchall()
-    return {f"state/{part}": arrays_sha256(decode_part(state_payload(connection, part, at))) for part, at in newest}
+    parts = {part: arrays_sha256(decode_part(state_payload(connection, part, at))) for part, at in newest}
+    of_map = [part for part in parts if part.startswith((GEOMETRY_PART, CELL_PREFIX, ELITE_PREFIX))]
+    together = {"map": hashlib.sha256("".join(f"{part}\0{parts.pop(part)}\n" for part in of_map).encode()).hexdigest()}
+    return {f"state/{part}": sha256 for part, sha256 in parts.items()} | (together if of_map else {})
 
 
 def arrays_sha256(arrays: dict[str, NDArray[Any]]) -> str:

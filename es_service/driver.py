@@ -7,25 +7,40 @@ finished generation, and the next one depends only on (config, seed, state).
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from es_service.algorithms.base import Algorithm, Judgement, SearchState
+from es_service.algorithms.base import NO_CELL, Algorithm, Judgement, Member, SearchState
+from es_service.algorithms.me_es import restarted
 from es_service.algorithms.steps import first_state
+from es_service.clock import Clock
 from es_service.config.model import BudgetConfig, RunConfig
 from es_service.errors import EvaluationError
-from es_service.generation import estimate_gradient, evaluate_centre, evaluate_population, invalidate, valid_members
+from es_service.generation import estimate_gradient, evaluate_centre, evaluate_population, invalidate, judge
 from es_service.history import evaluation_columns, population_columns
+from es_service.maps.behaviour_map import (
+    ELITE_PREFIX,
+    BehaviourMap,
+    Elite,
+    elite_from_arrays,
+    elite_part,
+    empty_map,
+    make_elite,
+    map_columns,
+)
+from es_service.maps.geometry import make_geometry, reachable_cells
 from es_service.novelty import novelty
 from es_service.protocol import Centre, DispatchCounts, EpisodesResult, Evaluator, FloatArray, Moments, TaskSpec
 from es_service.run_state import Arrays, Best, RunState, state_from_parts, state_parts
 from es_service.statistics import merge_moments, normalisation
 
 HistoryRow = dict[str, int | float | None]
+Reachable = NDArray[np.bool_] | None
+"""Which cells of the map can be reached, [cells]; None where the task does not know."""
 
 
 class Store(Protocol):
@@ -34,7 +49,8 @@ class Store(Protocol):
     generation: int | None
     """Newest committed generation; None before the first."""
 
-    def load(self) -> Mapping[str, Arrays]: ...
+    def load(self, without: str | None = None) -> Mapping[str, Arrays]: ...
+    def part(self, name: str) -> Arrays: ...
     def last_history(self) -> Mapping[str, Any] | None: ...
     def commit(self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow) -> None: ...
 
@@ -69,16 +85,19 @@ def run(
         EvaluationError, StoreError: nothing committed is lost. Interrupted: a signal asked to stop.
     """
     budget = search.config.budget
-    clock = _Clock(0.0)
+    clock = Clock(0.0)
     if store.generation is None:
-        state = _keep(store, report, clock, None, *_first_generation(search, evaluator, clock))
+        map_ = empty_map(make_geometry(search.config.map)) if search.config.map.enabled else None
+        reachable = _reachable(search, map_)
+        state = _keep(store, report, clock, None, *_first_generation(search, evaluator, clock, map_, reachable))
     else:
         last = store.last_history() or {}
         seconds, dimensions = float(last.get("wall_clock_s") or 0.0), len(search.task.descriptor_names)
-        state = state_from_parts(store.load(), store.generation, seconds, dimensions)
-        clock = _Clock(state.wall_clock_s)
+        state = state_from_parts(store.load(without=ELITE_PREFIX), store.generation, seconds, dimensions)
+        reachable = _reachable(search, state.search.map)
+        clock = Clock(state.wall_clock_s)
     while (reason := spent(budget, state)) is None:
-        state = _keep(store, report, clock, state, *_next_generation(search, evaluator, clock, state))
+        state = _keep(store, report, clock, state, *_next_generation(search, evaluator, store, clock, state, reachable))
     return state, reason
 
 
@@ -95,19 +114,23 @@ def spent(budget: BudgetConfig, state: RunState) -> str | None:
     return None
 
 
-def _first_generation(search: Search, evaluator: Evaluator, clock: _Clock) -> tuple[RunState, HistoryRow]:
+def _first_generation(
+    search: Search, evaluator: Evaluator, clock: Clock, map_: BehaviourMap | None, reachable: Reachable
+) -> tuple[RunState, HistoryRow]:
     """Generation 0: the initial centres, evaluated. The history shows the fittest of them."""
     centres, observations = search.initial()
-    moved = first_state(centres, len(search.task.descriptor_names), search.algorithm.fitness_weight)
+    moved = first_state(centres, len(search.task.descriptor_names), search.algorithm.fitness_weight, map_)
     points = [_centre(search, 0, centre_D, observations) for centre_D in centres]
     episodes = search.config.search.evaluation_episodes
     evaluations = [evaluate_centre(evaluator, point, episodes, index) for index, point in enumerate(points)]
     clock.lap("seconds_evaluation")
     fittest = 0
     best = Best(0, -math.inf, centres[0], points[0].observation_mean_O, points[0].observation_std_O)
+    elites: dict[int, Elite] = {}
     for member, (point, evaluation) in enumerate(zip(points, evaluations, strict=True)):
         judgement = judge(0, member, evaluation)
         moved = search.algorithm.absorb(moved, judgement)
+        elites |= _entered(moved, member, point, evaluation)
         better = _better(best, point, judgement)
         best, fittest = better, fittest if better is best else member
     state = RunState(
@@ -118,9 +141,11 @@ def _first_generation(search: Search, evaluator: Evaluator, clock: _Clock) -> tu
         env_steps=sum(map(_steps, evaluations)),
         episodes=sum(evaluation.fitness.size for evaluation in evaluations),
         wall_clock_s=clock.total(),
+        elites=elites,
     )
     row: HistoryRow = {
         **_search_columns(fittest, search.algorithm.fitness_weight, None, moved),
+        **_map_columns(search, reachable, moved, fittest, None),
         "update_norm": None,
         "parameter_norm": _norm(centres[fittest]),
         "invalid_members": 0,
@@ -132,24 +157,29 @@ def _first_generation(search: Search, evaluator: Evaluator, clock: _Clock) -> tu
 
 
 def _next_generation(
-    search: Search, evaluator: Evaluator, clock: _Clock, state: RunState
+    search: Search, evaluator: Evaluator, store: Store, clock: Clock, state: RunState, reachable: Reachable
 ) -> tuple[RunState, HistoryRow]:
-    """One generation: a pure function of (search, state) but for its timings."""
+    """One generation: a pure function of (search, state, elites in the store) but for its timings."""
     settings, sizes, algorithm = search.config.search, search.config.compute, search.algorithm
     generation = state.generation + 1
     counts = evaluator.counts
 
-    plan = algorithm.plan(state.search, generation)
-    centre = _centre(search, generation, plan.centre_D, state.observations)
+    begun = state.search
+    start_cell = algorithm.start_cell(begun, generation)
+    if start_cell is not None:
+        elite = elite_from_arrays(store.part(elite_part(start_cell)))
+        begun = restarted(begun, start_cell, elite, own_statistics=settings.parent_statistics == "elite")
+    plan = algorithm.plan(begun, generation)
+    centre = _centre(search, generation, plan.centre_D, state.observations, begun.members[plan.member])
     clock.lap("seconds_driver")
     population, observed = evaluate_population(evaluator, centre, pairs=settings.pairs, chunk_pairs=sizes.chunk_pairs)
     clock.lap("seconds_rollout")
     population, invalid = invalidate(population, settings.max_invalid_fraction, generation)
-    weights_P = algorithm.weights(state.search, population)
+    weights_P = algorithm.weights(begun, plan, population)
     clock.lap("seconds_driver")
     gradient_D = estimate_gradient(evaluator, centre, weights_P, sizes.gradient_block_pairs)
     clock.lap("seconds_gradient")
-    moved = algorithm.step(state.search, plan, gradient_D)
+    moved = algorithm.step(begun, plan, gradient_D)
     new_centre_D = moved.members[plan.member].centre_D
     if not np.isfinite(new_centre_D).all():
         raise EvaluationError(
@@ -161,7 +191,7 @@ def _next_generation(
     new_centre = replace(centre, parameters_D=new_centre_D)  # evaluated with the statistics of the generation's start
     evaluation = evaluate_centre(evaluator, new_centre, settings.evaluation_episodes)
     clock.lap("seconds_evaluation")
-    judgement = judge(generation, plan.member, evaluation)
+    judgement = judge(generation, plan.member, evaluation, population)
     learned = algorithm.absorb(moved, judgement)
     nearest = search.config.novelty
     centre_novelty = novelty(
@@ -169,7 +199,8 @@ def _next_generation(
     )
 
     row: HistoryRow = {
-        **_search_columns(plan.member, state.search.weight.value, float(centre_novelty), learned),
+        **_search_columns(plan.member, plan.fitness_weight, float(centre_novelty), learned),
+        **_map_columns(search, reachable, learned, plan.member, start_cell),
         "update_norm": _norm(new_centre_D - plan.centre_D),
         "parameter_norm": _norm(new_centre_D),
         "invalid_members": invalid,
@@ -187,6 +218,7 @@ def _next_generation(
         + population.fitness.size * search.config.task.episodes_per_member
         + evaluation.fitness.size,
         wall_clock_s=clock.total(),
+        elites=_entered(learned, plan.member, new_centre, evaluation),
     )
     return state, row
 
@@ -194,7 +226,7 @@ def _next_generation(
 def _keep(
     store: Store,
     report: Callable[[HistoryRow], None],
-    clock: _Clock,
+    clock: Clock,
     before: RunState | None,
     state: RunState,
     row: HistoryRow,
@@ -219,21 +251,39 @@ def _keep(
     return state
 
 
-def _centre(search: Search, generation: int, centre_D: FloatArray, observations: Moments) -> Centre:
-    """The point to send out, with the statistics in force."""
+def _centre(
+    search: Search, generation: int, centre_D: FloatArray, observations: Moments, member: Member | None = None
+) -> Centre:
+    """The point to send out, with the statistics in force: the member's own if it has any, else the run's."""
     mean_O, std_O = normalisation(observations, search.config.policy.observation_normalization)
+    if member is not None and member.own_mean_O is not None and member.own_std_O is not None:
+        mean_O, std_O = member.own_mean_O, member.own_std_O
     return Centre(generation, centre_D, search.config.search.sigma, mean_O, std_O)
 
 
-def judge(generation: int, member: int, evaluation: EpisodesResult) -> Judgement:
-    """What a centre's evaluation episodes say of it."""
-    return Judgement(
-        generation,
-        member,
-        bool(valid_members(evaluation).all()),
-        float(np.mean(evaluation.fitness, dtype=np.float64)),
-        evaluation.descriptor.astype(np.float64).mean(axis=0),
-    )
+def _entered(state: SearchState, member: int, centre: Centre, evaluation: EpisodesResult) -> dict[int, Elite]:
+    """The centre just evaluated as an elite, by its cell, if it entered the map."""
+    cell = state.members[member].cell
+    if cell == NO_CELL or evaluation.trace_T_B is None:
+        return {}
+    return {cell: make_elite(centre, evaluation.trace_T_B)}
+
+
+def _reachable(search: Search, map_: BehaviourMap | None) -> Reachable:
+    return None if map_ is None else reachable_cells(map_.geometry, search.task)
+
+
+def _map_columns(
+    search: Search, reachable: Reachable, after: SearchState, member: int, start_cell: int | None
+) -> HistoryRow:
+    if after.map is None:
+        return {}
+    cell = after.members[member].cell
+    return {
+        "start_cell": start_cell,
+        "cell": None if cell == NO_CELL else cell,
+        **map_columns(after.map, search.config.map.qd_offset, reachable),
+    }
 
 
 def _search_columns(member: int, fitness_weight: float, centre_novelty: float | None, after: SearchState) -> HistoryRow:
@@ -268,30 +318,3 @@ def _faults(evaluator: Evaluator, before: DispatchCounts) -> HistoryRow:
         "lost_workers": now.lost_workers - before.lost_workers,
         "workers": now.workers,
     }
-
-
-class _Clock:
-    """Where the seconds of a generation go. Time of the commit is shown with the generation after it."""
-
-    def __init__(self, before_s: float) -> None:
-        self._origin = time.perf_counter() - before_s
-        self._last = self._generation_start = time.perf_counter()
-        self._laps: dict[str, float] = {}
-
-    def total(self) -> float:
-        """Seconds spent in this run, earlier sessions included."""
-        return time.perf_counter() - self._origin
-
-    def lap(self, name: str) -> None:
-        """Book the time since the last lap under `name`."""
-        now = time.perf_counter()
-        self._laps[name] = self._laps.get(name, 0.0) + now - self._last
-        self._last = now
-
-    def finish_generation(self) -> tuple[float, dict[str, float]]:
-        """(seconds since the last call, laps since then by name)."""
-        now = time.perf_counter()
-        seconds, laps = now - self._generation_start, self._laps
-        self._generation_start, self._laps = now, {}
-        names = ("seconds_rollout", "seconds_gradient", "seconds_evaluation", "seconds_driver", "seconds_store")
-        return seconds, {name: laps.get(name, 0.0) for name in names}

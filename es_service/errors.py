@@ -20,6 +20,10 @@ class StoreError(ServiceError, RuntimeError):
     """A run folder cannot be read, written or continued."""
 
 
+class NotInRunError(ServiceError, LookupError):
+    """A run does not have what was asked of it: a map, a cell, an elite (exit code 2)."""
+
+
 class RunLockedError(StoreError):
     """Another driver is writing to this run."""
 

@@ -5,6 +5,7 @@ Order never comes from arrival: results are taken by chunk id, and partial gradi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeVar
@@ -12,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.algorithms.base import Judgement
 from es_service.errors import EvaluationError
 from es_service.protocol import (
     EVALUATION_EPISODES_PER_CHUNK,
@@ -96,6 +98,26 @@ def invalidate(population: EpisodesResult, max_invalid_fraction: float, generati
     return replace(population, fitness=fitness_P_S), invalid
 
 
+def judge(
+    generation: int, member: int, evaluation: EpisodesResult, population: EpisodesResult | None = None
+) -> Judgement:
+    """What a centre's evaluation episodes say of it, and the population that led to it, invalid fitness being NaN."""
+    return Judgement(
+        generation,
+        member,
+        bool(valid_members(evaluation).all()),
+        float(np.mean(evaluation.fitness, dtype=np.float64)),
+        evaluation.descriptor.astype(np.float64).mean(axis=0),
+        _highest(population.fitness) if population is not None else math.nan,
+    )
+
+
+def _highest(fitness: FloatArray) -> float:
+    """Of the finite values; NaN where there is none."""
+    finite = fitness[np.isfinite(fitness)]
+    return float(finite.max()) if finite.size else math.nan
+
+
 def _all_of(kind: type[Result], results: Sequence[object]) -> list[Result]:
     """The same results, known to be of one kind."""
     checked = [result for result in results if isinstance(result, kind)]
@@ -116,4 +138,5 @@ def _concatenate(results: Sequence[EpisodesResult], count: int) -> EpisodesResul
         steps=join("steps"),
         goal_distance=join("goal_distance"),
         moments=None,
+        trace_T_B=results[0].trace_T_B,
     )

@@ -44,6 +44,15 @@ _GOAL = (
     Column("goal_distance", "REAL", True, "mean distance to the goal at the end of the evaluation episodes"),
     Column("goal_distance_min", "REAL", True, "least distance to the goal along any evaluation episode"),
 )
+_MAP = (
+    Column("start_cell", "INTEGER", True, "me_es: cell whose elite this generation began with; none inside a block"),
+    Column("cell", "INTEGER", True, "cell of the map that the new centre entered; none if it did not"),
+    Column("map_cells", "INTEGER", True, "filled cells of the map after this generation"),
+    Column("coverage", "REAL", True, "filled cells as a fraction of all"),
+    Column("coverage_reachable", "REAL", True, "the same of the cells that can be reached, where the task knows them"),
+    Column("map_fitness_max", "REAL", True, "highest fitness of an elite, as it was when it entered"),
+    Column("qd_score", "REAL", True, "sum over elites of fitness less map.qd_offset"),
+)
 _SEARCH_AND_TIMES = (
     Column("member", "INTEGER", True, "member whose centre this row is about; of the initial ones, the fittest"),
     Column("fitness_weight", "REAL", True, "weight of fitness beside novelty in this generation's utilities"),
@@ -65,8 +74,8 @@ _SEARCH_AND_TIMES = (
 )
 
 
-def history_columns(task: TaskSpec) -> tuple[Column, ...]:
-    """All columns of a run: one `centre_<name>` per descriptor dimension, goal distances if the task has a goal."""
+def history_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
+    """All columns of a run: `centre_<name>` per descriptor dimension, distances if the task has a goal, the map's."""
     descriptor = tuple(
         column
         for name in task.descriptor_names
@@ -75,7 +84,7 @@ def history_columns(task: TaskSpec) -> tuple[Column, ...]:
             Column(f"centre_{name}_std", "REAL", True, f"standard deviation of {name} over the same episodes"),
         )
     )
-    return (*_FITNESS, *descriptor, *(_GOAL if task.has_goal else ()), *_SEARCH_AND_TIMES)
+    return (*_FITNESS, *descriptor, *(_GOAL if task.has_goal else ()), *(_MAP if has_map else ()), *_SEARCH_AND_TIMES)
 
 
 def population_columns(population: EpisodesResult | None) -> dict[str, float | None]:

@@ -24,6 +24,7 @@ SPARE_CANDIDATES = 6
 """Neighbours asked of the tree beyond those wanted, so that rounding inside it can be noticed."""
 TREE_ROUNDING = 1e-9
 """Relative bound, generous, on how much the tree's distances differ from ours."""
+BLOCK_PREFIX = "novelty_"
 BLOCK_ENTRIES = 256
 """Entries in one part of the run store: a generation rewrites the last part and no other."""
 
@@ -94,7 +95,7 @@ def novelty(
 
 def block_part(block: int) -> str:
     """Name of a block of entries in the run store."""
-    return f"novelty_{block:05d}"
+    return f"{BLOCK_PREFIX}{block:05d}"
 
 
 def archive_to_parts(archive: NoveltyArchive, stored: int) -> dict[str, dict[str, np.ndarray]]:

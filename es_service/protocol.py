@@ -7,7 +7,7 @@ of one chunk, S sign [+, -], E episodes of one evaluation chunk, O observation, 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -15,8 +15,11 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float32]
 Bounds = tuple[tuple[float, float], ...]
+Segment = tuple[tuple[float, float], tuple[float, float]]
 SIGNS = (1.0, -1.0)
 """The two members of a pair, in the order of axis S."""
+TRACE_POINTS = 64
+"""Of an evaluation's trace; fewer if the episode has fewer steps."""
 EVALUATION_EPISODES_PER_CHUNK = 16
 """Episodes in one evaluation chunk; a constant, so that its compiled shape is one too."""
 
@@ -42,6 +45,22 @@ class TaskSpec:
     summary: str = ""
     descriptors: dict[str, tuple[tuple[str, ...], Bounds]] = field(default_factory=dict)
     """Where the task's option `descriptor` chooses: name -> (descriptor_names, descriptor_bounds)."""
+    walls: tuple[Segment, ...] | None = None
+    """Where the descriptor is a place in the plane: all walls there, so that it is known which places can be reached;
+    None where nobody says."""
+    wall_clearance: float = 0.0
+    """How near the middle of a wall no descriptor can come."""
+    least_reward: float | None = None
+    """A reward below which none is expected: what a QD-score counts from. None where nobody says."""
+
+
+def with_options(task: TaskSpec, options: Mapping[str, str]) -> TaskSpec:
+    """The task as these options make it: with the descriptor they choose."""
+    chosen = options.get("descriptor")
+    if chosen not in task.descriptors:
+        return task
+    names, bounds = task.descriptors[chosen]
+    return replace(task, descriptor_names=names, descriptor_bounds=bounds)
 
 
 @dataclass(frozen=True)
@@ -201,6 +220,8 @@ class EpisodesResult:
     """Leading axes + 2: distance to the goal at the end of the episode, and its minimum; NaN without a goal."""
     moments: Moments | None
     """Of every observation acted on before `done`; None for evaluations, which feed no statistics."""
+    trace_T_B: FloatArray | None = None
+    """Of an evaluation: the descriptor along its first episode, from the reset to the end in equal steps."""
 
 
 @dataclass(frozen=True)

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from es_service.algorithms.base import (
+    NO_CELL,
     SearchState,
     member_from_arrays,
     member_part,
     member_to_arrays,
     weight_from_arrays,
     weight_to_arrays,
+)
+from es_service.maps.behaviour_map import (
+    CELL_PREFIX,
+    ELITE_PREFIX,
+    Elite,
+    elite_part,
+    elite_to_arrays,
+    map_from_parts,
+    map_to_parts,
 )
 from es_service.novelty import archive_from_parts, archive_to_parts
 from es_service.protocol import FloatArray, Moments
@@ -45,6 +55,8 @@ class RunState:
     episodes: int
     wall_clock_s: float
     """Seconds spent so far, all sessions together. Kept in the history, not in the state: it is not deterministic."""
+    elites: Mapping[int, Elite] = field(default_factory=dict)
+    """Those that entered the map in this generation, by cell; older ones are in the store only."""
 
 
 def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
@@ -64,6 +76,9 @@ def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
     archive, stored = state.search.archive, before.search.archive.size if before is not None else 0
     if before is None or archive is not before.search.archive:
         parts |= archive_to_parts(archive, stored)
+    if state.search.map is not None:
+        parts |= map_to_parts(state.search.map, before.search.map if before is not None else None)
+        parts |= {elite_part(cell): elite_to_arrays(elite) for cell, elite in state.elites.items()}
     if before is None or state.best is not before.best:
         parts["best"] = _best_to_arrays(state.best)
     return parts
@@ -72,20 +87,38 @@ def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
 def state_from_parts(
     parts: Mapping[str, Mapping[str, np.ndarray]], generation: int, wall_clock_s: float, dimensions: int
 ) -> RunState:
-    """Inverse of `state_parts(state, None)`; `dimensions` of a descriptor, as long as the archive has no entry."""
+    """Inverse of `state_parts(state, None)`; elites are not needed.
+
+    Args:
+        dimensions: of a descriptor, as long as the archive has no entry.
+    """
     members = []
     while member_part(len(members)) in parts:
         members.append(member_from_arrays(parts[member_part(len(members))]))
     counters = parts["counters"]
     return RunState(
         generation=generation,
-        search=SearchState(tuple(members), archive_from_parts(parts, dimensions), weight_from_arrays(parts["weight"])),
+        search=SearchState(
+            tuple(members),
+            archive_from_parts(parts, dimensions),
+            weight_from_arrays(parts["weight"]),
+            map_from_parts(parts),
+        ),
         observations=moments_from_arrays(parts["observations"]),
         best=best_from_arrays(parts["best"]),
         env_steps=int(counters["env_steps"]),
         episodes=int(counters["episodes"]),
         wall_clock_s=wall_clock_s,
     )
+
+
+def without_elites(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, Arrays]:
+    """The parts of a state whose map has been emptied."""
+    kept = {name: dict(part) for name, part in parts.items() if not name.startswith((CELL_PREFIX, ELITE_PREFIX))}
+    for name, part in kept.items():
+        if name.startswith(member_part("")):
+            part["cell"] = np.asarray(NO_CELL, np.int64)
+    return kept
 
 
 def moments_to_arrays(moments: Moments) -> Arrays:

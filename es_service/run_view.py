@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,8 +12,20 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from es_service import digest as run_digest
-from es_service.algorithms.base import member_from_arrays, member_part
-from es_service.novelty import archive_from_parts
+from es_service.algorithms.base import Member, member_from_arrays, member_part
+from es_service.errors import NotInRunError
+from es_service.maps.behaviour_map import (
+    CELL_PREFIX,
+    ELITE_PREFIX,
+    GEOMETRY_PART,
+    BehaviourMap,
+    Elite,
+    elite_from_arrays,
+    elite_part,
+    map_from_parts,
+)
+from es_service.maps.geometry import Grid
+from es_service.novelty import BLOCK_PREFIX, archive_from_parts
 from es_service.protocol import FloatArray, PolicyShape
 from es_service.run_state import best_from_arrays, moments_from_arrays
 from es_service.statistics import normalisation
@@ -88,19 +100,84 @@ class Run:
         """History as dictionaries, oldest first; only from `since_generation` on if given."""
         return reader.read_history(self.folder, since_generation)
 
-    def parts(self, generation: int | None = None) -> tuple[int, dict[str, dict[str, np.ndarray]]]:
-        """(generation, state parts), verified; the newest, or one of the last two generations."""
-        return reader.read_parts(self.folder, generation)
+    def parts(
+        self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
+    ) -> tuple[int, dict[str, dict[str, np.ndarray]]]:
+        """(generation, state parts, perhaps only some), verified; the newest, or one of the last two generations."""
+        return reader.read_parts(self.folder, generation, wanted)
 
     @property
     def novelty(self) -> pd.DataFrame:
         """The novelty archive, one row per evaluated valid centre in order: generation, member, descriptor."""
         import pandas as pd
 
-        names = self.meta.task["descriptor_names"]
-        archive = archive_from_parts(self.parts()[1], len(names))
+        names = self.descriptor_names
+        parts = self.parts(wanted=lambda part: part.startswith(BLOCK_PREFIX))[1]
+        archive = archive_from_parts(parts, len(names))
         columns = {"generation": archive.generation_N, "member": archive.member_N}
         return pd.DataFrame(columns | dict(zip(names, archive.descriptor_N_B.T, strict=True)))
+
+    @property
+    def behaviour_map(self) -> BehaviourMap:
+        """The map as arrays, without the elites' parameters. Raises NotInRunError if the run keeps none."""
+        return self._map(self.parts(wanted=_light)[1])
+
+    @property
+    def map(self) -> pd.DataFrame:
+        """The map, one row per filled cell in the order of discovery: the cell's place along each dimension (or, of a
+        cvt, its number), fitness when it entered, descriptor, generation, member."""
+        import pandas as pd
+
+        map_, names = self.behaviour_map, self.descriptor_names
+        places = np.array([map_.geometry.index_of(int(cell)) for cell in map_.cell_N]).reshape(map_.size, -1)
+        labels = [f"cell_{name}" for name in names] if isinstance(map_.geometry, Grid) else ["cell"]
+        return pd.DataFrame(
+            dict(zip(labels, places.T, strict=True))
+            | {"fitness": map_.fitness_N}
+            | dict(zip(names, map_.descriptor_N_B.T, strict=True))
+            | {"generation": map_.generation_N, "member": map_.member_N}
+        )
+
+    def cell(self, place: int | Sequence[int]) -> int:
+        """Number of a filled cell named by its place, as `map` has it: (3, 17), or 1023 of a cvt.
+
+        Raises NotInRunError if there is no such cell, or nothing in it; the message names the nearest one that is
+        filled.
+        """
+        map_ = self.behaviour_map
+        place = (int(place),) if isinstance(place, int | np.integer) else tuple(int(i) for i in place)
+        shown = ",".join(map(str, place))
+        cell = map_.geometry.cell_at(place)
+        if cell is not None and map_.row_of(cell) is not None:
+            return cell
+        near = nearest_filled(map_, place)
+        hint = f"; the nearest filled cell is {','.join(map(str, near))}" if near else "; the map is empty"
+        if cell is None:
+            sizes = " and ".join(f"0 to {n - 1}" for n in map_.geometry.shape)
+            raise NotInRunError(f"cell {shown} is not in the map of {self.folder}, whose cells are {sizes}{hint}")
+        raise NotInRunError(f"cell {shown} of {self.folder} is empty{hint}")
+
+    def elite(self, place: int | Sequence[int]) -> Elite:
+        """What is kept of a cell's elite: parameters, statistics, trace. Raises as `cell`."""
+        name = elite_part(self.cell(place))
+        return elite_from_arrays(self.parts(wanted=lambda part: part == name)[1][name])
+
+    def elites(self) -> tuple[BehaviourMap, list[Elite]]:
+        """The map and all of its elites in the same order; together as large as all of their policies."""
+        parts = self.parts(wanted=lambda part: _light(part) or part.startswith(ELITE_PREFIX))[1]
+        map_ = self._map(parts)
+        return map_, [elite_from_arrays(parts[elite_part(int(cell))]) for cell in map_.cell_N]
+
+    def _map(self, parts: Mapping[str, Mapping[str, np.ndarray]]) -> BehaviourMap:
+        map_ = map_from_parts(parts)
+        if map_ is None:
+            raise NotInRunError(f"{self.folder} keeps no map; it was started with map.enabled = false")
+        return map_
+
+    @property
+    def descriptor_names(self) -> list[str]:
+        """Of the descriptor's dimensions, in order."""
+        return list(self.meta.task["descriptor_names"])
 
     @property
     def generation(self) -> int | None:
@@ -117,23 +194,52 @@ class Run:
         task = self.meta.task
         return PolicyShape((task["observation_size"], *self.constants["policy.hidden"], task["action_size"]))
 
-    def policy(self, which: Literal["best", "centre"] = "best") -> Policy:
-        """The best centre so far with the statistics it was evaluated with, or the newest centre with the newest."""
-        at, parts = self.parts()
+    def policy(self, which: Literal["best", "centre"] | int | Sequence[int] = "best") -> Policy:
+        """The best centre so far, or a cell's elite, with the statistics it was evaluated with; or the newest centre
+        with those it would go on with.
+
+        Args:
+            which: "best", "centre", or a cell by its place, such as (3, 17). Raises NotInRunError for an empty one.
+        """
         clip = self.constants["policy.observation_clip"]
+        if not isinstance(which, str):
+            elite = self.elite(which)
+            return Policy(self.policy_shape, elite.centre_D, elite.observation_mean_O, elite.observation_std_O, clip)
+        at, parts = self.parts(wanted=_without_elites)
         if which == "best":
             best = best_from_arrays(parts["best"])
             return Policy(self.policy_shape, best.centre_D, best.observation_mean_O, best.observation_std_O, clip)
         if which != "centre":
-            raise ValueError(f"policy({which!r}): choose 'best' or 'centre'")
+            raise ValueError(f"policy({which!r}): choose 'best', 'centre', or a cell such as (3, 17)")
         enabled = self.constants["policy.observation_normalization"]
         mean_O, std_O = normalisation(moments_from_arrays(parts["observations"]), enabled)
-        return Policy(self.policy_shape, self.newest_centre(at, parts), mean_O, std_O, clip)
+        member = self.newest_member(at, parts)
+        if member.own_mean_O is not None and member.own_std_O is not None:
+            mean_O, std_O = member.own_mean_O, member.own_std_O
+        return Policy(self.policy_shape, member.centre_D, mean_O, std_O, clip)
 
-    def newest_centre(self, generation: int, parts: Mapping[str, Mapping[str, np.ndarray]]) -> FloatArray:
-        """The centre that the history row of `generation` is about, `parts` being the state of that generation."""
+    def newest_member(self, generation: int, parts: Mapping[str, Mapping[str, np.ndarray]]) -> Member:
+        """The member that the history row of `generation` is about, `parts` being the state of that generation."""
         member = int(self.history_rows(generation)[0]["member"])
-        return member_from_arrays(parts[member_part(member)]).centre_D
+        return member_from_arrays(parts[member_part(member)])
+
+
+def nearest_filled(map_: BehaviourMap, place: Sequence[int]) -> tuple[int, ...] | None:
+    """Place of the filled cell nearest to another place, counted in cells (of a cvt: numbers); the first of equals."""
+    if not map_.size:
+        return None
+    filled = [map_.geometry.index_of(int(cell)) for cell in map_.cell_N]
+    if len(place) != len(map_.geometry.shape):
+        return filled[0]
+    return min(filled, key=lambda other: sum((a - b) ** 2 for a, b in zip(other, place, strict=True)))
+
+
+def _light(part: str) -> bool:
+    return part == GEOMETRY_PART or part.startswith(CELL_PREFIX)
+
+
+def _without_elites(part: str) -> bool:
+    return not part.startswith((ELITE_PREFIX, CELL_PREFIX))
 
 
 def open_run(folder: str | os.PathLike[str]) -> Run:

@@ -10,7 +10,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import cache
 
 from es_service.errors import ConfigError
@@ -33,15 +32,6 @@ class Tasks(Mapping[str, TaskSpec]):
 
     def __len__(self) -> int:
         return len(TASKS)
-
-
-def with_options(task: TaskSpec, options: Mapping[str, str]) -> TaskSpec:
-    """The task as these options make it: with the descriptor they choose."""
-    chosen = options.get("descriptor")
-    if chosen not in task.descriptors:
-        return task
-    names, bounds = task.descriptors[chosen]
-    return replace(task, descriptor_names=names, descriptor_bounds=bounds)
 
 
 def child_environment() -> dict[str, str]:

@@ -63,8 +63,11 @@ class MemoryStore:
         self.parts: dict[str, dict[str, np.ndarray]] = {}
         self.rows: list[dict] = []
 
-    def load(self) -> dict[str, dict[str, np.ndarray]]:
-        return self.parts
+    def load(self, without: str | None = None) -> dict[str, dict[str, np.ndarray]]:
+        return {name: part for name, part in self.parts.items() if without is None or not name.startswith(without)}
+
+    def part(self, name: str) -> dict[str, np.ndarray]:
+        return self.parts[name]
 
     def last_history(self) -> dict | None:
         return self.rows[-1] if self.rows else None

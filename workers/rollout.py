@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 
 from es_service.noise import NORMAL_STD, normal_integers
-from es_service.protocol import SIGNS, WorkerSpec
+from es_service.protocol import SIGNS, TRACE_POINTS, WorkerSpec
 from workers.environments import Environment
 from workers.policy import Layers, act, normalise, split_layers
 
@@ -33,6 +33,8 @@ class Episodes(NamedTuple):
     shifted_sum_O: Any
     """Sum over counted steps of (observation - statistics' mean); float32, exact enough for one episode."""
     shifted_square_sum_O: Any
+    trace_T_B: Any
+    """Of evaluations: descriptors along the first episode; nothing in training."""
 
 
 class _Carry(NamedTuple):
@@ -82,7 +84,7 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Calla
     """Compile-once rollout of one evaluation chunk: episodes of one policy, without action noise.
 
     Returns:
-        f(centre_D, mean_O, std_O, reset_keys_E_4) -> Episodes with leading axis [E].
+        f(centre_D, mean_O, std_O, reset_keys_E_4) -> Episodes with leading axis [E], but for the trace.
     """
     return jax.jit(_make_episodes(environment, spec, training=False))
 
@@ -106,6 +108,7 @@ def _make_member_episodes(environment: Environment, spec: WorkerSpec, *, trainin
             goal_distance=jnp.stack([end_M, least_M], axis=-1),
             shifted_sum_O=all_E_M.shifted_sum_O.sum(0),
             shifted_square_sum_O=all_E_M.shifted_square_sum_O.sum(0),
+            trace_T_B=None,
         )
 
     return episodes
@@ -129,6 +132,17 @@ def _make_episodes(environment: Environment, spec: WorkerSpec, *, training: bool
 
     def split(parameters_D):
         return split_layers(spec.policy, parameters_D)
+
+    points = min(TRACE_POINTS, spec.episode_steps + 1)
+    places = np.arange(points)
+
+    def traced(trace_T_B, carry: _Carry, state):
+        """Point k is where the first episode was after k / (points - 1) of its steps; all later ones are there for now,
+        so that an episode that ends early stays where it ended."""
+        first_B = environment.descriptor(jax.tree.map(lambda x: x[0], state))
+        # ceil((step + 1) * (points - 1) / episode_steps), in integers
+        place = ((carry.step + 1) * (points - 1) + spec.episode_steps - 1) // spec.episode_steps
+        return jnp.where(((places >= place) & carry.alive[0])[:, None], first_B, trace_T_B)
 
     policies = jax.vmap(policy, in_axes=(0 if training else None, 0, None, None))
 
@@ -159,6 +173,7 @@ def _make_episodes(environment: Environment, spec: WorkerSpec, *, training: bool
                 goal_distance=jnp.where(alive[:, None], jnp.stack([distance_L, least_L], -1), so_far.goal_distance),
                 shifted_sum_O=so_far.shifted_sum_O + shifted_L_O,
                 shifted_square_sum_O=so_far.shifted_square_sum_O + shifted_L_O * shifted_L_O,
+                trace_T_B=None if training else traced(so_far.trace_T_B, carry, state),
             )
             return _Carry(carry.step + 1, state, alive & ~done_L, last_reward_L, now)
 
@@ -166,17 +181,18 @@ def _make_episodes(environment: Environment, spec: WorkerSpec, *, training: bool
             return (carry.step < spec.episode_steps) & carry.alive.any()
 
         state = jax.vmap(environment.reset)(reset_keys_L)
-        descriptor_size = jax.eval_shape(jax.vmap(environment.descriptor), state).shape[-1]
+        start_L_B = jax.vmap(environment.descriptor)(state)
         zero_L = jnp.zeros(lanes, jnp.float32)
         sums = jnp.zeros((lanes, mean_O.shape[0] if training else 1), jnp.float32)
         nothing = Episodes(
             fitness=zero_L,
             returns=zero_L,
-            descriptor=jnp.zeros((lanes, descriptor_size), jnp.float32),
+            descriptor=jnp.zeros_like(start_L_B),
             steps=jnp.zeros(lanes, jnp.int32),
             goal_distance=jnp.full((lanes, 2), jnp.nan, jnp.float32),
             shifted_sum_O=sums,
             shifted_square_sum_O=sums,
+            trace_T_B=None if training else jnp.broadcast_to(start_L_B[0], (points, start_L_B.shape[-1])),
         )
         start = _Carry(jnp.int32(0), state, jnp.ones(lanes, bool), zero_L, nothing)
         return lax.while_loop(unfinished, body, start).episodes

@@ -85,7 +85,7 @@ def episode_keys(spec: WorkerSpec, domain: Domain, generation: int, pairs_P: Any
 
 def _episodes_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
     """Copy a finished batch to the host, and reduce its observation sums in float64."""
-    host = Episodes(*(np.array(x) for x in episodes))
+    host = Episodes(*(None if x is None else np.array(x) for x in episodes))
     return EpisodesResult(
         fitness=host.fitness,
         returns=host.returns,
@@ -93,6 +93,7 @@ def _episodes_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
         steps=host.steps,
         goal_distance=host.goal_distance,
         moments=None if shift_O is None else _moments(host, shift_O),
+        trace_T_B=host.trace_T_B,
     )
 
 

@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.maps.behaviour_map import BehaviourMap
 from es_service.novelty import NoveltyArchive
 from es_service.optimizer import Adam
 from es_service.protocol import EpisodesResult, FloatArray
 
 NO_ENTRY = -1
 """`Member.entry` of a member none of whose centres was valid so far."""
+NO_CELL = -1
+"""`Member.cell` of a member whose centre is no elite."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,11 @@ class Member:
     adam: Adam
     entry: int = NO_ENTRY
     """Index of its newest entry in the novelty archive."""
+    cell: int = NO_CELL
+    """Cell of the map whose elite its centre is."""
+    own_mean_O: FloatArray | None = None
+    own_std_O: FloatArray | None = None
+    """Observation statistics that its centres run with instead of the whole run's; None if they do not."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,8 @@ class SearchState:
     members: tuple[Member, ...]
     archive: NoveltyArchive
     weight: FitnessWeight
+    map: BehaviourMap | None = None
+    """None where the config switches it off."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +62,8 @@ class Plan:
 
     member: int
     centre_D: FloatArray
+    fitness_weight: float
+    """How much fitness counts beside novelty in this generation, from 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +79,8 @@ class Judgement:
     """Mean over the episodes."""
     descriptor_B: NDArray[np.float64]
     """Mean over the episodes."""
+    population_max: float = np.nan
+    """Highest fitness of a valid member of the population that led to it; NaN for an initial centre."""
 
 
 @dataclass(frozen=True)
@@ -75,37 +89,44 @@ class Algorithm:
 
     plan: Callable[[SearchState, int], Plan]
     """(state, generation) -> what to evaluate in that generation."""
-    weights: Callable[[SearchState, EpisodesResult], NDArray[np.float32]]
-    """The whole population's results (axes P, S) -> weight of each pair's noise [P]."""
+    weights: Callable[[SearchState, Plan, EpisodesResult], NDArray[np.float32]]
+    """(state, plan, the whole population's results with axes P, S) -> weight of each pair's noise [P]."""
     step: Callable[[SearchState, Plan, FloatArray], SearchState]
     """(state, plan, gradient estimate [D]) -> state with the planned member moved."""
     absorb: Callable[[SearchState, Judgement], SearchState]
     """(state, a centre's evaluation) -> state that has learned from it; initial centres come first, in order."""
     fitness_weight: float
     """What the state's `weight` starts with."""
+    start_cell: Callable[[SearchState, int], int | None] = lambda state, generation: None
+    """(state, generation) -> cell of the map whose elite takes the place of member 0 before that generation; None to go
+    on from where it is."""
 
 
-def member_part(index: int) -> str:
-    """Name of a member's part in the run store."""
+def member_part(index: int | str) -> str:
+    """Name of a member's part in the run store; of "", how all such names begin."""
     return f"member_{index}"
 
 
 def member_to_arrays(member: Member) -> dict[str, np.ndarray]:
     """A member as the store keeps it."""
     adam = member.adam
+    own = {"own_mean_O": member.own_mean_O, "own_std_O": member.own_std_O}
     return {
+        **{name: values for name, values in own.items() if values is not None},
         "centre_D": member.centre_D,
         "adam_m_D": adam.m_D,
         "adam_v_D": adam.v_D,
         "adam_step": np.asarray(adam.step, np.int64),
         "entry": np.asarray(member.entry, np.int64),
+        "cell": np.asarray(member.cell, np.int64),
     }
 
 
 def member_from_arrays(arrays: Mapping[str, np.ndarray]) -> Member:
     """Inverse of `member_to_arrays`."""
     adam = Adam(arrays["adam_m_D"], arrays["adam_v_D"], int(arrays["adam_step"]))
-    return Member(arrays["centre_D"], adam, int(arrays["entry"]))
+    own_mean_O, own_std_O = arrays.get("own_mean_O"), arrays.get("own_std_O")
+    return Member(arrays["centre_D"], adam, int(arrays["entry"]), int(arrays["cell"]), own_mean_O, own_std_O)
 
 
 def weight_to_arrays(weight: FitnessWeight) -> dict[str, np.ndarray]:

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.algorithms.base import NO_ENTRY, Algorithm, FitnessWeight, Judgement, Member, Plan, SearchState
+from es_service.algorithms.base import NO_CELL, NO_ENTRY, Algorithm, FitnessWeight, Judgement, Member, Plan, SearchState
 from es_service.config.model import NoveltyConfig, RunConfig, SearchConfig
+from es_service.maps.behaviour_map import BehaviourMap, insert, with_score
 from es_service.noise import Domain, stream_keys, uniforms
 from es_service.novelty import empty_archive, extended, novelty
 from es_service.optimizer import adam_ascent, fresh_adam
@@ -32,10 +33,10 @@ def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight 
 
     def plan(state: SearchState, generation: int) -> Plan:
         member = choose_member(state, generation, config)
-        return Plan(member, state.members[member].centre_D)
+        return Plan(member, state.members[member].centre_D, state.weight.value)
 
-    def weights(state: SearchState, population: EpisodesResult) -> NDArray[np.float32]:
-        return pair_weights(mixed_utilities(state, population, config.novelty))
+    def weights(state: SearchState, plan: Plan, population: EpisodesResult) -> NDArray[np.float32]:
+        return pair_weights(mixed_utilities(state, plan.fitness_weight, population, config.novelty))
 
     def step(state: SearchState, plan: Plan, gradient_D: FloatArray) -> SearchState:
         return moved(state, plan, gradient_D, config.search)
@@ -44,15 +45,17 @@ def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight 
         weight = state.weight
         if adapt is not None and judgement.generation > 0:
             weight = adapt(weight, judgement)
-        return replace(archived(state, judgement), weight=weight)
+        return replace(mapped(archived(state, judgement), judgement), weight=weight)
 
     return Algorithm(plan, weights, step, absorb, fitness_weight)
 
 
-def first_state(centres: Sequence[FloatArray], dimensions: int, fitness_weight: float) -> SearchState:
-    """The state before any evaluation: initial centres with fresh optimisers, an empty archive."""
+def first_state(
+    centres: Sequence[FloatArray], dimensions: int, fitness_weight: float, map_: BehaviourMap | None = None
+) -> SearchState:
+    """The state before any evaluation: initial centres, fresh optimisers, an empty archive, an empty map or none."""
     members = tuple(Member(centre_D, fresh_adam(centre_D.size)) for centre_D in centres)
-    return SearchState(members, empty_archive(dimensions), FitnessWeight(fitness_weight))
+    return SearchState(members, empty_archive(dimensions), FitnessWeight(fitness_weight), map_)
 
 
 def choose_member(state: SearchState, generation: int, config: RunConfig) -> int:
@@ -91,13 +94,14 @@ def member_novelty(state: SearchState, settings: NoveltyConfig) -> NDArray[np.fl
     return novelty_M
 
 
-def mixed_utilities(state: SearchState, population: EpisodesResult, settings: NoveltyConfig) -> NDArray[np.float64]:
+def mixed_utilities(
+    state: SearchState, w: float, population: EpisodesResult, settings: NoveltyConfig
+) -> NDArray[np.float64]:
     """(1 - w) * rank(novelty) + w * rank(fitness) per member of the population, axes [P, S].
 
     Ranks are taken per objective and then mixed, so that the scales of fitness and novelty do not matter. Novelty is
     judged in the archive as it was before the generation. An invalid member (fitness NaN) is last in both.
     """
-    w = state.weight.value
     utility_P_S = np.zeros(population.fitness.shape)
     if w > 0.0:
         utility_P_S += w * centred_ranks(population.fitness)
@@ -126,6 +130,30 @@ def archived(state: SearchState, judgement: Judgement) -> SearchState:
     archive = extended(state.archive, judgement.descriptor_B, judgement.generation, judgement.member)
     member = replace(state.members[judgement.member], entry=archive.size - 1)
     return replace(_with_member(state, judgement.member, member), archive=archive)
+
+
+def mapped(state: SearchState, judgement: Judgement) -> SearchState:
+    """The state with a valid centre offered to the map; the member then knows of which cell it is the elite, if any.
+
+    A member whose centre was an elite first hands that cell the score of the population it led.
+    """
+    member, map_ = state.members[judgement.member], state.map
+    if map_ is None:
+        return state
+    if member.cell != NO_CELL and np.isfinite(judgement.population_max):
+        map_ = with_score(map_, member.cell, judgement.member, judgement.population_max)
+    cell = NO_CELL
+    if judgement.valid:
+        map_, offered, entered = insert(
+            map_,
+            judgement.descriptor_B,
+            judgement.fitness,
+            judgement.generation,
+            judgement.member,
+            judgement.population_max,
+        )
+        cell = offered if entered else NO_CELL
+    return replace(_with_member(state, judgement.member, replace(member, cell=cell)), map=map_)
 
 
 def _with_member(state: SearchState, index: int, member: Member) -> SearchState:

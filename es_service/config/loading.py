@@ -15,11 +15,11 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+from es_service.config.map_rules import OPTIONS, map_problems
 from es_service.config.model import RunConfig, WorkerResources, changed_constants, describe_changes
 from es_service.config.presets import PRESETS, preset_values
 from es_service.config.resolution import (
     LEFT_OPEN,
-    OPTIONS,
     RESOURCES,
     did_you_mean,
     engine_problems,
@@ -136,7 +136,7 @@ def _load(
         task = None
         problems.append(f"task.environment: {error}")
     values = resolve(values, left_open, task)
-    problems += task_problems(values, task) if task else []
+    problems += task_problems(values, task) + map_problems(values, task) if task else []
     problems += member_problems(values) + shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & _BUDGET and all(values.get(key) is None for key in _BUDGET):

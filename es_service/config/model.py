@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from es_service.config.yaml_text import dump_yaml, show
-from es_service.protocol import PolicyShape, TaskSpec, WorkerSpec
+from es_service.protocol import Bounds, PolicyShape, TaskSpec, WorkerSpec
 
 # A string beside a type is what error messages say is allowed.
 Count = Annotated[int, Field(ge=1), "a whole number, at least 1"]
@@ -28,6 +28,25 @@ Widths = Annotated[
     tuple[Count, ...],
     BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value),
     "a list of whole numbers, each at least 1, such as [64, 64]",
+]
+
+
+def _tuples(value: Any) -> Any:
+    """Lists as tuples, and whole numbers among them as they are in a file: [[-1, 1], [0, 2.5]]."""
+    if not isinstance(value, list | tuple):
+        return value
+    return tuple(
+        tuple(float(x) if type(x) is int else x for x in pair) if isinstance(pair, list | tuple) else pair
+        for pair in value
+    )
+
+
+BoundPairs = Annotated[Bounds, BeforeValidator(_tuples), "a list of pairs [low, high], such as [[-1, 1], [-1, 1]]"]
+CellCounts = Annotated[
+    tuple[Count, ...],
+    Field(min_length=1),
+    BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value),
+    "a list of whole numbers, each at least 1, such as [20, 20]",
 ]
 
 
@@ -112,6 +131,27 @@ class SearchConfig(_Section):
         description="nsra_es: an improvement beats the record by more than this fraction of its size. Set by the "
         "preset."
     )
+    mode: Literal["explore_exploit", "explore", "exploit"] = Field(
+        "explore_exploit",
+        description="me_es: what a block of generations climbs: novelty (explore), fitness (exploit), or either.",
+    )
+    alternation: Literal["round_robin", "coin"] = Field(
+        "round_robin", description="me_es: whether exploring and exploiting blocks take turns or a coin decides."
+    )
+    first_block: Literal["explore", "exploit"] = Field(
+        description="me_es: what the first block does where they take turns. Set by the preset."
+    )
+    block_generations: Count = Field(
+        10, description="me_es: generations between two draws from the map; each block has a fresh optimiser."
+    )
+    cell_sampling: Literal["top", "score"] = Field(
+        description="me_es: how a cell is drawn, as QDax (top) or the released code (score) has it; "
+        "es_service/algorithms/me_es.py says how. Set by the preset."
+    )
+    parent_statistics: Literal["global", "elite"] = Field(
+        description="me_es: observation statistics that a block runs with: those of the whole run, or those that the "
+        "elite it began with was evaluated with. Set by the preset."
+    )
     evaluation_episodes: Count = Field(
         30,
         description="Episodes without noise on which each new centre is judged; counted as environment steps.",
@@ -135,6 +175,27 @@ class NoveltyConfig(_Section):
     )
     distance: Literal["euclidean", "squared_euclidean"] = Field(
         description="Distance between descriptors. Set by the preset."
+    )
+
+
+class MapConfig(_Section):
+    """The behaviour map, whose cells keep the fittest evaluated centre each. Constants of the run."""
+
+    enabled: Switch = Field(True, description="Whether the run fills a map; me_es needs one.")
+    kind: Literal["grid", "cvt"] = Field(
+        "grid", description="grid: cells of equal sides. cvt: as many cells as wanted, for many dimensions."
+    )
+    bounds: BoundPairs = Field(
+        description="[low, high] for each dimension of the descriptor; what lies outside belongs to the border cells. "
+        "auto: the task's own."
+    )
+    cells: CellCounts = Field(
+        description="grid: cells along each dimension. cvt: one number, of all. auto: [20, 20] for two dimensions, "
+        "about 10,000 at most for others; [1024] for cvt."
+    )
+    qd_offset: Number = Field(
+        description="Fitness that counts as 0 in the QD-score. auto: the least reward of the task times its steps "
+        "(fitness: sum), or 0 where the task names none."
     )
 
 
@@ -217,6 +278,7 @@ class RunConfig(_Section):
     policy: PolicyConfig
     search: SearchConfig
     novelty: NoveltyConfig
+    map: MapConfig
     budget: BudgetConfig
     compute: ComputeConfig
     seed: Seed = Field(0, description="Address of all random numbers of the run.")
@@ -259,7 +321,7 @@ def describe_changes(changes: Sequence[tuple[str, Any, Any]], run: str = "RUN") 
     settings = " ".join(f"--set {shlex.quote(f'{name}={show(new)}')}" for name, _, new in changes if new != ABSENT)
     return "\n".join(
         [
-            "a run keeps its task, policy, search, novelty, seed and chunk shapes for life; this would change:",
+            "a run keeps its task, policy, search, novelty, map, seed and chunk shapes for life; this would change:",
             *(f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes),
             f"to go on from its state with other settings: es-service fork {run} {settings}".rstrip(),
         ]

@@ -84,6 +84,25 @@ _ROWS = (
         "any gain counts.",
     ),
     PresetRow(
+        "search.first_block",
+        "explore",
+        "exploit",
+        "ME-ES. literature: QDax. uber: ME-ES, whose flag starts at explore and is flipped before its first use.",
+    ),
+    PresetRow(
+        "search.cell_sampling",
+        "top",
+        "score",
+        "ME-ES. literature: QDax, whose authors say they follow the paper. uber: ME-ES, by novelty and by the best "
+        "single episode of a cell's population.",
+    ),
+    PresetRow(
+        "search.parent_statistics",
+        "elite",
+        "global",
+        "ME-ES. uber: ME-ES, one running statistic for all. literature: ours; an elite acts as it did when it entered.",
+    ),
+    PresetRow(
         "novelty.distance",
         "euclidean",
         "squared_euclidean",

@@ -13,22 +13,25 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+from es_service.config.map_rules import OPTIONS, default_cells, default_qd_offset, options_of
 from es_service.config.model import PolicyConfig, RunConfig
 from es_service.config.yaml_text import show
-from es_service.protocol import PolicyShape, TaskSpec
+from es_service.protocol import PolicyShape, TaskSpec, with_options
 
 LEFT_OPEN: dict[str, str | None] = {
     "task.episode_steps": None,
     "search.members": "auto",
+    "map.bounds": "auto",
+    "map.cells": "auto",
+    "map.qd_offset": "auto",
     "compute.rollout": "auto",
     "compute.chunk_pairs": "auto",
     "compute.rollout_block_pairs": "auto",
     "compute.gradient_block_pairs": "auto",
 }
 """Keys that this module resolves -> the value that asks for it, in a file the same as leaving the key out."""
-OPTIONS = "task.options."
 RESOURCES = "compute.worker_resources."
-SINGLE_MEMBER = ("es",)
+SINGLE_MEMBER = ("es", "me_es")
 """Algorithms without a meta-population."""
 MEMBERS = 5
 """Of a meta-population: deep-neuroevolution's Humanoid settings and the released ME-ES code."""
@@ -94,6 +97,14 @@ def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpe
             values["task.episode_steps"] = task.episode_steps
         for option, allowed in task.options.items():
             values.setdefault(f"{OPTIONS}{option}", allowed[0])
+        chosen = with_options(task, options_of(values))
+        kind = values.get("map.kind", "grid")
+        if "map.bounds" in left_open:
+            values["map.bounds"] = chosen.descriptor_bounds
+        if "map.cells" in left_open:
+            values["map.cells"] = default_cells(kind, len(chosen.descriptor_names))
+        if "map.qd_offset" in left_open:
+            values["map.qd_offset"] = default_qd_offset(values, task)
     if "search.members" in left_open and "search.algorithm" in values:
         values["search.members"] = 1 if values["search.algorithm"] in SINGLE_MEMBER else MEMBERS
     if "compute.rollout" in left_open:

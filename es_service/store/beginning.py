@@ -22,6 +22,7 @@ from es_service.store.codec import (
     history_row,
     part_sha256,
     state_sha256,
+    state_sum,
     text_sha256,
 )
 from es_service.store.schema import RunMeta, history_insert
@@ -59,7 +60,7 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
     insert = history_insert(meta.columns)
     for generation, given in enumerate(beginning.history):
         # Of all but the newest generation the state is not kept.
-        state = state_sha256(in_force if generation == newest else {})
+        state = state_sha256(state_sum(in_force if generation == newest else {}))
         values = {name: given.get(name) for name in names}
         connection.execute(insert, history_row(meta.columns, generation, values, state))
     for generation, platform in beginning.platforms:

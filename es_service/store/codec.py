@@ -29,6 +29,7 @@ _HEADER_LENGTH = struct.Struct("<I")
 _INTEGER = struct.Struct("<cq")
 _REAL = struct.Struct("<cd")
 _NUMERIC_KINDS = "biufc"
+_SUM_MODULUS = 2**256
 
 
 def encode_part(part: Part) -> bytes:
@@ -78,13 +79,27 @@ def part_sha256(part: str, generation: int, payload: bytes) -> str:
     return digest.hexdigest()
 
 
-def state_sha256(rows: Mapping[str, tuple[int, str]]) -> str:
-    """Of the whole state of one generation, from (generation, sha256) of each part's row in force.
+def state_sum(rows: Mapping[str, tuple[int, str]]) -> int:
+    """A number that stands for the whole state of a generation, from (generation, sha256) of each part's row in force.
 
-    Stored with the history row, so that a state row that has vanished is noticed and not replaced by an older one.
+    The sum, modulo 2^256, of one SHA-256 per row: a generation that changes few of many parts changes few terms.
     """
-    lines = (f"{part}\0{generation}\0{sha256}\n" for part, (generation, sha256) in sorted(rows.items()))
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
+    return sum(_row_term(part, generation, sha256) for part, (generation, sha256) in rows.items()) % _SUM_MODULUS
+
+
+def changed_sum(total: int, old: Mapping[str, tuple[int, str]], new: Mapping[str, tuple[int, str]]) -> int:
+    """`state_sum` after the rows `new` have come into force in the place of `old`."""
+    return (total - state_sum(old) + state_sum(new)) % _SUM_MODULUS
+
+
+def state_sha256(total: int) -> str:
+    """What is stored of `state_sum` with the history row, so that a state row that has vanished is noticed and not
+    replaced by an older one."""
+    return f"{total:064x}"
+
+
+def _row_term(part: str, generation: int, sha256: str) -> int:
+    return int.from_bytes(hashlib.sha256(f"{part}\0{generation}\0{sha256}".encode()).digest())
 
 
 def text_sha256(key: str, text: str) -> str:

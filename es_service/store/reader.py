@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -115,8 +115,10 @@ def read_history(folder: Path, since_generation: int | None = None) -> list[dict
         return rows
 
 
-def read_parts(folder: Path, generation: int | None = None) -> tuple[int, dict[str, dict[str, NDArray[Any]]]]:
-    """A generation (the newest if None) and every state part as of it.
+def read_parts(
+    folder: Path, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
+) -> tuple[int, dict[str, dict[str, NDArray[Any]]]]:
+    """A generation (the newest if None) and every state part as of it, or those whose names are wanted.
 
     Raises StoreError if its state is not kept, naming those that are, or does not match its SHA-256.
     """
@@ -129,24 +131,26 @@ def read_parts(folder: Path, generation: int | None = None) -> tuple[int, dict[s
         )
         if not states:
             raise StoreError(f"{folder} has no generation yet; `es-service resume {folder}` continues it")
-        wanted = max(states) if generation is None else generation
+        asked = max(states) if generation is None else generation
         whole = sorted(
             at for at, state in states.items() if rows_in_force(kept, at) and state_in_force(kept, at) == state
         )
-        if wanted not in whole:
-            if wanted in states and wanted == max(states):
-                raise Damaged(f"the state of generation {wanted} is damaged")
+        if asked not in whole:
+            if asked in states and asked == max(states):
+                raise Damaged(f"the state of generation {asked} is damaged")
             raise StoreError(
-                f"{folder} does not keep the state of generation {wanted}; it keeps that of {whole}, "
+                f"{folder} does not keep the state of generation {asked}; it keeps that of {whole}, "
                 f"the history reaches generation {max(states)}"
             )
         parts: dict[str, dict[str, NDArray[Any]]] = {}
-        for part, (at, sha256) in sorted(rows_in_force(kept, wanted).items()):
+        for part, (at, sha256) in sorted(rows_in_force(kept, asked).items()):
+            if not wanted(part):
+                continue
             payload = state_payload(connection, part, at)
             if part_sha256(part, at, payload) != sha256:
                 raise Damaged(f"the state of {part!r} at generation {at} does not match its SHA-256")
             parts[part] = decode_part(payload)
-        return wanted, parts
+        return asked, parts
 
 
 def state_payload(connection: sqlite3.Connection, part: str, generation: int) -> bytes:

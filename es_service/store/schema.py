@@ -13,7 +13,7 @@ from es_service.errors import StoreError
 from es_service.history import Column
 from es_service.store.codec import text_sha256
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 APPLICATION_ID = 0x45535256
 """In the file's header, for tools that tell database files apart."""
 PAGE_BYTES = 8192

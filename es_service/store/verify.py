@@ -13,6 +13,7 @@ from es_service.store.codec import (
     part_sha256,
     row_sha256,
     state_sha256,
+    state_sum,
     text_sha256,
 )
 from es_service.store.schema import Damaged, RunMeta, history_select, load_meta, table_statements
@@ -102,7 +103,7 @@ def _verify(connection: sqlite3.Connection, file: Path) -> Verdict:
         for generation in (newest, newest - 1):
             in_force = rows_in_force(kept, generation) if 0 <= generation < sound_history else {}
             # Before a fork's first generation there is history without a state.
-            if in_force and states[generation] == state_sha256(in_force):
+            if in_force and states[generation] == state_sha256(state_sum(in_force)):
                 good = generation
                 break
         else:
@@ -165,4 +166,4 @@ def rows_in_force(kept: Mapping[str, Mapping[int, str]], generation: int) -> dic
 
 def state_in_force(kept: Mapping[str, Mapping[int, str]], generation: int) -> str:
     """`state_sha256` of the state at `generation`, put together from the rows at hand."""
-    return state_sha256(rows_in_force(kept, generation))
+    return state_sha256(state_sum(rows_in_force(kept, generation)))

@@ -22,11 +22,14 @@ from es_service.errors import StoreError
 from es_service.store.beginning import Beginning, load_start
 from es_service.store.codec import (
     Part,
+    changed_sum,
     decode_part,
     encode_part,
     history_row,
     part_sha256,
     row_dict,
+    state_sha256,
+    state_sum,
     text_sha256,
 )
 from es_service.store.create import create_run_folder
@@ -35,7 +38,7 @@ from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.repair import open_sound
 from es_service.store.schema import PAGE_BYTES, RunMeta, history_insert, history_select
 from es_service.store.upkeep import Upkeep
-from es_service.store.verify import rows_in_force, state_in_force
+from es_service.store.verify import rows_in_force
 
 Values = Mapping[str, int | float | None]
 """One history row by column name; NaN or None for no value."""
@@ -69,6 +72,9 @@ class RunStore:
         self.meta = verdict.meta
         self.generation = verdict.good
         self._kept = verdict.kept
+        # Parts of which the row before the newest is at hand too, for the generation before.
+        self._doubled = [part for part, rows in self._kept.items() if len(rows) > 1]
+        self._state_sum = 0 if self.generation is None else state_sum(rows_in_force(self._kept, self.generation))
         self._insert_history = history_insert(self.meta.columns)
         try:
             with self._explaining(f"opening {DATABASE}"):
@@ -121,23 +127,28 @@ class RunStore:
             lock.release()
             raise
 
-    def load(self) -> dict[str, dict[str, NDArray[Any]]]:
-        """Every state part as of the newest generation, checked once more; empty before the first commit."""
-        parts: dict[str, dict[str, NDArray[Any]]] = {}
-        if self.generation is None:
-            return parts
+    def load(self, without: str | None = None) -> dict[str, dict[str, NDArray[Any]]]:
+        """Every state part as of the newest generation, checked once more; empty before the first commit.
+
+        Args:
+            without: how the names of parts begin that are left out.
+        """
+        names = sorted(self._kept) if self.generation is not None else []
+        return {name: self.part(name) for name in names if without is None or not name.startswith(without)}
+
+    def part(self, name: str) -> dict[str, NDArray[Any]]:
+        """One state part as of the newest generation, checked once more. Raises KeyError if there is none."""
+        at = max(self._kept[name])
         with self._explaining("loading the state"):
-            for part, (at, sha256) in sorted(rows_in_force(self._kept, self.generation).items()):
-                row = self._connection.execute(
-                    "SELECT payload FROM state WHERE part = ? AND generation = ?", (part, at)
-                ).fetchone()
-                if row is None or part_sha256(part, at, row[0]) != sha256:
-                    raise StoreError(
-                        f"{self.folder / DATABASE}: state of {part!r} at generation {at} was damaged since it was "
-                        f"opened; `es-service resume {self.folder}` falls back to what is sound"
-                    )
-                parts[part] = decode_part(row[0])
-        return parts
+            row = self._connection.execute(
+                "SELECT payload FROM state WHERE part = ? AND generation = ?", (name, at)
+            ).fetchone()
+            if row is None or part_sha256(name, at, row[0]) != self._kept[name][at]:
+                raise StoreError(
+                    f"{self.folder / DATABASE}: state of {name!r} at generation {at} was damaged since it was "
+                    f"opened; `es-service resume {self.folder}` falls back to what is sound"
+                )
+            return decode_part(row[0])
 
     def commit(self, generation: int, parts: Mapping[str, Part], history: Values) -> None:
         """Store a generation: all of it or, if this raises, nothing of it.
@@ -154,27 +165,29 @@ class RunStore:
         if generation != expected:
             raise StoreError(f"{self.folder}: generation {generation} cannot be stored, the next one is {expected}")
         payloads = {part: encode_part(arrays) for part, arrays in parts.items()}
-        kept = {part: dict(rows) for part, rows in self._kept.items()}
-        for part, payload in payloads.items():
-            kept.setdefault(part, {})[generation] = part_sha256(part, generation, payload)
-        history_values = history_row(self.meta.columns, generation, history, state_in_force(kept, generation))
+        new = {part: (generation, part_sha256(part, generation, payload)) for part, payload in payloads.items()}
+        old = {part: max(self._kept[part].items()) for part in new if part in self._kept}
+        total = changed_sum(self._state_sum, old, new)
+        history_values = history_row(self.meta.columns, generation, history, state_sha256(total))
         # Enough stays to put together the newest generation and the one before it.
-        fallback = rows_in_force(kept, generation - 1)
-        outdated = [(part, at) for part, (oldest, _) in fallback.items() for at in kept[part] if at < oldest]
-        for part, at in outdated:
-            del kept[part][at]
+        outdated = [(part, at) for part in self._doubled for at in self._kept[part] if at < max(self._kept[part])]
         self._hook("before_begin")
         with self._transaction(f"storing generation {generation}") as execute:
             # First, so that the new rows take the pages of the old ones.
             for part, at in outdated:
                 execute("DELETE FROM state WHERE part = ? AND generation = ?", (part, at))
             for part, payload in payloads.items():
-                row = (part, generation, kept[part][generation], payload)
+                row = (part, *new[part], payload)
                 execute("INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)", row)
             self._hook("mid_transaction")
             execute(self._insert_history, history_values)
             self._hook("before_commit")
-        self.generation, self._kept = generation, kept
+        self.generation, self._state_sum = generation, total
+        for part, at in outdated:
+            del self._kept[part][at]
+        for part, (at, sha256) in new.items():
+            self._kept.setdefault(part, {})[at] = sha256
+        self._doubled = list(old)
         self._hook("after_commit")
         self.upkeep.after_commit(sum(map(len, payloads.values())) + 4 * PAGE_BYTES)
 

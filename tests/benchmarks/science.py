@@ -1,11 +1,12 @@
-"""What do ES, NS-ES, NSR-ES and NSRA-ES find on PointMaze? The shipped configs, seeds 0 to 4, all reported.
+"""What do ES, NS-ES, NSR-ES, NSRA-ES and ME-ES find on PointMaze? The shipped configs, seeds 0 to 4, all reported.
 
-    python -m tests.benchmarks.science                 # 20 runs of 500 M steps: about an hour on two cores
-    python -m tests.benchmarks.science --algorithms nsra_es --seeds 100 --env-steps 100_000_000 \\
+    python -m tests.benchmarks.science                 # 35 runs of 500 M steps: two hours on two cores
+    python -m tests.benchmarks.science --methods nsra_es --seeds 100 --env-steps 100_000_000 \\
         --set search.sigma=0.1                         # a trial: printed only
 
-Without --set, writes results/point_maze.csv (a row per run) and results/point_maze.png. One run per core, each with one
-worker: the engine and the number of workers change no result.
+Without --set, each finished run becomes a line of results/point_maze_runs.jsonl, runs that have one are not repeated
+(delete the file to begin again), and in the end results/point_maze.csv (a row per run) and results/point_maze.png are
+written from it. One run per core, each with one worker: the engine and the number of workers change no result.
 """
 
 from __future__ import annotations
@@ -15,8 +16,7 @@ import json
 import os
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -30,26 +30,26 @@ from es_service.run_view import Policy, Run
 from tests.benchmarks import science_picture
 
 RESULTS = Path(__file__).parent / "results"
+RUNS = RESULTS / "point_maze_runs.jsonl"
 CONFIGS = Path(__file__).parents[2] / "configs"
-ALGORITHMS = ("es", "ns_es", "nsr_es", "nsra_es")
+METHODS: dict[str, tuple[str, ...]] = {
+    "es": (),
+    "ns_es": (),
+    "nsr_es": (),
+    "nsra_es": (),
+    "me_es": (),
+    "me_es explore": ("search.mode=explore",),
+    "me_es exploit": ("search.mode=exploit",),
+}
+"""Name, of which the first word is that of the algorithm and its config -> settings besides the config's."""
 CHAMBER_EDGES = (-0.495, 0.205)
 """y that separates the first chamber (start), the second (dead end) and the third (goal): the middles of the walls."""
 SOLVED = -30.0
 RETEST_EPISODES = 1000
 RETEST_SEED = 1_000_003
-
-
-@dataclass(frozen=True)
-class Found:
-    """One run, as far as table and picture need it."""
-
-    row: dict[str, Any]
-    ends_N_2: np.ndarray
-    """Where the episodes of each evaluated centre ended, on average."""
-    curve_N_2: np.ndarray
-    """(environment steps, best centre return so far) at each improvement, and at the end."""
-    way_T_2: np.ndarray
-    """Positions of one episode of the best centre."""
+BINS = 50
+"""Along each side, of the picture of where centres ended."""
+CURVE_POINTS = 100
 
 
 def episodes(policy: Policy, seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -79,30 +79,29 @@ def chamber_shares(y: np.ndarray) -> list[float]:
     return [round(100 * float(share.mean()), 2) for share in (first, second, ~(first | second))]
 
 
-def run_one(algorithm: str, seed: int, env_steps: int, settings: tuple[str, ...]) -> Found:
-    """One run from its config to its row."""
+def run_one(method: str, seed: int, env_steps: int, settings: tuple[str, ...]) -> dict[str, Any]:
+    """One run from its config to what is kept of it."""
     budget = [f"budget.env_steps={env_steps}", "budget.generations=100_000_000"]
     config = api.load_config(
-        CONFIGS / f"point_maze_{algorithm}.yaml",
-        [*budget, "compute.engine=inline", "compute.workers=1", f"seed={seed}", *settings],
+        CONFIGS / f"point_maze_{method.split()[0]}.yaml",
+        [*budget, "compute.engine=inline", "compute.workers=1", f"seed={seed}", *METHODS[method], *settings],
     )
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         run = api.run(config, Path(folder) / "run").run
         seconds = time.perf_counter() - started
-        return _read(run, algorithm, seed, seconds)
+        return _read(run, method, seed, seconds)
 
 
-def _read(run: Run, algorithm: str, seed: int, seconds: float) -> Found:
+def _read(run: Run, method: str, seed: int, seconds: float) -> dict[str, Any]:
+    """{"row": of the table, "ends": where centres ended, "curve": steps, best return, cells, "way": of the best}."""
     history, ends = run.history, run.novelty[["x", "y"]].to_numpy()
     best = history["centre_return_mean"].cummax()
-    better = best.diff().fillna(1.0) > 0
-    better.iloc[-1] = True
     solved = history[history["centre_return_mean"] >= SOLVED]
     returns, way = episodes(run.policy("best"), RETEST_SEED + seed, RETEST_EPISODES)
     shares = chamber_shares(ends[:, 1])
     row = {
-        "algorithm": algorithm,
+        "method": method,
         "seed": seed,
         "generations": len(history) - 1,
         "env_steps": int(history["env_steps"].iloc[-1]),
@@ -110,6 +109,8 @@ def _read(run: Run, algorithm: str, seed: int, seconds: float) -> Found:
         "best_return_retested": round(float(returns.mean()), 2),
         "steps_to_minus_30": int(solved["env_steps"].iloc[0]) if len(solved) else None,
         "last_return": round(float(history["centre_return_mean"].iloc[-1]), 2),
+        "map_cells": int(history["map_cells"].iloc[-1]),
+        "qd_score": round(float(history["qd_score"].iloc[-1])),
         "evaluated_centres": len(ends),
         **{f"chamber_{number}_percent": share for number, share in enumerate(shares, 1)},
         "least_goal_distance": round(float(history["goal_distance"].min()), 3),
@@ -117,47 +118,74 @@ def _read(run: Run, algorithm: str, seed: int, seconds: float) -> Found:
         "seconds": round(seconds),
         "cpu": cpu_kind(),
     }
-    return Found(row, ends, np.column_stack([history["env_steps"][better], best[better]]), way)
+    counts, _, _ = np.histogram2d(*ends.T, bins=BINS, range=((-1, 1), (-1, 1)))
+    wanted = np.linspace(0, row["env_steps"], CURVE_POINTS)
+    # The last generation that ended by then, and the instant of the solution besides.
+    at = np.unique(np.maximum(np.searchsorted(history["env_steps"], wanted, side="right") - 1, 0))
+    at = np.union1d(at, solved.index[:1].to_numpy(int))
+    curve = np.column_stack([history["env_steps"].iloc[at], best.iloc[at].round(2), history["map_cells"].iloc[at]])
+    return {
+        "row": row,
+        "ends": [[int(i), int(j), int(counts[i, j])] for i, j in np.argwhere(counts)],
+        "curve": curve.tolist(),
+        "way": way.round(3).tolist(),
+    }
 
 
 def quartiles(table: pd.DataFrame) -> pd.DataFrame:
-    """Per algorithm: quartiles of the best return, of the steps to -30, and mean shares of the chambers."""
+    """Per method: quartiles of the best return and of the filled cells, steps to -30, mean shares of the chambers."""
     rows = {}
-    for algorithm, runs in table.groupby("algorithm", sort=False):
+    for method, runs in table.groupby("method", sort=False):
         low, median, high = np.quantile(runs["best_return"], [0.25, 0.5, 0.75])
+        cells = np.quantile(runs["map_cells"], [0.25, 0.5, 0.75])
         steps = pd.to_numeric(runs["steps_to_minus_30"]).dropna()
-        rows[algorithm] = {
+        rows[method] = {
             "best_return_q25": low,
             "best_return_median": median,
             "best_return_q75": high,
             "solved": f"{len(steps)} of {len(runs)}",
             "steps_to_minus_30_median_of_solved": steps.median(),
+            **dict(zip(("cells_q25", "cells_median", "cells_q75"), cells, strict=True)),
             **{f"chamber_{number}": runs[f"chamber_{number}_percent"].mean() for number in (1, 2, 3)},
         }
     return pd.DataFrame(rows).T
 
 
+def kept_runs() -> list[dict[str, Any]]:
+    """What is known, in the order of METHODS and seeds."""
+    lines = RUNS.read_text().splitlines() if RUNS.exists() else []
+    found = [json.loads(line) for line in lines]
+    return sorted(found, key=lambda one: (list(METHODS).index(one["row"]["method"]), one["row"]["seed"]))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--algorithms", nargs="+", default=list(ALGORITHMS), choices=ALGORITHMS)
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(5)))
     parser.add_argument("--env-steps", type=int, default=500_000_000)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     arguments = parser.parse_args()
+    trial = bool(arguments.set)
+    known = set() if trial else {(one["row"]["method"], one["row"]["seed"]) for one in kept_runs()}
     cores = len(os.sched_getaffinity(0))
     with ProcessPoolExecutor(cores, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         pending = [
-            pool.submit(run_one, algorithm, seed, arguments.env_steps, tuple(arguments.set))
-            for algorithm in arguments.algorithms
+            pool.submit(run_one, method, seed, arguments.env_steps, tuple(arguments.set))
+            for method in arguments.methods
             for seed in arguments.seeds
+            if (method, seed) not in known
         ]
         found = []
-        for future in pending:
+        for future in as_completed(pending):
             found.append(future.result())
-            print(json.dumps(found[-1].row), flush=True)
-    table = pd.DataFrame([one.row for one in found])
+            print(json.dumps(found[-1]["row"]), flush=True)
+            if not trial:
+                with RUNS.open("a") as file:
+                    file.write(json.dumps(found[-1], separators=(",", ":")) + "\n")
+    found = found if trial else kept_runs()
+    table = pd.DataFrame([one["row"] for one in found])
     print(quartiles(table).to_string())
-    if not arguments.set:
+    if not trial:
         table.astype({"steps_to_minus_30": "Int64"}).to_csv(
             RESULTS / "point_maze.csv", index=False, lineterminator="\n"
         )

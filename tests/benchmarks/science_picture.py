@@ -1,10 +1,10 @@
-"""The picture of `science.py`: where the evaluated centres of each algorithm ended, and their best return over time."""
+"""The picture of `science.py`: where the evaluated centres of each method ended, their best return, their map."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib
 
@@ -16,32 +16,62 @@ from matplotlib.patches import Rectangle
 
 from workers.environments import point_maze as maze
 
-if TYPE_CHECKING:
-    from tests.benchmarks.science import Found
-
-NAMES = {"es": "ES", "ns_es": "NS-ES", "nsr_es": "NSR-ES", "nsra_es": "NSRA-ES"}
-COLOURS = {"es": "#777777", "ns_es": "#d1495b", "nsr_es": "#c77d0a", "nsra_es": "#1b6ca8"}
+NAMES = {
+    "es": "ES",
+    "ns_es": "NS-ES",
+    "nsr_es": "NSR-ES",
+    "nsra_es": "NSRA-ES",
+    "me_es": "ME-ES",
+    "me_es explore": "ME-ES, explore",
+    "me_es exploit": "ME-ES, exploit",
+}
+COLOURS = {
+    "es": "#777777",
+    "ns_es": "#d1495b",
+    "nsr_es": "#c77d0a",
+    "nsra_es": "#1b6ca8",
+    "me_es": "#2a7f3f",
+    "me_es explore": "#7fb069",
+    "me_es exploit": "#7b4fa3",
+}
 BINS = 50
+COLUMNS = 4
+CELLS = 400
 DECEPTIVE, BEST_KNOWN = -126.4, -24.0
+
+Found = dict[str, Any]
 
 
 def draw(found: Sequence[Found], path: Path) -> None:
-    """One maze per algorithm, all seeds together, and beneath them the curves, one line per seed."""
-    algorithms = list(dict.fromkeys(one.row["algorithm"] for one in found))
-    figure = plt.figure(figsize=(3.1 * len(algorithms), 6.6), layout="constrained")
-    grid = figure.add_gridspec(2, len(algorithms), height_ratios=(1.0, 0.95))
-    for column, algorithm in enumerate(algorithms):
-        _maze(
-            figure.add_subplot(grid[0, column]), algorithm, [one for one in found if one.row["algorithm"] == algorithm]
-        )
-    _curves(figure.add_subplot(grid[1, :]), found)
+    """One maze per method, all seeds together, and beneath them the curves, one line per seed."""
+    methods = [method for method in NAMES if any(one["row"]["method"] == method for one in found)]
+    rows = -(-len(methods) // COLUMNS)
+    figure = plt.figure(figsize=(3.0 * COLUMNS, 3.3 * rows + 3.4), layout="constrained")
+    grid = figure.add_gridspec(rows + 1, COLUMNS, height_ratios=(*[1.0] * rows, 1.05))
+    for number, method in enumerate(methods):
+        axes = figure.add_subplot(grid[number // COLUMNS, number % COLUMNS])
+        _maze(axes, method, [one for one in found if one["row"]["method"] == method])
+    half = COLUMNS // 2
+    returns, cells = figure.add_subplot(grid[rows, :half]), figure.add_subplot(grid[rows, half:])
+    _curves(returns, found, column=1)
+    _curves(cells, found, column=2)
+    for value, text in ((DECEPTIVE, "dead end, -126.4"), (BEST_KNOWN, "best known, -24")):
+        returns.axhline(value, color="black", linewidth=0.8, linestyle=":")
+        returns.annotate(text, (returns.get_xlim()[1], value), ha="right", va="bottom", fontsize=9)
+    returns.set(ylim=(-200, 0), ylabel="best centre's return so far\n(mean of 30 episodes)")
+    cells.set(ylim=(0, CELLS), ylabel=f"filled cells of {CELLS}")
+    figure.legend(*returns.get_legend_handles_labels(), loc="outside lower center", ncols=len(methods), frameon=False)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
-def _maze(axes: Any, algorithm: str, found: Sequence[Found]) -> None:
-    ends = np.concatenate([one.ends_N_2 for one in found])
-    axes.hist2d(*ends.T, bins=BINS, range=((-1, 1), (-1, 1)), cmap="YlOrBr", norm=LogNorm(), zorder=1)
+def _maze(axes: Any, method: str, found: Sequence[Found]) -> None:
+    counts = np.zeros((BINS, BINS))
+    for one in found:
+        x, y, count = np.array(one["ends"]).T
+        counts[x, y] += count
+    shown = np.where(counts > 0, counts, np.nan).T
+    axes.imshow(shown, origin="lower", extent=(-1, 1, -1, 1), cmap="YlOrBr", norm=LogNorm(), zorder=1)
     half = maze.GOAL_HALF_SIDE
     for wall in (
         Rectangle((maze.LOWER_WALL_FROM_X, maze.LOWER_WALL[0]), 1 - maze.LOWER_WALL_FROM_X, 0.01, color="black"),
@@ -58,22 +88,19 @@ def _maze(axes: Any, algorithm: str, found: Sequence[Found]) -> None:
     ):
         axes.add_patch(wall)
     for one in found:
-        axes.plot(*one.way_T_2.T, color=COLOURS[algorithm], linewidth=1.1, zorder=3)
+        axes.plot(*np.array(one["way"]).T, color=COLOURS[method], linewidth=1.1, zorder=3)
     axes.set(xlim=(-1, 1), ylim=(-1, 1), aspect="equal", xticks=(), yticks=())
-    third = np.mean([one.row["chamber_3_percent"] for one in found])
-    axes.set_title(f"{NAMES[algorithm]}\n{third:.1f} % of centres in the last chamber", fontsize=10)
+    cells = np.median([one["row"]["map_cells"] for one in found])
+    solved = sum(one["row"]["steps_to_minus_30"] is not None for one in found)
+    axes.set_title(f"{NAMES[method]}\n{solved} of {len(found)} beyond -30; {cells:.0f} cells", fontsize=10)
 
 
-def _curves(axes: Any, found: Sequence[Found]) -> None:
+def _curves(axes: Any, found: Sequence[Found], column: int) -> None:
     for one in found:
-        name = one.row["algorithm"]
-        steps, best = one.curve_N_2.T
-        label = NAMES[name] if one.row["seed"] == min(o.row["seed"] for o in found) else None
-        axes.step(steps / 1e6, best, where="post", color=COLOURS[name], linewidth=1.4, alpha=0.9, label=label)
-    for value, text in ((DECEPTIVE, "dead end, -126.4"), (BEST_KNOWN, "best known, -24")):
-        axes.axhline(value, color="black", linewidth=0.8, linestyle=":")
-        axes.annotate(text, (axes.get_xlim()[1], value), ha="right", va="bottom", fontsize=9)
-    axes.set(ylim=(-200, 0), xlim=(0, None), xlabel="environment steps, millions")
-    axes.set_ylabel("best centre's return so far\n(mean of 30 episodes)")
-    axes.legend(loc="center right", ncols=len(NAMES), frameon=False)
+        method, curve = one["row"]["method"], np.array(one["curve"])
+        first = one["row"]["seed"] == min(o["row"]["seed"] for o in found if o["row"]["method"] == method)
+        label = NAMES[method] if first else None
+        line = {"color": COLOURS[method], "linewidth": 1.3, "alpha": 0.9, "label": label}
+        axes.step(curve[:, 0] / 1e6, curve[:, column], where="post", **line)
+    axes.set(xlim=(0, None), xlabel="environment steps, millions")
     axes.spines[["top", "right"]].set_visible(False)

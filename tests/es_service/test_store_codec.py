@@ -2,7 +2,16 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
-from es_service.store.codec import decode_part, encode_part, part_sha256, row_bytes, row_values, state_sha256
+from es_service.store.codec import (
+    changed_sum,
+    decode_part,
+    encode_part,
+    part_sha256,
+    row_bytes,
+    row_values,
+    state_sha256,
+    state_sum,
+)
 from tests.es_service.store_examples import COLUMNS, assert_same_state, history_row
 
 ARRAYS = {
@@ -53,8 +62,11 @@ def test_a_state_row_cannot_pass_for_another():
     payload = encode_part({"a": np.zeros(2)})
     hashes = {part_sha256("a", 1, payload), part_sha256("b", 1, payload), part_sha256("a", 2, payload)}
     assert len(hashes) == 3
-    assert state_sha256({"a": (1, "x"), "b": (2, "y")}) == state_sha256({"b": (2, "y"), "a": (1, "x")})
-    assert state_sha256({"a": (1, "x")}) != state_sha256({"a": (2, "x")})
+    a, b = {"a": (1, "x")}, {"b": (2, "y")}
+    assert state_sum(a | b) == state_sum(b | a) == changed_sum(state_sum(a), {}, b)
+    assert state_sum(a) != state_sum({"a": (2, "x")}) == changed_sum(state_sum(a), a, {"a": (2, "x")})
+    assert len({state_sum(rows) for rows in ({}, a, b, a | b, {"a": (1, "y")}, {"b": (1, "x")})}) == 6
+    assert len(state_sha256(state_sum(a))) == len(state_sha256(0)) == 64
 
 
 def test_history_values_become_what_the_database_gives_back():

@@ -67,8 +67,8 @@ def test_what_is_no_run_folder_is_called_that(tmp_path):
 @pytest.mark.parametrize(
     ("version", "message"),
     [
-        (7, r"schema version 7; .* versions up to 2\. Upgrade"),
-        (1, r"schema version 1; this es-service reads version 2\. Use the"),
+        (7, r"schema version 7; .* versions up to 3\. Upgrade"),
+        (1, r"schema version 1; this es-service reads version 3\. Use the"),
     ],
 )
 def test_another_schema_version_names_both_and_says_what_to_use(tmp_path, monkeypatch, version, message):

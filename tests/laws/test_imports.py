@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 LEAVES = {"es_service.protocol", "es_service.noise"}
-JOINERS = {"api.py", "bench.py", "cli.py", "doctor.py", "run_view.py", "tasks.py"}
+JOINERS = {"api.py", "bench.py", "cli.py", "doctor.py", "run_view.py", "session.py", "tasks.py"}
 """Files of es_service that know both sides: the Python interface and the command line. `run_view` is the interface's
 reading half (a policy runs in NumPy), `doctor` the command's."""
 RAY_USERS = {"ray_cluster.py", "jobs.py"}

@@ -348,12 +348,12 @@ def test_damage_gives_the_same_digest_or_a_named_error(config, finished, tmp_pat
 
 
 def test_other_versions_on_resume_are_told_and_make_the_digest_mixed(config, tmp_path, monkeypatch):
-    from es_service import api
+    from es_service import api, session
 
     folder = tmp_path / "run"
     assert es("run", config, "--out", folder, "--set", "budget.generations=3")[0] == 0
     assert "mixed" not in digest(folder)
-    monkeypatch.setattr(api, "platform_info", lambda: {"jax": "99.0"})
+    monkeypatch.setattr(session, "platform_info", lambda: {"jax": "99.0"})
     notices: list[str] = []
     api.resume(folder, ["budget.generations=4"], on_notice=notices.append)
     assert any("from generation 4 on" in notice for notice in notices)

@@ -15,7 +15,9 @@ from es_service.errors import StoreError
 from es_service.store.reader import read_generation
 from tests.system.session import SMALL, finish, start
 
-LONG = SMALL | {"budget": {"generations": 400}}
+SEARCH = {"algorithm": "me_es", "pairs": 16, "evaluation_episodes": 4, "block_generations": 5}
+LONG = SMALL | {"search": SEARCH, "budget": {"generations": 400}}
+"""ME-ES: a map, an elite drawn from the store every five generations, a fresh optimiser for each block."""
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +83,18 @@ def test_killed_during_start_up(tmp_path, reference):
         assert digest_parts(folder) == reference
         delay_s *= 1.3
     assert begun.count(False) >= 3
+
+
+def test_killed_in_every_generation_of_two_blocks(tmp_path):
+    blocks = SMALL | {"search": SEARCH, "budget": {"generations": 11}}
+    assert finish(tmp_path / "undisturbed", config=blocks) == 0
+    folder = tmp_path / "run"
+    for generation in range(11):
+        kill = {"at": "before_commit" if generation % 2 else "after_commit", "nth": 2 if generation % 2 else 1}
+        assert finish(folder, config=None if generation else blocks, kill=kill) == -signal.SIGKILL
+        assert committed(folder) == generation
+    assert finish(folder) == 0
+    assert digest_parts(folder) == digest_parts(tmp_path / "undisturbed")
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from es_service.config.presets import preset_table
@@ -41,6 +42,17 @@ def test_every_command_and_every_line_of_python_works(folder):
         assert result.returncode == 0, (command, result.stdout, result.stderr)
     for code in blocks("python"):
         subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, check=True, timeout=120)
+
+
+def test_exported_policies_replayed_by_the_readme_s_lines_return_what_the_run_says(folder, monkeypatch):
+    """From the corner, so that there is no luck in an episode. Needs the commands above."""
+    (code,) = [block for block in blocks("python") if "policies.npz" in block]
+    monkeypatch.chdir(folder)
+    names: dict = {}
+    exec(code, names)
+    assert len(names["returns"]) >= 8
+    np.testing.assert_allclose(names["returns"], names["file"]["fitness"], atol=1e-3)
+    names["file"].close()
 
 
 def test_make_targets_exist():

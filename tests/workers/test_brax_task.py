@@ -9,8 +9,8 @@ import pytest
 
 from es_service.errors import ConfigError
 from es_service.noise import Domain, stream_keys
-from es_service.protocol import PolicyShape
-from es_service.tasks import Tasks, with_options
+from es_service.protocol import PolicyShape, with_options
+from es_service.tasks import Tasks
 from tests.examples.ant_slalom import AntSlalom
 from tests.helpers import centre, random_parameters, spec
 from workers.environments import TaskError, brax_parts, brax_task, describe_environment, make_environment, user_task

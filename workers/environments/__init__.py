@@ -14,6 +14,9 @@ class TaskError(Exception):
     """A task that cannot be had; the message says why."""
 
 
+ANT_CLEARANCE = 0.65
+"""Half a wall and the torso's radius, less the tenth of a metre that a wall may give way."""
+
 TASKS: Mapping[str, TaskSpec] = {
     "point_maze": TaskSpec(
         name="point_maze",
@@ -25,6 +28,8 @@ TASKS: Mapping[str, TaskSpec] = {
         final_fitness=True,
         has_goal=True,
         options={"start": ("default", "corner")},
+        walls=(((-0.5, -0.495), (1.0, -0.495)), ((-1.0, 0.205), (0.5, 0.205))),
+        least_reward=-2.3431,  # from the corner (1, -1)
         summary="a point crosses a square behind two walls; the straight way to the goal is blocked twice",
     ),
     "ant_maze": TaskSpec(
@@ -36,6 +41,17 @@ TASKS: Mapping[str, TaskSpec] = {
         descriptor_bounds=((-35.0, 40.0), (-35.0, 40.0)),
         final_fitness=True,
         has_goal=True,
+        walls=(
+            ((-35.0, -35.0), (40.0, -35.0)),
+            ((-35.0, 40.0), (40.0, 40.0)),
+            ((-35.0, -35.0), (-35.0, 40.0)),
+            ((40.0, -35.0), (40.0, 40.0)),
+            ((-15.0, 3.0), (-15.0, 37.0)),
+            ((-16.0, -15.0), (10.0, -15.0)),
+            ((10.0, -35.0), (10.0, 0.0)),
+        ),
+        wall_clearance=ANT_CLEARANCE,
+        least_reward=-95.6,  # from the corner (-35, 40)
         summary="an ant must go round three walls to a goal 60 m away; the straight way ends in a pocket",
     ),
     "ant_trap": TaskSpec(
@@ -47,6 +63,9 @@ TASKS: Mapping[str, TaskSpec] = {
         descriptor_bounds=((0.0, 30.0), (-8.0, 8.0)),
         final_fitness=False,
         has_goal=False,
+        walls=(((12.0, -2.0), (12.0, 2.0)), ((7.0, 3.0), (12.0, 3.0)), ((7.0, -3.0), (12.0, -3.0))),
+        wall_clearance=ANT_CLEARANCE,
+        least_reward=-3.38,  # what the benchmark's own environment says
         summary="an ant is rewarded for running straight into a trap; far ahead is only behind it",
     ),
 }

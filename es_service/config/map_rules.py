@@ -1,0 +1,71 @@
+"""What a config leaves open of the behaviour map, and whether it fits the task's descriptor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from es_service.config.yaml_text import show
+from es_service.protocol import TaskSpec, with_options
+
+OPTIONS = "task.options."
+MOST_AUTO_CELLS = 10_000
+MOST_CELLS = 10_000_000
+CVT_CELLS = 1024
+
+
+def default_cells(kind: str, dimensions: int) -> tuple[int, ...]:
+    """20 x 20 in the plane, 100 on a line; else as many alike as make at most 10,000 cells, but 2. Of cvt 1,024."""
+    if kind == "cvt":
+        return (CVT_CELLS,)
+    each = {1: 100, 2: 20}.get(dimensions) or max(2, int(MOST_AUTO_CELLS ** (1.0 / dimensions) + 1e-9))
+    return (each,) * dimensions
+
+
+def default_qd_offset(values: Mapping[str, Any], task: TaskSpec) -> float:
+    """The least fitness of an episode, where the task names its least reward; else 0."""
+    if task.least_reward is None:
+        return 0.0
+    counted = 1 if values.get("task.fitness") == "final" else values.get("task.episode_steps", task.episode_steps)
+    return task.least_reward * counted
+
+
+def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
+    """Where the map does not fit the descriptor, or the algorithm needs one."""
+    problems = []
+    if values.get("search.algorithm") == "me_es" and values.get("map.enabled", True) is False:
+        problems.append(
+            "map.enabled: false is not allowed for me_es, which draws its parents from the map; must be true"
+        )
+    names = with_options(task, options_of(values)).descriptor_names
+    bounds, cells, kind = values.get("map.bounds"), values.get("map.cells"), values.get("map.kind", "grid")
+    if bounds is not None:
+        if len(bounds) != len(names):
+            problems.append(
+                f"map.bounds: {show(bounds)} has {len(bounds)} pairs; the descriptor has {len(names)} dimensions "
+                f"({', '.join(names)}), so must be a list of {len(names)} pairs [low, high], or auto"
+            )
+        else:
+            problems += [
+                f"map.bounds: {show(pair)} for {name} is not allowed; must be [low, high] with low below high"
+                + (f"; did you mean {show(pair[::-1])}?" if pair[0] > pair[1] else "")
+                for name, pair in zip(names, bounds, strict=True)
+                if not pair[0] < pair[1]
+            ]
+    if cells is not None:
+        wanted = 1 if kind == "cvt" else len(names)
+        if len(cells) != wanted:
+            what = "one number for a cvt" if kind == "cvt" else f"{wanted} numbers, one for each of {', '.join(names)}"
+            problems.append(f"map.cells: {show(cells)} has {len(cells)} numbers; must be {what}, or auto")
+        elif math.prod(cells) > MOST_CELLS:
+            problems.append(
+                f"map.cells: {show(cells)} makes {math.prod(cells):,} cells; must be at most {MOST_CELLS:,}"
+                + ("" if kind == "cvt" else "; with many dimensions use map.kind = cvt")
+            )
+    return problems
+
+
+def options_of(values: Mapping[str, Any]) -> dict[str, str]:
+    """The task options among flat values."""
+    return {key.removeprefix(OPTIONS): value for key, value in values.items() if key.startswith(OPTIONS)}

@@ -1,0 +1,131 @@
+"""`es-service evaluate`: fresh episodes for policies that a run has kept, beside what the run believed of them.
+
+An elite, or a best centre, is the highest of many noisy means: part of its fitness is luck. Episodes that selection has
+never seen tell how much. Every policy gets the same fresh episodes, and the same command again gets them too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.algorithms import ALGORITHMS
+from es_service.config.loading import resume_config
+from es_service.config.model import worker_spec
+from es_service.dispatch.inline_engine import inline_engine
+from es_service.generation import evaluate_centre
+from es_service.protocol import Centre, Evaluator, FloatArray
+from es_service.run_state import best_from_arrays
+from es_service.run_view import Policy, Run
+from es_service.session import TASKS, scheduling_policy, task_of
+from es_service.signals import stop_on_signals
+
+FRESH_GENERATION = 2**40
+"""Of the resets of fresh episodes; no run counts so far."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A policy of a run, and what the run says of it."""
+
+    name: str
+    """best, centre, or the place of its cell."""
+    policy: Policy
+    generation: int
+    """In which it was evaluated."""
+    stored_fitness: float
+    cell: int | None = None
+
+
+@dataclass(frozen=True)
+class Fresh:
+    """What fresh episodes say of a candidate."""
+
+    candidate: Candidate
+    fitness_E: FloatArray
+    descriptor_E_B: FloatArray
+    cell: int | None
+    """Where its mean descriptor lies now; None without a map."""
+
+    @property
+    def mean(self) -> float:
+        """Mean fitness."""
+        return float(self.fitness_E.mean(dtype=np.float64))
+
+    @property
+    def standard_error(self) -> float:
+        """Of the mean: standard deviation (n - 1) over the square root of n; NaN for one episode."""
+        count = self.fitness_E.size
+        return float(self.fitness_E.std(dtype=np.float64, ddof=1) / sqrt(count)) if count > 1 else float("nan")
+
+    @property
+    def descriptor(self) -> NDArray[np.float64]:
+        """Its mean over the episodes, [B]."""
+        return self.descriptor_E_B.mean(axis=0, dtype=np.float64)
+
+    @property
+    def descriptor_std(self) -> NDArray[np.float64]:
+        """Its standard deviation over the episodes, [B]."""
+        return self.descriptor_E_B.std(axis=0, dtype=np.float64)
+
+
+def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[int]], every: bool) -> list[Candidate]:
+    """What is to be evaluated, in this order; every elite in the order of discovery.
+
+    Raises NotInRunError for a cell that is not there or empty, StoreError for a run without any generation.
+    """
+    found = []
+    if best:
+        kept = best_from_arrays(run.parts(wanted=lambda part: part == "best")[1]["best"])
+        found.append(Candidate("best", run.policy("best"), kept.generation, kept.fitness))
+    if centre:
+        last = run.history_rows()[-1]
+        found.append(Candidate("centre", run.policy("centre"), last["generation"], last["centre_fitness_mean"]))
+    if not cells and not every:
+        return found
+    shape, clip = run.policy_shape, run.constants["policy.observation_clip"]
+    if every:
+        map_, elites = run.elites()
+        chosen = zip(range(map_.size), elites, strict=True)
+    else:
+        map_ = run.behaviour_map
+        chosen = [(map_.row_of(run.cell(place)) or 0, run.elite(place)) for place in cells]
+    for row, elite in chosen:
+        cell = int(map_.cell_N[row])
+        policy = Policy(shape, elite.centre_D, elite.observation_mean_O, elite.observation_std_O, clip)
+        name = ",".join(map(str, map_.geometry.index_of(cell)))
+        found.append(Candidate(name, policy, int(map_.generation_N[row]), float(map_.fitness_N[row]), cell))
+    return found
+
+
+def evaluate(run: Run, chosen: Sequence[Candidate], episodes: int, workers: int | None = None) -> Iterator[Fresh]:
+    """Fresh episodes without noise for each candidate, on this machine: results one by one, in order.
+
+    Raises EvaluationError where rollouts cannot go on; Interrupted when asked to stop.
+    """
+    overrides = ["compute.engine=inline", "compute.address=null"]
+    overrides += ["compute.worker_resources.cpu=1", "compute.worker_resources.gpu=0"]
+    overrides += [f"compute.workers={workers or 'auto'}"]
+    config = resume_config(run.config, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+    geometry = run.behaviour_map.geometry if config.map.enabled else None
+    with (
+        stop_on_signals() as should_stop,
+        inline_engine(worker_spec(config, task_of(config)), scheduling_policy(config), should_stop) as engine,
+    ):
+        for candidate in chosen:
+            fitness_E, descriptor_E_B = _episodes(engine, candidate.policy, config.search.sigma, episodes)
+            mean_B = descriptor_E_B.mean(axis=0, dtype=np.float64)
+            cell = None
+            if geometry is not None and np.isfinite(mean_B).all():
+                cell = int(geometry.cells_of(mean_B[None])[0])
+            yield Fresh(candidate, fitness_E, descriptor_E_B, cell)
+
+
+def _episodes(engine: Evaluator, policy: Policy, sigma: float, count: int) -> tuple[FloatArray, FloatArray]:
+    centre = Centre(FRESH_GENERATION, policy.parameters_D, sigma, policy.observation_mean_O, policy.observation_std_O)
+    result = evaluate_centre(engine, centre, count)
+    return result.fitness, result.descriptor

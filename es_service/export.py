@@ -1,0 +1,169 @@
+"""`es-service export`: a run as tables (csv, parquet), as arrays that NumPy alone opens, or as a pyribs archive."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from es_service.config.resolution import did_you_mean, one_of
+from es_service.errors import ConfigError, NotInRunError, StoreError
+from es_service.maps.behaviour_map import BehaviourMap, Elite
+from es_service.maps.geometry import Grid
+from es_service.run_view import Run
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def export(run: Run, to: str, folder: Path) -> list[Path]:
+    """Write a run into `folder`, which is made if need be: the files written, older ones of these names replaced.
+
+    Args:
+        to: a key of FORMATS.
+
+    Raises:
+        ConfigError: no such format, or a package it needs is not installed. NotInRunError: the run has no map to make
+            one of. StoreError: the folder cannot be written.
+    """
+    if to not in FORMATS:
+        raise ConfigError(f"--to {to}: no known format; must be {one_of(FORMATS)}{did_you_mean(to, FORMATS)}")
+    if run.generation is None:
+        raise NotInRunError(f"{run.folder} has no generation yet; `es-service resume {run.folder}` continues it")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return FORMATS[to](run, folder)
+    except OSError as error:
+        raise StoreError(f"cannot write into {folder}: {error.strerror or error}; choose another --out") from error
+
+
+def tables(run: Run) -> dict[str, pd.DataFrame]:
+    """History, novelty archive and, where there is one, the map."""
+    found = {"history": run.history.reset_index(), "novelty": run.novelty}
+    return found | ({"map": run.map} if run.constants["map.enabled"] else {})
+
+
+def arrays(run: Run) -> dict[str, np.ndarray]:
+    """All policies of a run, with what each needs to act: the best centre, the newest one, every elite of the map.
+
+    Names: `widths` of the layers, `observation_clip` (NaN: none); for the best and the newest centre `best_parameters`
+    [D], `best_mean` [O], `best_std` [O], `centre_parameters`, ...; for N elites `cell` [N, dimensions of the map],
+    `fitness` [N], `descriptor` [N, B], `generation` [N], `parameters` [N, D], `mean` [N, O], `std` [N, O], `trace`
+    [N, T, B]. A layer's weights [inputs, outputs] come before its biases, layer after layer.
+    """
+    clip = run.constants["policy.observation_clip"]
+    found: dict[str, Any] = {
+        "widths": np.array(run.policy_shape.widths),
+        "observation_clip": np.array(math.nan if clip is None else clip),
+    }
+    for which in ("best", "centre"):
+        policy = run.policy(which)
+        found |= {
+            f"{which}_parameters": policy.parameters_D,
+            f"{which}_mean": policy.observation_mean_O,
+            f"{which}_std": policy.observation_std_O,
+        }
+    if run.constants["map.enabled"]:
+        map_, elites = run.elites()
+        found |= _map_arrays(map_, elites)
+    return found
+
+
+def ribs_archive(run: Run) -> Any:
+    """The map as a `ribs.archives.GridArchive`: solutions are parameters, measures descriptors, objectives fitness.
+
+    Fields besides: `generation`, `observation_mean`, `observation_std`. A descriptor exactly on an edge may lie in the
+    neighbouring cell there, whose arithmetic is another one.
+
+    Raises:
+        ConfigError: pyribs is not installed. NotInRunError: the run has no map, an empty one, or one that is no grid.
+    """
+    try:
+        from ribs.archives import GridArchive
+    except ImportError as error:
+        raise ConfigError("--to ribs needs pyribs: pip install 'es-service[ribs]', or pip install ribs") from error
+    map_, elites = run.elites()
+    if not isinstance(map_.geometry, Grid):
+        raise NotInRunError(f"the map of {run.folder} is a cvt and no grid, as a GridArchive is; --to npz has it all")
+    if not map_.size:
+        raise NotInRunError(f"the map of {run.folder} is empty")
+    columns = _map_arrays(map_, elites)
+    size = columns["mean"].shape[1]
+    archive = GridArchive(
+        solution_dim=columns["parameters"].shape[1],
+        dims=map_.geometry.shape,
+        ranges=map_.geometry.bounds,
+        qd_score_offset=run.constants["map.qd_offset"],
+        extra_fields={
+            "generation": ((), np.int64),
+            "observation_mean": ((size,), np.float32),
+            "observation_std": ((size,), np.float32),
+        },
+    )
+    low_B, high_B = np.array(map_.geometry.bounds).T
+    archive.add(
+        solution=columns["parameters"],
+        objective=columns["fitness"],
+        measures=np.clip(columns["descriptor"], low_B, high_B),
+        generation=columns["generation"],
+        observation_mean=columns["mean"],
+        observation_std=columns["std"],
+    )
+    return archive
+
+
+def _map_arrays(map_: BehaviourMap, elites: list[Elite]) -> dict[str, np.ndarray]:
+    fields = {"parameters": "centre_D", "mean": "observation_mean_O", "std": "observation_std_O", "trace": "trace_T_B"}
+    return {
+        "cell": np.array([map_.geometry.index_of(int(cell)) for cell in map_.cell_N], np.int64),
+        "fitness": map_.fitness_N,
+        "descriptor": map_.descriptor_N_B,
+        "generation": map_.generation_N,
+        **{name: np.array([getattr(elite, field) for elite in elites]) for name, field in fields.items()},
+    }
+
+
+def _csv(run: Run, folder: Path) -> list[Path]:
+    written = []
+    for name, table in tables(run).items():
+        written.append(folder / f"{name}.csv")
+        table.to_csv(written[-1], index=False, lineterminator="\n")
+    return written
+
+
+def _parquet(run: Run, folder: Path) -> list[Path]:
+    written = []
+    for name, table in tables(run).items():
+        written.append(folder / f"{name}.parquet")
+        try:
+            table.to_parquet(written[-1], index=False)
+        except ImportError as error:
+            raise ConfigError("--to parquet needs pyarrow: pip install 'es-service[parquet]'") from error
+    return written
+
+
+def _npz(run: Run, folder: Path) -> list[Path]:
+    file = folder / "policies.npz"
+    np.savez(file, allow_pickle=False, **arrays(run))
+    return [file]
+
+
+def _ribs(run: Run, folder: Path) -> list[Path]:
+    file = folder / "archive.pickle"
+    archive = ribs_archive(run)
+    with file.open("wb") as stream:
+        pickle.dump(archive, stream)
+    return [file]
+
+
+FORMATS: dict[str, Callable[[Run, Path], list[Path]]] = {
+    "csv": _csv,
+    "parquet": _parquet,
+    "npz": _npz,
+    "ribs": _ribs,
+}
+"""How a run can be written."""

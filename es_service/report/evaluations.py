@@ -1,0 +1,82 @@
+"""What `es-service evaluate` prints: stored and fresh values side by side."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from es_service.errors import StoreError
+from es_service.evaluation import Fresh
+from es_service.run_view import Run
+
+
+def print_evaluations(console: Console, run: Run, results: Iterable[Fresh], file: Path | None) -> None:
+    """A line per policy as it comes, then what it says of the map if all of its elites were asked; perhaps a CSV."""
+    names = run.descriptor_names
+    rows: list[dict[str, Any]] = []
+    found: list[Fresh] = []
+    _line(console, f"{'policy':<10} {'from':>7} {'stored':>10} {'fresh':>10} {'± s.e.':>8}  where (± spread)")
+    for fresh in results:
+        found.append(fresh)
+        rows.append(_row(fresh, names))
+        where = ", ".join(f"{name} {rows[-1][name]:.3g} ± {rows[-1][f'{name}_std']:.2g}" for name in names)
+        one = fresh.candidate
+        _line(
+            console,
+            f"{one.name:<10} {one.generation:>7} {one.stored_fitness:>10.2f} {fresh.mean:>10.2f} "
+            f"{fresh.standard_error:>8.2f}  {where}",
+        )
+    elites = [fresh for fresh in found if fresh.candidate.cell is not None]
+    if len(elites) > 1:
+        _line(console, _about_elites(run, elites))
+    if file is not None:
+        _write(file, rows)
+
+
+def _row(fresh: Fresh, names: list[str]) -> dict[str, Any]:
+    one = fresh.candidate
+    return {
+        "policy": one.name,
+        "generation": one.generation,
+        "episodes": fresh.fitness_E.size,
+        "stored_fitness": one.stored_fitness,
+        "fresh_fitness": fresh.mean,
+        "fresh_standard_error": fresh.standard_error,
+        **{name: float(value) for name, value in zip(names, fresh.descriptor, strict=True)},
+        **{f"{name}_std": float(value) for name, value in zip(names, fresh.descriptor_std, strict=True)},
+    }
+
+
+def _about_elites(run: Run, elites: list[Fresh]) -> str:
+    """Stored and fresh QD-score, and how many elites still end in their cells."""
+    offset = run.constants["map.qd_offset"]
+    stayed = sum(fresh.cell == fresh.candidate.cell for fresh in elites)
+    best: dict[int, float] = {}
+    for fresh in elites:
+        if fresh.cell is not None and math.isfinite(fresh.mean):
+            best[fresh.cell] = max(best.get(fresh.cell, -math.inf), fresh.mean)
+    stored = math.fsum(fresh.candidate.stored_fitness - offset for fresh in elites)
+    again = math.fsum(fitness - offset for fitness in best.values())
+    return (
+        f"{len(elites)} elites: {stayed} still end in their cell on average; put into a new map by their fresh values "
+        f"they fill {len(best)} cells.\nQD-score (offset {offset:g}): {stored:,.0f} stored, {again:,.0f} fresh"
+    )
+
+
+def _write(file: Path, rows: list[dict[str, Any]]) -> None:
+    try:
+        with file.open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    except OSError as error:
+        raise StoreError(f"cannot write {file}: {error.strerror}; choose another --out") from error
+
+
+def _line(console: Console, text: str) -> None:
+    console.print(text, highlight=False, markup=False, soft_wrap=True)

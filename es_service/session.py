@@ -1,0 +1,139 @@
+"""One sitting of a run: its engine starts, the loop works until the budget is spent or somebody stops it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from es_service import driver
+from es_service.algorithms import ALGORITHMS
+from es_service.config.model import RunConfig, policy_shape, worker_spec
+from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log
+from es_service.dispatch.engine import Engine
+from es_service.dispatch.inline_engine import inline_engine
+from es_service.dispatch.messages import Policy as SchedulingPolicy
+from es_service.platform_info import platform_info
+from es_service.protocol import FloatArray, Moments, TaskSpec, with_options
+from es_service.run_state import moments_from_arrays
+from es_service.run_view import Run, open_run
+from es_service.signals import stop_on_signals
+from es_service.statistics import no_observations
+from es_service.store.writer import RunStore
+from es_service.tasks import Tasks
+from workers.actor import WorkerActor
+from workers.policy import initial_parameters
+
+TASKS = Tasks()
+
+OnGeneration = Callable[[Mapping[str, Any]], None]
+"""Called with each history row once it is safe."""
+OnNotice = Callable[[str], None]
+"""Called with what had to be repaired, or what the user should know, as soon as it is known."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a session of a run ended."""
+
+    run: Run
+    reason: str
+    """Which budget was spent, in words."""
+
+
+def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_notice: OnNotice) -> Outcome:
+    """Run the loop until the budget is spent."""
+    task = task_of(config)
+    told = 0
+
+    def tell_notices() -> None:
+        nonlocal told
+        for notice in store.notices[told:]:
+            on_notice(notice)
+        told = len(store.notices)
+
+    tell_notices()
+    platform = platform_info()
+    if config.compute.worker_resources.gpu:
+        platform |= {"device": "gpu"}  # whose bits are others
+    first = 0 if store.generation is None else store.generation + 1
+    if store.record_platform(first, platform) and first:
+        on_notice(f"from generation {first} on this run has another platform: {platform}. Its digest now says `mixed`.")
+    search = driver.Search(
+        config=config,
+        algorithm=ALGORITHMS[config.search.algorithm](config),
+        initial=lambda: _initial(config, store),
+        task=task,
+    )
+    with (
+        dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
+        stop_on_signals() as should_stop,
+        _engine(config, should_stop, log) as engine,
+    ):
+
+        def after_generation(row: Mapping[str, Any]) -> None:
+            log(Committed(row["generation"]))
+            tell_notices()
+            if lost := row["lost_workers"]:
+                who = "a worker" if lost == 1 else f"{lost} workers"
+                on_notice(f"generation {row['generation']}: lost {who}; {engine.last_loss}")
+            on_generation(row)
+
+        _, reason = driver.run(search, engine, store, after_generation)
+    return Outcome(open_run(store.folder), reason)
+
+
+def scheduling_policy(config: RunConfig) -> SchedulingPolicy:
+    """How patient the engine is, and with how many workers."""
+    compute = config.compute
+    return SchedulingPolicy(
+        workers=worker_count(config),
+        max_attempts=compute.max_attempts,
+        start_deadline_s=compute.no_worker_timeout_s / 2,  # two tries fit in
+        first_deadline_s=compute.compile_timeout_s,
+        min_deadline_s=compute.chunk_timeout_s,
+        no_worker_timeout_s=compute.no_worker_timeout_s,
+    )
+
+
+def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) -> Engine[Any]:
+    """What runs the workers, as configured; they are starting."""
+    spec, compute, scheduling = worker_spec(config, task_of(config)), config.compute, scheduling_policy(config)
+    if compute.engine == "inline":
+        return inline_engine(spec, scheduling, should_stop, log=log)
+    from es_service.dispatch.ray_cluster import Claim
+    from es_service.dispatch.ray_engine import ray_engine
+
+    return ray_engine(
+        spec,
+        scheduling,
+        should_stop,
+        actor=WorkerActor,
+        address=compute.address,
+        claim=Claim(compute.worker_resources.cpu, compute.worker_resources.gpu),
+        elastic=compute.workers == "auto",
+        log=log,
+    )
+
+
+def task_of(config: RunConfig) -> TaskSpec:
+    """The task of a run, with the descriptor that its options choose."""
+    return with_options(TASKS[config.task.environment], config.task.options)
+
+
+def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Moments]:
+    """Each member's first centre, and the observation statistics: random ones with none, or all of them the one that
+    the run was created with."""
+    task, members = task_of(config), range(config.search.members)
+    if store.start is not None:
+        return [store.start["centre_D"] for _ in members], moments_from_arrays(store.start)
+    shape = policy_shape(config, task)
+    centres = [initial_parameters(shape, config.policy.init, config.seed, member) for member in members]
+    return centres, no_observations(task.observation_size)
+
+
+def worker_count(config: RunConfig) -> int:
+    """Workers to start: as configured, or one per core this process may use."""
+    workers = config.compute.workers
+    return len(os.sched_getaffinity(0)) if workers == "auto" else workers

@@ -1,0 +1,227 @@
+"""ME-ES from the outside: placement, resume, fork, what can be asked of a finished map, and what cannot."""
+
+from __future__ import annotations
+
+import csv
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from es_service import api
+from es_service.digest import digest_parts
+from es_service.errors import ConfigError, NotInRunError
+from es_service.export import ribs_archive
+from es_service.maps.geometry import Grid
+from tests.system.test_workers import children
+
+CONFIG = {
+    "task": {"environment": "point_maze", "episode_steps": 60, "options": {"start": "corner"}},
+    "policy": {"hidden": [8]},
+    "search": {
+        "algorithm": "me_es",
+        "pairs": 16,
+        "sigma": 0.2,
+        "learning_rate": 0.3,
+        "l2": 0.0,
+        "evaluation_episodes": 4,
+        "block_generations": 4,
+    },
+    "map": {"cells": [16, 16]},
+    "budget": {"generations": 40},
+    "compute": {"engine": "inline", "workers": 1, "chunk_pairs": 4, "gradient_block_pairs": 8},
+}
+
+
+def run(folder: Path, *overrides: str, config=CONFIG, **callbacks):
+    return api.run(api.load_config(config, overrides), folder, **callbacks).run
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    return run(tmp_path_factory.mktemp("me_es") / "run")
+
+
+def command(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "es_service", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_a_map_has_filled_and_blocks_began_in_several_cells(finished):
+    history = finished.history
+    assert history["map_cells"].iloc[-1] == len(finished.map) >= 10
+    assert history["start_cell"].notna().sum() == 10
+    assert history["start_cell"].nunique() >= 4
+    assert set(history["fitness_weight"].iloc[1:]) == {0.0, 1.0}
+    assert history["coverage"].iloc[-1] == history["coverage_reachable"].iloc[-1] == len(finished.map) / 256
+    assert (history["qd_score"].diff().iloc[1:] >= 0).all()
+
+
+@pytest.mark.slow
+def test_two_workers_of_which_one_is_killed(tmp_path, finished):
+    notices = []
+
+    def strike(row):
+        if row["generation"] == 6:
+            threading.Timer(0.002, os.kill, (children()[-1], signal.SIGKILL)).start()
+
+    other = run(tmp_path / "two", "compute.workers=2", on_generation=strike, on_notice=notices.append)
+    assert other.history["lost_workers"].sum() == 1
+    assert digest_parts(tmp_path / "two") == digest_parts(finished.folder)
+
+
+def test_resumed_inside_a_block_and_forked(tmp_path, finished):
+    folder = tmp_path / "stopped"
+    run(folder, "budget.generations=13")
+    api.resume(folder, ["budget.generations=18"])
+    api.fork(folder, ["budget.generations=40"], out=tmp_path / "fork")
+    assert digest_parts(tmp_path / "fork") == digest_parts(finished.folder)
+    api.resume(folder, ["budget.generations=40"])
+    assert digest_parts(folder) == digest_parts(finished.folder)
+
+
+def test_a_fork_with_another_task_begins_with_an_empty_map(tmp_path, finished):
+    changes = ["task.options.start=default", "budget.generations=41"]
+    forked = api.fork(finished.folder, changes, out=tmp_path / "fork").run
+    assert len(forked.map) <= 1
+    with pytest.raises(ConfigError, match=r"map\.cells"):
+        api.fork(finished.folder, ["map.cells=[4, 4]"], out=tmp_path / "other")
+
+
+def test_every_algorithm_fills_the_same_map(tmp_path):
+    one = run(tmp_path / "ns", config=CONFIG | {"search": {"algorithm": "ns_es", "pairs": 16, "members": 3}})
+    assert len(one.map) > 1
+    assert one.history["start_cell"].isna().all()
+    without = run(tmp_path / "none", "map.enabled=false", config=CONFIG | {"search": {"algorithm": "es", "pairs": 16}})
+    assert "map_cells" not in without.history
+    with pytest.raises(NotInRunError, match=r"map\.enabled = false"):
+        _ = without.map
+    assert command("evaluate", without.folder, "--all").returncode == 2
+    assert command("export", without.folder, "--to", "ribs").returncode == 2
+
+
+def test_cvt_maps_run_resume_and_refuse_ribs(tmp_path):
+    whole = run(tmp_path / "whole", "map.kind=cvt", "map.cells=[50]")
+    part = run(tmp_path / "part", "map.kind=cvt", "map.cells=[50]", "budget.generations=7")
+    api.resume(part.folder, ["budget.generations=40"])
+    assert digest_parts(part.folder) == digest_parts(whole.folder)
+    first = int(whole.map["cell"].iloc[0])
+    assert whole.policy(first)(np.zeros(2)).shape == (2,)
+    with pytest.raises(NotInRunError, match="cvt"):
+        ribs_archive(whole)
+
+
+def test_policies_of_cells_and_their_traces(finished):
+    map_ = finished.map
+    place = tuple(map_[["cell_x", "cell_y"]].iloc[-1])
+    elite = finished.elite(place)
+    assert elite.trace_T_B.shape == (61, 2)  # of 60 steps, the start and every one
+    np.testing.assert_allclose(elite.trace_T_B[0], (0.9, -0.9), atol=1e-6)
+    np.testing.assert_allclose(elite.trace_T_B[-1], map_[["x", "y"]].iloc[-1], atol=1e-5)
+    geometry = finished.behaviour_map.geometry
+    assert isinstance(geometry, Grid)
+    assert geometry.index_of(int(geometry.cells_of(elite.trace_T_B[-1:])[0])) == place
+    # The trace is what the policy does: stepping PointMaze with it goes the same way.
+    moved = elite.trace_T_B[1] - elite.trace_T_B[0]
+    np.testing.assert_allclose(moved, finished.policy(place)(elite.trace_T_B[0]) / 10, atol=1e-5)
+
+
+def test_a_cell_that_is_empty_or_not_there_names_the_nearest_filled_one(finished):
+    filled = {tuple(row) for row in finished.map[["cell_x", "cell_y"]].to_numpy().tolist()}
+    empty = next((i, j) for i in range(16) for j in range(16) if (i, j) not in filled)
+    near = min(filled, key=lambda cell: (cell[0] - empty[0]) ** 2 + (cell[1] - empty[1]) ** 2)
+    distance = (near[0] - empty[0]) ** 2 + (near[1] - empty[1]) ** 2
+    for place, what in ((empty, "is empty"), ((16, 0), "is not in the map"), ((1, 2, 3), "is not in the map")):
+        with pytest.raises(NotInRunError, match=what) as error:
+            finished.policy(place)
+        named = tuple(int(i) for i in str(error.value).rsplit(" ", 1)[1].split(","))
+        assert named in filled
+        if place == empty:
+            assert (named[0] - empty[0]) ** 2 + (named[1] - empty[1]) ** 2 == distance
+
+
+def test_evaluate_puts_fresh_values_beside_stored_ones(tmp_path, finished):
+    file = tmp_path / "rows.csv"
+    result = command("evaluate", finished.folder, "--best", "--centre", "--all", "--episodes", 5, "--out", file)
+    assert result.returncode == 0, result.stderr
+    rows = list(csv.DictReader(file.read_text().splitlines()))
+    assert len(rows) == 2 + len(finished.map)
+    assert [row["policy"] for row in rows[:2]] == ["best", "centre"]
+    # From one corner and without noise, fresh episodes are the old ones.
+    for row, fitness in zip(rows[2:], finished.map["fitness"], strict=True):
+        assert float(row["stored_fitness"]) == fitness
+        assert float(row["fresh_fitness"]) == pytest.approx(fitness, abs=1e-3)
+        assert float(row["fresh_standard_error"]) == pytest.approx(0.0, abs=1e-4)
+    assert f"{len(finished.map)} elites: {len(finished.map)} still end in their cell" in result.stdout
+    one = ",".join(map(str, finished.map[["cell_x", "cell_y"]].iloc[0]))
+    assert command("evaluate", finished.folder, "--cell", one).returncode == 0
+    for wrong, message in (("99,0", "is not in the map"), ("a", "whole numbers")):
+        result = command("evaluate", finished.folder, "--cell", wrong)
+        assert result.returncode == 2
+        assert message in result.stderr
+
+
+def test_fresh_episodes_differ_from_those_that_chose(tmp_path):
+    luck = run(tmp_path / "luck", "task.options.start=default")
+    rows = tmp_path / "rows.csv"
+    assert command("evaluate", luck.folder, "--all", "--episodes", 32, "--out", rows).returncode == 0
+    table = pd.read_csv(rows)
+    assert (table["fresh_fitness"] != table["stored_fitness"]).all()
+    far = (table["fresh_fitness"] - table["stored_fitness"]).abs() / table["fresh_standard_error"]
+    assert far.median() < 5, "and are of the same policies"
+    again = tmp_path / "again.csv"
+    command("evaluate", luck.folder, "--all", "--episodes", 32, "--out", again, "--workers", 1)
+    assert again.read_text() == rows.read_text()
+
+
+def test_exports_hold_what_the_run_holds(tmp_path, finished):
+    for to in ("csv", "parquet", "npz", "ribs"):
+        result = command("export", finished.folder, "--to", to, "--out", tmp_path)
+        assert result.returncode == 0, result.stderr
+    for read, ending in ((pd.read_csv, "csv"), (pd.read_parquet, "parquet")):
+        pd.testing.assert_frame_equal(read(tmp_path / f"map.{ending}"), finished.map)
+        history = read(tmp_path / f"history.{ending}").set_index("generation")
+        pd.testing.assert_frame_equal(history, finished.history, check_dtype=False)
+    with np.load(tmp_path / "policies.npz") as arrays:
+        assert arrays["widths"].tolist() == [2, 8, 2]
+        assert arrays["cell"].tolist() == finished.map[["cell_x", "cell_y"]].to_numpy().tolist()
+        np.testing.assert_array_equal(arrays["fitness"], finished.map["fitness"])
+        np.testing.assert_array_equal(arrays["best_parameters"], finished.policy("best").parameters_D)
+        elite = finished.elite(arrays["cell"][3])
+        np.testing.assert_array_equal(arrays["parameters"][3], elite.centre_D)
+        np.testing.assert_array_equal(arrays["trace"][3], elite.trace_T_B)
+    result = command("export", finished.folder, "--to", "pdf")
+    assert result.returncode == 2
+    assert "must be csv, parquet, npz or ribs" in result.stderr
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_ribs_archive_opens_and_plots(tmp_path, finished):
+    ribs_visualize = pytest.importorskip("ribs.visualize")
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    assert command("export", finished.folder, "--to", "ribs", "--out", tmp_path).returncode == 0
+    with (tmp_path / "archive.pickle").open("rb") as file:
+        archive = pickle.load(file)
+    assert archive.stats.num_elites == len(finished.map)
+    assert archive.stats.obj_max == pytest.approx(finished.map["fitness"].max())
+    assert archive.stats.qd_score == pytest.approx(finished.history["qd_score"].iloc[-1])
+    ribs_visualize.grid_archive_heatmap(archive)
+    plt.savefig(tmp_path / "heatmap.png")
+    plt.close()
+    assert (tmp_path / "heatmap.png").stat().st_size > 1000
