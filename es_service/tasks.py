@@ -73,6 +73,7 @@ def _task_spec(fields: dict) -> TaskSpec:
         | {
             "descriptor_names": tuple(fields["descriptor_names"]),
             "descriptor_bounds": bounds(fields["descriptor_bounds"]),
+            "walls": None if fields["walls"] is None else tuple(bounds(wall) for wall in fields["walls"]),
             "options": {name: tuple(values) for name, values in fields["options"].items()},
             "descriptors": {
                 name: (tuple(names), bounds(pairs)) for name, (names, pairs) in fields["descriptors"].items()

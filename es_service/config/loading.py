@@ -247,11 +247,11 @@ def _value_problems(values: Mapping[str, Any]) -> dict[str, str]:
     try:
         RunConfig.model_validate(_nested(values))
     except ValidationError as error:
-        found = [item["loc"] for item in error.errors(include_url=False) if item["type"] != "missing"]
+        found = [item["loc"] for item in error.errors(include_url=False)]
     else:
         return {}
     # A location goes deeper than our keys where a value has parts: ("policy", "hidden", 1).
-    names = {next(n for k in range(len(loc), 0, -1) if (n := ".".join(map(str, loc[:k]))) in values) for loc in found}
+    names = {n for loc in found for k in range(len(loc)) if (n := ".".join(map(str, loc[: k + 1]))) in values}
     return {name: _bad_value(name, value) for name, value in values.items() if name in names}
 
 

@@ -84,6 +84,20 @@ def file(tmp_path):
         ("compute.workers=0", "0 ... must be auto or a whole number, at least 1"),
         ("compute.chunk_pairs=half", "half ... must be auto or a whole number"),
         ("search.init_from=/no/such/run", "/no/such/run does not exist; must be the folder of another run"),
+        ("map.kind=gird", "gird ... must be grid or cvt; did you mean grid?"),
+        ("map.bounds=3", "3 ... must be auto or a list of pairs [low, high], such as [[-1, 1], [-1, 1]]"),
+        ("map.bounds=[[0, 1], [0, .inf]]", "[[0, 1], [0, .inf]] is not allowed"),
+        ("map.bounds=[[0, 1], [a, 1]]", "[[0, 1], [a, 1]] is not allowed"),
+        ("map.bounds=[[0, 1], [1]]", "[[0, 1], [1]] is not allowed"),
+        ("map.bounds=[[0, 1]]", "[[0, 1]] has 1 pairs; the descriptor has 2 dimensions (x, y), so must be a list of"),
+        ("map.bounds=[[0, 1], [3, -2]]", "[3, -2] for y ... must be [low, high] with low below high; did you mean"),
+        ("map.cells=[20]", "[20] has 1 numbers; must be 2 numbers, one for each of x, y, or auto"),
+        ("map.cells=[20, 0]", "[20, 0] ... must be auto or a list of whole numbers, each at least 1"),
+        ("map.cells=[]", "[] ... must be auto or a list of whole numbers"),
+        ("map.cells=20", "20 ... must be auto or a list of whole numbers"),
+        ("map.cells=[2.5, 3]", "[2.5, 3] is not allowed"),
+        ("map.cells=[9999, 9999]", "[9999, 9999] makes 99,980,001 cells; must be at most 10,000,000; with many dim"),
+        ("map.qd_offset=low", "low ... must be auto or a number"),
         ("compute.rollout_block_pairs=24", "24 does not divide compute.chunk_pairs (64); try 16 or 32"),
         ("compute.gradient_block_pairs=513", "513 is more than search.pairs (512); try 512"),
     ],
@@ -253,3 +267,13 @@ def test_config_errors_survive_pickling():
     with pytest.raises(ConfigError) as caught:
         load(MINIMAL, "search.sgima=1")
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+
+
+def test_a_map_that_does_not_fit_the_algorithm_or_its_kind_is_refused():
+    assert problems(MINIMAL, "map.kind=cvt", "map.cells=[20, 20]") == [
+        "map.cells: [20, 20] has 2 numbers; must be one number for a cvt, or auto"
+    ]
+    with pytest.raises(ConfigError) as caught:
+        load_config(MINIMAL, ["search.algorithm=me_es", "map.enabled=false"], tasks=TASKS, algorithms=("me_es",))
+    (line,) = (line.strip() for line in str(caught.value).splitlines()[1:])
+    assert line.startswith("map.enabled: false is not allowed for me_es, which draws its parents from the map; must be")

@@ -13,14 +13,17 @@
         def descriptor(self, state): ...   # -> descriptor [len(descriptor_names)] of an episode that ends here
 
 and may have: `goal_distance(self, state)`; `final_fitness = True` where the last reward says how well the whole episode
-went; `options = {"name": ("default", "other")}`, keywords of its constructor, which must not change any size; a
-docstring, whose first line `es-service` shows. All methods are pure functions that JAX can trace, of one state: they
-are batched and compiled for you. `es_service.noise.uniforms(key, counters)` makes random numbers.
+went; `options = {"name": ("default", "other")}`, keywords of its constructor, which must not change any size; where the
+descriptor is a place in the plane, `walls`, a tuple of segments ((x, y), (x, y)), and `wall_clearance`, how near to one
+nothing comes, for the map's coverage of what can be reached; `least_reward`, from which QD-scores count; a docstring,
+whose first line `es-service` shows. All methods are pure functions that JAX can trace, of one state: they are batched
+and compiled for you. `es_service.noise.uniforms(key, counters)` makes random numbers.
 """
 
 from __future__ import annotations
 
 import importlib
+import math
 import os
 import sys
 from collections.abc import Mapping
@@ -61,6 +64,9 @@ def describe(path: str) -> TaskSpec:
         names, bounds = len(task.descriptor_names), len(task.descriptor_bounds)
         if names != bounds or not names:
             wrong.append(f"{names} descriptor_names but {bounds} descriptor_bounds")
+        wrong += _wrong_pairs(task.descriptor_bounds)
+        if not _are_walls(getattr(task, "walls", None)):
+            wrong.append(f"walls = {task.walls!r} is no tuple of segments ((x, y), (x, y))")
         sizes = {name: getattr(task, name) for name, kind in ATTRIBUTES.items() if kind is int}
         wrong += [f"{name} = {size} is not positive" for name, size in sizes.items() if size < 1]
     if wrong:
@@ -77,7 +83,27 @@ def describe(path: str) -> TaskSpec:
         has_goal=hasattr(task, "goal_distance"),
         options={name: tuple(values) for name, values in getattr(task, "options", {}).items()},
         summary=(task.__doc__ or "").strip().partition("\n")[0],
+        walls=getattr(task, "walls", None),
+        wall_clearance=float(getattr(task, "wall_clearance", 0.0)),
+        least_reward=getattr(task, "least_reward", None),
     )
+
+
+def _wrong_pairs(bounds: tuple) -> list[str]:
+    return [
+        f"descriptor_bounds: {pair!r} is no pair (low, high) of finite numbers, low below high"
+        for pair in bounds
+        if not (_are_finite(pair) and len(pair) == 2 and pair[0] < pair[1])
+    ]
+
+
+def _are_walls(walls: Any) -> bool:
+    ends: list[Any] = [end for wall in walls or () for end in (wall if len(wall) == 2 else (None,))]
+    return all(_are_finite(end) and len(end) == 2 for end in ends)
+
+
+def _are_finite(numbers: Any) -> bool:
+    return isinstance(numbers, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in numbers)
 
 
 def _check_shapes(path: str) -> None:

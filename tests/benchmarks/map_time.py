@@ -1,0 +1,166 @@
+"""What does a full map cost the driver? ME-ES with 10,000 members and 50 x 50 cells, all of them filled by hand.
+
+    python -m tests.benchmarks.map_time                # needs 2 GB of disk for a minute or two
+
+Rollouts are made up, so that what is left is the driver and the store, in one process. In the worst case every
+generation's centre enters the map. Medians of 200 generations, or 100 for the ant's policy; without a map beside it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import multiprocessing
+import resource
+import tempfile
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from es_service import api, driver
+from es_service.algorithms import ALGORITHMS
+from es_service.config.model import policy_shape
+from es_service.history import history_columns
+from es_service.maps.behaviour_map import Elite, cell_part, elite_part, elite_to_arrays
+from es_service.protocol import DispatchCounts, EpisodesResult, GradientChunk, GradientResult, TrainingChunk
+from es_service.run_state import Arrays
+from es_service.session import task_of
+from es_service.statistics import no_observations
+from es_service.store.beginning import Beginning
+from es_service.store.folder import DATABASE
+from es_service.store.schema import RunMeta
+from es_service.store.writer import RunStore
+from tests.helpers import MemoryStore
+
+CELLS = (50, 50)
+
+
+class Inventing:
+    """Answers every chunk at once: centres end anywhere and are better each time, so that each enters the map."""
+
+    counts = DispatchCounts()
+
+    def __init__(self, parameters: int, observations: int, bounds: Any, chunk_pairs: int) -> None:
+        self._sum_D = np.ones(parameters, np.float32)
+        self._none, self._bounds, self._pairs = no_observations(observations), np.array(bounds).T, chunk_pairs
+        self._rng, self._centres = np.random.default_rng(0), 0
+
+    def evaluate(self, centre, chunks):
+        place_2 = self._rng.uniform(*self._bounds)
+        self._centres += isinstance(chunks[0], GradientChunk)
+        return [self._answer(chunk, place_2) for chunk in chunks]
+
+    def _answer(self, chunk, place_2):
+        if isinstance(chunk, GradientChunk):
+            return GradientResult(self._sum_D)
+        training = isinstance(chunk, TrainingChunk)
+        axes = (self._pairs, 2) if training else (16,)
+        fitness = self._rng.normal(size=axes).astype(np.float32) if training else np.full(axes, self._centres, "f4")
+        spread = self._rng.normal(size=(*axes, 2)) * (0.1 if training else 0.0)
+        descriptor = (place_2 + spread).astype(np.float32)
+        trace = None if training else np.zeros((64, 2), np.float32)
+        return EpisodesResult(fitness, fitness, descriptor, np.full(axes, 200, np.int32), descriptor, self._none, trace)
+
+
+def filled(parts: dict[str, Arrays], parameters: int, observations: int) -> dict[str, Arrays]:
+    """The parts of generation 0 with an elite in every cell."""
+    rng = np.random.default_rng(1)
+    known = [name for name in parts if name.startswith("cell_")]
+    first = dict(parts[known[0]])
+    for cell in range(CELLS[0] * CELLS[1]):
+        if cell_part(cell) not in parts:
+            order = np.asarray(sum(name.startswith("cell_") for name in parts), np.int64)
+            parts[cell_part(cell)] = first | {"order": order, "fitness": np.asarray(-1e6)}
+            numbers = rng.normal(size=parameters).astype(np.float32)
+            zeros, ones = np.zeros(observations, np.float32), np.ones(observations, np.float32)
+            parts[elite_part(cell)] = elite_to_arrays(Elite(numbers, zeros, ones, np.zeros((64, 2), np.float32)))
+    return parts
+
+
+def prepared(environment: str, hidden: list[int], algorithm: str, generations: int, enabled: bool) -> tuple[Any, ...]:
+    """(config, search, invented rollouts) of a case."""
+    config = api.load_config(
+        {
+            "task": {"environment": environment},
+            "policy": {"hidden": hidden},
+            "search": {"algorithm": algorithm, "pairs": 5000},
+            "map": {"cells": CELLS, "enabled": enabled},
+            "budget": {"generations": generations},
+        }
+    )
+    task, shape = task_of(config), policy_shape(config, task_of(config))
+    initial = [np.zeros(shape.parameters, np.float32)], no_observations(task.observation_size)
+    search = driver.Search(config, ALGORITHMS[algorithm](config), lambda: initial, task)
+    size = shape.parameters, task.observation_size, task.descriptor_bounds, config.compute.chunk_pairs
+    return config, search, Inventing(*size)
+
+
+def fill(place: Path, *case: Any) -> None:
+    """Create the run of a case, after generation 0, its map full."""
+    config, search, invented = prepared(*case)
+    memory = MemoryStore()
+    with contextlib.suppress(_Enough):
+        driver.run(search, invented, memory, _stop)
+    parts = memory.parts
+    if config.map.enabled:
+        parts = filled(parts, policy_shape(config, search.task).parameters, search.task.observation_size)
+    columns = history_columns(search.task, config.map.enabled)
+    meta = RunMeta("benchmark", "", config.model_dump(mode="json"), config.constants(), asdict(search.task), columns)
+    beginning = Beginning(history=[memory.rows[0]], parts=parts)
+    RunStore.create(place, config.resolved_yaml(), meta, beginning).close()
+
+
+def measure(place: Path, *case: Any) -> dict[str, Any]:
+    """Go on with the run of a case, in this process."""
+    config, search, invented = prepared(*case)
+    rows: list[dict[str, Any]] = []
+    sizes: list[int] = []
+    started = time.perf_counter()
+    with RunStore.open(place) as store:
+        opened_s = time.perf_counter() - started
+        upkeep = store.upkeep.after_commit
+        store.upkeep.after_commit = lambda log_bytes: (sizes.append(log_bytes), upkeep(log_bytes))[1]
+        driver.run(search, invented, store, rows.append)
+    driver_ms, store_ms = (
+        round(float(np.median([row[f"seconds_{part}"] for row in rows[5:]])) * 1e3, 2) for part in ("driver", "store")
+    )
+    return {
+        "task": config.task.environment,
+        "algorithm": config.search.algorithm,
+        "map": config.map.enabled,
+        "driver_ms": driver_ms,
+        "store_ms": store_ms,
+        "store_kb_per_generation": round(float(np.median(sizes)) / 1e3),
+        "entered_percent": round(100 * np.mean([row["cell"] is not None for row in rows])) if config.map.enabled else 0,
+        "open_s": round(opened_s, 2),
+        "run_db_mb": round((place / DATABASE).stat().st_size / 1e6),
+        "peak_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+    }
+
+
+class _Enough(Exception):  # noqa: N818 (ends a loop)
+    """Generation 0 is done."""
+
+
+def _stop(row: object) -> None:
+    raise _Enough
+
+
+def main() -> None:
+    context = multiprocessing.get_context("spawn")
+    for environment, hidden, generations in (("point_maze", [64, 64], 200), ("ant_maze", [256, 256], 100)):
+        for algorithm, enabled in (("es", False), ("es", True), ("me_es", True)):
+            case = environment, hidden, algorithm, generations, enabled
+            with tempfile.TemporaryDirectory() as folder:
+                place = Path(folder) / "run"
+                for step in (fill, measure):  # each in a process of its own, for its own peak of memory
+                    with context.Pool(1) as pool:
+                        found = pool.apply(step, (place, *case))
+                print(json.dumps(found), flush=True)
+
+
+if __name__ == "__main__":
+    main()
