@@ -54,9 +54,10 @@ def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group
         "env steps": lambda row: _short(row["env_steps"]),
         "steps/s": lambda row: _short(row["steps_per_second"]),
         "population median": lambda row: _number(row["population_fitness_median"]),
+        "cells": lambda row: str(row.get("map_cells", "-")),
         "invalid": lambda row: str(row["invalid_members"]),
     }
-    shown = [name for name, least in zip(columns, (0, 0, 45, 60, 75, 100, 110), strict=True) if width >= least]
+    shown = [name for name, least in zip(columns, (0, 0, 45, 60, 75, 100, 108, 118), strict=True) if width >= least]
     table = Table(title=title, title_justify="left", header_style="bold")
     for name in shown:
         table.add_column(name, justify="right", no_wrap=True)

@@ -56,6 +56,7 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
     program = "es-service" if shutil.which("es-service") else sys.argv[0]  # `make run` has it in .venv/bin only
     for command in (
         f"status {folder}",
+        f"evaluate {folder}",
         f"digest {folder}",
         f"resume {folder} {twice}",
         f"fork {folder} --set search.sigma={run.constants['search.sigma'] * 2:g} {twice}",
@@ -68,6 +69,9 @@ def _progress(rows: list[dict[str, Any]]) -> dict[str, str]:
     goal = {}
     if "goal_distance" in last:
         goal["goal distance"] = f"{last['goal_distance']:.3f} at the end, {last['goal_distance_min']:.3f} at its least"
+    filled = {}
+    if "map_cells" in last:
+        filled["map"] = f"{last['map_cells']:,} cells, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
     lost, retries = (sum(row[name] for row in rows) for name in ("lost_workers", "retries"))
     faults = {"faults survived": f"{lost} workers replaced, {retries} chunks run again"} if lost or retries else {}
@@ -76,6 +80,7 @@ def _progress(rows: list[dict[str, Any]]) -> dict[str, str]:
         "best fitness": f"{last['best_fitness']:.2f}",
         "centre fitness": f"{last['centre_fitness_mean']:.2f} ± {last['centre_fitness_std']:.2f}",
         **goal,
+        **filled,
         "novelty archive": f"{last['archive_size']:,} centres",
         "weight of fitness": f"{last['fitness_weight']:g} (novelty: {1.0 - last['fitness_weight']:g})",
         "environment steps": f"{last['env_steps']:,} in {last['episodes']:,} episodes",

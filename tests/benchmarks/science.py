@@ -4,14 +4,16 @@
     python -m tests.benchmarks.science --methods nsra_es --seeds 100 --env-steps 100_000_000 \\
         --set search.sigma=0.1                         # a trial: printed only
 
-Without --set, each finished run becomes a line of results/point_maze_runs.jsonl, runs that have one are not repeated
-(delete the file to begin again), and in the end results/point_maze.csv (a row per run) and results/point_maze.png are
-written from it. One run per core, each with one worker: the engine and the number of workers change no result.
+Of runs with the usual seeds, steps and settings each finished one becomes a line of results/point_maze_runs.jsonl.gz;
+those that have one are not repeated (delete the file to begin again). In the end results/point_maze.csv, a row per run,
+and results/point_maze.png are written from it. One run per core, each with one worker: the engine and the number of
+workers change no result.
 """
 
 from __future__ import annotations
 
 import argparse
+import gzip
 import json
 import os
 import tempfile
@@ -30,7 +32,7 @@ from es_service.run_view import Policy, Run
 from tests.benchmarks import science_picture
 
 RESULTS = Path(__file__).parent / "results"
-RUNS = RESULTS / "point_maze_runs.jsonl"
+RUNS = RESULTS / "point_maze_runs.jsonl.gz"
 CONFIGS = Path(__file__).parents[2] / "configs"
 METHODS: dict[str, tuple[str, ...]] = {
     "es": (),
@@ -42,6 +44,7 @@ METHODS: dict[str, tuple[str, ...]] = {
     "me_es exploit": ("search.mode=exploit",),
 }
 """Name, of which the first word is that of the algorithm and its config -> settings besides the config's."""
+SEEDS, ENV_STEPS = range(5), 500_000_000
 CHAMBER_EDGES = (-0.495, 0.205)
 """y that separates the first chamber (start), the second (dead end) and the third (goal): the middles of the walls."""
 SOLVED = -30.0
@@ -153,7 +156,7 @@ def quartiles(table: pd.DataFrame) -> pd.DataFrame:
 
 def kept_runs() -> list[dict[str, Any]]:
     """What is known, in the order of METHODS and seeds."""
-    lines = RUNS.read_text().splitlines() if RUNS.exists() else []
+    lines = gzip.decompress(RUNS.read_bytes()).splitlines() if RUNS.exists() else []
     found = [json.loads(line) for line in lines]
     return sorted(found, key=lambda one: (list(METHODS).index(one["row"]["method"]), one["row"]["seed"]))
 
@@ -161,11 +164,11 @@ def kept_runs() -> list[dict[str, Any]]:
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(range(5)))
-    parser.add_argument("--env-steps", type=int, default=500_000_000)
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument("--env-steps", type=int, default=ENV_STEPS)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     arguments = parser.parse_args()
-    trial = bool(arguments.set)
+    trial = bool(arguments.set) or arguments.env_steps != ENV_STEPS or not set(arguments.seeds) <= set(SEEDS)
     known = set() if trial else {(one["row"]["method"], one["row"]["seed"]) for one in kept_runs()}
     cores = len(os.sched_getaffinity(0))
     with ProcessPoolExecutor(cores, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
@@ -180,7 +183,7 @@ def main() -> None:
             found.append(future.result())
             print(json.dumps(found[-1]["row"]), flush=True)
             if not trial:
-                with RUNS.open("a") as file:
+                with gzip.open(RUNS, "at") as file:
                     file.write(json.dumps(found[-1], separators=(",", ":")) + "\n")
     found = found if trial else kept_runs()
     table = pd.DataFrame([one["row"] for one in found])
