@@ -1,4 +1,4 @@
-"""The Python interface, and with the command line the one place that joins the driver's side and the workers' side."""
+"""The Python interface: start a run, go on with it, fork it."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from es_service.config.model import RunConfig, changed_constants, describe_chang
 from es_service.errors import ConfigError, StoreError
 from es_service.history import history_columns
 from es_service.maps.behaviour_map import ELITE_PREFIX
+from es_service.protocol import Moments
 from es_service.run_state import moments_from_arrays, moments_to_arrays, without_elites
 from es_service.run_view import Run, open_run
 from es_service.session import TASKS, OnGeneration, OnNotice, Outcome, task_of, work
@@ -28,6 +29,8 @@ from es_service.store.folder import DATABASE, explained, write_config
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook
 
+OBSERVED = ("policy.observation_clip", "policy.observation_normalization")
+"""What a policy does with its observations."""
 MAP_GEOMETRY = ("map.enabled", "map.kind", "map.bounds", "map.cells")
 """What the state of a map depends on."""
 RUNS_FOLDER = Path("runs")
@@ -161,8 +164,8 @@ def fork(
     """Start a new run from another run's state (the newest, or that of `generation` if it is kept), settings changed.
 
     The history up to there comes along and generations count on, so a fork that changes nothing ends with the same
-    bits as its parent would. Where a setting of the task changes, fitness no longer means the same, so the best centre
-    so far no longer counts as one, and the map begins empty.
+    bits as its parent would. Where a setting changes what an evaluation means, of the task or of how observations are
+    normalised, the best centre so far no longer counts as one, and the map begins empty.
 
     Raises:
         ConfigError: a change that the state does not fit (another task, network or algorithm). StoreError: the
@@ -170,7 +173,8 @@ def fork(
     """
     origin, config = open_run(parent), fork_config(parent, overrides)
     at, parts = origin.parts(generation)
-    if any(name.startswith("task.") for name, _, _ in changed_constants(origin.constants, config.constants())):
+    changed = {name for name, _, _ in changed_constants(origin.constants, config.constants())}
+    if any(name in OBSERVED or name.startswith("task.") for name in changed - {"task.episodes_per_member"}):
         parts = without_elites(parts) | {"best": parts["best"] | {"fitness": np.asarray(-np.inf)}}
     history = [row for row in origin.history_rows() if row["generation"] <= at]
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
@@ -194,6 +198,8 @@ def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -
         )
     mapping = {name: dict(section) if isinstance(section, dict) else section for name, section in origin.config.items()}
     mapping["search"]["init_from"] = None  # it has the parent's state instead
+    if {"task.fitness", "task.episode_steps"} & set(keys):
+        mapping["map"]["qd_offset"] = "auto"  # which follows from them; unless it is set as well
     if "search.pairs" in keys:
         for shape in ("chunk_pairs", "rollout_block_pairs", "gradient_block_pairs"):
             mapping["compute"][shape] = "auto"
@@ -257,10 +263,12 @@ def _start_from(config: RunConfig, folder: str) -> tuple[dict[str, Any], Beginni
             f"this run's has {list(shape.widths)}; use the same task and policy.hidden"
         )
     at, parts = origin.parts(wanted=lambda part: not part.startswith(ELITE_PREFIX))
-    start = {
-        "centre_D": origin.newest_member(at, parts).centre_D,
-        **moments_to_arrays(moments_from_arrays(parts["observations"])),
-    }
+    member, moments = origin.newest_member(at, parts), moments_from_arrays(parts["observations"])
+    if member.own_mean_O is not None and member.own_std_O is not None:
+        # Those that its policy runs with, as if that many observations had given them.
+        mean_O, std_O = member.own_mean_O.astype(np.float64), member.own_std_O.astype(np.float64)
+        moments = Moments(moments.count, mean_O, moments.count * np.square(std_O))
+    start = {"centre_D": member.centre_D, **moments_to_arrays(moments)}
     return _lineage(origin, at), Beginning(start=start)
 
 

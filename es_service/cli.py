@@ -168,17 +168,20 @@ def evaluate(
 ) -> None:
     """Run fresh episodes of what a run has found, beside what it believed of it."""
     from es_service import evaluation
-    from es_service.report.evaluations import print_evaluations
+    from es_service.report.evaluations import csv_file, print_evaluations
 
+    if every and cell:
+        raise ConfigError("--all has every cell already; give --all or --cell")
     found = api.open_run(folder)
     chosen = evaluation.candidates(
         found,
         best=best or not (centre or cell or every),
         centre=centre,
-        cells=[_place(text) for text in cell or ()],
+        cells=list(dict.fromkeys(_place(text) for text in cell or ())),
         every=every,
     )
-    print_evaluations(console, found, evaluation.evaluate(found, chosen, episodes, workers), out)
+    with csv_file(out) as rows:
+        print_evaluations(console, found, evaluation.evaluate(found, chosen, episodes, workers), rows, every=every)
 
 
 @app.command()

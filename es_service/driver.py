@@ -264,8 +264,9 @@ def _centre(
 def _entered(state: SearchState, member: int, centre: Centre, evaluation: EpisodesResult) -> dict[int, Elite]:
     """The centre just evaluated as an elite, by its cell, if it entered the map."""
     cell = state.members[member].cell
-    if cell == NO_CELL or evaluation.trace_T_B is None:
+    if cell == NO_CELL:
         return {}
+    assert evaluation.trace_T_B is not None, "an evaluation has a trace"
     return {cell: make_elite(centre, evaluation.trace_T_B)}
 
 

@@ -17,6 +17,7 @@ from es_service.algorithms import ALGORITHMS
 from es_service.config.loading import resume_config
 from es_service.config.model import worker_spec
 from es_service.dispatch.inline_engine import inline_engine
+from es_service.errors import NotInRunError
 from es_service.generation import evaluate_centre
 from es_service.protocol import Centre, Evaluator, FloatArray
 from es_service.run_state import best_from_arrays
@@ -74,29 +75,33 @@ class Fresh:
 
 
 def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[int]], every: bool) -> list[Candidate]:
-    """What is to be evaluated, in this order; every elite in the order of discovery.
+    """What is to be evaluated, in this order; cells as often as they are named, every elite in the order of discovery.
 
-    Raises NotInRunError for a cell that is not there or empty, StoreError for a run without any generation.
+    Each is read as of one generation, also while a driver is writing.
+
+    Raises NotInRunError for a cell that is not there or empty, for `every` of an empty map, and for a run without any
+    generation.
     """
+    if run.generation is None:
+        raise NotInRunError(f"{run.folder} has no generation yet; `es-service resume {run.folder}` continues it")
     found = []
     if best:
         kept = best_from_arrays(run.parts(wanted=lambda part: part == "best")[1]["best"])
-        found.append(Candidate("best", run.policy("best"), kept.generation, kept.fitness))
+        policy = run.policy_of(kept.centre_D, kept.observation_mean_O, kept.observation_std_O)
+        found.append(Candidate("best", policy, kept.generation, kept.fitness))
     if centre:
-        last = run.history_rows()[-1]
-        found.append(Candidate("centre", run.policy("centre"), last["generation"], last["centre_fitness_mean"]))
+        at, policy = run.newest_policy()
+        found.append(Candidate("centre", policy, at, run.history_rows(at)[0]["centre_fitness_mean"]))
     if not cells and not every:
         return found
-    shape, clip = run.policy_shape, run.constants["policy.observation_clip"]
-    if every:
-        map_, elites = run.elites()
-        chosen = zip(range(map_.size), elites, strict=True)
-    else:
-        map_ = run.behaviour_map
-        chosen = [(map_.row_of(run.cell(place)) or 0, run.elite(place)) for place in cells]
-    for row, elite in chosen:
-        cell = int(map_.cell_N[row])
-        policy = Policy(shape, elite.centre_D, elite.observation_mean_O, elite.observation_std_O, clip)
+    wanted = None if every else [run.cell(place) for place in cells]
+    map_, elites = run.elites(wanted)
+    if not elites:
+        raise NotInRunError(f"the map of {run.folder} is empty")
+    for cell in map_.cell_N.tolist() if wanted is None else wanted:
+        row, elite = map_.row_of(cell), elites[cell]
+        assert row is not None
+        policy = run.policy_of(elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
         name = ",".join(map(str, map_.geometry.index_of(cell)))
         found.append(Candidate(name, policy, int(map_.generation_N[row]), float(map_.fitness_N[row]), cell))
     return found

@@ -14,10 +14,14 @@ from es_service.config.resolution import did_you_mean, one_of
 from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.maps.behaviour_map import BehaviourMap, Elite
 from es_service.maps.geometry import Grid
-from es_service.run_view import Run
+from es_service.run_view import Run, map_places
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+RIBS_MARGIN = 2e-6
+"""pyribs adds a millionth to a measure before it looks for its cell."""
 
 
 def export(run: Run, to: str, folder: Path) -> list[Path]:
@@ -69,15 +73,15 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
         }
     if run.constants["map.enabled"]:
         map_, elites = run.elites()
-        found |= _map_arrays(map_, elites)
+        found |= _map_arrays(run, map_, elites)
     return found
 
 
 def ribs_archive(run: Run) -> Any:
     """The map as a `ribs.archives.GridArchive`: solutions are parameters, measures descriptors, objectives fitness.
 
-    Fields besides: `generation`, `observation_mean`, `observation_std`. A descriptor exactly on an edge may lie in the
-    neighbouring cell there, whose arithmetic is another one.
+    Fields besides: `generation`, `observation_mean`, `observation_std`. Its arithmetic of cells is another one, so
+    descriptors within two millionths of an edge, and those outside the bounds, are moved that far into their cell.
 
     Raises:
         ConfigError: pyribs is not installed. NotInRunError: the run has no map, an empty one, or one that is no grid.
@@ -91,7 +95,7 @@ def ribs_archive(run: Run) -> Any:
         raise NotInRunError(f"the map of {run.folder} is a cvt and no grid, as a GridArchive is; --to npz has it all")
     if not map_.size:
         raise NotInRunError(f"the map of {run.folder} is empty")
-    columns = _map_arrays(map_, elites)
+    columns = _map_arrays(run, map_, elites)
     size = columns["mean"].shape[1]
     archive = GridArchive(
         solution_dim=columns["parameters"].shape[1],
@@ -104,26 +108,40 @@ def ribs_archive(run: Run) -> Any:
             "observation_std": ((size,), np.float32),
         },
     )
-    low_B, high_B = np.array(map_.geometry.bounds).T
+    edges = list(zip(map_.geometry.edges, columns["cell"].T, strict=True))
+    low_N_B, high_N_B = (np.stack([of[cell + up] for of, cell in edges], axis=1) for up in (0, 1))
+    margin_N_B = np.minimum(RIBS_MARGIN, (high_N_B - low_N_B) / 4)
     archive.add(
         solution=columns["parameters"],
         objective=columns["fitness"],
-        measures=np.clip(columns["descriptor"], low_B, high_B),
+        measures=np.clip(columns["descriptor"], low_N_B + margin_N_B, high_N_B - margin_N_B),
         generation=columns["generation"],
         observation_mean=columns["mean"],
         observation_std=columns["std"],
     )
+    if archive.stats.num_elites != map_.size:
+        raise NotInRunError(
+            f"pyribs puts the {map_.size} elites of {run.folder} into {archive.stats.num_elites} of its cells, too "
+            "small for its arithmetic; --to npz has them all"
+        )
     return archive
 
 
-def _map_arrays(map_: BehaviourMap, elites: list[Elite]) -> dict[str, np.ndarray]:
+def _map_arrays(run: Run, map_: BehaviourMap, elites: dict[int, Elite]) -> dict[str, np.ndarray]:
     fields = {"parameters": "centre_D", "mean": "observation_mean_O", "std": "observation_std_O", "trace": "trace_T_B"}
+    sizes = {"parameters": (run.policy_shape.parameters,), "trace": (0, len(map_.geometry.bounds))}
+    none = run.policy_shape.widths[:1]
     return {
-        "cell": np.array([map_.geometry.index_of(int(cell)) for cell in map_.cell_N], np.int64),
+        "cell": map_places(map_),
         "fitness": map_.fitness_N,
         "descriptor": map_.descriptor_N_B,
         "generation": map_.generation_N,
-        **{name: np.array([getattr(elite, field) for elite in elites]) for name, field in fields.items()},
+        **{
+            name: np.array([getattr(elite, field) for elite in elites.values()], np.float32)
+            if elites
+            else np.zeros((0, *sizes.get(name, none)), np.float32)
+            for name, field in fields.items()
+        },
     }
 
 

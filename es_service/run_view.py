@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from es_service import digest as run_digest
 from es_service.algorithms.base import Member, member_from_arrays, member_part
@@ -129,7 +131,7 @@ class Run:
         import pandas as pd
 
         map_, names = self.behaviour_map, self.descriptor_names
-        places = np.array([map_.geometry.index_of(int(cell)) for cell in map_.cell_N]).reshape(map_.size, -1)
+        places = map_places(map_)
         labels = [f"cell_{name}" for name in names] if isinstance(map_.geometry, Grid) else ["cell"]
         return pd.DataFrame(
             dict(zip(labels, places.T, strict=True))
@@ -145,8 +147,15 @@ class Run:
         filled.
         """
         map_ = self.behaviour_map
-        place = (int(place),) if isinstance(place, int | np.integer) else tuple(int(i) for i in place)
+        place = (index(place),) if isinstance(place, int | np.integer) else tuple(index(i) for i in place)
         shown = ",".join(map(str, place))
+        dimensions = len(map_.geometry.shape)
+        if len(place) != dimensions:
+            near = ",".join(map(str, map_places(map_)[0])) if map_.size else "none yet"
+            raise NotInRunError(
+                f"cell {shown} is not in the map of {self.folder}: a cell has {dimensions} numbers there, "
+                f"such as {near}, the first that was filled"
+            )
         cell = map_.geometry.cell_at(place)
         if cell is not None and map_.row_of(cell) is not None:
             return cell
@@ -159,14 +168,23 @@ class Run:
 
     def elite(self, place: int | Sequence[int]) -> Elite:
         """What is kept of a cell's elite: parameters, statistics, trace. Raises as `cell`."""
-        name = elite_part(self.cell(place))
-        return elite_from_arrays(self.parts(wanted=lambda part: part == name)[1][name])
+        cell = self.cell(place)
+        return self.elites([cell])[1][cell]
 
-    def elites(self) -> tuple[BehaviourMap, list[Elite]]:
-        """The map and all of its elites in the same order; together as large as all of their policies."""
-        parts = self.parts(wanted=lambda part: _light(part) or part.startswith(ELITE_PREFIX))[1]
+    def elites(self, cells: Collection[int] | None = None) -> tuple[BehaviourMap, dict[int, Elite]]:
+        """The map and, by number of their cells, some of its elites or all of them, as of one generation.
+
+        All of them take as much memory as all of their policies.
+        """
+        names = None if cells is None else {elite_part(cell) for cell in cells}
+
+        def wanted(part: str) -> bool:
+            return _light(part) or (part.startswith(ELITE_PREFIX) if names is None else part in names)
+
+        parts = self.parts(wanted=wanted)[1]
         map_ = self._map(parts)
-        return map_, [elite_from_arrays(parts[elite_part(int(cell))]) for cell in map_.cell_N]
+        chosen = map_.cell_N.tolist() if cells is None else cells
+        return map_, {cell: elite_from_arrays(parts[elite_part(cell)]) for cell in chosen}
 
     def _map(self, parts: Mapping[str, Mapping[str, np.ndarray]]) -> BehaviourMap:
         map_ = map_from_parts(parts)
@@ -201,22 +219,29 @@ class Run:
         Args:
             which: "best", "centre", or a cell by its place, such as (3, 17). Raises NotInRunError for an empty one.
         """
-        clip = self.constants["policy.observation_clip"]
-        if not isinstance(which, str):
-            elite = self.elite(which)
-            return Policy(self.policy_shape, elite.centre_D, elite.observation_mean_O, elite.observation_std_O, clip)
-        at, parts = self.parts(wanted=_without_elites)
+        if which == "centre":
+            return self.newest_policy()[1]
         if which == "best":
-            best = best_from_arrays(parts["best"])
-            return Policy(self.policy_shape, best.centre_D, best.observation_mean_O, best.observation_std_O, clip)
-        if which != "centre":
+            best = best_from_arrays(self.parts(wanted=lambda part: part == "best")[1]["best"])
+            return self.policy_of(best.centre_D, best.observation_mean_O, best.observation_std_O)
+        if isinstance(which, str):
             raise ValueError(f"policy({which!r}): choose 'best', 'centre', or a cell such as (3, 17)")
-        enabled = self.constants["policy.observation_normalization"]
-        mean_O, std_O = normalisation(moments_from_arrays(parts["observations"]), enabled)
+        elite = self.elite(which)
+        return self.policy_of(elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
+
+    def policy_of(self, parameters_D: FloatArray, mean_O: FloatArray, std_O: FloatArray) -> Policy:
+        """A policy of this run's shape."""
+        return Policy(self.policy_shape, parameters_D, mean_O, std_O, self.constants["policy.observation_clip"])
+
+    def newest_policy(self) -> tuple[int, Policy]:
+        """(generation, the centre updated in it with the statistics that it would go on with)."""
+        at, parts = self.parts(wanted=lambda part: not part.startswith((ELITE_PREFIX, CELL_PREFIX)))
         member = self.newest_member(at, parts)
-        if member.own_mean_O is not None and member.own_std_O is not None:
-            mean_O, std_O = member.own_mean_O, member.own_std_O
-        return Policy(self.policy_shape, member.centre_D, mean_O, std_O, clip)
+        mean_O, std_O = member.own_mean_O, member.own_std_O
+        if mean_O is None or std_O is None:
+            enabled = self.constants["policy.observation_normalization"]
+            mean_O, std_O = normalisation(moments_from_arrays(parts["observations"]), enabled)
+        return at, self.policy_of(member.centre_D, mean_O, std_O)
 
     def newest_member(self, generation: int, parts: Mapping[str, Mapping[str, np.ndarray]]) -> Member:
         """The member that the history row of `generation` is about, `parts` being the state of that generation."""
@@ -224,22 +249,24 @@ class Run:
         return member_from_arrays(parts[member_part(member)])
 
 
+def map_places(map_: BehaviourMap) -> NDArray[np.int64]:
+    """Place of each filled cell along each dimension of the map, [N, dimensions]."""
+    places = [map_.geometry.index_of(int(cell)) for cell in map_.cell_N]
+    return np.array(places, np.int64).reshape(map_.size, len(map_.geometry.shape))
+
+
 def nearest_filled(map_: BehaviourMap, place: Sequence[int]) -> tuple[int, ...] | None:
     """Place of the filled cell nearest to another place, counted in cells (of a cvt: numbers); the first of equals."""
     if not map_.size:
         return None
-    filled = [map_.geometry.index_of(int(cell)) for cell in map_.cell_N]
-    if len(place) != len(map_.geometry.shape):
-        return filled[0]
-    return min(filled, key=lambda other: sum((a - b) ** 2 for a, b in zip(other, place, strict=True)))
+    return min(
+        (map_.geometry.index_of(int(cell)) for cell in map_.cell_N),
+        key=lambda other: sum((a - b) ** 2 for a, b in zip(other, place, strict=True)),
+    )
 
 
 def _light(part: str) -> bool:
     return part == GEOMETRY_PART or part.startswith(CELL_PREFIX)
-
-
-def _without_elites(part: str) -> bool:
-    return not part.startswith((ELITE_PREFIX, CELL_PREFIX))
 
 
 def open_run(folder: str | os.PathLike[str]) -> Run:

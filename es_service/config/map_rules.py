@@ -13,10 +13,21 @@ OPTIONS = "task.options."
 MOST_AUTO_CELLS = 10_000
 MOST_CELLS = 10_000_000
 CVT_CELLS = 1024
+MOST_CVT_CELLS = 4096
+"""Placing them takes time that grows with their square: some 15 seconds for so many."""
+MOST_GRID_DIMENSIONS = 6
+"""Of a descriptor for which `kind: auto` is a grid."""
+LARGEST = 1e30
+"""Of bounds and offsets, so that sums and differences of them stay finite."""
+
+
+def default_kind(dimensions: int) -> str:
+    """grid for up to six dimensions, else cvt."""
+    return "grid" if dimensions <= MOST_GRID_DIMENSIONS else "cvt"
 
 
 def default_cells(kind: str, dimensions: int) -> tuple[int, ...]:
-    """20 x 20 in the plane, 100 on a line; else as many alike as make at most 10,000 cells, but 2. Of cvt 1,024."""
+    """20 x 20 in the plane, 100 on a line; else as many alike, 2 at least, as make at most 10,000. Of a cvt 1,024."""
     if kind == "cvt":
         return (CVT_CELLS,)
     each = {1: 100, 2: 20}.get(dimensions) or max(2, int(MOST_AUTO_CELLS ** (1.0 / dimensions) + 1e-9))
@@ -39,7 +50,11 @@ def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
             "map.enabled: false is not allowed for me_es, which draws its parents from the map; must be true"
         )
     names = with_options(task, options_of(values)).descriptor_names
-    bounds, cells, kind = values.get("map.bounds"), values.get("map.cells"), values.get("map.kind", "grid")
+    bounds, cells, kind = values.get("map.bounds"), values.get("map.cells"), values.get("map.kind")
+    qd_offset = values.get("map.qd_offset", 0.0)
+    for key, numbers in (("map.bounds", [x for pair in bounds or () for x in pair]), ("map.qd_offset", [qd_offset])):
+        if any(abs(number) > LARGEST for number in numbers):
+            problems.append(f"{key}: {show(values[key])} is not allowed; must be within {LARGEST:g} of 0")
     if bounds is not None:
         if len(bounds) != len(names):
             problems.append(
@@ -53,15 +68,15 @@ def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
                 for name, pair in zip(names, bounds, strict=True)
                 if not pair[0] < pair[1]
             ]
-    if cells is not None:
+    if cells is not None and kind is not None:
         wanted = 1 if kind == "cvt" else len(names)
         if len(cells) != wanted:
             what = "one number for a cvt" if kind == "cvt" else f"{wanted} numbers, one for each of {', '.join(names)}"
             problems.append(f"map.cells: {show(cells)} has {len(cells)} numbers; must be {what}, or auto")
-        elif math.prod(cells) > MOST_CELLS:
+        elif math.prod(cells) > (most := MOST_CVT_CELLS if kind == "cvt" else MOST_CELLS):
             problems.append(
-                f"map.cells: {show(cells)} makes {math.prod(cells):,} cells; must be at most {MOST_CELLS:,}"
-                + ("" if kind == "cvt" else "; with many dimensions use map.kind = cvt")
+                f"map.cells: {show(cells)} makes {math.prod(cells):,} cells; must be at most {most:,}"
+                + (" for a cvt" if kind == "cvt" else "; with many dimensions use map.kind = cvt")
             )
     return problems
 

@@ -36,7 +36,9 @@ def _tuples(value: Any) -> Any:
     if not isinstance(value, list | tuple):
         return value
     return tuple(
-        tuple(float(x) if type(x) is int else x for x in pair) if isinstance(pair, list | tuple) else pair
+        tuple(float(x) if type(x) is int and abs(x) < 2**1000 else x for x in pair)
+        if isinstance(pair, list | tuple)
+        else pair
         for pair in value
     )
 
@@ -149,8 +151,10 @@ class SearchConfig(_Section):
         "es_service/algorithms/me_es.py says how. Set by the preset."
     )
     parent_statistics: Literal["global", "elite"] = Field(
+        "global",
         description="me_es: observation statistics that a block runs with: those of the whole run, or those that the "
-        "elite it began with was evaluated with. Set by the preset."
+        "elite it began with was evaluated with. With elite, all elites descend from the first centre and so keep its "
+        "statistics: none, unless the run started from another one.",
     )
     evaluation_episodes: Count = Field(
         30,
@@ -183,7 +187,8 @@ class MapConfig(_Section):
 
     enabled: Switch = Field(True, description="Whether the run fills a map; me_es needs one.")
     kind: Literal["grid", "cvt"] = Field(
-        "grid", description="grid: cells of equal sides. cvt: as many cells as wanted, for many dimensions."
+        description="grid: cells of equal sides. cvt: as many cells as wanted, for many dimensions. auto: grid for up "
+        "to six dimensions."
     )
     bounds: BoundPairs = Field(
         description="[low, high] for each dimension of the descriptor; what lies outside belongs to the border cells. "
@@ -191,7 +196,7 @@ class MapConfig(_Section):
     )
     cells: CellCounts = Field(
         description="grid: cells along each dimension. cvt: one number, of all. auto: [20, 20] for two dimensions, "
-        "about 10,000 at most for others; [1024] for cvt."
+        "10,000 in all at most for others; [1024] for cvt."
     )
     qd_offset: Number = Field(
         description="Fitness that counts as 0 in the QD-score. auto: the least reward of the task times its steps "

@@ -97,12 +97,6 @@ _ROWS = (
         "single episode of a cell's population.",
     ),
     PresetRow(
-        "search.parent_statistics",
-        "elite",
-        "global",
-        "ME-ES. uber: ME-ES, one running statistic for all. literature: ours; an elite acts as it did when it entered.",
-    ),
-    PresetRow(
         "novelty.distance",
         "euclidean",
         "squared_euclidean",

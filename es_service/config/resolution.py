@@ -13,7 +13,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from es_service.config.map_rules import OPTIONS, default_cells, default_qd_offset, options_of
+from es_service.config.map_rules import OPTIONS, default_cells, default_kind, default_qd_offset, options_of
 from es_service.config.model import PolicyConfig, RunConfig
 from es_service.config.yaml_text import show
 from es_service.protocol import PolicyShape, TaskSpec, with_options
@@ -21,6 +21,7 @@ from es_service.protocol import PolicyShape, TaskSpec, with_options
 LEFT_OPEN: dict[str, str | None] = {
     "task.episode_steps": None,
     "search.members": "auto",
+    "map.kind": "auto",
     "map.bounds": "auto",
     "map.cells": "auto",
     "map.qd_offset": "auto",
@@ -98,10 +99,12 @@ def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpe
         for option, allowed in task.options.items():
             values.setdefault(f"{OPTIONS}{option}", allowed[0])
         chosen = with_options(task, options_of(values))
-        kind = values.get("map.kind", "grid")
+        if "map.kind" in left_open:
+            values["map.kind"] = default_kind(len(chosen.descriptor_names))
+        kind = values.get("map.kind")
         if "map.bounds" in left_open:
             values["map.bounds"] = chosen.descriptor_bounds
-        if "map.cells" in left_open:
+        if "map.cells" in left_open and kind is not None:
             values["map.cells"] = default_cells(kind, len(chosen.descriptor_names))
         if "map.qd_offset" in left_open:
             values["map.qd_offset"] = default_qd_offset(values, task)

@@ -141,12 +141,11 @@ def elite_part(cell: int) -> str:
 def map_to_parts(map_: BehaviourMap, before: BehaviourMap | None) -> dict[str, dict[str, np.ndarray]]:
     """The light parts that differ from an earlier map, as the store keeps them; of None, all and the cells' own."""
     parts = {GEOMETRY_PART: geometry_to_arrays(map_.geometry)} if before is None else {}
-    known = before.size if before is not None else 0
     same_N = np.zeros(map_.size, bool)
     if before is not None:
-        for now_N, then_N in ((map_.generation_N, before.generation_N), (map_.score_N, before.score_N)):
-            equal = (now_N[:known] == then_N) | (np.isnan(now_N[:known]) & np.isnan(then_N))
-            same_N[:known] = equal if now_N is map_.generation_N else same_N[:known] & equal
+        known = slice(before.size)
+        same_score_N = np.isclose(map_.score_N[known], before.score_N, rtol=0, atol=0, equal_nan=True)
+        same_N[known] = (map_.generation_N[known] == before.generation_N) & same_score_N
     for row in np.flatnonzero(~same_N):
         parts[cell_part(int(map_.cell_N[row]))] = {
             "order": np.asarray(row, np.int64),

@@ -1,7 +1,8 @@
 """How the space of descriptors is cut into cells: a regular grid, or the Voronoi cells of spread-out centroids.
 
 Descriptors outside the bounds belong to the nearest cell of the border. Everything is float64 and written so that equal
-descriptors fall into equal cells on every machine.
+descriptors fall into equal cells on every machine. Where the centroids of a cvt come to lie may depend on it, so they
+are stored with the run.
 """
 
 from __future__ import annotations

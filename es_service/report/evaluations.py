@@ -2,21 +2,44 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from rich.console import Console
 
-from es_service.errors import StoreError
+from es_service.errors import ConfigError, StoreError
 from es_service.evaluation import Fresh
 from es_service.run_view import Run
 
 
-def print_evaluations(console: Console, run: Run, results: Iterable[Fresh], file: Path | None) -> None:
-    """A line per policy as it comes, then what it says of the map if all of its elites were asked; perhaps a CSV."""
+@contextlib.contextmanager
+def csv_file(path: Path | None) -> Iterator[IO[str] | None]:
+    """The file to write rows to, opened before there are any; None for none.
+
+    Raises ConfigError for a name without .csv, so that nothing else is ever overwritten, StoreError if it cannot be
+    written.
+    """
+    if path is None:
+        yield None
+        return
+    if path.suffix != ".csv":
+        raise ConfigError(f"--out {path}: must end in .csv")
+    try:
+        file = path.open("w", newline="")
+    except OSError as error:
+        raise StoreError(f"cannot write {path}: {error.strerror}; choose another --out") from error
+    with file:
+        yield file
+
+
+def print_evaluations(
+    console: Console, run: Run, results: Iterable[Fresh], file: IO[str] | None, *, every: bool
+) -> None:
+    """A line per policy as it comes, then, if `every` elite was asked, what it says of the map; rows also as CSV."""
     names = run.descriptor_names
     rows: list[dict[str, Any]] = []
     found: list[Fresh] = []
@@ -31,11 +54,12 @@ def print_evaluations(console: Console, run: Run, results: Iterable[Fresh], file
             f"{one.name:<10} {one.generation:>7} {one.stored_fitness:>10.2f} {fresh.mean:>10.2f} "
             f"{fresh.standard_error:>8.2f}  {where}",
         )
-    elites = [fresh for fresh in found if fresh.candidate.cell is not None]
-    if len(elites) > 1:
-        _line(console, _about_elites(run, elites))
+    if every:
+        _line(console, _about_elites(run, [fresh for fresh in found if fresh.candidate.cell is not None]))
     if file is not None:
-        _write(file, rows)
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def _row(fresh: Fresh, names: list[str]) -> dict[str, Any]:
@@ -66,16 +90,6 @@ def _about_elites(run: Run, elites: list[Fresh]) -> str:
         f"{len(elites)} elites: {stayed} still end in their cell on average; put into a new map by their fresh values "
         f"they fill {len(best)} cells.\nQD-score (offset {offset:g}): {stored:,.0f} stored, {again:,.0f} fresh"
     )
-
-
-def _write(file: Path, rows: list[dict[str, Any]]) -> None:
-    try:
-        with file.open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-    except OSError as error:
-        raise StoreError(f"cannot write {file}: {error.strerror}; choose another --out") from error
 
 
 def _line(console: Console, text: str) -> None:

@@ -84,13 +84,15 @@ def file(tmp_path):
         ("compute.workers=0", "0 ... must be auto or a whole number, at least 1"),
         ("compute.chunk_pairs=half", "half ... must be auto or a whole number"),
         ("search.init_from=/no/such/run", "/no/such/run does not exist; must be the folder of another run"),
-        ("map.kind=gird", "gird ... must be grid or cvt; did you mean grid?"),
+        ("map.kind=gird", "gird ... must be auto or grid or cvt; did you mean grid?"),
         ("map.bounds=3", "3 ... must be auto or a list of pairs [low, high], such as [[-1, 1], [-1, 1]]"),
         ("map.bounds=[[0, 1], [0, .inf]]", "[[0, 1], [0, .inf]] is not allowed"),
         ("map.bounds=[[0, 1], [a, 1]]", "[[0, 1], [a, 1]] is not allowed"),
         ("map.bounds=[[0, 1], [1]]", "[[0, 1], [1]] is not allowed"),
         ("map.bounds=[[0, 1]]", "[[0, 1]] has 1 pairs; the descriptor has 2 dimensions (x, y), so must be a list of"),
         ("map.bounds=[[0, 1], [3, -2]]", "[3, -2] for y ... must be [low, high] with low below high; did you mean"),
+        ("map.bounds=[[-1e308, 1e308], [0, 1]]", "[[-1.0e+308, 1.0e+308], [0, 1]] ... must be within 1e+30 of 0"),
+        ("map.qd_offset=-1e308", "-1.0e+308 ... must be within 1e+30 of 0"),
         ("map.cells=[20]", "[20] has 1 numbers; must be 2 numbers, one for each of x, y, or auto"),
         ("map.cells=[20, 0]", "[20, 0] ... must be auto or a list of whole numbers, each at least 1"),
         ("map.cells=[]", "[] ... must be auto or a list of whole numbers"),
@@ -273,6 +275,8 @@ def test_a_map_that_does_not_fit_the_algorithm_or_its_kind_is_refused():
     assert problems(MINIMAL, "map.kind=cvt", "map.cells=[20, 20]") == [
         "map.cells: [20, 20] has 2 numbers; must be one number for a cvt, or auto"
     ]
+    (line,) = problems(MINIMAL, "map.kind=cvt", "map.cells=[5000]")
+    assert line == "map.cells: [5000] makes 5,000 cells; must be at most 4,096 for a cvt"
     with pytest.raises(ConfigError) as caught:
         load_config(MINIMAL, ["search.algorithm=me_es", "map.enabled=false"], tasks=TASKS, algorithms=("me_es",))
     (line,) = (line.strip() for line in str(caught.value).splitlines()[1:])

@@ -245,7 +245,8 @@ class Inventing:
         fitness = self.rng.normal(size=axes).astype(np.float32)
         steps = np.full(axes, 200, np.int32)
         descriptor = np.zeros((*axes, 2), np.float32)
-        return EpisodesResult(fitness, fitness, descriptor, steps, descriptor, no_observations(2))
+        trace = np.zeros((64, 2), np.float32)
+        return EpisodesResult(fitness, fitness, descriptor, steps, descriptor, no_observations(2), trace)
 
 
 def test_the_driver_holds_no_population_times_parameters_array():

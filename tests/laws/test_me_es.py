@@ -49,6 +49,7 @@ def config_of(preset="literature", generations=30, seed=0, neighbours=3, **searc
                 "learning_rate": 0.2,
                 "evaluation_episodes": 20,
                 "block_generations": BLOCK,
+                "parent_statistics": "elite" if preset == "literature" else "global",  # both, and one for each preset
                 **search,
             },
             "novelty": {"neighbours": neighbours},

@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +20,9 @@ import pytest
 from es_service import api
 from es_service.digest import digest_parts
 from es_service.errors import ConfigError, NotInRunError
-from es_service.export import ribs_archive
+from es_service.export import arrays, ribs_archive
 from es_service.maps.geometry import Grid
+from es_service.run_view import map_places
 from tests.system.test_workers import children
 
 CONFIG = {
@@ -96,6 +99,16 @@ def test_a_fork_with_another_task_begins_with_an_empty_map(tmp_path, finished):
     changes = ["task.options.start=default", "budget.generations=41"]
     forked = api.fork(finished.folder, changes, out=tmp_path / "fork").run
     assert len(forked.map) <= 1
+    changes = ["task.episode_steps=30", "budget.generations=40"]  # which are spent already
+    forked = api.fork(finished.folder, changes, out=tmp_path / "empty").run
+    assert forked.constants["map.qd_offset"] == pytest.approx(-2.3431 * 30)
+    assert len(forked.map) == 0
+    assert arrays(forked)["parameters"].shape == (0, forked.policy_shape.parameters)
+    assert command("export", forked.folder, "--to", "csv").returncode == 0
+    for wrong in (("evaluate", forked.folder, "--all"), ("export", forked.folder, "--to", "ribs")):
+        result = command(*wrong)
+        assert result.returncode == 2
+        assert "is empty" in result.stderr
     with pytest.raises(ConfigError, match=r"map\.cells"):
         api.fork(finished.folder, ["map.cells=[4, 4]"], out=tmp_path / "other")
 
@@ -146,7 +159,7 @@ def test_a_cell_that_is_empty_or_not_there_names_the_nearest_filled_one(finished
     for place, what in ((empty, "is empty"), ((16, 0), "is not in the map"), ((1, 2, 3), "is not in the map")):
         with pytest.raises(NotInRunError, match=what) as error:
             finished.policy(place)
-        named = tuple(int(i) for i in str(error.value).rsplit(" ", 1)[1].split(","))
+        named = tuple(map(int, re.findall(r"(\d+),(\d+)(?:, the first|$)", str(error.value))[0]))
         assert named in filled
         if place == empty:
             assert (named[0] - empty[0]) ** 2 + (named[1] - empty[1]) ** 2 == distance
@@ -167,10 +180,35 @@ def test_evaluate_puts_fresh_values_beside_stored_ones(tmp_path, finished):
     assert f"{len(finished.map)} elites: {len(finished.map)} still end in their cell" in result.stdout
     one = ",".join(map(str, finished.map[["cell_x", "cell_y"]].iloc[0]))
     assert command("evaluate", finished.folder, "--cell", one).returncode == 0
-    for wrong, message in (("99,0", "is not in the map"), ("a", "whole numbers")):
+    for wrong, message in (
+        ("99,0", "is not in the map"),
+        ("a", "whole numbers"),
+        ("3", "has 2 numbers there, such as"),
+    ):
         result = command("evaluate", finished.folder, "--cell", wrong)
         assert result.returncode == 2
         assert message in result.stderr
+
+
+def test_evaluate_overwrites_nothing_but_csv_files(tmp_path, finished):
+    for out, code in ((finished.folder / "run.db", 2), (tmp_path / "no" / "rows.csv", 1)):
+        result = command("evaluate", finished.folder, "--out", out)
+        assert result.returncode == code
+        assert str(out) in result.stderr
+    assert command("evaluate", finished.folder, "--all", "--cell", "1,1").returncode == 2
+
+
+def test_elites_at_the_edges_of_cells_keep_their_cells_in_pyribs(monkeypatch, finished):
+    map_, elites = finished.elites()
+    geometry = map_.geometry
+    assert isinstance(geometry, Grid)
+    low_N_2 = np.stack([edges[place] for edges, place in zip(geometry.edges, map_places(map_).T, strict=True)], axis=1)
+    for shifted in (low_N_2, np.nextafter(low_N_2 + 1 / 8, -9)):
+        moved = replace(map_, descriptor_N_B=shifted)
+        np.testing.assert_array_equal(geometry.cells_of(shifted), map_.cell_N)
+        monkeypatch.setattr(type(finished), "elites", lambda self, moved=moved: (moved, elites))
+        archive = ribs_archive(finished)
+        assert archive.stats.num_elites == map_.size
 
 
 def test_fresh_episodes_differ_from_those_that_chose(tmp_path):
@@ -225,3 +263,15 @@ def test_a_ribs_archive_opens_and_plots(tmp_path, finished):
     plt.savefig(tmp_path / "heatmap.png")
     plt.close()
     assert (tmp_path / "heatmap.png").stat().st_size > 1000
+
+
+def test_a_run_that_starts_from_another_s_centre_starts_with_the_statistics_that_centre_runs_with(tmp_path):
+    origin = run(tmp_path / "origin", "search.parent_statistics=elite", "budget.generations=9")
+    centre = origin.policy("centre")
+    assert centre.observation_std_O.tolist() == [1.0, 1.0]  # those of the first centre, whatever has been seen since
+    begun = run(tmp_path / "begun", f"search.init_from={origin.folder}", "budget.generations=1")
+    map_, elites = begun.elites()
+    (first,) = (elites[int(cell)] for cell, at in zip(map_.cell_N, map_.generation_N, strict=True) if at == 0)
+    np.testing.assert_array_equal(first.centre_D, centre.parameters_D)
+    np.testing.assert_array_equal(first.observation_mean_O, centre.observation_mean_O)
+    np.testing.assert_array_equal(first.observation_std_O, centre.observation_std_O)

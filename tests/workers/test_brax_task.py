@@ -103,6 +103,10 @@ def test_a_class_with_contradictions_is_refused(monkeypatch):
         ("action_size", 7, r"cannot be traced: "),
         ("descriptor_bounds", ((1.0, 0.0), (0.0, 1.0)), r"\(1.0, 0.0\) is no pair \(low, high\)"),
         ("walls", ((0.0, 1.0),), r"is no tuple of segments"),
+        ("walls", 5, r"is no tuple of segments"),
+        ("walls", (((0.0, 1.0), (0.0, 1.0)),), r"is no tuple of segments"),
+        ("least_reward", "low", r"least_reward = 'low' is no finite number"),
+        ("wall_clearance", float("nan"), r"wall_clearance = nan is no finite number"),
         ("options", {"walls": "both"}, r"option walls = 'both' is no tuple of text"),
         (
             "step",

@@ -67,6 +67,9 @@ def describe(path: str) -> TaskSpec:
         wrong += _wrong_pairs(task.descriptor_bounds)
         if not _are_walls(getattr(task, "walls", None)):
             wrong.append(f"walls = {task.walls!r} is no tuple of segments ((x, y), (x, y))")
+        for name in ("wall_clearance", "least_reward"):
+            if not _are_finite((getattr(task, name, 0.0) or 0.0,)):
+                wrong.append(f"{name} = {getattr(task, name)!r} is no finite number")
         sizes = {name: getattr(task, name) for name, kind in ATTRIBUTES.items() if kind is int}
         wrong += [f"{name} = {size} is not positive" for name, size in sizes.items() if size < 1]
     if wrong:
@@ -98,8 +101,12 @@ def _wrong_pairs(bounds: tuple) -> list[str]:
 
 
 def _are_walls(walls: Any) -> bool:
-    ends: list[Any] = [end for wall in walls or () for end in (wall if len(wall) == 2 else (None,))]
-    return all(_are_finite(end) and len(end) == 2 for end in ends)
+    """None, or segments between two different places."""
+    return walls is None or (
+        isinstance(walls, tuple)
+        and all(isinstance(wall, tuple) and len(wall) == 2 and wall[0] != wall[1] for wall in walls)
+        and all(_are_finite(end) and len(end) == 2 for wall in walls for end in wall)
+    )
 
 
 def _are_finite(numbers: Any) -> bool:
