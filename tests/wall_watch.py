@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from es_service.protocol import Segment
 from workers.environments import ant_maze, ant_trap
 from workers.environments.ant import LEG_LENGTH, LEG_RADIUS, LOWER_LEGS, TORSO_RADIUS, AntState, expand
 from workers.environments.brax_parts import Transform
 from workers.environments.walls import WALL_RADIUS
 
-Walls = tuple[tuple[tuple[float, float], tuple[float, float]], ...]
+Walls = tuple[Segment, ...]
 WALLS: dict[str, Walls] = {"ant_maze": ant_maze.WALLS, "ant_trap": ant_trap.WALLS}
 CLEAR_M = 1.0
 """Between a start and the nearest wall's surface: no leg of an ant reaches further from its torso's surface."""

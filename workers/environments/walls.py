@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from es_service.protocol import Segment
+
 WALL_RADIUS = 0.5
 TINY = 1e-9
-
-Segment = tuple[tuple[float, float], tuple[float, float]]
 
 
 class WallContact(NamedTuple):
