@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -18,6 +19,7 @@ BATCHES = {"point_maze": (64,)}
 ANT_BATCHES = (8, 16, 64)
 PAPER = {"point_maze": 1_520_000, "ant_maze": 4_480, "ant_trap": 7_470}
 """Steps a second on one CPU, without a policy (Chalumeau et al. 2022): other physics, another machine."""
+ROLLOUTS = ("xla", "simd")
 HIDDEN = {"point_maze": [64, 64]}
 ANT_HIDDEN = [256, 256]
 
@@ -26,18 +28,23 @@ def bench_rollouts(
     tasks: Sequence[str] = (),
     *,
     policies: Sequence[bool] = (False, True),
+    rollouts: Sequence[str] = ROLLOUTS,
     batches: Sequence[int] = (),
     seconds: float = 3.0,
 ) -> Iterator[dict[str, Any]]:
-    """One row per task, with and without policy, batch, and on one core and on all: as each is measured.
+    """One row per task, with and without policy, rollout, batch, and on one core and on all: as each is measured.
 
     The hidden layers are the paper's: 64x64 for PointMaze, else 256x256. Each core has a process like a worker's; rates
-    on several, measured side by side, are added.
+    on several, measured side by side, are added. simd has no policies yet, and rows without them only. Where it cannot
+    compile a task the only row for it is {"task", "rollout", "note"}, and xla is what there is.
 
     Raises:
-        ConfigError: a task cannot be had. EvaluationError: it cannot be run.
+        ConfigError: a task cannot be had. EvaluationError: it cannot be run, or not by simd, and nothing else was asked
+            for.
     """
     known = Tasks()
+    if set(policies) == {True} and set(rollouts) == {"simd"}:
+        raise ConfigError("--policy on: simd computes steps without policies so far; add --rollout xla or --policy off")
     for task in tasks:
         if task not in known:
             raise ConfigError(
@@ -46,8 +53,10 @@ def bench_rollouts(
             )
     every = sorted({1, len(os.sched_getaffinity(0))})
     for task in tasks or TASKS:
-        for policy in policies:
-            for batch in batches or BATCHES.get(task, ANT_BATCHES):
+        for policy, rollout in itertools.product(policies, rollouts):
+            if policy and rollout == "simd":
+                continue
+            for batch, cores in itertools.product(batches or BATCHES.get(task, ANT_BATCHES), every):
                 arguments = {
                     "task": task,
                     "options": {},
@@ -55,9 +64,14 @@ def bench_rollouts(
                     "policy": policy,
                     "batch": batch,
                     "seconds": seconds,
+                    "rollout": rollout,
                 }
-                for cores in every:
-                    yield _row(arguments, cores)
+                row = _row(arguments, cores)
+                if "note" in row and set(rollouts) == {"simd"}:
+                    raise EvaluationError(f"{task}: {row['note']}")
+                yield row
+                if "note" in row:
+                    break
 
 
 def _row(arguments: Mapping[str, Any], cores: int) -> dict[str, Any]:
@@ -73,9 +87,10 @@ def _row(arguments: Mapping[str, Any], cores: int) -> dict[str, Any]:
         if process.returncode:
             raise EvaluationError(f"{arguments['task']} cannot be measured:\n{errors.strip()}")
         found.append(json.loads(printed.splitlines()[-1]))
-    return {
-        "task": arguments["task"],
-        "rollout": "xla",
+    named = {"task": arguments["task"], "rollout": arguments["rollout"]}
+    if "problem" in found[0]:
+        return named | {"note": f"simd cannot compile it: {found[0]['problem']}; it runs on xla"}
+    return named | {
         "policy": "on" if arguments["policy"] else "off",
         "batch": arguments["batch"],
         "cores": cores,
@@ -85,16 +100,19 @@ def _row(arguments: Mapping[str, Any], cores: int) -> dict[str, Any]:
     }
 
 
-HEADER = (
-    f"{'task':<12}{'policy':<8}{'batch':>6}{'cores':>7}{'steps/s':>12}{'compile s':>11}{'peak MiB':>10}{'paper':>12}"
-)
+COLUMNS = {"task": -16, "policy": -8, "rollout": -9, "batch": 5, "cores": 7, "steps/s": 13, "compile s": 11,
+           "peak MiB": 10, "paper": 12}  # fmt: skip
+"""Title -> width; negative ones are flush left."""
+HEADER = "".join(f"{title:{'<' if width < 0 else '>'}{abs(width)}}" for title, width in COLUMNS.items())
 
 
 def line(row: Mapping[str, Any]) -> str:
     """A row under HEADER, with the paper's rate where that is comparable."""
+    if "note" in row:
+        return f"{row['task']:<16}{row['note']}"
     comparable = row["policy"] == "off" and row["cores"] == 1 and row["task"] in PAPER
     paper = f"{PAPER[row['task']]:,}" if comparable else ""
-    return (
-        f"{row['task']:<12}{row['policy']:<8}{row['batch']:>6}{row['cores']:>7}{row['steps_per_second']:>12,}"
-        f"{row['compile_seconds']:>11}{row['peak_mib']:>10}{paper:>12}"
-    )
+    shown = (row["task"], row["policy"], row["rollout"], row["batch"], row["cores"], f"{row['steps_per_second']:,}",
+             row["compile_seconds"], row["peak_mib"], paper)  # fmt: skip
+    widths = COLUMNS.values()
+    return "".join(f"{one!s:{'<' if width < 0 else '>'}{abs(width)}}" for one, width in zip(shown, widths, strict=True))

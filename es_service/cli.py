@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 from es_service import api, digest, jobs
-from es_service.config.resolution import config_warnings
+from es_service.config.resolution import config_warnings, one_of
 from es_service.errors import ConfigError, EvaluationError, Interrupted, NotInRunError, ServiceError
 from es_service.report.catalogue import print_catalogue
 from es_service.report.progress import Row, show_progress
@@ -255,6 +255,9 @@ def _bench() -> None:
 def rollouts(
     task: Annotated[list[str] | None, typer.Option("--task", help="Task to measure; default: all of ours.")] = None,
     policy: Annotated[str | None, typer.Option("--policy", help="on or off; default: both.")] = None,
+    rollout: Annotated[
+        str, typer.Option("--rollout", help="xla, simd (our own compiler, physics alone so far), or both.")
+    ] = "xla,simd",
     batch: Annotated[
         list[int] | None, typer.Option("--batch", min=2, help="Episodes that step together, an even number.")
     ] = None,
@@ -265,12 +268,18 @@ def rollouts(
     from es_service import bench as measured
 
     policies = {None: (False, True), "on": (True,), "off": (False,)}.get(policy)
-    if policies is None or any(number % 2 for number in batch or ()):
-        wrong = (
-            f"--policy {policy}: must be on or off" if policies is None else "--batch: must be even, for whole pairs"
+    rollouts = rollout.split(",")
+    if policies is None:
+        raise ConfigError(f"--policy {policy}: must be on or off")
+    if not set(rollouts) <= set(measured.ROLLOUTS):
+        raise ConfigError(
+            f"--rollout {rollout}: must be {one_of(measured.ROLLOUTS)}, or both with a comma between them"
         )
-        raise ConfigError(wrong)
-    rows = measured.bench_rollouts(task or (), policies=policies, batches=batch or (), seconds=seconds)
+    if any(number % 2 for number in batch or ()):
+        raise ConfigError("--batch: must be even, for whole pairs")
+    rows = measured.bench_rollouts(
+        task or (), policies=policies, rollouts=rollouts, batches=batch or (), seconds=seconds
+    )
     if as_json:
         print(json.dumps(list(rows), indent=1))
         return

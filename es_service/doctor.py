@@ -27,6 +27,8 @@ from es_service.statistics import no_observations, normalisation
 from es_service.store.folder import is_network_filesystem
 from workers.environments import TASKS
 from workers.policy import initial_parameters
+from workers.simd.kernel import compile_kernel
+from workers.simd.target import host_target
 
 Finding = tuple[str, str]
 """("ok" | "note" | "FAIL", text)."""
@@ -37,7 +39,7 @@ MIN_MEMORY_BYTES = 2 << 30
 def examine(console: Console) -> bool:
     """Print every finding; whether nothing failed."""
     healthy = True
-    for check in (_software, _ray, _machine, _disk, _noise, _rollout):
+    for check in (_software, _ray, _machine, _vectors, _disk, _noise, _rollout):
         for level, text in _guarded(check):
             healthy &= level != "FAIL"
             colour = {"ok": "green", "note": "yellow", "FAIL": "red"}[level]
@@ -76,6 +78,22 @@ def _machine() -> Iterator[Finding]:
     yield "ok", f"{usable} of {present} cores usable: that many workers by default"
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
     yield ("ok" if memory >= MIN_MEMORY_BYTES else "note"), f"{memory / 2**30:.1f} GiB of memory free"
+
+
+def _vectors() -> Iterator[Finding]:
+    """The width of the vectors that steps can be compiled for, tried on a small one."""
+    try:
+        target = host_target()
+    except LookupError as error:
+        yield "note", f"simd: {error}: rollouts run on xla"
+        return
+    started = time.perf_counter()
+    kernel = compile_kernel(lambda x: x * x + 1.0, np.zeros((), np.float32))
+    found = kernel(np.arange(100, dtype=np.float32))
+    if not np.array_equal(found, np.arange(100, dtype=np.float32) ** 2 + 1):
+        yield "FAIL", f"simd ({target.describe()}): a compiled kernel gives wrong numbers"
+        return
+    yield "ok", f"simd: {target.describe()}; a kernel compiles and runs in {time.perf_counter() - started:.2f} s"
 
 
 def _disk() -> Iterator[Finding]:

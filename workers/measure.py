@@ -24,12 +24,22 @@ from es_service.protocol import PolicyShape, WorkerSpec
 from workers.environments import TASKS, Environment, describe_environment, make_environment
 from workers.policy import initial_parameters
 from workers.rollout import make_training_rollout
+from workers.simd.kernel import compile_kernel
+from workers.simd.primitives import UnsupportedError
 
 STEPS = 50
 """Control steps of one call."""
 
 
-def measure(task: str, options: Mapping[str, str], hidden: list[int], policy: bool, batch: int, seconds: float) -> dict:
+def measure(
+    task: str,
+    options: Mapping[str, str],
+    hidden: list[int],
+    policy: bool,
+    batch: int,
+    seconds: float,
+    rollout: str = "xla",
+) -> dict:
     """Environment steps a second of one process, after compiling.
 
     Args:
@@ -38,12 +48,23 @@ def measure(task: str, options: Mapping[str, str], hidden: list[int], policy: bo
         policy: with a policy of its own weights for each member, noise and statistics; else random actions alone.
         batch: episodes that step together; with a policy, both members of batch / 2 pairs.
         seconds: to measure for.
+        rollout: what computes the steps, "xla" or "simd"; the latter without a policy so far.
+
+    Returns:
+        steps_per_second, compile_seconds, peak_mib; or the problem, where simd cannot compile the task or run here.
     """
     size = TASKS[task] if task in TASKS else describe_environment(task)
     environment = make_environment(task, options)
     shape = PolicyShape((size.observation_size, *hidden, size.action_size))
-    call = (_with_policy if policy else _without_policy)(environment, shape, task, batch)
+    states = _after_reset(environment, batch)
     started = time.perf_counter()
+    try:
+        if policy:
+            call = _with_policy(environment, shape, task, batch)
+        else:
+            call = _without_policy(environment, shape, states, rollout)
+    except (UnsupportedError, LookupError) as error:
+        return {"problem": str(error)}
     call(0)
     ready = time.perf_counter()
     steps = calls = 0
@@ -86,22 +107,34 @@ def _with_policy(environment: Environment, shape: PolicyShape, task: str, batch:
     return call
 
 
-def _without_policy(environment: Environment, shape: PolicyShape, task: str, batch: int) -> Any:
+def _after_reset(environment: Environment, batch: int) -> Any:
+    """States [batch, ...] to begin with."""
+    keys = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(batch))
+    return jax.block_until_ready(jax.jit(jax.vmap(environment.reset))(keys))
+
+
+def _without_policy(environment: Environment, shape: PolicyShape, states: Any, rollout: str) -> Any:
+    """STEPS control steps with random actions."""
+    batch = len(jax.tree.leaves(states)[0])
     coordinates_A = jnp.arange(shape.widths[-1], dtype=jnp.uint32)
 
-    def episode(key: Any) -> Any:
+    def episode(key: Any, state: Any) -> Any:
         def step(number: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
             state, total = carry
             noise_A = normal_integers(jnp, key, number.astype(jnp.uint32) * 1024 + coordinates_A)
             state, reward, _ = environment.step(state, jnp.clip(noise_A.astype(jnp.float32) / NORMAL_STD, -1.0, 1.0))
             return state, total + reward + environment.observe(state).sum()
 
-        return lax.fori_loop(0, STEPS, step, (environment.reset(key), jnp.float32(0.0)))[1]
+        return lax.fori_loop(0, STEPS, step, (state, jnp.float32(0.0)))[1]
 
-    episodes = jax.jit(jax.vmap(episode))
+    if rollout == "xla":
+        episodes = jax.jit(jax.vmap(episode))
+    else:
+        one_state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), states)
+        episodes = compile_kernel(episode, jax.ShapeDtypeStruct((4,), jnp.uint32), one_state)
 
     def call(number: int) -> int:
-        jax.block_until_ready(episodes(stream_keys(0, Domain.TRAINING_RESET, number, np.arange(batch))))
+        jax.block_until_ready(episodes(stream_keys(0, Domain.TRAINING_RESET, number, np.arange(batch)), states))
         return batch * STEPS
 
     return call

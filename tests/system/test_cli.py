@@ -87,16 +87,32 @@ def test_bench_rollouts_prints_a_row_per_policy_batch_and_number_of_cores():
     assert code == 0, printed
     rows = json.loads(printed)
     assert {row["policy"] for row in rows} == {"on", "off"}
-    assert {(row["task"], row["rollout"], row["batch"]) for row in rows} == {("point_maze", "xla", 8)}
+    assert {(row["policy"], row["rollout"]) for row in rows} == {("on", "xla"), ("off", "xla"), ("off", "simd")}
+    assert {(row["task"], row["batch"]) for row in rows} == {("point_maze", 8)}
     assert all(row["steps_per_second"] > 0 and row["compile_seconds"] > 0 for row in rows)
     for wrong, message in (
         (("--batch", 7), "must be even"),
         (("--policy", "maybe"), "--policy maybe: must be on or off"),
         (("--task", "ant_maz"), "did you mean ant_maze?"),
+        (("--rollout", "gpu"), "--rollout gpu: must be xla or simd, or both"),
+        (("--rollout", "simd", "--policy", "on"), "simd computes steps without policies so far"),
     ):
         code, printed = es("bench", "rollouts", *wrong)
         assert code == 2
         assert message in printed
+
+
+def test_what_simd_cannot_compile_is_said_in_one_line_and_runs_on_xla():
+    task = "tests.examples.sorting:Sorting"
+    code, printed = es("bench", "rollouts", "--task", task, "--policy", "off", "--batch", 8, "--seconds", 0)
+    assert code == 0, printed
+    lines = [line for line in printed.splitlines() if line.startswith(task)]
+    assert [line.split()[2] for line in lines[:-1]] == ["xla"] * (len(lines) - 1)
+    assert "simd cannot compile it: the primitive sort, from" in lines[-1]
+    assert "sorting.py:" in lines[-1]
+    code, printed = es("bench", "rollouts", "--task", task, "--policy", "off", "--rollout", "simd", "--seconds", 0)
+    assert code != 0
+    assert "simd cannot compile it: the primitive sort" in printed
 
 
 def test_options_stand_for_keys(config, tmp_path):

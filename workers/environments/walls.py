@@ -3,7 +3,7 @@
 A wall is a plane segment thickened by WALL_RADIUS, a collider one thickened by its own radius: a lower leg from foot to
 knee, or the torso, whose segment is a point. They touch where the two segments are closest. A contact's normal is
 horizontal and points from the wall to the collider, so that nothing lifts an ant over a wall. Each collider has one
-contact, with the wall nearest to it. Choices are sums over masks, without gathers, for compilers to come.
+contact, with the wall nearest to it. Choices are made without gathers, and divisions spared, for compilers' sake.
 """
 
 from __future__ import annotations
@@ -43,56 +43,57 @@ def nearest_wall(walls: tuple[Segment, ...], foot_3: Any, knee_3: Any, radius: A
     """
     ends = np.array(walls, np.float32)
     start_W_2, way_W_2 = ends[:, 0], ends[:, 1] - ends[:, 0]
+    inverse_W = 1.0 / (way_W_2**2).sum(-1)
     foot_2, knee_2 = foot_3[:2], knee_3[:2]
     leg_2 = knee_2 - foot_2
+    inverse_leg = 1.0 / jnp.maximum(_dot(leg_2, leg_2), TINY)
 
-    # The four candidates C of each wall: foot, knee, and the wall's two ends, each against the other segment.
-    offset_W_C_2, along_W_C = [], []
+    # The four candidates of each wall: foot, knee, and the wall's two ends, each against the other segment.
+    candidates = []
     for point_2, along in ((foot_2, 0.0), (knee_2, 1.0)):
-        share_W = _share(point_2 - start_W_2, way_W_2)
-        offset_W_C_2.append(point_2 - start_W_2 - share_W[:, None] * way_W_2)
-        along_W_C.append(jnp.full(len(walls), along))
+        share_W = jnp.clip(_dot(point_2 - start_W_2, way_W_2) * inverse_W, 0.0, 1.0)
+        candidates.append((point_2 - start_W_2 - share_W[:, None] * way_W_2, jnp.full(len(walls), along)))
     for end_W_2 in (start_W_2, ends[:, 1]):
-        share_W = _share(end_W_2 - foot_2, leg_2)
-        offset_W_C_2.append(foot_2 + share_W[:, None] * leg_2 - end_W_2)
-        along_W_C.append(share_W)
-    offset_W_C_2, along_W_C = jnp.stack(offset_W_C_2, 1), jnp.stack(along_W_C, 1)
-    nearest_W_C = _first_least(jnp.sum(offset_W_C_2 * offset_W_C_2, -1))
-    offset_W_2 = jnp.sum(offset_W_C_2 * nearest_W_C[:, :, None], 1)
-    along_W = jnp.sum(along_W_C * nearest_W_C, 1)
-    gap_W = jnp.sqrt(jnp.sum(offset_W_2 * offset_W_2, -1))
+        share_W = jnp.clip(_dot(end_W_2 - foot_2, leg_2) * inverse_leg, 0.0, 1.0)
+        candidates.append((foot_2 + share_W[:, None] * leg_2 - end_W_2, share_W))
+    square_W, offset_W_2, along_W = _least([(_dot(offset, offset), offset, along) for offset, along in candidates])
 
+    # Squares of gaps decide which wall is nearest, those of feet that came through as negative numbers.
     side_foot_W, side_knee_W = _cross(way_W_2, foot_2 - start_W_2), _cross(way_W_2, knee_2 - start_W_2)
     ends_apart_W = _cross(leg_2, start_W_2 - foot_2) * _cross(leg_2, ends[:, 1] - foot_2) < 0
     crosses_W = (side_foot_W * side_knee_W < 0) & ends_apart_W
-    length_W = np.sqrt((way_W_2**2).sum(-1))
-    across_W_2 = np.stack([-way_W_2[:, 1], way_W_2[:, 0]], -1) / length_W[:, None]
-    through_W_2 = across_W_2 * jnp.sign(side_knee_W)[:, None]
-    normal_W_2 = jnp.where(crosses_W[:, None], through_W_2, offset_W_2 / jnp.maximum(gap_W, TINY)[:, None])
-    gap_W = jnp.where(crosses_W, -jnp.abs(side_foot_W) / length_W, gap_W)
+    across_W_2 = np.stack([-way_W_2[:, 1], way_W_2[:, 0]], -1) * np.sqrt(inverse_W)[:, None]
+    through_W = side_foot_W * np.sqrt(inverse_W)
+    square_W = jnp.where(crosses_W, -through_W * through_W, square_W)
+    offset_W_2 = jnp.where(crosses_W[:, None], across_W_2 * jnp.sign(side_knee_W)[:, None], offset_W_2)
     along_W = jnp.where(crosses_W, 0.0, along_W)
+    square, offset_2, along = _least(list(zip(square_W, offset_W_2, along_W, strict=True)))
 
-    chosen_W = _first_least(gap_W[None])[0]
-    distance = jnp.sum(gap_W * chosen_W) - WALL_RADIUS - radius
-    normal_2 = jnp.sum(normal_W_2 * chosen_W[:, None], 0)
+    came_through = square < 0
+    gap = jnp.sqrt(jnp.abs(square))
+    normal_2 = jnp.where(came_through, offset_2, offset_2 * (1.0 / jnp.maximum(gap, TINY)))
     normal_3 = jnp.concatenate([normal_2, jnp.zeros(1)])
-    on_axis_3 = foot_3 + jnp.sum(along_W * chosen_W) * (knee_3 - foot_3)
+    distance = jnp.where(came_through, -gap, gap) - WALL_RADIUS - radius
+    on_axis_3 = foot_3 + along * (knee_3 - foot_3)
     return WallContact(distance, normal_3, on_axis_3 - normal_3 * (radius + 0.5 * distance))
 
 
-def _share(from_2: Any, way_2: Any) -> Any:
-    """How far along a way, from 0 to 1, the point lies that is nearest to one `from_2` away from its start."""
-    length = (way_2 * way_2).sum(-1)
-    return jnp.clip((from_2 * way_2).sum(-1) / jnp.maximum(length, TINY), 0.0, 1.0)
+def _dot(a_2: Any, b_2: Any) -> Any:
+    return (a_2 * b_2).sum(-1)
+
+
+def _least(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
+    """Of each lane's rows the one whose first entry is least; of equal ones the first."""
+    best = rows[0]
+    for row in rows[1:]:
+        less = row[0] < best[0]
+        best = tuple(
+            jnp.where(less if new.ndim == less.ndim else less[..., None], new, old)
+            for new, old in zip(row, best, strict=True)
+        )
+    return best
 
 
 def _cross(way_2: Any, from_2: Any) -> Any:
     """Positive to the left of the way, negative to its right."""
     return way_2[..., 0] * from_2[..., 1] - way_2[..., 1] * from_2[..., 0]
-
-
-def _first_least(values: Any) -> Any:
-    """1.0 at the first least of the last axis, 0.0 elsewhere."""
-    least = values == values.min(-1, keepdims=True)
-    before = jnp.cumsum(least, -1) - least
-    return (least & (before == 0)).astype(jnp.float32)

@@ -1,0 +1,90 @@
+"""A scalar graph computed in NumPy, node after node: what its machine code must give, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from workers.simd.graph import Graph
+from workers.simd.operations import DTYPES, OPERATIONS
+from workers.simd.schedule import Region, schedule
+
+TINY = np.finfo(np.float32).tiny
+
+
+def evaluate(
+    graph: Graph,
+    outputs: Sequence[int],
+    words: np.ndarray,
+    seen: Callable[[int, Sequence[Any]], None] = lambda node, arguments: None,
+    *,
+    fuse: bool = True,
+) -> list[np.ndarray]:
+    """Values of outputs over lanes.
+
+    Args:
+        words: uint32 [input word, lane].
+        seen: told of every operation and its arguments, each time it is computed.
+        fuse: products with their sums, as kernels do.
+    """
+    order = schedule(graph, outputs)
+    values: dict[int, np.ndarray] = {}
+
+    def value(node: int) -> np.ndarray:
+        key = graph.keys[node]
+        if key[0] == "const":
+            return np.full(words.shape[1], graph.constant(node))
+        if key[0] == "input":
+            word = words[key[2]]
+            return word != 0 if key[1] == "b" else _flushed(word.view(DTYPES[key[1]]))
+        return values[node]
+
+    def compute(node: int) -> None:
+        arguments = [value(one) for one in graph.arguments(node)]
+        seen(node, arguments)
+        product = order.fused.get(node) if fuse else None
+        if product is None:
+            values[node] = _apply(graph.keys[node][0], arguments)
+            return
+        left, right = graph.arguments(node)
+        a, b = (value(one) for one in graph.arguments(product))
+        if graph.keys[node][0] == "sub" and product == right:
+            values[node] = _apply("fma", [-a, b, value(left)])
+        elif graph.keys[node][0] == "sub":
+            values[node] = _apply("fma", [a, b, -value(right)])
+        else:
+            values[node] = _apply("fma", [a, b, value(right if product == left else left)])
+
+    def run(region: Region) -> None:
+        for step in region.steps:
+            if not isinstance(step, Region):
+                compute(step)
+                continue
+            loop = step.loop
+            assert loop is not None
+            carried = {k: value(loop.inits[k]) for k in step.carried}
+            for _ in range(loop.trips):
+                values.update({loop.carries[k]: one for k, one in carried.items()})
+                run(step)
+                carried = {k: value(loop.outs[k]) for k in step.carried}
+            values.update({loop.results[k]: one for k, one in carried.items()})
+
+    run(order.region)
+    return [value(node) for node in outputs]
+
+
+def _apply(name: str, arguments: list[Any]) -> np.ndarray:
+    operation = OPERATIONS[name]
+    with np.errstate(all="ignore"):
+        found = np.asarray(operation.meaning(*arguments), DTYPES[operation.gives])
+    bitwise = ("unbits", "neg", "abs", "select")  # these move bits and flush nothing
+    return _flushed(found) if operation.gives == "f" and name not in bitwise else found
+
+
+def _flushed(x: np.ndarray) -> np.ndarray:
+    """Denormal numbers are zeros."""
+    if x.dtype != np.float32:
+        return x
+    return np.where(np.abs(x) < TINY, np.copysign(np.float32(0.0), x), x)

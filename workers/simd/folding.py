@@ -1,0 +1,182 @@
+"""Identities that graphs apply while they are built.
+
+With NaN, infinities and signed zeros in mind, they are of three sorts:
+
+* exact for every value: x * 1, x / 1, x - 0, x + (-0), -(-x), |-x|, a + (-b) = a - b, (-a) * b = -(a * b), choices
+  between equal things or by constants, x < x (false for NaN too), logic with constants.
+* exact but for the sign of a zero: x + 0 = x, 0 - x = -x, -(a - b) = b - a. Only division by that zero, atan2 and bit
+  tricks could tell.
+* exact for finite values: x * 0 = 0. Brax's constant joint frames are full of it: without it an ant has twice as many
+  operations. Where a factor is infinite or NaN, JAX has NaN and the graph 0; but the factor itself stays what it was on
+  every other way through the graph, so a state that was not finite stays so. `is_finite` is computed, never assumed.
+
+Not done: 0 / x, x / x, x - x, x == x (NaN matters there), reassociation, approximations.
+
+A rule is f(graph, arguments, their values where constant) -> a simpler node of the same value, or None.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from workers.simd.graph import Graph
+
+Rule = Callable[["Graph", tuple[int, ...], list[Any]], int | None]
+
+
+def _is(value: Any, number: float) -> bool:
+    return value is not None and value == number
+
+
+def _fold_add(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    a, b = args
+    for x, value in ((b, values[0]), (a, values[1])):
+        if _is(value, 0.0):
+            return x
+    if (minus := g.negated(b)) is not None:
+        return g.op_again("sub", a, minus)
+    if (minus := g.negated(a)) is not None:
+        return g.op_again("sub", b, minus)
+    return None
+
+
+def _fold_sub(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    a, b = args
+    if _is(values[1], 0.0):
+        return a
+    if _is(values[0], 0.0):
+        return g.op_again("neg", b)
+    if (minus := g.negated(b)) is not None:
+        return g.op_again("add", a, minus)
+    if (minus := g.negated(a)) is not None:
+        return g.op_again("neg", g.op_again("add", minus, b))
+    return None
+
+
+def _fold_mul(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    a, b = args
+    for x, value in ((b, values[0]), (a, values[1])):
+        if _is(value, 1.0):
+            return x
+        if _is(value, -1.0):
+            return g.op_again("neg", x)
+        if _is(value, 0.0):
+            return g.f(0.0)
+    minus_a, minus_b = g.negated(a), g.negated(b)
+    if minus_a is not None and minus_b is not None:
+        return g.op_again("mul", minus_a, minus_b)
+    if minus_a is not None:
+        return (
+            g.op_again("mul", minus_a, g.op_again("neg", b))
+            if values[1] is not None
+            else g.op_again("neg", g.op_again("mul", minus_a, b))
+        )
+    if minus_b is not None:
+        return (
+            g.op_again("mul", minus_b, g.op_again("neg", a))
+            if values[0] is not None
+            else g.op_again("neg", g.op_again("mul", a, minus_b))
+        )
+    return None
+
+
+def _fold_div(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    a, _ = args
+    if _is(values[1], 1.0):
+        return a
+    if values[1] is not None and np.isfinite(values[1]) and values[1] != 0.0:
+        mantissa, exponent = np.frexp(abs(float(values[1])))
+        if mantissa == 0.5 and abs(exponent) < 100:  # the reciprocal of a power of two is exact
+            return g.op_again("mul", a, g.f(1.0 / float(values[1])))
+    return None
+
+
+def _fold_neg(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    key = g.keys[args[0]]
+    if key[0] == "neg":
+        return key[1]
+    return g.op_again("sub", key[2], key[1]) if key[0] == "sub" else None
+
+
+def _fold_abs(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    key = g.keys[args[0]]
+    if key[0] in ("abs", "sqrt"):
+        return args[0]
+    return g.op_again("abs", key[1]) if key[0] == "neg" else None
+
+
+def _fold_less(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    return g.const("b", False) if args[0] == args[1] else None
+
+
+def _fold_select(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    mask, a, b = args
+    if a == b:
+        return a
+    if values[0] is not None:
+        return a if values[0] else b
+    key = g.keys[mask]
+    if key[0] == "xor" and _is(g.constant(key[1]), True):
+        return g.op_again("iselect" if g.kinds[a] == "i" else "select", key[2], b, a)
+    return None
+
+
+def _fold_logic(neutral: bool, absorbing: bool) -> Rule:
+    def fold(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+        a, b = args
+        for x, value in ((b, values[0]), (a, values[1])):
+            if value is not None:
+                return x if bool(value) is neutral else g.const("b", absorbing)
+        return a if a == b else None
+
+    return fold
+
+
+def _fold_xor(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    a, b = args
+    for one, other, value in ((a, b, values[0]), (b, a, values[1])):
+        if value is not None and not value:
+            return other
+        key = g.keys[other]
+        if value is not None and key[0] == "xor" and one in key[1:]:
+            return key[2] if key[1] == one else key[1]  # not (not x)
+    return None
+
+
+def _fold_by_zero(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    """x + 0, x - 0, x | 0, x ^ 0, x << 0 of integers."""
+    return args[0] if _is(values[1], 0) else None
+
+
+def _fold_by_zero_either(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    return args[1] if _is(values[0], 0) else _fold_by_zero(g, args, values)
+
+
+RULES: dict[str, Rule] = {
+    "add": _fold_add,
+    "sub": _fold_sub,
+    "mul": _fold_mul,
+    "div": _fold_div,
+    "neg": _fold_neg,
+    "abs": _fold_abs,
+    "lt": _fold_less,
+    "slt": _fold_less,
+    "ult": _fold_less,
+    "select": _fold_select,
+    "iselect": _fold_select,
+    "and": _fold_logic(neutral=True, absorbing=False),
+    "or": _fold_logic(neutral=False, absorbing=True),
+    "xor": _fold_xor,
+    "iadd": _fold_by_zero_either,
+    "ior": _fold_by_zero_either,
+    "ixor": _fold_by_zero_either,
+    "isub": _fold_by_zero,
+    "shl": _fold_by_zero,
+    "lshr": _fold_by_zero,
+    "ashr": _fold_by_zero,
+}
+"""Operation -> rule."""

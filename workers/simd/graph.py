@@ -1,0 +1,151 @@
+"""A graph of scalar operations, folded while it is built. Nodes are numbers, in an order in which they can be computed.
+
+Equal expressions are one node (hash-consing), expressions of constants are constants, and the identities of
+`folding.py` are applied at once.
+
+A loop is a `Loop`: its carries are nodes ("carry") that its body hangs on, its results nodes ("result") that what comes
+after hangs on. What hangs on no carry lies outside by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from workers.simd.folding import RULES
+from workers.simd.operations import DTYPES, OPERATIONS
+
+Key = tuple
+SMALLEST_NORMAL = np.finfo(np.float32).tiny
+
+
+@dataclass
+class Loop:
+    """Repeated `trips` times, at least once: carry k starts as inits[k], and is outs[k] at the end of each trip."""
+
+    number: int
+    trips: int
+    inits: list[int]
+    carries: list[int]
+    outs: list[int] = field(default_factory=list)
+    results: list[int] = field(default_factory=list)
+
+
+class Graph:
+    """Append-only; `keys[node]` is what a node is: (operation, *argument nodes), or
+
+    ("const", kind, bits), ("input", kind, position), ("carry", kind, loop, position), ("result", kind, loop, position).
+    """
+
+    def __init__(self) -> None:
+        self.keys: list[Key] = []
+        self.kinds: list[str] = []
+        self.loops: list[Loop] = []
+        self.asked = 0
+        """Operations asked for, before any folding."""
+        self._known: dict[Key, int] = {}
+
+    def const(self, kind: str, value: float | int | bool) -> int:
+        """A constant; denormal numbers are zeros, as they are in the kernels."""
+        array = np.asarray(value, DTYPES[kind])
+        if kind == "f" and abs(array) < SMALLEST_NORMAL:
+            array = np.copysign(np.float32(0.0), array)
+        bits = int(array.view(np.int32)) if kind == "f" else int(array)
+        return self._node(("const", kind, bits), kind)
+
+    def f(self, value: float) -> int:
+        """A float32 constant."""
+        return self.const("f", value)
+
+    def i(self, value: int) -> int:
+        """An integer constant; numbers of 2^31 and more are those of the same bits."""
+        return self.const("i", (value + 2**31) % 2**32 - 2**31)
+
+    def input(self, kind: str, position: int) -> int:
+        """The kernel's input word at a position."""
+        return self._node(("input", kind, position), kind)
+
+    def constant(self, node: int) -> Any:
+        """The value of a constant node, a NumPy scalar; else None."""
+        key = self.keys[node]
+        if key[0] != "const":
+            return None
+        array = np.array(key[2], np.int32 if key[1] == "f" else DTYPES[key[1]])
+        return array.view(np.float32)[()] if key[1] == "f" else array[()]
+
+    def arguments(self, node: int) -> tuple[int, ...]:
+        """Nodes that an operation is applied to; nothing for other nodes."""
+        key = self.keys[node]
+        return key[1:] if key[0] in OPERATIONS else ()
+
+    def needs(self, node: int) -> tuple[int, ...]:
+        """Nodes that a node cannot do without: a result its carry, a carry its start and its end."""
+        key = self.keys[node]
+        match key[0]:
+            case "result":
+                return (self.loops[key[2]].carries[key[3]],)
+            case "carry":
+                loop = self.loops[key[2]]
+                return (loop.inits[key[3]], loop.outs[key[3]]) if loop.outs else (loop.inits[key[3]],)
+        return self.arguments(node)
+
+    def loop(self, trips: int, inits: list[int]) -> Loop:
+        """Open a loop; its body is whatever is then built on its carries. Close it with `close`."""
+        number = len(self.loops)
+        kinds = [self.kinds[node] for node in inits]
+        carries = [self._node(("carry", kind, number, k), kind) for k, kind in enumerate(kinds)]
+        self.loops.append(Loop(number, trips, list(inits), carries))
+        return self.loops[-1]
+
+    def close(self, loop: Loop, outs: list[int]) -> list[int]:
+        """Give a loop its ends; returns its results."""
+        loop.outs = list(outs)
+        for k, out in enumerate(outs):
+            assert self.kinds[out] == self.kinds[loop.carries[k]], "a loop carries values of one kind"
+        kinds = [self.kinds[node] for node in outs]
+        loop.results = [self._node(("result", kind, loop.number, k), kind) for k, kind in enumerate(kinds)]
+        return loop.results
+
+    def op(self, name: str, *arguments: int) -> int:
+        """The node of an operation on nodes, after folding."""
+        self.asked += 1
+        return self.op_again(name, *arguments)
+
+    def op_again(self, name: str, *arguments: int) -> int:
+        """As `op`, of what was asked for before."""
+        operation = OPERATIONS[name]
+        if operation.commutes and arguments[0] > arguments[1]:
+            arguments = (arguments[1], arguments[0])
+        known = self._known.get((name, *arguments))
+        if known is not None:
+            return known
+        assert "".join(self.kinds[a] for a in arguments) == operation.takes, (name, arguments)
+        folded = self._fold(name, arguments)
+        if folded is None:
+            return self._node((name, *arguments), operation.gives)
+        self._known[(name, *arguments)] = folded
+        return folded
+
+    def _node(self, key: Key, kind: str) -> int:
+        known = self._known.get(key)
+        if known is None:
+            known = self._known[key] = len(self.keys)
+            self.keys.append(key)
+            self.kinds.append(kind)
+        return known
+
+    def _fold(self, name: str, arguments: tuple[int, ...]) -> int | None:
+        """A simpler node of the same value, or None."""
+        values = [self.constant(a) for a in arguments]
+        if all(value is not None for value in values):
+            with np.errstate(all="ignore"):
+                return self.const(OPERATIONS[name].gives, OPERATIONS[name].meaning(*values))
+        rule = RULES.get(name)
+        return rule(self, arguments, values) if rule else None
+
+    def negated(self, node: int) -> int | None:
+        """What a node is the negative of, or None."""
+        key = self.keys[node]
+        return key[1] if key[0] == "neg" else None

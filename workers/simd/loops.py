@@ -1,0 +1,145 @@
+"""Loops carry the least they can. Brax's state is some 600 numbers, most of them functions of the others.
+
+A carry is not needed where it stays what it was, and where its end is made of other carries' ends. Then it is
+
+* *derived*, if its start is made in the same way of their starts (hash-consing shows it): computed from those at the
+  start of each trip, as before at the end;
+* *late*, if no trip looks at it: computed from the others' results, once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from workers.simd.graph import Graph, Loop
+
+Body = Callable[[list[int]], list[int]]
+UNROLLED_OPERATIONS = 2000
+"""A loop whose trips have no more than this many operations in all becomes straight code."""
+
+
+def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> list[int]:
+    """Results of repeating `body` (carries -> their ends): a Loop with as few carries as will do, or straight code.
+
+    `body` is called again for another set of carries, and must build the same for the same.
+    """
+    loop = graph.loop(trips, list(inits))
+    before = len(graph.keys)
+    outs = body(loop.carries)
+    if trips * (len(graph.keys) - before) <= UNROLLED_OPERATIONS:
+        nodes = list(inits)
+        for _ in range(trips):
+            nodes = body(nodes)
+        return nodes
+    kept, derived, late, firsts = _sort(graph, loop, outs)
+    if len(kept) == len(inits):
+        return graph.close(loop, outs)
+
+    # The same body again, on the carries that are kept and what is derived from them.
+    short = graph.loop(trips, [inits[k] for k in kept])
+    # Of carries with one end, the start that `_sort` compared with counts.
+    starts = {outs[k]: carry for k, carry in zip(kept, short.carries, strict=True) if k in firsts}
+    carries = list(inits)
+    for k, carry in zip(kept, short.carries, strict=True):
+        carries[k] = carry
+    for k in derived:
+        carries[k] = substitute(graph, outs[k], starts)
+    for k in late:
+        carries[k] = inits[k]  # nothing looks at it
+    new_outs = body(carries)
+    results = graph.close(short, [new_outs[k] for k in kept])
+    found = list(inits)  # what is constant stays
+    for k, result in zip(kept, results, strict=True):
+        found[k] = result
+    ends = dict(zip((outs[k] for k in kept), results, strict=True))
+    for k in (*derived, *late):
+        found[k] = substitute(graph, outs[k], ends)
+    return found
+
+
+def _sort(graph: Graph, loop: Loop, outs: Sequence[int]) -> tuple[list[int], list[int], list[int], list[int]]:
+    """Positions of carries: (kept, derived, late, those whose start stands for all with the same end).
+
+    What is in none of the first three stays what it was.
+    """
+    inits, carries = loop.inits, loop.carries
+    candidates = [k for k, out in enumerate(outs) if out != carries[k]]
+    inside = depending(graph, loop)
+    used = live(graph, outs)
+    first_with: dict[int, int] = {}
+    for k in sorted(candidates, key=lambda k: carries[k] not in used):  # what trips look at comes first
+        first_with.setdefault(outs[k], k)
+    starts = {out: inits[k] for out, k in first_with.items()}
+    kept, derived, late = [], [], []
+    for k in candidates:
+        is_first = first_with[outs[k]] == k
+        if is_first and not _made_of(graph, outs[k], set(first_with), inside):
+            kept.append(k)
+        elif carries[k] not in used:
+            late.append(k)
+        elif inits[k] == (starts[outs[k]] if not is_first else substitute(graph, outs[k], starts, itself=False)):
+            derived.append(k)
+        else:
+            kept.append(k)
+    return kept, derived, late, list(first_with.values())
+
+
+def live(graph: Graph, outputs: Iterable[int]) -> set[int]:
+    """Nodes that outputs hang on. A loop's carry is among them only where somebody needs it."""
+    found: set[int] = set()
+    waiting = list(outputs)
+    while waiting:
+        node = waiting.pop()
+        if node not in found:
+            found.add(node)
+            waiting += graph.needs(node)
+    return found
+
+
+def depending(graph: Graph, loop: Loop) -> set[int]:
+    """Nodes of a loop's body: what is made of its carries, but for its results and what comes after."""
+    found = set(loop.carries)
+    size = 0
+    while len(found) != size:  # an inner loop's carries come before their ends: look again
+        size = len(found)
+        for node in range(min(found, default=0), len(graph.keys)):
+            if node not in found and not found.isdisjoint(graph.needs(node)):
+                key = graph.keys[node]
+                if key[0] != "result" or key[2] != loop.number:
+                    found.add(node)
+    return found
+
+
+def _made_of(graph: Graph, node: int, ends: set[int], inside: set[int]) -> bool:
+    """Whether a node inside a loop is made of other ends and of what is outside, by operations alone."""
+    waiting, seen = list(graph.arguments(node)), set()
+    if node in inside and not waiting:
+        return False  # another carry, or an inner loop's result
+    while waiting:
+        one = waiting.pop()
+        if one in seen or one not in inside or one in ends:
+            continue
+        seen.add(one)
+        if not graph.arguments(one):
+            return False
+        waiting += graph.arguments(one)
+    return True
+
+
+def substitute(graph: Graph, node: int, replaced: Mapping[int, int], *, itself: bool = True) -> int:
+    """The same operations on other nodes: those in `replaced`, but for the node itself if not `itself`."""
+    copies = dict(replaced)
+    if not itself:
+        copies.pop(node, None)
+    waiting = [node]
+    while waiting:
+        top = waiting[-1]
+        missing = [a for a in graph.arguments(top) if a not in copies] if top not in copies else []
+        if missing:
+            waiting += missing
+            continue
+        waiting.pop()
+        if top not in copies:
+            key = graph.keys[top]
+            copies[top] = graph.op_again(key[0], *(copies[a] for a in key[1:])) if graph.arguments(top) else top
+    return copies[node]

@@ -1,0 +1,105 @@
+"""The operations that a scalar graph is made of: what each takes, gives and means, and how LLVM writes it.
+
+Three kinds of values: "f" float32, "i" 32 bits (signed or not is the operation's affair), "b" truth. Every operation is
+one instruction of a vector unit, or nearly; all of them give the same bits on every machine and at every width. There
+is no approximate division or root here, no tangent and no exponential: `elementary.py` makes those of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Operation(NamedTuple):
+    """One row of OPERATIONS."""
+
+    takes: str
+    """Kinds of the arguments."""
+    gives: str
+    """Kind of the result."""
+    meaning: Callable[..., Any]
+    """In NumPy: folds constants, and is the twin that tests hold machine code against."""
+    llvm: str
+    """Its instruction: {0}, {1}, {2} are arguments; {F}, {I}, {B} the vector types; {N} the suffix of intrinsics."""
+    commutes: bool = False
+
+
+def _fused(a: Any, b: Any, c: Any) -> Any:
+    """a * b + c, rounded once: the product is exact in 64 bits; the sum is rounded to odd there before it is to 24."""
+    product = np.asarray(a, np.float64) * np.asarray(b, np.float64)
+    c = np.asarray(c, np.float64)
+    total = product + c
+    away = total - product
+    error = (product - (total - away)) + (c - away)  # exact: total + error == product + c
+    bits = total.view(np.int64)
+    inexact_and_even = np.isfinite(total) & (error != 0) & (bits & 1 == 0)
+    toward = np.where((error > 0) == (total > 0), 1, -1)
+    return np.where(inexact_and_even, (bits + toward).view(np.float64), total).astype(np.float32)
+
+
+def _unsigned(x: Any) -> Any:
+    return np.asarray(x, np.int32).view(np.uint32)
+
+
+def _bits(x: Any) -> Any:
+    return np.asarray(x, np.float32).view(np.int32)
+
+
+def _float(x: Any) -> Any:
+    return np.asarray(x, np.int32).view(np.float32)
+
+
+OPERATIONS: dict[str, Operation] = {
+    "add": Operation("ff", "f", np.add, "fadd {F} {0}, {1}", commutes=True),
+    "sub": Operation("ff", "f", np.subtract, "fsub {F} {0}, {1}"),
+    "mul": Operation("ff", "f", np.multiply, "fmul {F} {0}, {1}", commutes=True),
+    "div": Operation("ff", "f", np.divide, "fdiv {F} {0}, {1}"),
+    "fma": Operation("fff", "f", _fused, "call {F} @llvm.fma.{N}({F} {0}, {F} {1}, {F} {2})"),
+    "neg": Operation("f", "f", np.negative, "fneg {F} {0}"),
+    "abs": Operation("f", "f", np.abs, "call {F} @llvm.fabs.{N}({F} {0})"),
+    "sqrt": Operation("f", "f", np.sqrt, "call {F} @llvm.sqrt.{N}({F} {0})"),
+    "floor": Operation("f", "f", np.floor, "call {F} @llvm.floor.{N}({F} {0})"),
+    "ceil": Operation("f", "f", np.ceil, "call {F} @llvm.ceil.{N}({F} {0})"),
+    "round": Operation("f", "f", np.rint, "call {F} @llvm.roundeven.{N}({F} {0})"),
+    # Comparisons with NaN are false, but for `ne`.
+    "eq": Operation("ff", "b", np.equal, "fcmp oeq {F} {0}, {1}", commutes=True),
+    "ne": Operation("ff", "b", np.not_equal, "fcmp une {F} {0}, {1}", commutes=True),
+    "lt": Operation("ff", "b", np.less, "fcmp olt {F} {0}, {1}"),
+    "le": Operation("ff", "b", np.less_equal, "fcmp ole {F} {0}, {1}"),
+    # Integers wrap around.
+    "iadd": Operation("ii", "i", np.add, "add {I} {0}, {1}", commutes=True),
+    "isub": Operation("ii", "i", np.subtract, "sub {I} {0}, {1}"),
+    "imul": Operation("ii", "i", np.multiply, "mul {I} {0}, {1}", commutes=True),
+    "iand": Operation("ii", "i", np.bitwise_and, "and {I} {0}, {1}", commutes=True),
+    "ior": Operation("ii", "i", np.bitwise_or, "or {I} {0}, {1}", commutes=True),
+    "ixor": Operation("ii", "i", np.bitwise_xor, "xor {I} {0}, {1}", commutes=True),
+    # Shifts are by 0 to 31; primitives see to that.
+    "shl": Operation("ii", "i", np.left_shift, "shl {I} {0}, {1}"),
+    "lshr": Operation("ii", "i", lambda a, b: (_unsigned(a) >> _unsigned(b)).view(np.int32), "lshr {I} {0}, {1}"),
+    "ashr": Operation("ii", "i", np.right_shift, "ashr {I} {0}, {1}"),
+    "popcount": Operation(
+        "i", "i", lambda a: np.bitwise_count(_unsigned(a)).astype(np.int32), "call {I} @llvm.ctpop.{M}({I} {0})"
+    ),
+    "ieq": Operation("ii", "b", np.equal, "icmp eq {I} {0}, {1}", commutes=True),
+    "slt": Operation("ii", "b", np.less, "icmp slt {I} {0}, {1}"),
+    "ult": Operation("ii", "b", lambda a, b: _unsigned(a) < _unsigned(b), "icmp ult {I} {0}, {1}"),
+    "float_of_int": Operation("i", "f", lambda a: np.asarray(a).astype(np.float32), "sitofp {I} {0} to {F}"),
+    "float_of_uint": Operation("i", "f", lambda a: _unsigned(a).astype(np.float32), "uitofp {I} {0} to {F}"),
+    # Of whole numbers that fit; primitives see to that.
+    "int_of_float": Operation("f", "i", lambda a: np.asarray(a).astype(np.int32), "fptosi {F} {0} to {I}"),
+    "bits": Operation("f", "i", _bits, "bitcast {F} {0} to {I}"),
+    "unbits": Operation("i", "f", _float, "bitcast {I} {0} to {F}"),
+    "int_of_bool": Operation("b", "i", lambda a: np.asarray(a).astype(np.int32), "zext {B} {0} to {I}"),
+    "and": Operation("bb", "b", np.logical_and, "and {B} {0}, {1}", commutes=True),
+    "or": Operation("bb", "b", np.logical_or, "or {B} {0}, {1}", commutes=True),
+    "xor": Operation("bb", "b", np.logical_xor, "xor {B} {0}, {1}", commutes=True),
+    "select": Operation("bff", "f", np.where, "select {B} {0}, {F} {1}, {F} {2}"),
+    "iselect": Operation("bii", "i", np.where, "select {B} {0}, {I} {1}, {I} {2}"),
+}
+"""Name -> operation. `mul` and `add` stay apart until `contract.py` fuses them."""
+
+DTYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtype(bool)}
+"""Kind -> how NumPy holds it."""

@@ -1,0 +1,128 @@
+"""Arithmetic and elementary functions, element by element."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jax import lax
+
+from workers.simd import elementary
+from workers.simd.primitives.registry import PRIMITIVES, Nodes, Rule, UnsupportedError, dtype_in, kind_of, primitive
+
+if TYPE_CHECKING:
+    from workers.simd.trace import Tracer
+
+
+def _by_kind(floats: str | None, integers: str | None, booleans: str | None = None) -> Rule:
+    """A rule that is one operation of the graph for each kind."""
+
+    def rule(t: Tracer, equation: Any, *arrays: Nodes) -> Nodes:
+        kind = kind_of(dtype_in(equation))
+        name = {"f": floats, "i": integers, "b": booleans}[kind]
+        if name is None or dtype_in(equation) == "uint8":
+            raise UnsupportedError(f"{equation.primitive.name} of {dtype_in(equation)}")
+        return t.ops(name, *arrays)
+
+    return rule
+
+
+PRIMITIVES["add"] = _by_kind("add", "iadd")
+PRIMITIVES["sub"] = _by_kind("sub", "isub")
+PRIMITIVES["mul"] = _by_kind("mul", "imul")
+PRIMITIVES["sqrt"] = _by_kind("sqrt", None)
+PRIMITIVES["floor"] = _by_kind("floor", None)
+PRIMITIVES["ceil"] = _by_kind("ceil", None)
+PRIMITIVES["and"] = _by_kind(None, "iand", "and")
+PRIMITIVES["or"] = _by_kind(None, "ior", "or")
+PRIMITIVES["xor"] = _by_kind(None, "ixor", "xor")
+PRIMITIVES["population_count"] = _by_kind(None, "popcount")
+
+
+@primitive("div")
+def _div(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
+    if kind_of(dtype_in(equation)) == "f":
+        return t.ops("div", a, b)
+    return _constant_integers(t, equation, lax.div, a, b)
+
+
+@primitive("rem")
+def _rem(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
+    return _constant_integers(t, equation, lax.rem, a, b)
+
+
+def _constant_integers(t: Tracer, equation: Any, function: Callable, a: Nodes, b: Nodes) -> Nodes:
+    """Vector units do not divide integers; indices, which are constants, are divided here."""
+    value_a, value_b = t.values(a), t.values(b)
+    if kind_of(dtype_in(equation)) == "f" or value_a is None or value_b is None:
+        raise UnsupportedError(f"{equation.primitive.name} of {dtype_in(equation)} that are no constants")
+    if not value_b.all():
+        raise UnsupportedError(f"{equation.primitive.name} by 0")
+    dtype = np.dtype(dtype_in(equation))
+    exact_a, exact_b = (value.astype(np.int32).view(dtype).astype(np.int64) for value in (value_a, value_b))
+    quotient = np.sign(exact_a) * np.sign(exact_b) * (np.abs(exact_a) // np.abs(exact_b))
+    found = quotient if function is lax.div else exact_a - quotient * exact_b
+    return t.constants(np.asarray(found.astype(dtype)))
+
+
+@primitive("neg")
+def _neg(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    return t.ops("neg", x) if kind_of(dtype_in(equation)) == "f" else t.ops("isub", t.constants(np.int32(0)), x)
+
+
+@primitive("abs")
+def _abs(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    if kind_of(dtype_in(equation)) == "f":
+        return t.ops("abs", x)
+    return t.map(
+        lambda n: t.graph.op("iselect", t.graph.op("slt", n, t.graph.i(0)), t.graph.op("isub", t.graph.i(0), n), n), x
+    )
+
+
+@primitive("sign")
+def _sign(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    g = t.graph
+    if kind_of(dtype_in(equation)) != "f":
+        raise UnsupportedError(f"sign of {dtype_in(equation)}")
+
+    def sign(n: int) -> int:
+        negative = g.op("select", g.op("lt", n, g.f(0.0)), g.f(-1.0), n)  # zeros and NaN are their own sign
+        return g.op("select", g.op("lt", g.f(0.0), n), g.f(1.0), negative)
+
+    return t.map(sign, x)
+
+
+@primitive("square")
+def _square(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    return t.ops("mul" if kind_of(dtype_in(equation)) == "f" else "imul", x, x)
+
+
+@primitive("integer_pow")
+def _integer_pow(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    if kind_of(dtype_in(equation)) != "f":
+        raise UnsupportedError(f"integer_pow of {dtype_in(equation)}")
+    return t.map(lambda n: elementary.whole_power(t.graph, n, equation.params["y"]), x)
+
+
+@primitive("round")
+def _round(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    if equation.params["rounding_method"] != lax.RoundingMethod.TO_NEAREST_EVEN:
+        raise UnsupportedError("rounding half away from zero")
+    return t.ops("round", x)
+
+
+def _elementary(function: Callable[..., int]) -> Rule:
+    """A rule that is one of our own functions of nodes."""
+
+    def rule(t: Tracer, equation: Any, *arrays: Nodes) -> Nodes:
+        if any(str(variable.aval.dtype) != "float32" for variable in equation.invars):
+            raise UnsupportedError(f"{equation.primitive.name} of {[str(v.aval.dtype) for v in equation.invars]}")
+        return t.map(lambda *nodes: function(t.graph, *nodes), *arrays)
+
+    return rule
+
+
+for _name in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "exp", "exp2", "expm1", "log", "log1p", "tanh",
+              "logistic", "rsqrt", "pow"):  # fmt: skip
+    PRIMITIVES[_name] = _elementary(getattr(elementary, _name))

@@ -1,0 +1,163 @@
+"""Comparisons, choices between values, and conversions from one kind to another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from workers.simd import elementary
+from workers.simd.graph import Graph
+from workers.simd.primitives.registry import Nodes, UnsupportedError, dtype_in, kind_of, primitive
+
+if TYPE_CHECKING:
+    from workers.simd.trace import Tracer
+
+
+@primitive("eq", "ne", "lt", "le", "gt", "ge")
+def _compare(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
+    g, name, dtype = t.graph, equation.primitive.name, dtype_in(equation)
+    if name in ("gt", "ge"):
+        name, a, b = {"gt": "lt", "ge": "le"}[name], b, a
+    kind = kind_of(dtype)
+    if kind == "f":
+        return t.ops(name, a, b)
+    less = "slt" if dtype == "int32" else "ult"
+    if kind == "b":
+        if name not in ("eq", "ne"):
+            raise UnsupportedError(f"{name} of bool")
+        different = t.ops("xor", a, b)
+        return different if name == "ne" else _not(t, different)
+    match name:
+        case "eq":
+            return t.ops("ieq", a, b)
+        case "ne":
+            return _not(t, t.ops("ieq", a, b))
+        case "lt":
+            return t.map(lambda x, y: g.op(less, x, y), a, b)
+        case _:
+            return _not(t, t.map(lambda x, y: g.op(less, y, x), a, b))
+
+
+def _not(t: Tracer, x: Nodes) -> Nodes:
+    return t.map(lambda n: t.graph.op("xor", t.graph.const("b", True), n), x)
+
+
+@primitive("not")
+def _not_primitive(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    return _not(t, x) if kind_of(dtype_in(equation)) == "b" else t.ops("ixor", x, t.constants(np.int32(-1)))
+
+
+@primitive("is_finite")
+def _is_finite(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    return t.map(lambda n: t.graph.op("lt", t.graph.op("abs", n), t.graph.f(np.inf)), x)
+
+
+@primitive("max", "min")
+def _extreme(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
+    return t.map(extreme_of(t.graph, equation.primitive.name, dtype_in(equation)), a, b)
+
+
+def extreme_of(g: Graph, name: str, dtype: str) -> Callable[[int, int], int]:
+    """The greater or the lesser of two nodes; NaN if one is. Which of two zeros is not said."""
+    kind = kind_of(dtype)
+    if kind == "b":
+        return lambda a, b: g.op("or" if name == "max" else "and", a, b)
+    if kind == "i":
+        less = "slt" if dtype == "int32" else "ult"
+        return lambda a, b: g.op("iselect", g.op(less, a, b), *((b, a) if name == "max" else (a, b)))
+
+    def extreme(a: int, b: int) -> int:
+        if a == b:
+            return a
+        if g.constant(b) is not None:
+            a, b = b, a
+        first = g.op("lt", b, a) if name == "max" else g.op("lt", a, b)
+        found = g.op("select", first, a, b)  # b if either is NaN: one instruction
+        constant = g.constant(a)
+        if constant is not None and not np.isnan(constant):
+            return found
+        return g.op("select", g.op("ne", a, a), a, found)
+
+    return extreme
+
+
+@primitive("clamp")
+def _clamp(t: Tracer, equation: Any, low: Nodes, x: Nodes, high: Nodes) -> Nodes:
+    dtype = str(equation.invars[1].aval.dtype)
+    greater, lesser = extreme_of(t.graph, "max", dtype), extreme_of(t.graph, "min", dtype)
+    return t.map(lambda lo, n, hi: lesser(greater(n, lo), hi), low, x, high)
+
+
+@primitive("select_n")
+def _select_n(t: Tracer, equation: Any, which: Nodes, *cases: Nodes) -> Nodes:
+    g = t.graph
+    kind = kind_of(equation.outvars[0].aval.dtype)
+
+    def choose(mask: int, if_true: int, if_false: int) -> int:
+        if kind != "b":
+            return g.op("select" if kind == "f" else "iselect", mask, if_true, if_false)
+        return g.op("or", g.op("and", mask, if_true), g.op("and", g.op("xor", g.const("b", True), mask), if_false))
+
+    if kind_of(dtype_in(equation)) == "b":
+        return t.map(lambda mask, a, b: choose(mask, b, a), which, *cases)
+    chosen = cases[-1]  # indices are clamped by JAX to what there is
+    for number in reversed(range(len(cases) - 1)):
+        chosen = t.map(
+            lambda n, a, b, number=number: choose(g.op("slt", n, g.i(number + 1)), a, b), which, cases[number], chosen
+        )
+    return chosen
+
+
+@primitive("convert_element_type")
+def _convert(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    g = t.graph
+    source, target = dtype_in(equation), str(equation.params["new_dtype"])
+    if target == "uint8" and kind_of(source) == "i":
+        return t.ops("iand", x, t.constants(np.int32(255)))
+    match kind_of(source), kind_of(target):
+        case same, also if same == also:
+            return x
+        case "b", "i":
+            return t.ops("int_of_bool", x)
+        case "i", "b":
+            return _not(t, t.map(lambda n: g.op("ieq", n, g.i(0)), x))
+        case "f", "b":
+            return t.map(lambda n: g.op("ne", n, g.f(0.0)), x)
+        case _, "f":
+            return to_float(t, source, x)
+    if target != "int32":
+        raise UnsupportedError(f"conversion of {source} to {target}")
+    return t.map(lambda n: elementary.int_of_float(g, n), x)
+
+
+def to_float(t: Tracer, dtype: str, x: Nodes) -> Nodes:
+    """Nodes of any dtype as floats."""
+    match kind_of(dtype):
+        case "b":
+            return t.map(lambda n: t.graph.op("select", n, t.graph.f(1.0), t.graph.f(0.0)), x)
+        case "i":
+            return t.ops("float_of_int" if dtype == "int32" else "float_of_uint", x)
+    return x
+
+
+@primitive("bitcast_convert_type")
+def _bitcast(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    match kind_of(dtype_in(equation)), kind_of(equation.params["new_dtype"]):
+        case "f", "i":
+            return t.ops("bits", x)
+        case "i", "f":
+            return t.ops("unbits", x)
+        case "i", "i":
+            return x
+    raise UnsupportedError(f"bitcast of {dtype_in(equation)} to {equation.params['new_dtype']}")
+
+
+@primitive("shift_left", "shift_right_logical", "shift_right_arithmetic")
+def _shift(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
+    name = {"shift_left": "shl", "shift_right_logical": "lshr", "shift_right_arithmetic": "ashr"}
+    by = t.values(b)
+    if by is None or (by < 0).any() or (by > 31).any():
+        raise UnsupportedError(f"{equation.primitive.name} by other than a constant from 0 to 31")
+    return t.ops(name[equation.primitive.name], a, b)

@@ -1,0 +1,101 @@
+"""Calls, branches and loops."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from workers.simd.primitives.registry import Nodes, UnsupportedError, primitive
+
+if TYPE_CHECKING:
+    from workers.simd.trace import Tracer
+
+
+@primitive("jit", "custom_jvp_call", "custom_vjp_call", "remat2")
+def _call(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
+    inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
+    return t.closed(inner, arrays) if hasattr(inner, "consts") else t.jaxpr(inner, [], arrays)
+
+
+@primitive("platform_index")
+def _platform_index(t: Tracer, equation: Any) -> Nodes:
+    """Which branch is for CPUs: the first that names them, or that names no platform."""
+    for number, platforms in enumerate(equation.params["platforms"]):
+        if platforms is None or "cpu" in platforms:
+            return t.constants(np.int32(number))
+    raise UnsupportedError("a choice by platform without CPUs")
+
+
+@primitive("cond")
+def _cond(t: Tracer, equation: Any, which: Nodes, *arrays: Nodes) -> list[Nodes]:
+    """A constant choice takes its branch; else all are computed and the results chosen from."""
+    branches = equation.params["branches"]
+    value = t.values(which)
+    if value is not None:
+        return t.closed(branches[min(max(int(value), 0), len(branches) - 1)], arrays)
+    g = t.graph
+    boolean = g.kinds[int(which)] == "b"
+    cases = [t.closed(branch, arrays) for branch in branches]
+    chosen = cases[-1]
+    for number in reversed(range(len(branches) - 1)):
+        first = g.op("xor", g.const("b", True), int(which)) if boolean else g.op("slt", int(which), g.i(number + 1))
+        chosen = [
+            t.map(lambda a, b, first=first: _choose(t, first, a, b), one, other)
+            for one, other in zip(cases[number], chosen, strict=True)
+        ]
+    return chosen
+
+
+def _choose(t: Tracer, mask: int, a: int, b: int) -> int:
+    g = t.graph
+    match g.kinds[a]:
+        case "f":
+            return g.op("select", mask, a, b)
+        case "i":
+            return g.op("iselect", mask, a, b)
+    return g.op("or", g.op("and", mask, a), g.op("and", g.op("xor", g.const("b", True), mask), b))
+
+
+@primitive("scan")
+def _scan(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
+    """Kept as a loop where nothing is read or written step by step, and it is long; else straight code."""
+    params = equation.params
+    constants, carries, length = params["num_consts"], params["num_carry"], params["length"]
+    shared, carry, rows = (
+        arrays[:constants],
+        list(arrays[constants : constants + carries]),
+        arrays[constants + carries :],
+    )
+    body = params["jaxpr"]
+    if not rows and len(equation.outvars) == carries and length > 0:
+        return t.keep_loop(length, lambda carry: t.closed(body, [*shared, *carry]), carry)
+    stacked: list[list[Nodes]] = [[] for _ in range(len(equation.outvars) - carries)]
+    order = reversed(range(length)) if params["reverse"] else range(length)
+    for trip in order:
+        outputs = t.closed(body, [*shared, *carry, *(row[trip] for row in rows)])
+        carry = outputs[:carries]
+        for kept, one in zip(stacked, outputs[carries:], strict=True):
+            kept.append(one)
+    found = []
+    for kept, variable in zip(stacked, equation.outvars[carries:], strict=True):
+        kept = kept[::-1] if params["reverse"] else kept
+        found.append(np.stack(kept) if kept else np.zeros(variable.aval.shape, np.int64))
+    return [*carry, *found]
+
+
+@primitive("while")
+def _while(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
+    """Only loops whose end is known while tracing; they become straight code."""
+    params = equation.params
+    in_condition, in_body = params["cond_nconsts"], params["body_nconsts"]
+    for_condition, for_body = arrays[:in_condition], arrays[in_condition : in_condition + in_body]
+    carry = list(arrays[in_condition + in_body :])
+    while True:
+        (go_on,) = t.closed(params["cond_jaxpr"], [*for_condition, *carry])
+        value = t.values(go_on)
+        if value is None:
+            raise UnsupportedError("a while loop whose end depends on the state")
+        if not value:
+            return carry
+        carry = t.closed(params["body_jaxpr"], [*for_body, *carry])

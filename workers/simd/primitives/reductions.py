@@ -1,0 +1,129 @@
+"""Sums, products and other combinations along axes: one after another, in the order of the elements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from workers.simd.primitives.choices import extreme_of, to_float
+from workers.simd.primitives.registry import PRIMITIVES, Nodes, Rule, UnsupportedError, dtype_in, kind_of, primitive
+
+if TYPE_CHECKING:
+    from workers.simd.trace import Tracer
+
+
+def _reduce(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Rule:
+    """A rule that combines the elements along axes, one after another in their order."""
+
+    def rule(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+        axes = tuple(int(axis) for axis in equation.params["axes"])
+        kept = [axis for axis in range(x.ndim) if axis not in axes]
+        shape = tuple(x.shape[axis] for axis in kept)
+        rows = np.transpose(x, [*kept, *axes]).reshape(int(np.prod(shape)), -1)
+        function = combine(t, equation)
+        found = []
+        for row in rows.tolist():
+            if not row:
+                raise UnsupportedError(f"{equation.primitive.name} of nothing")
+            total = row[0]
+            for node in row[1:]:
+                total = function(total, node)
+            found.append(total)
+        return np.array(found, np.int64).reshape(shape)
+
+    return rule
+
+
+def _adder(t: Tracer, equation: Any) -> Callable[[int, int], int]:
+    name = "add" if kind_of(dtype_in(equation)) == "f" else "iadd"
+    return lambda a, b: t.graph.op(name, a, b)
+
+
+def _multiplier(t: Tracer, equation: Any) -> Callable[[int, int], int]:
+    name = "mul" if kind_of(dtype_in(equation)) == "f" else "imul"
+    return lambda a, b: t.graph.op(name, a, b)
+
+
+def _logic(name: str) -> Callable[[Tracer, Any], Callable[[int, int], int]]:
+    def combine(t: Tracer, equation: Any) -> Callable[[int, int], int]:
+        if kind_of(dtype_in(equation)) != "b":
+            raise UnsupportedError(f"{equation.primitive.name} of {dtype_in(equation)}")
+        return lambda a, b: t.graph.op(name, a, b)
+
+    return combine
+
+
+PRIMITIVES["reduce_sum"] = _reduce(_adder)
+PRIMITIVES["reduce_prod"] = _reduce(_multiplier)
+PRIMITIVES["reduce_max"] = _reduce(lambda t, equation: extreme_of(t.graph, "max", dtype_in(equation)))
+PRIMITIVES["reduce_min"] = _reduce(lambda t, equation: extreme_of(t.graph, "min", dtype_in(equation)))
+PRIMITIVES["reduce_and"] = _reduce(_logic("and"))
+PRIMITIVES["reduce_or"] = _reduce(_logic("or"))
+
+
+@primitive("argmin", "argmax")
+def _arg_extreme(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    """The first extreme; the first NaN, if there is one."""
+    g = t.graph
+    (axis,) = equation.params["axes"]
+    dtype = dtype_in(equation)
+    if kind_of(dtype) != "f" or str(equation.params["index_dtype"]) != "int32":
+        raise UnsupportedError(f"{equation.primitive.name} of {dtype}")
+    rows = np.moveaxis(x, axis, -1)
+    found = []
+    for row in rows.reshape(-1, x.shape[axis]).tolist():
+        best, at = row[0], g.i(0)
+        for number, node in enumerate(row[1:], 1):
+            ahead = g.op("lt", node, best) if equation.primitive.name == "argmin" else g.op("lt", best, node)
+            ahead = g.op("or", ahead, g.op("and", g.op("ne", node, node), g.op("eq", best, best)))
+            best = g.op("select", ahead, node, best)
+            at = g.op("iselect", ahead, g.i(number), at)
+        found.append(at)
+    return np.array(found, np.int64).reshape(rows.shape[:-1])
+
+
+def _cumulate(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Rule:
+    def rule(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+        function = combine(t, equation)
+        rows = np.moveaxis(x, equation.params["axis"], 0)
+        rows = rows[::-1] if equation.params["reverse"] else rows
+        found = [rows[0]]
+        for row in rows[1:]:
+            found.append(t.map(function, found[-1], row))
+        stacked = np.stack(found[::-1] if equation.params["reverse"] else found)
+        return np.moveaxis(stacked, 0, equation.params["axis"])
+
+    return rule
+
+
+PRIMITIVES["cumsum"] = _cumulate(_adder)
+PRIMITIVES["cumprod"] = _cumulate(_multiplier)
+PRIMITIVES["cummax"] = _cumulate(lambda t, equation: extreme_of(t.graph, "max", dtype_in(equation)))
+PRIMITIVES["cummin"] = _cumulate(lambda t, equation: extreme_of(t.graph, "min", dtype_in(equation)))
+
+
+@primitive("dot_general")
+def _dot_general(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
+    """Sums of products in the order of the contracted axes, whatever precision was asked for: always float32."""
+    if str(equation.outvars[0].aval.dtype) != "float32":
+        raise UnsupportedError(f"dot_general to {equation.outvars[0].aval.dtype}")
+    a, b = (to_float(t, dtype_in(equation, k), operand) for k, operand in enumerate((a, b)))
+    (contract_a, contract_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
+    free_a = [axis for axis in range(a.ndim) if axis not in (*contract_a, *batch_a)]
+    free_b = [axis for axis in range(b.ndim) if axis not in (*contract_b, *batch_b)]
+    shape = [a.shape[axis] for axis in (*batch_a, *free_a)] + [b.shape[axis] for axis in free_b]
+    batch = int(np.prod([a.shape[axis] for axis in batch_a]))
+    inner = int(np.prod([a.shape[axis] for axis in contract_a]))
+    rows_a = np.transpose(a, (*batch_a, *free_a, *contract_a)).reshape(batch, -1, inner)
+    rows_b = np.transpose(b, (*batch_b, *free_b, *contract_b)).reshape(batch, -1, inner)
+    g, found = t.graph, []
+    for left, right in zip(rows_a.tolist(), rows_b.tolist(), strict=True):
+        for row in left:
+            for column in right:
+                total = g.f(0.0)
+                for x, y in zip(row, column, strict=True):
+                    total = g.op("add", total, g.op("mul", x, y))
+                found.append(total)
+    return np.array(found, np.int64).reshape(shape)

@@ -1,0 +1,49 @@
+"""The table of primitives, and what its rules share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Nodes = NDArray[np.int64]
+"""Numbers of nodes, in the shape of the array they stand for."""
+Rule = Callable[..., Any]
+PRIMITIVES: dict[str, Rule] = {}
+"""Name of JAX's primitive -> its rule."""
+
+
+class UnsupportedError(Exception):
+    """The function uses what this compiler cannot compile; the message names it and where it comes from."""
+
+
+def primitive(*names: str) -> Callable[[Rule], Rule]:
+    """Enter a rule under the names of primitives."""
+
+    def enter(rule: Rule) -> Rule:
+        PRIMITIVES.update(dict.fromkeys(names, rule))
+        return rule
+
+    return enter
+
+
+def kind_of(dtype: Any) -> str:
+    """Kind of node that holds values of a dtype. Raises UnsupportedError for any but float32, int32, uint32 and bool.
+
+    uint8 is let through for conversions: JAX counts bits in it.
+    """
+    match str(dtype):
+        case "float32":
+            return "f"
+        case "int32" | "uint32" | "uint8":
+            return "i"
+        case "bool":
+            return "b"
+    raise UnsupportedError(f"values of type {dtype}: only float32, int32, uint32 and bool are compiled")
+
+
+def dtype_in(equation: Any, position: int = 0) -> str:
+    """Name of the dtype of one of an equation's inputs."""
+    return str(equation.invars[position].aval.dtype)

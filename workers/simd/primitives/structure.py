@@ -1,0 +1,185 @@
+"""Primitives that only move values about: nothing of them is left in the graph."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jax import lax
+
+from workers.simd.primitives.registry import Nodes, UnsupportedError, kind_of, primitive
+
+if TYPE_CHECKING:
+    from workers.simd.trace import Tracer
+
+
+@primitive("broadcast_in_dim")
+def _broadcast_in_dim(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    shape = equation.params["shape"]
+    with_ones = [1] * len(shape)
+    for size, axis in zip(x.shape, equation.params["broadcast_dimensions"], strict=True):
+        with_ones[axis] = size
+    return np.broadcast_to(x.reshape(with_ones), shape)
+
+
+@primitive("reshape", "squeeze")
+def _reshape(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    return x.reshape(equation.outvars[0].aval.shape)
+
+
+@primitive("copy", "stop_gradient", "optimization_barrier", "device_put")
+def _same(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
+    return list(arrays)
+
+
+@primitive("slice")
+def _slice(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    starts, limits = equation.params["start_indices"], equation.params["limit_indices"]
+    strides = equation.params["strides"] or [1] * len(starts)
+    return x[tuple(slice(*one) for one in zip(starts, limits, strides, strict=True))]
+
+
+@primitive("transpose")
+def _transpose(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    return np.transpose(x, equation.params["permutation"])
+
+
+@primitive("rev")
+def _rev(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    return np.flip(x, equation.params["dimensions"])
+
+
+@primitive("concatenate")
+def _concatenate(t: Tracer, equation: Any, *arrays: Nodes) -> Nodes:
+    return np.concatenate(arrays, equation.params["dimension"])
+
+
+@primitive("stack")
+def _stack(t: Tracer, equation: Any, *arrays: Nodes) -> Nodes:
+    return np.stack(arrays, equation.params["axis"])
+
+
+@primitive("tile")
+def _tile(t: Tracer, equation: Any, x: Nodes) -> Nodes:
+    return np.tile(x, equation.params["reps"])
+
+
+@primitive("iota")
+def _iota(t: Tracer, equation: Any) -> Nodes:
+    shape, axis = equation.params["shape"], equation.params["dimension"]
+    along = np.arange(shape[axis]).astype(equation.params["dtype"])
+    return t.constants(np.broadcast_to(np.expand_dims(along, [k for k in range(len(shape)) if k != axis]), shape))
+
+
+@primitive("pad")
+def _pad(t: Tracer, equation: Any, x: Nodes, value: Nodes) -> Nodes:
+    for axis, (low, high, inner) in enumerate(equation.params["padding_config"]):
+        x = np.moveaxis(x, axis, 0)
+        spread = np.full(((len(x) - 1) * (inner + 1) + 1 if len(x) else 0, *x.shape[1:]), value[()], np.int64)
+        spread[:: inner + 1] = x
+        edges = [np.full((max(0, width), *x.shape[1:]), value[()], np.int64) for width in (low, high)]
+        spread = spread[max(0, -low) : len(spread) - max(0, -high)]
+        x = np.moveaxis(np.concatenate([edges[0], spread, edges[1]]), 0, axis)
+    return x
+
+
+def _indices(t: Tracer, equation: Any, indices: Nodes, source: str) -> np.ndarray:
+    """Indices as numbers; they must be constants."""
+    values = t.values(indices)
+    if values is None:
+        raise UnsupportedError(f"{equation.primitive.name} with indices that depend on the state")
+    return values.astype(np.int32).view(source).astype(np.int64)
+
+
+@primitive("dynamic_slice")
+def _dynamic_slice(t: Tracer, equation: Any, x: Nodes, *starts: Nodes) -> Nodes:
+    sizes = equation.params["slice_sizes"]
+    at = _dynamic_starts(t, equation, x, sizes, starts, 1)
+    return x[tuple(slice(start, start + size) for start, size in zip(at, sizes, strict=True))]
+
+
+@primitive("dynamic_update_slice")
+def _dynamic_update_slice(t: Tracer, equation: Any, x: Nodes, update: Nodes, *starts: Nodes) -> Nodes:
+    at = _dynamic_starts(t, equation, x, update.shape, starts, 2)
+    found = x.copy()
+    found[tuple(slice(start, start + size) for start, size in zip(at, update.shape, strict=True))] = update
+    return found
+
+
+def _dynamic_starts(t: Tracer, equation: Any, x: Nodes, sizes: Any, starts: Any, first: int) -> list[int]:
+    at = []
+    for axis, start in enumerate(starts):
+        value = int(_indices(t, equation, start, str(equation.invars[first + axis].aval.dtype)))
+        at.append(min(max(value, 0), x.shape[axis] - sizes[axis]))
+    return at
+
+
+@primitive("gather")
+def _gather(t: Tracer, equation: Any, x: Nodes, indices: Nodes) -> Nodes:
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    mode = equation.params["mode"]
+    starts = _indices(t, equation, indices, str(equation.invars[1].aval.dtype))
+    batch_shape = starts.shape[:-1]
+    out_shape = equation.outvars[0].aval.shape
+    batch_axes = [axis for axis in range(len(out_shape)) if axis not in numbers.offset_dims]
+    removed = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    kept = [axis for axis in range(x.ndim) if axis not in removed]
+    found = np.empty([*batch_shape, *(sizes[axis] for axis in kept)], np.int64)
+    for place in np.ndindex(*batch_shape):
+        at = np.zeros(x.ndim, np.int64)
+        for axis, start in zip(numbers.start_index_map, starts[place], strict=True):
+            at[axis] = start
+        for axis, along in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
+            at[axis] = place[along]
+        most = np.array(x.shape) - sizes
+        if ((at < 0) | (at > most)).any() and mode == lax.GatherScatterMode.FILL_OR_DROP:
+            found[place] = _fill(t, equation)
+            continue
+        at = np.clip(at, 0, most)
+        part = x[tuple(slice(start, start + size) for start, size in zip(at, sizes, strict=True))]
+        found[place] = part.reshape([sizes[axis] for axis in kept])
+    order = [*batch_axes, *numbers.offset_dims]
+    return np.transpose(found, np.argsort(order)).reshape(out_shape)
+
+
+def _fill(t: Tracer, equation: Any) -> int:
+    """What a gather from outside gives: the value it names, or NaN, the least integer, true."""
+    dtype, value = np.dtype(equation.outvars[0].aval.dtype), equation.params["fill_value"]
+    if value is None:
+        value = {"f": np.nan, "i": np.iinfo(dtype).min if dtype.kind == "i" else -1, "b": True}[kind_of(dtype)]
+        if dtype.kind == "u":
+            value = np.iinfo(dtype).max
+    return int(t.constants(np.asarray(value).astype(dtype))[()])
+
+
+@primitive("scatter", "scatter-add", "scatter-mul")
+def _scatter(t: Tracer, equation: Any, x: Nodes, indices: Nodes, updates: Nodes) -> Nodes:
+    """Updates outside are dropped, negative indices among them; or moved inside, where the mode says so."""
+    numbers, mode = equation.params["dimension_numbers"], equation.params["mode"]
+    starts = _indices(t, equation, indices, str(equation.invars[1].aval.dtype))
+    float_kind = kind_of(equation.invars[0].aval.dtype) == "f"
+    name = {"scatter": None, "scatter-add": "add", "scatter-mul": "mul"}[equation.primitive.name]
+    name = name if float_kind or name is None else f"i{name}"
+    window_axes = list(numbers.update_window_dims)
+    batch_axes = [axis for axis in range(updates.ndim) if axis not in window_axes]
+    rows = np.transpose(updates, [*batch_axes, *window_axes])
+    removed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
+    kept = [axis for axis in range(x.ndim) if axis not in removed]
+    sizes = np.ones(x.ndim, np.int64)
+    sizes[kept] = [updates.shape[axis] for axis in window_axes]
+    found = x.copy()
+    for place in np.ndindex(*starts.shape[:-1]):
+        at = np.zeros(x.ndim, np.int64)
+        for axis, start in zip(numbers.scatter_dims_to_operand_dims, starts[place], strict=True):
+            at[axis] = start
+        for axis, along in zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True):
+            at[axis] = place[along]
+        most = np.array(x.shape) - sizes
+        if ((at < 0) | (at > most)).any():
+            if mode == lax.GatherScatterMode.FILL_OR_DROP:
+                continue
+            at = np.clip(at, 0, most)
+        window = tuple(slice(start, start + size) for start, size in zip(at, sizes, strict=True))
+        update = rows[place].reshape(sizes)
+        found[window] = update if name is None else t.ops(name, found[window], update)
+    return found

@@ -1,0 +1,133 @@
+"""First stage: a JAX function becomes a scalar graph.
+
+Its jaxpr is evaluated with each array replaced by an array of nodes. What only moves values about (slices, gathers,
+transposes) happens here and now, to the numbers of the nodes, and costs the kernel nothing; arithmetic makes nodes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jax.extend import source_info_util
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from numpy.typing import NDArray
+
+from workers.simd.graph import Graph
+from workers.simd.loops import build_loop
+from workers.simd.primitives import PRIMITIVES, Nodes, UnsupportedError, kind_of
+
+GRAPH_LIMIT = 2_000_000
+"""Nodes; what needs more would not be compiled in useful time."""
+
+
+def trace_jaxpr(closed: ClosedJaxpr) -> tuple[Graph, int, list[int]]:
+    """The graph of a function of one lane: (graph, number of input words, output nodes).
+
+    Each element of each array that goes in is an input of the graph, in order; each that comes out an output.
+
+    Raises:
+        UnsupportedError: the function cannot be compiled.
+    """
+    graph = Graph()
+    words = itertools.count()
+    inputs = []
+    for variable in closed.jaxpr.invars:
+        kind = kind_of(variable.aval.dtype)
+        nodes = [graph.input(kind, next(words)) for _ in range(int(np.prod(variable.aval.shape)))]
+        inputs.append(np.array(nodes, np.int64).reshape(variable.aval.shape))
+    outputs = Tracer(graph).closed(closed, inputs)
+    return graph, next(words), [node for nodes in outputs for node in nodes.reshape(-1).tolist()]
+
+
+def _aval(atom: Any) -> Any:
+    """Shape and dtype of a variable or literal."""
+    return atom.aval
+
+
+class Tracer:
+    """Evaluates jaxprs over nodes. What `primitives.py` needs to make nodes is here."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+
+    def closed(self, closed: ClosedJaxpr, inputs: Sequence[Nodes]) -> list[Nodes]:
+        """Outputs of a jaxpr with its constants."""
+        constants = [self.constants(np.asarray(value)) for value in closed.consts]
+        return self.jaxpr(closed.jaxpr, constants, inputs)
+
+    def jaxpr(self, jaxpr: Jaxpr, constants: Sequence[Nodes], inputs: Sequence[Nodes]) -> list[Nodes]:
+        """Outputs of a jaxpr."""
+        values: dict[Any, Nodes] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
+
+        def read(atom: Any) -> Nodes:
+            return (
+                self.constants(np.asarray(atom.val, _aval(atom).dtype)) if isinstance(atom, Literal) else values[atom]
+            )
+
+        for equation in jaxpr.eqns:
+            rule = PRIMITIVES.get(equation.primitive.name)
+            try:
+                if rule is None:
+                    raise UnsupportedError(f"the primitive {equation.primitive.name}")
+                outputs = rule(self, equation, *map(read, equation.invars))
+                if len(self.graph.keys) > GRAPH_LIMIT:
+                    raise UnsupportedError(f"more than {GRAPH_LIMIT:,} operations")
+            except UnsupportedError as error:
+                # What is inside of a library's function may not know from where it was called; the call does.
+                where = source_info_util.summarize(equation.source_info)
+                if where and ", from " not in str(error):
+                    raise UnsupportedError(f"{error}, from {where}") from None
+                raise
+            if not isinstance(outputs, list):
+                outputs = [outputs]
+            for variable, nodes in zip(equation.outvars, outputs, strict=True):
+                aval = _aval(variable)
+                assert nodes.shape == aval.shape, (equation.primitive.name, nodes.shape, aval)
+                kinds = {self.graph.kinds[node] for node in nodes.reshape(-1).tolist()}
+                assert kinds <= {kind_of(aval.dtype)}, (equation.primitive.name, kinds, aval)
+                values[variable] = nodes
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def constants(self, numbers: Any) -> Nodes:
+        """Nodes of an array of numbers."""
+        array = np.asarray(numbers)
+        kind = kind_of(array.dtype)
+        made = self.graph.i if kind == "i" else lambda value: self.graph.const(kind, value)
+        return np.array([made(value) for value in array.reshape(-1).tolist()], np.int64).reshape(array.shape)
+
+    def values(self, nodes: Nodes) -> NDArray | None:
+        """What an array of nodes holds, if all are constants."""
+        found = [self.graph.constant(node) for node in nodes.reshape(-1).tolist()]
+        if any(value is None for value in found):
+            return None
+        return np.array(found).reshape(nodes.shape)
+
+    def map(self, function: Callable[..., int], *arrays: Nodes) -> Nodes:
+        """A function of nodes, element by element; shapes are equal or ()."""
+        shape = np.broadcast_shapes(*(array.shape for array in arrays))
+        flat = [np.broadcast_to(array, shape).reshape(-1).tolist() for array in arrays]
+        return np.array([function(*nodes) for nodes in zip(*flat, strict=True)], np.int64).reshape(shape)
+
+    def ops(self, name: str, *arrays: Nodes) -> Nodes:
+        """An operation, element by element."""
+        return self.map(lambda *nodes: self.graph.op(name, *nodes), *arrays)
+
+    def keep_loop(self, trips: int, body: Callable[[list[Nodes]], list[Nodes]], carry: list[Nodes]) -> list[Nodes]:
+        """`carry` after some trips through `body`, which does not ask which trip it is."""
+        shapes = [nodes.shape for nodes in carry]
+        ends = np.cumsum([nodes.size for nodes in carry])
+
+        def flat(arrays: Sequence[Nodes]) -> list[int]:
+            return [node for nodes in arrays for node in nodes.reshape(-1).tolist()]
+
+        def shaped(nodes: Sequence[int]) -> list[Nodes]:
+            parts = np.split(np.array(nodes, np.int64), ends[:-1])
+            return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+        def straight(nodes: list[int]) -> list[int]:
+            return flat(body(shaped(nodes)))
+
+        return shaped(build_loop(self.graph, trips, straight, flat(carry)))
