@@ -100,7 +100,7 @@ def _row(arguments: Mapping[str, Any], cores: int) -> dict[str, Any]:
     }
 
 
-COLUMNS = {"task": -16, "policy": -8, "rollout": -9, "batch": 5, "cores": 7, "steps/s": 13, "compile s": 11,
+COLUMNS = {"task": -36, "policy": -8, "rollout": -9, "batch": 5, "cores": 7, "steps/s": 13, "compile s": 11,
            "peak MiB": 10, "paper": 12}  # fmt: skip
 """Title -> width; negative ones are flush left."""
 HEADER = "".join(f"{title:{'<' if width < 0 else '>'}{abs(width)}}" for title, width in COLUMNS.items())
@@ -109,7 +109,7 @@ HEADER = "".join(f"{title:{'<' if width < 0 else '>'}{abs(width)}}" for title, w
 def line(row: Mapping[str, Any]) -> str:
     """A row under HEADER, with the paper's rate where that is comparable."""
     if "note" in row:
-        return f"{row['task']:<16}{row['note']}"
+        return f"{row['task']:<36}{row['note']}"
     comparable = row["policy"] == "off" and row["cores"] == 1 and row["task"] in PAPER
     paper = f"{PAPER[row['task']]:,}" if comparable else ""
     shown = (row["task"], row["policy"], row["rollout"], row["batch"], row["cores"], f"{row['steps_per_second']:,}",

@@ -6,6 +6,7 @@ import os
 import shutil
 import sqlite3
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from importlib import metadata
@@ -28,7 +29,7 @@ from es_service.store.folder import is_network_filesystem
 from workers.environments import TASKS
 from workers.policy import initial_parameters
 from workers.simd.kernel import compile_kernel
-from workers.simd.target import host_target
+from workers.simd.target import NoVectorsError, host_target
 
 Finding = tuple[str, str]
 """("ok" | "note" | "FAIL", text)."""
@@ -84,11 +85,12 @@ def _vectors() -> Iterator[Finding]:
     """The width of the vectors that steps can be compiled for, tried on a small one."""
     try:
         target = host_target()
-    except LookupError as error:
+    except NoVectorsError as error:
         yield "note", f"simd: {error}: rollouts run on xla"
         return
     started = time.perf_counter()
-    kernel = compile_kernel(lambda x: x * x + 1.0, np.zeros((), np.float32))
+    with tempfile.TemporaryDirectory() as folder:
+        kernel = compile_kernel(lambda x: x * x + 1.0, np.zeros((), np.float32), folder=Path(folder))
     found = kernel(np.arange(100, dtype=np.float32))
     if not np.array_equal(found, np.arange(100, dtype=np.float32) ** 2 + 1):
         yield "FAIL", f"simd ({target.describe()}): a compiled kernel gives wrong numbers"

@@ -26,6 +26,7 @@ from workers.policy import initial_parameters
 from workers.rollout import make_training_rollout
 from workers.simd.kernel import compile_kernel
 from workers.simd.primitives import UnsupportedError
+from workers.simd.target import NoVectorsError
 
 STEPS = 50
 """Control steps of one call."""
@@ -51,20 +52,21 @@ def measure(
         rollout: what computes the steps, "xla" or "simd"; the latter without a policy so far.
 
     Returns:
-        steps_per_second, compile_seconds, peak_mib; or the problem, where simd cannot compile the task or run here.
+        steps_per_second, compile_seconds (without that of resets, where there is no policy), peak_mib; or the problem,
+        where simd cannot compile the task or run here.
     """
     size = TASKS[task] if task in TASKS else describe_environment(task)
     environment = make_environment(task, options)
     shape = PolicyShape((size.observation_size, *hidden, size.action_size))
-    states = _after_reset(environment, batch)
+    states = None if policy else _after_reset(environment, batch)
     started = time.perf_counter()
-    try:
-        if policy:
-            call = _with_policy(environment, shape, task, batch)
-        else:
+    if policy:
+        call = _with_policy(environment, shape, task, batch)
+    else:
+        try:
             call = _without_policy(environment, shape, states, rollout)
-    except (UnsupportedError, LookupError) as error:
-        return {"problem": str(error)}
+        except (UnsupportedError, NoVectorsError) as error:
+            return {"problem": str(error)}
     call(0)
     ready = time.perf_counter()
     steps = calls = 0

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from workers.simd.graph import Graph
-from workers.simd.operations import DTYPES, OPERATIONS
+from workers.simd.operations import DTYPES
+from workers.simd.operations import compute as compute_operation
 from workers.simd.schedule import Region, schedule
-
-TINY = np.finfo(np.float32).tiny
 
 
 def evaluate(
@@ -38,7 +37,7 @@ def evaluate(
             return np.full(words.shape[1], graph.constant(node))
         if key[0] == "input":
             word = words[key[2]]
-            return word != 0 if key[1] == "b" else _flushed(word.view(DTYPES[key[1]]))
+            return word != 0 if key[1] == "b" else word.view(DTYPES[key[1]])
         return values[node]
 
     def compute(node: int) -> None:
@@ -46,16 +45,16 @@ def evaluate(
         seen(node, arguments)
         product = order.fused.get(node) if fuse else None
         if product is None:
-            values[node] = _apply(graph.keys[node][0], arguments)
+            values[node] = compute_operation(graph.keys[node][0], arguments)
             return
         left, right = graph.arguments(node)
         a, b = (value(one) for one in graph.arguments(product))
         if graph.keys[node][0] == "sub" and product == right:
-            values[node] = _apply("fma", [-a, b, value(left)])
+            values[node] = compute_operation("fma", [-a, b, value(left)])
         elif graph.keys[node][0] == "sub":
-            values[node] = _apply("fma", [a, b, -value(right)])
+            values[node] = compute_operation("fma", [a, b, -value(right)])
         else:
-            values[node] = _apply("fma", [a, b, value(right if product == left else left)])
+            values[node] = compute_operation("fma", [a, b, value(right if product == left else left)])
 
     def run(region: Region) -> None:
         for step in region.steps:
@@ -73,18 +72,3 @@ def evaluate(
 
     run(order.region)
     return [value(node) for node in outputs]
-
-
-def _apply(name: str, arguments: list[Any]) -> np.ndarray:
-    operation = OPERATIONS[name]
-    with np.errstate(all="ignore"):
-        found = np.asarray(operation.meaning(*arguments), DTYPES[operation.gives])
-    bitwise = ("unbits", "neg", "abs", "select")  # these move bits and flush nothing
-    return _flushed(found) if operation.gives == "f" and name not in bitwise else found
-
-
-def _flushed(x: np.ndarray) -> np.ndarray:
-    """Denormal numbers are zeros."""
-    if x.dtype != np.float32:
-        return x
-    return np.where(np.abs(x) < TINY, np.copysign(np.float32(0.0), x), x)

@@ -83,3 +83,10 @@ def test_a_foot_that_has_come_through_is_pushed_back_to_the_knee_s_side():
         distance, normal, _ = contact(ALONG_X, (2.0, -0.1 * side, 0.1), (2.0, 0.4 * side, 0.4))
         assert distance == pytest.approx(-0.1 - 0.58)
         np.testing.assert_allclose(normal, [0, side, 0])
+
+
+def test_a_foot_that_has_hardly_come_through_has_a_normal_too():
+    """The square of its depth is no float32 any more."""
+    distance, normal, _ = contact(ALONG_X, (2.0, -1e-20, 0.1), (2.0, 0.4, 0.4))
+    assert distance == pytest.approx(-0.58)
+    np.testing.assert_allclose(normal, [0, 1, 0])

@@ -67,9 +67,8 @@ def nearest_wall(walls: tuple[Segment, ...], foot_3: Any, knee_3: Any, radius: A
     square_W = jnp.where(crosses_W, -through_W * through_W, square_W)
     offset_W_2 = jnp.where(crosses_W[:, None], across_W_2 * jnp.sign(side_knee_W)[:, None], offset_W_2)
     along_W = jnp.where(crosses_W, 0.0, along_W)
-    square, offset_2, along = _least(list(zip(square_W, offset_W_2, along_W, strict=True)))
+    square, offset_2, along, came_through = _least(list(zip(square_W, offset_W_2, along_W, crosses_W, strict=True)))
 
-    came_through = square < 0
     gap = jnp.sqrt(jnp.abs(square))
     normal_2 = jnp.where(came_through, offset_2, offset_2 * (1.0 / jnp.maximum(gap, TINY)))
     normal_3 = jnp.concatenate([normal_2, jnp.zeros(1)])

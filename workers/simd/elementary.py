@@ -174,8 +174,14 @@ def _within_range(g: Graph, x: int, y: int, below: int) -> int:
 
 
 def exp2(g: Graph, x: int) -> int:
-    """2^x, within 2 + |x| / 2 ulp."""
-    return exp(g, g.op("mul", x, g.f(math.log(2.0))))
+    """2^x, within 2 ulp; infinite from 128 on, 0 below -125."""
+    powers = g.op("add", x, g.f(ROUNDER))
+    rest = g.op("mul", g.op("sub", x, g.op("sub", powers, g.f(ROUNDER))), g.f(math.log(2.0)))
+    less_one = g.op("fma", g.op("mul", rest, rest), _horner(g, rest, EXPM1), rest)
+    half = _times_half_power(g, g.op("add", less_one, g.f(1.0)), g.op("bits", powers))
+    found = g.op("select", g.op("lt", x, g.f(-125.0)), g.f(0.0), g.op("add", half, half))
+    found = g.op("select", g.op("le", g.f(128.0), x), g.f(math.inf), found)
+    return _nan_where_nan(g, x, found)
 
 
 def log(g: Graph, x: int) -> int:
@@ -238,7 +244,7 @@ def whole_power(g: Graph, x: int, exponent: int) -> int:
 
 def pow(g: Graph, x: int, y: int) -> int:
     """x^y. By squaring for a constant whole y up to 64 in size, sqrt for 1/2; else e^(y log x), within
-    3 + 2 |y log x| ulp. NaN where x is negative, unless y is whole."""
+    3 + 2 |y log x| ulp. NaN where x is negative, -inf too, unless y is whole; zeros count as +0."""
     exponent = g.constant(y)
     if exponent is not None and float(exponent).is_integer() and abs(exponent) <= 64:
         return whole_power(g, x, int(exponent))

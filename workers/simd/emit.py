@@ -15,10 +15,13 @@ from collections.abc import Sequence
 
 from workers.simd.graph import Graph
 from workers.simd.operations import OPERATIONS
+from workers.simd.primitives.registry import UnsupportedError
 from workers.simd.schedule import Region, schedule
 
 MXCSR = 0x9FC0
 """Round to nearest, no traps, denormal results and operands are zeros: as XLA computes, and five times faster."""
+MOST_SLOTS = 8192
+"""Vectors in the memory of a block, which is on the stack: half a MiB."""
 SCALARS = {"f": "float", "i": "i32", "b": "i1"}
 
 FRAME = """\
@@ -63,12 +66,18 @@ attributes #0 = {{ nounwind "prefer-vector-width"="512" "min-legal-vector-width"
 
 
 def emit(graph: Graph, outputs: Sequence[int], inputs: int, width: int) -> str:
-    """LLVM IR of a kernel with one output word for each of `outputs`, and `inputs` words in, for vectors of `width`."""
+    """LLVM IR of a kernel with one output word for each of `outputs`, and `inputs` words in, for vectors of `width`.
+
+    Raises:
+        UnsupportedError: loops carry more than fits on a stack.
+    """
     writer = _Writer(graph, outputs, width)
     body = writer.block(outputs)
+    if writer.slot_count > MOST_SLOTS:
+        raise UnsupportedError(f"{writer.slot_count:,} values that loops carry and look at")
     return FRAME.format(
         body="\n".join(body),
-        slots=1 + max(writer.slots.values(), default=0),
+        slots=max(1, writer.slot_count),
         width=width,
         mxcsr=MXCSR,
         in_bytes=4 * width * inputs,
@@ -94,6 +103,7 @@ class _Writer:
         self.declarations: set[str] = set()
         self.slots: dict[int, int] = {}
         """Node -> its place in the memory of the block: carries, and what loops look at."""
+        self.slot_count = 0
         self.values: dict[int, str] = {}
         """Node -> its name in the present block; what is loaded once stays known."""
         self.names = 0
@@ -217,4 +227,7 @@ class _Writer:
 
     def slot(self, node: int) -> str:
         """The place of a node in the memory of the block; a new one if it has none."""
-        return f"%slots, i64 {self.slots.setdefault(node, len(self.slots))}"
+        if node not in self.slots:
+            self.slots[node] = self.slot_count
+            self.slot_count += 1
+        return f"%slots, i64 {self.slots[node]}"

@@ -2,13 +2,14 @@
 
 With NaN, infinities and signed zeros in mind, they are of three sorts:
 
-* exact for every value: x * 1, x / 1, x - 0, x + (-0), -(-x), |-x|, a + (-b) = a - b, (-a) * b = -(a * b), choices
-  between equal things or by constants, x < x (false for NaN too), logic with constants.
-* exact but for the sign of a zero: x + 0 = x, 0 - x = -x, -(a - b) = b - a. Only division by that zero, atan2 and bit
+* exact for every value: x * 1, x / 1, x - 0, x + (-0), -0 - x, -(-x), |-x|, a + (-b) = a - b, (-a) * b = -(a * b),
+  choices between equal things or by constants, x < x (false for NaN too), logic with constants.
+* exact but for the sign of a zero: x + 0 = x, -(a - b) = b - a. Only division by that zero, atan2 and bit
   tricks could tell.
 * exact for finite values: x * 0 = 0. Brax's constant joint frames are full of it: without it an ant has twice as many
   operations. Where a factor is infinite or NaN, JAX has NaN and the graph 0; but the factor itself stays what it was on
-  every other way through the graph, so a state that was not finite stays so. `is_finite` is computed, never assumed.
+  every other way through the graph; what hangs on that product alone does not see it. `is_finite` is computed, never
+  assumed.
 
 Not done: 0 / x, x / x, x - x, x == x (NaN matters there), reassociation, approximations.
 
@@ -48,7 +49,7 @@ def _fold_sub(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
     a, b = args
     if _is(values[1], 0.0):
         return a
-    if _is(values[0], 0.0):
+    if _is(values[0], 0.0) and np.signbit(values[0]):
         return g.op_again("neg", b)
     if (minus := g.negated(b)) is not None:
         return g.op_again("add", a, minus)
@@ -120,8 +121,9 @@ def _fold_select(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | No
     if values[0] is not None:
         return a if values[0] else b
     key = g.keys[mask]
-    if key[0] == "xor" and _is(g.constant(key[1]), True):
-        return g.op_again("iselect" if g.kinds[a] == "i" else "select", key[2], b, a)
+    for one, other in ((key[1], key[2]), (key[2], key[1])) if key[0] == "xor" else ():
+        if _is(g.constant(one), True):  # a negation
+            return g.op_again("iselect" if g.kinds[a] == "i" else "select", other, b, a)
     return None
 
 

@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from workers.simd.folding import RULES
-from workers.simd.operations import DTYPES, OPERATIONS
+from workers.simd.operations import DTYPES, OPERATIONS, compute
 
 Key = tuple
-SMALLEST_NORMAL = np.finfo(np.float32).tiny
 
 
 @dataclass
@@ -48,10 +47,8 @@ class Graph:
         self._known: dict[Key, int] = {}
 
     def const(self, kind: str, value: float | int | bool) -> int:
-        """A constant; denormal numbers are zeros, as they are in the kernels."""
+        """A constant."""
         array = np.asarray(value, DTYPES[kind])
-        if kind == "f" and abs(array) < SMALLEST_NORMAL:
-            array = np.copysign(np.float32(0.0), array)
         bits = int(array.view(np.int32)) if kind == "f" else int(array)
         return self._node(("const", kind, bits), kind)
 
@@ -140,8 +137,7 @@ class Graph:
         """A simpler node of the same value, or None."""
         values = [self.constant(a) for a in arguments]
         if all(value is not None for value in values):
-            with np.errstate(all="ignore"):
-                return self.const(OPERATIONS[name].gives, OPERATIONS[name].meaning(*values))
+            return self.const(OPERATIONS[name].gives, compute(name, values))
         rule = RULES.get(name)
         return rule(self, arguments, values) if rule else None
 

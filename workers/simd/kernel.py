@@ -7,7 +7,6 @@ import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +16,8 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from numpy.typing import NDArray
 
 from workers.simd import cache as kernel_cache
+from workers.simd import loops
 from workers.simd.emit import emit
-from workers.simd.loops import live
 from workers.simd.operations import OPERATIONS
 from workers.simd.target import Target, compile_object, compiler_version, host_target, load_object
 from workers.simd.trace import trace_jaxpr
@@ -26,6 +25,10 @@ from workers.simd.trace import trace_jaxpr
 Words = NDArray[np.uint32]
 """[block, word, lane]: what kernels read and write; floats and integers by their bits, truth as 0 or 1."""
 ALIGNMENT = 64
+OWN_VERSION = hashlib.sha256(
+    b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py")))
+).hexdigest()
+"""Of this compiler: a hash of its source, as it was imported."""
 
 
 class Facts(NamedTuple):
@@ -37,7 +40,7 @@ class Facts(NamedTuple):
     """From the jaxpr to the scalar graph. 0 from the cache."""
     emit_s: float
     compile_s: float
-    """LLVM's part. From the cache: finding and reading."""
+    """LLVM's part. From the cache: hashing the jaxpr, finding and reading."""
     asked: int
     """Scalar operations of the function, loops' bodies once; 0 from the cache."""
     computed: int
@@ -79,13 +82,15 @@ class Kernel:
             assert array.dtype == np.uint32
             assert array.flags.c_contiguous
             assert array.size == 0 or array.ctypes.data % ALIGNMENT == 0
+        assert out.flags.writeable
+        assert words is not out
         self._function(words.ctypes.data, out.ctypes.data, blocks)
 
     def __call__(self, *arguments: Any) -> Any:
         """The function of pytrees whose leaves have one more axis in front, of lanes; NumPy arrays come back."""
         leaves, tree = jax.tree.flatten(arguments)
         assert tree == self.in_tree, f"{tree} is not what was compiled for: {self.in_tree}"
-        lanes = len(leaves[0])
+        lanes = len(leaves[0]) if leaves else 1
         words = self.pack(leaves, lanes)
         out = aligned((len(words), self.words_out, self.target.width))
         self.run(words, out)
@@ -102,8 +107,8 @@ class Kernel:
             assert array.shape == (lanes, *aval.shape), (array.shape, aval)
             array = array.astype(np.uint32) if array.itemsize < 4 else np.ascontiguousarray(array).view(np.uint32)
             columns.append(array.reshape(lanes, int(np.prod(aval.shape))))
-        rows = np.concatenate(columns, axis=1)
-        filled = rows[np.minimum(np.arange(blocks * width), lanes - 1)]
+        rows = np.concatenate([np.zeros((lanes, 0), np.uint32), *columns], axis=1)
+        filled = rows[np.minimum(np.arange(blocks * width), lanes - 1)] if lanes else rows
         words = aligned((blocks, rows.shape[1], width))
         words[:] = filled.reshape(blocks, width, -1).transpose(0, 2, 1)
         return words
@@ -111,9 +116,9 @@ class Kernel:
     def unpack(self, out: Words, lanes: int) -> list[NDArray]:
         """Leaves [lane, ...] of words that came out."""
         rows = out.transpose(0, 2, 1).reshape(len(out) * out.shape[2], out.shape[1])[:lanes]
-        ends = np.cumsum([int(np.prod(aval.shape)) for aval in self.out_avals])
+        ends = np.cumsum([int(np.prod(aval.shape)) for aval in self.out_avals], dtype=np.int64)
         found = []
-        for column, aval in zip(np.split(rows, ends[:-1], axis=1), self.out_avals, strict=True):
+        for column, aval in zip(np.split(rows, ends, axis=1)[:-1], self.out_avals, strict=True):
             column = np.ascontiguousarray(column)
             array = column.astype(aval.dtype) if aval.dtype.itemsize < 4 else column.view(aval.dtype)
             found.append(array.reshape(lanes, *aval.shape))
@@ -139,8 +144,8 @@ def compile_kernel(
         folder: of compiled kernels; the user's cache if None.
 
     Raises:
-        UnsupportedError: the function has something that cannot be compiled. LookupError: the processor has no AVX2
-            or FMA.
+        UnsupportedError: the function has something that cannot be compiled. NoVectorsError: the processor has no
+            AVX2 or FMA.
     """
     target = target or host_target()
     folder = folder or kernel_cache.cache_folder()
@@ -148,12 +153,14 @@ def compile_kernel(
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     jaxpr_s = time.perf_counter() - started
     started = time.perf_counter()
-    key = hashlib.sha256(f"{jaxpr_digest(closed)} {target} {compiler_version()} {_own_version()}".encode()).hexdigest()
-    code = kernel_cache.load(folder, key)
+    versions = f"{target} {compiler_version()} {OWN_VERSION} {loops.UNROLLED_OPERATIONS}"
+    key = hashlib.sha256(f"{jaxpr_digest(closed)} {versions}".encode()).hexdigest()
+    code = kernel_cache.load(folder, key) if folder else None
     facts = Facts(jaxpr_s, 0.0, 0.0, time.perf_counter() - started, 0, 0, len(code or b""), True)
     if code is None:
         code, facts = _compile(closed, target, jaxpr_s)
-        kernel_cache.save(folder, key, code)
+        if folder:
+            kernel_cache.save(folder, key, code)
     address, alive = load_object(code, target)
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(address)
     leaves, out_tree = jax.tree.flatten(shape)
@@ -177,21 +184,17 @@ def _compile(closed: ClosedJaxpr, target: Target, jaxpr_s: float) -> tuple[bytes
     emitted = time.perf_counter()
     code = compile_object(text, target)
     compiled = time.perf_counter()
-    computed = sum(graph.keys[node][0] in OPERATIONS for node in live(graph, outputs))
+    computed = sum(graph.keys[node][0] in OPERATIONS for node in loops.live(graph, outputs))
     seconds = (jaxpr_s, traced - started, emitted - traced, compiled - emitted)
     return code, Facts(*seconds, graph.asked, computed, len(code), False)
 
 
-@cache
-def _own_version() -> str:
-    """Of this compiler: a hash of its source."""
-    folder = Path(__file__).parent
-    sources = sorted(folder.rglob("*.py"))
-    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
-
-
 def jaxpr_digest(closed: ClosedJaxpr) -> str:
-    """A hash of everything a jaxpr computes: its equations, their parameters and its constants, not its names."""
+    """A hash of everything a jaxpr computes: its equations, their parameters and its constants; not names of variables.
+
+    Raises:
+        ValueError: a parameter has no text that is the same in every process.
+    """
     digests: dict[int, str] = {}
 
     def of_closed(one: ClosedJaxpr) -> str:
@@ -212,7 +215,7 @@ def jaxpr_digest(closed: ClosedJaxpr) -> str:
 
         lines = [" ".join(map(name, [*jaxpr.constvars, *jaxpr.invars]))]
         for equation in jaxpr.eqns:
-            parameters = [f"{key}={of_value(value)}" for key, value in sorted(equation.params.items())]
+            parameters = [f"{key}={of_value(value)}" for key, value in sorted(equation.params.items()) if key != "name"]
             lines.append(f"{list(map(name, equation.outvars))} {equation.primitive.name} {parameters} "
                          f"{list(map(name, equation.invars))}")  # fmt: skip
         lines.append(" ".join(map(name, jaxpr.outvars)))
@@ -226,11 +229,13 @@ def jaxpr_digest(closed: ClosedJaxpr) -> str:
             return of_jaxpr(value)
         if isinstance(value, tuple | list):
             return f"({','.join(map(of_value, value))})"
-        if hasattr(value, "dtype") and hasattr(value, "shape") and not hasattr(value, "aval_is_abstract"):
+        if isinstance(value, np.ndarray | np.generic | jax.Array):
             array = np.asarray(value)
             return f"{array.dtype}{array.shape}{hashlib.sha256(array.tobytes()).hexdigest()}"
         if callable(value):
             return ""  # rules for derivatives
-        return repr(value)
+        if " at 0x" in (text := repr(value)):
+            raise ValueError(text)
+        return text
 
     return of_closed(closed)

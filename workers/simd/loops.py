@@ -12,10 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from workers.simd.graph import Graph, Loop
+from workers.simd.primitives.registry import UnsupportedError
 
 Body = Callable[[list[int]], list[int]]
 UNROLLED_OPERATIONS = 2000
 """A loop whose trips have no more than this many operations in all becomes straight code."""
+MOST_STRAIGHT_TRIPS = 64
+"""Of a loop that can only be straight code, because its trips look at their numbers."""
 
 
 def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> list[int]:
@@ -25,12 +28,14 @@ def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> li
     """
     loop = graph.loop(trips, list(inits))
     before = len(graph.keys)
-    outs = body(loop.carries)
-    if trips * (len(graph.keys) - before) <= UNROLLED_OPERATIONS:
-        nodes = list(inits)
-        for _ in range(trips):
-            nodes = body(nodes)
-        return nodes
+    try:
+        outs = body(loop.carries)
+    except UnsupportedError:
+        if trips > MOST_STRAIGHT_TRIPS:
+            raise
+        return _straight(trips, body, inits)  # where the number of the trip is an index, it has to be a constant
+    if trips * max(1, len(graph.keys) - before) <= UNROLLED_OPERATIONS:
+        return _straight(trips, body, inits)
     kept, derived, late, firsts = _sort(graph, loop, outs)
     if len(kept) == len(inits):
         return graph.close(loop, outs)
@@ -57,6 +62,13 @@ def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> li
     return found
 
 
+def _straight(trips: int, body: Body, inits: Sequence[int]) -> list[int]:
+    nodes = list(inits)
+    for _ in range(trips):
+        nodes = body(nodes)
+    return nodes
+
+
 def _sort(graph: Graph, loop: Loop, outs: Sequence[int]) -> tuple[list[int], list[int], list[int], list[int]]:
     """Positions of carries: (kept, derived, late, those whose start stands for all with the same end).
 
@@ -69,15 +81,17 @@ def _sort(graph: Graph, loop: Loop, outs: Sequence[int]) -> tuple[list[int], lis
     first_with: dict[int, int] = {}
     for k in sorted(candidates, key=lambda k: carries[k] not in used):  # what trips look at comes first
         first_with.setdefault(outs[k], k)
-    starts = {out: inits[k] for out, k in first_with.items()}
+    made_of_ends = {k for k in candidates if _made_of(graph, outs[k], set(first_with), inside)}
+    # A late carry is computed from others, also where it did not start so: its start says nothing about what it is.
+    starts = {out: inits[k] for out, k in first_with.items() if carries[k] in used or k not in made_of_ends}
     kept, derived, late = [], [], []
     for k in candidates:
         is_first = first_with[outs[k]] == k
-        if is_first and not _made_of(graph, outs[k], set(first_with), inside):
+        if is_first and k not in made_of_ends:
             kept.append(k)
         elif carries[k] not in used:
             late.append(k)
-        elif inits[k] == (starts[outs[k]] if not is_first else substitute(graph, outs[k], starts, itself=False)):
+        elif inits[k] == substitute(graph, outs[k], starts, itself=not is_first):
             derived.append(k)
         else:
             kept.append(k)
@@ -107,6 +121,9 @@ def depending(graph: Graph, loop: Loop) -> set[int]:
                 key = graph.keys[node]
                 if key[0] != "result" or key[2] != loop.number:
                     found.add(node)
+        # A loop is inside with all its carries, or not at all.
+        numbers = {graph.keys[node][2] for node in found if graph.keys[node][0] == "carry"}
+        found.update(carry for number in numbers for carry in graph.loops[number].carries)
     return found
 
 

@@ -7,7 +7,7 @@ is no approximate division or root here, no tangent and no exponential: `element
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,8 @@ class Operation(NamedTuple):
     meaning: Callable[..., Any]
     """In NumPy: folds constants, and is the twin that tests hold machine code against."""
     llvm: str
-    """Its instruction: {0}, {1}, {2} are arguments; {F}, {I}, {B} the vector types; {N} the suffix of intrinsics."""
+    """Its instruction: {0}, {1}, {2} are arguments; {F}, {I}, {B} the vector types; {N} and {M} the suffixes
+    of intrinsics on floats and on integers."""
     commutes: bool = False
 
 
@@ -99,7 +100,25 @@ OPERATIONS: dict[str, Operation] = {
     "select": Operation("bff", "f", np.where, "select {B} {0}, {F} {1}, {F} {2}"),
     "iselect": Operation("bii", "i", np.where, "select {B} {0}, {I} {1}, {I} {2}"),
 }
-"""Name -> operation. `mul` and `add` stay apart until `contract.py` fuses them."""
+"""Name -> operation. Products and sums stay apart until `schedule.py` fuses them."""
 
 DTYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtype(bool)}
 """Kind -> how NumPy holds it."""
+BIT_MOVES = {"unbits", "bits", "neg", "abs", "select"}
+"""Operations that take floats as they are. All others see zeros for denormal numbers, and give zeros for them."""
+SMALLEST_NORMAL = np.finfo(np.float32).tiny
+
+
+def compute(name: str, arguments: Sequence[Any]) -> Any:
+    """An operation in NumPy, as kernels do it."""
+    operation = OPERATIONS[name]
+    if name not in BIT_MOVES:
+        arguments = [_flushed(x) if kind == "f" else x for kind, x in zip(operation.takes, arguments, strict=True)]
+    with np.errstate(all="ignore"):
+        found = np.asarray(operation.meaning(*arguments), DTYPES[operation.gives])
+    return _flushed(found) if operation.gives == "f" and name not in BIT_MOVES else found
+
+
+def _flushed(x: Any) -> Any:
+    """Denormal numbers as zeros of their sign."""
+    return np.where(np.abs(x) < SMALLEST_NORMAL, np.copysign(np.float32(0.0), x), x)

@@ -12,6 +12,10 @@ WIDTHS = {"avx512": 16, "avx2": 8, "four": 4}
 """Kind of code -> float32 lanes of its vectors. "four" is AVX2's code on half its vectors, for tests."""
 
 
+class NoVectorsError(Exception):
+    """The processor has not the vectors that code is wanted for."""
+
+
 @dataclass(frozen=True)
 class Target:
     """What code is made for."""
@@ -44,17 +48,17 @@ def host_target(kind: str | None = None) -> Target:
     """The widest this machine has, or a narrower kind.
 
     Raises:
-        LookupError: the processor cannot run it; the message says what it lacks.
+        NoVectorsError: the processor cannot run it; the message says what it lacks.
     """
     cpu, features = _host()
     lacks = [name for name in ("avx2", "fma") if not features.get(name)]
     if lacks:
-        raise LookupError(f"the processor ({cpu}) has no {' and no '.join(name.upper() for name in lacks)}")
+        raise NoVectorsError(f"the processor ({cpu}) has no {' and no '.join(name.upper() for name in lacks)}")
     has_512 = all(features.get(name) for name in ("avx512f", "avx512dq", "avx512vl", "avx512bw"))
     if kind is None:
         kind = "avx512" if has_512 else "avx2"
     if kind == "avx512" and not has_512:
-        raise LookupError(f"the processor ({cpu}) has no AVX-512")
+        raise NoVectorsError(f"the processor ({cpu}) has no AVX-512")
     wanted = {name: on and (kind == "avx512" or not name.startswith("avx512")) for name, on in features.items()}
     return Target(kind, cpu, ",".join(f"{'+' if on else '-'}{name}" for name, on in sorted(wanted.items())))
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from workers.simd.graph import Graph
 from workers.simd.loops import build_loop
-from workers.simd.primitives import PRIMITIVES, Nodes, UnsupportedError, kind_of
+from workers.simd.primitives import PRIMITIVES, Nodes, UnsupportedError
+from workers.simd.primitives.registry import aval_of, check_bytes, kind_of
 
 GRAPH_LIMIT = 2_000_000
 """Nodes; what needs more would not be compiled in useful time."""
@@ -42,13 +43,8 @@ def trace_jaxpr(closed: ClosedJaxpr) -> tuple[Graph, int, list[int]]:
     return graph, next(words), [node for nodes in outputs for node in nodes.reshape(-1).tolist()]
 
 
-def _aval(atom: Any) -> Any:
-    """Shape and dtype of a variable or literal."""
-    return atom.aval
-
-
 class Tracer:
-    """Evaluates jaxprs over nodes. What `primitives.py` needs to make nodes is here."""
+    """Evaluates jaxprs over nodes. What the rules of `primitives` need to make nodes is here."""
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
@@ -64,7 +60,7 @@ class Tracer:
 
         def read(atom: Any) -> Nodes:
             return (
-                self.constants(np.asarray(atom.val, _aval(atom).dtype)) if isinstance(atom, Literal) else values[atom]
+                self.constants(np.asarray(atom.val, aval_of(atom).dtype)) if isinstance(atom, Literal) else values[atom]
             )
 
         for equation in jaxpr.eqns:
@@ -72,6 +68,7 @@ class Tracer:
             try:
                 if rule is None:
                     raise UnsupportedError(f"the primitive {equation.primitive.name}")
+                check_bytes(equation)
                 outputs = rule(self, equation, *map(read, equation.invars))
                 if len(self.graph.keys) > GRAPH_LIMIT:
                     raise UnsupportedError(f"more than {GRAPH_LIMIT:,} operations")
@@ -84,7 +81,7 @@ class Tracer:
             if not isinstance(outputs, list):
                 outputs = [outputs]
             for variable, nodes in zip(equation.outvars, outputs, strict=True):
-                aval = _aval(variable)
+                aval = aval_of(variable)
                 assert nodes.shape == aval.shape, (equation.primitive.name, nodes.shape, aval)
                 kinds = {self.graph.kinds[node] for node in nodes.reshape(-1).tolist()}
                 assert kinds <= {kind_of(aval.dtype)}, (equation.primitive.name, kinds, aval)
@@ -118,13 +115,13 @@ class Tracer:
     def keep_loop(self, trips: int, body: Callable[[list[Nodes]], list[Nodes]], carry: list[Nodes]) -> list[Nodes]:
         """`carry` after some trips through `body`, which does not ask which trip it is."""
         shapes = [nodes.shape for nodes in carry]
-        ends = np.cumsum([nodes.size for nodes in carry])
+        ends = np.cumsum([nodes.size for nodes in carry], dtype=np.int64)
 
         def flat(arrays: Sequence[Nodes]) -> list[int]:
             return [node for nodes in arrays for node in nodes.reshape(-1).tolist()]
 
         def shaped(nodes: Sequence[int]) -> list[Nodes]:
-            parts = np.split(np.array(nodes, np.int64), ends[:-1])
+            parts = np.split(np.array(nodes, np.int64), ends)[:-1]
             return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
         def straight(nodes: list[int]) -> list[int]:

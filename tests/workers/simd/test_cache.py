@@ -69,13 +69,38 @@ def test_the_folder_is_the_users_cache(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert cache.cache_folder() == tmp_path / "home" / ".cache" / "es-service" / "kernels"
 
 
+def key(number: int) -> str:
+    return f"{number:064x}"
+
+
+def test_a_failed_write_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    cache.save(tmp_path, key(0), b"code")
+    assert list(tmp_path.iterdir()) == []
+    assert "not kept: [Errno 28]" in capsys.readouterr().err
+
+
+def test_without_a_home_there_is_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
+    assert cache.cache_folder() is None
+    found = compile_kernel(lambda x: x + 1.0, jax.ShapeDtypeStruct((), jnp.float32))
+    assert not found.facts.cached
+
+
 def test_the_entries_longest_unused_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "MOST_ENTRIES", 3)
+    (tmp_path / "thesis.txt").write_text("not ours to remove")
     for number in range(5):
-        cache.save(tmp_path, f"key{number}", b"code")
-        os.utime(tmp_path / f"key{number}", (number, number))
-        assert cache.load(tmp_path, "key0") == b"code", "used, and so kept"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["key0", "key3", "key4"]
+        cache.save(tmp_path, key(number), b"code")
+        os.utime(tmp_path / key(number), (number, number))
+        assert cache.load(tmp_path, key(0)) == b"code", "used, and so kept"
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([key(0), key(3), key(4), "thesis.txt"])
 
 
 def test_writers_at_the_same_time_leave_a_whole_entry(tmp_path: Path) -> None:

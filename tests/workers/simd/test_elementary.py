@@ -48,7 +48,7 @@ CASES: dict[str, tuple[Callable, Callable, float, float, float]] = {
     "acos": (jnp.arccos, np.arccos, -1.0, 1.0, 3.0),
     "atan": (jnp.arctan, np.arctan, -1e30, 1e30, 3.0),
     "rsqrt": (jax.lax.rsqrt, lambda x: 1 / np.sqrt(x), TINY, 3e38, 2.0),
-    "exp2": (jnp.exp2, np.exp2, -1.0, 1.0, 2.5),
+    "exp2": (jnp.exp2, np.exp2, -125.0, 127.99, 2.0),
 }
 """Name -> (ours, exact, from, to, ulp)."""
 
@@ -120,6 +120,7 @@ def test_powers_at_the_edges_are_as_numpys(y: float) -> None:
 
 EDGES: list[tuple[Callable, list[float], list[float]]] = [
     (jnp.exp, [INF, -INF, NAN, 89.0, -87.0, 0.0], [INF, 0.0, NAN, INF, 0.0, 1.0]),
+    (jnp.exp2, [INF, -INF, NAN, 128.0, -126.0, 0.0, 10.0, -125.0], [INF, 0.0, NAN, INF, 0.0, 1.0, 1024.0, 2.0**-125]),
     (jnp.expm1, [INF, -INF, NAN, 89.0, -87.0, 0.0], [INF, -1.0, NAN, INF, -1.0, 0.0]),
     (jnp.log, [INF, 0.0, -0.0, -1.0, NAN, 1.0], [INF, -INF, -INF, NAN, NAN, 0.0]),
     (jnp.log1p, [INF, -1.0, -2.0, NAN, 0.0], [INF, -INF, NAN, NAN, 0.0]),

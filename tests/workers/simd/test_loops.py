@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from jax import lax
 
 from workers.simd import loops
@@ -186,6 +188,99 @@ def test_conditions_are_carried() -> None:
             return jnp.where(alive, settle(x) * 1.05, x), alive, steps + alive
 
         return lax.fori_loop(0, 20, trip, (x, x[0] > -1.0, jnp.int32(0)))
+
+    check(function)
+
+
+def test_a_late_carry_s_start_says_nothing_about_what_it_is() -> None:
+    def function(x):
+        def trip(_, carry):
+            x, double, size = carry
+            x = 0.9 * x + 0.1 * jnp.abs(size)
+            double = x * 2.0
+            return x, double, jnp.abs(double) + 1.0
+
+        start = x[0] * 3.0
+        return lax.fori_loop(0, 3, trip, (x[1], start, jnp.abs(start) + 1.0))
+
+    check(function)
+
+
+def test_an_inner_loop_s_carry_may_hang_on_nothing_outside() -> None:
+    def gain(x):
+        def outer(_, x):
+            y, gain = lax.fori_loop(0, 5, lambda _, c: (c[0] - 0.01 * jnp.sin(c[0]) * c[1], c[1] * 0.99), (x, 1.0))
+            return y * gain
+
+        return lax.fori_loop(0, 4, outer, x[0])
+
+    def counter(x):
+        def inner(number, z):
+            return z * 0.5 + jnp.sin(jnp.cos(number.astype(jnp.float32)))
+
+        return lax.fori_loop(0, 5, lambda _, y: 0.9 * lax.fori_loop(0, 4, inner, y), x[0])
+
+    check(gain)
+    check(counter)
+
+
+def test_the_number_of_a_trip_may_be_an_index() -> None:
+    table = np.array([0.5, -1.0, 2.0], np.float32)
+
+    def function(x):
+        return lax.fori_loop(0, 3, lambda number, c: c.at[number].add(jnp.asarray(table)[number] * c[2 - number]), x)
+
+    check(function)
+
+
+def test_a_loop_may_carry_nothing() -> None:
+    check(lambda x: lax.scan(lambda c, _: (c, None), x, None, length=3)[0])
+
+
+LEAVES = 4
+STEPS = ("add", "mul", "sin", "half", "abs")
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_random_loops_are_jaxs(data: st.DataObject) -> None:
+    """Bodies of random operations on carries with random starts and ends; one inside another now and then.
+
+    Values stay bounded but are not damped, so that a wrong first trip is seen at the end.
+    """
+
+    def body(depth: int):
+        program = data.draw(st.lists(st.tuples(st.sampled_from(STEPS), st.integers(0, 99), st.integers(0, 99)),
+                                     min_size=2, max_size=7))  # fmt: skip
+        ends = data.draw(st.lists(st.integers(0, 99), min_size=LEAVES, max_size=LEAVES))
+        inner = body(depth - 1) if depth and data.draw(st.booleans()) else None
+
+        def run(carry: tuple) -> tuple:
+            values = list(carry)
+            if inner is not None:
+                values += lax.fori_loop(0, 3, lambda _, c: inner(c), (values[0], values[1], *starts_inside(values)))
+            for name, one, other in program:
+                a, b = values[one % len(values)], values[other % len(values)]
+                values.append({
+                    "add": lambda a=a, b=b: jnp.sin(a + b), "mul": lambda a=a, b=b: jnp.cos(a * b),
+                    "sin": lambda a=a: jnp.sin(2.0 * a), "half": lambda a=a: a * 0.5 + 0.25,
+                    "abs": lambda a=a: jnp.abs(a),
+                }[name]())  # fmt: skip
+            return tuple(values[end % len(values)] for end in ends)
+
+        return run
+
+    def starts_inside(values: list) -> tuple:
+        return (values[2], jnp.float32(0.3))
+
+    run = body(1)
+    start_ends = data.draw(st.booleans())
+
+    def function(x):
+        start = (x[0], x[1], x[2], x[0] * 2.0)
+        if start_ends:
+            start = run(start)  # so that some carries are derived
+        return lax.fori_loop(0, 4, lambda _, c: run(c), start)
 
     check(function)
 

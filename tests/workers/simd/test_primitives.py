@@ -266,6 +266,23 @@ CASES: dict[str, Callable[[Draw], Case]] = {
     "pow": lambda draw: (jnp.power, [floats(draw, (3,), 0.1, 3.0), floats(draw, (3,))]),
     "clamp": lambda draw: (lambda x: jnp.clip(x, -1.0, 1.5), [special(draw, (4,))]),
     "lax.clamp": lambda draw: (lambda x: lax.clamp(np.float32(-1), x, np.float32(2)), [floats(draw, (4,))]),
+    "of nothing": lambda draw: (
+        lambda x: (
+            x[:0].sum(0),
+            x[:0].prod(0),
+            x[:0].max(0, initial=-1.0),
+            (x[:0] > 0).all(0),
+            (x[:0] > 0).any(0),
+            jnp.cumsum(x[:0]),
+            x[:0].reshape(0, 2).T @ x[:0].reshape(0, 2),
+            lax.pad(x, 0.0, [(-5, 4, 0)]),
+        ),
+        [floats(draw, (3,))],
+    ),
+    "bytes": lambda draw: (
+        lambda x: jnp.bitwise_count(x)[::1].reshape(1, 3).astype(jnp.float32),
+        [integers(draw, (3,), "uint32")],
+    ),
     "cumulations": along(
         lambda x, axis, reverse: [f(x, axis, reverse) for f in (lax.cumsum, lax.cumprod, lax.cummax, lax.cummin)]
     ),
@@ -352,6 +369,11 @@ def test_every_primitive_has_a_case() -> None:
         (lambda x: lax.while_loop(lambda y: y.sum() < 9.0, lambda y: y + 1.0, x), "a while loop whose end depends"),
         (lambda x: x.astype(jnp.float16).astype(jnp.float32), "values of type float16"),
         (lambda x: jnp.fmod(x, 1.5), "rem of float32"),
+        (lambda x: (x.astype(jnp.int32).astype(jnp.uint8) + 1).astype(jnp.float32), "add of uint8"),
+        (
+            lambda x: lax.while_loop(lambda c: c[0] < 10**6, lambda c: (c[0] + 1, c[1]), (0, x))[1],
+            "a while loop of more",
+        ),
     ],
 )
 def test_what_cannot_be_compiled_is_named_with_where_it_comes_from(function: Callable, says: str) -> None:

@@ -21,7 +21,7 @@ def _by_kind(floats: str | None, integers: str | None, booleans: str | None = No
     def rule(t: Tracer, equation: Any, *arrays: Nodes) -> Nodes:
         kind = kind_of(dtype_in(equation))
         name = {"f": floats, "i": integers, "b": booleans}[kind]
-        if name is None or dtype_in(equation) == "uint8":
+        if name is None:
             raise UnsupportedError(f"{equation.primitive.name} of {dtype_in(equation)}")
         return t.ops(name, *arrays)
 
@@ -44,15 +44,15 @@ PRIMITIVES["population_count"] = _by_kind(None, "popcount")
 def _div(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
     if kind_of(dtype_in(equation)) == "f":
         return t.ops("div", a, b)
-    return _constant_integers(t, equation, lax.div, a, b)
+    return _constant_integers(t, equation, a, b)
 
 
 @primitive("rem")
 def _rem(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
-    return _constant_integers(t, equation, lax.rem, a, b)
+    return _constant_integers(t, equation, a, b)
 
 
-def _constant_integers(t: Tracer, equation: Any, function: Callable, a: Nodes, b: Nodes) -> Nodes:
+def _constant_integers(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
     """Vector units do not divide integers; indices, which are constants, are divided here."""
     value_a, value_b = t.values(a), t.values(b)
     if kind_of(dtype_in(equation)) == "f" or value_a is None or value_b is None:
@@ -62,7 +62,7 @@ def _constant_integers(t: Tracer, equation: Any, function: Callable, a: Nodes, b
     dtype = np.dtype(dtype_in(equation))
     exact_a, exact_b = (value.astype(np.int32).view(dtype).astype(np.int64) for value in (value_a, value_b))
     quotient = np.sign(exact_a) * np.sign(exact_b) * (np.abs(exact_a) // np.abs(exact_b))
-    found = quotient if function is lax.div else exact_a - quotient * exact_b
+    found = quotient if equation.primitive.name == "div" else exact_a - quotient * exact_b
     return t.constants(np.asarray(found.astype(dtype)))
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @primitive("eq", "ne", "lt", "le", "gt", "ge")
 def _compare(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
-    g, name, dtype = t.graph, equation.primitive.name, dtype_in(equation)
+    name, dtype = equation.primitive.name, dtype_in(equation)
     if name in ("gt", "ge"):
         name, a, b = {"gt": "lt", "ge": "le"}[name], b, a
     kind = kind_of(dtype)
@@ -35,9 +35,9 @@ def _compare(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
         case "ne":
             return _not(t, t.ops("ieq", a, b))
         case "lt":
-            return t.map(lambda x, y: g.op(less, x, y), a, b)
+            return t.ops(less, a, b)
         case _:
-            return _not(t, t.map(lambda x, y: g.op(less, y, x), a, b))
+            return _not(t, t.ops(less, b, a))
 
 
 def _not(t: Tracer, x: Nodes) -> Nodes:
@@ -90,23 +90,23 @@ def _clamp(t: Tracer, equation: Any, low: Nodes, x: Nodes, high: Nodes) -> Nodes
     return t.map(lambda lo, n, hi: lesser(greater(n, lo), hi), low, x, high)
 
 
+def choose(g: Graph, mask: int, if_true: int, if_false: int) -> int:
+    """One of two nodes of the same kind."""
+    kind = g.kinds[if_true]
+    if kind != "b":
+        return g.op("select" if kind == "f" else "iselect", mask, if_true, if_false)
+    return g.op("or", g.op("and", mask, if_true), g.op("and", g.op("xor", g.const("b", True), mask), if_false))
+
+
 @primitive("select_n")
 def _select_n(t: Tracer, equation: Any, which: Nodes, *cases: Nodes) -> Nodes:
     g = t.graph
-    kind = kind_of(equation.outvars[0].aval.dtype)
-
-    def choose(mask: int, if_true: int, if_false: int) -> int:
-        if kind != "b":
-            return g.op("select" if kind == "f" else "iselect", mask, if_true, if_false)
-        return g.op("or", g.op("and", mask, if_true), g.op("and", g.op("xor", g.const("b", True), mask), if_false))
-
     if kind_of(dtype_in(equation)) == "b":
-        return t.map(lambda mask, a, b: choose(mask, b, a), which, *cases)
+        return t.map(lambda mask, a, b: choose(g, mask, b, a), which, *cases)
     chosen = cases[-1]  # indices are clamped by JAX to what there is
     for number in reversed(range(len(cases) - 1)):
-        chosen = t.map(
-            lambda n, a, b, number=number: choose(g.op("slt", n, g.i(number + 1)), a, b), which, cases[number], chosen
-        )
+        first = t.map(lambda n, number=number: g.op("slt", n, g.i(number + 1)), which)
+        chosen = t.map(lambda mask, a, b: choose(g, mask, a, b), first, cases[number], chosen)
     return chosen
 
 

@@ -6,10 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from workers.simd.primitives.choices import choose
 from workers.simd.primitives.registry import Nodes, UnsupportedError, primitive
 
 if TYPE_CHECKING:
     from workers.simd.trace import Tracer
+
+MOST_TRIPS = 10_000
+"""Of loops that become straight code."""
 
 
 @primitive("jit", "custom_jvp_call", "custom_vjp_call", "remat2")
@@ -41,20 +45,10 @@ def _cond(t: Tracer, equation: Any, which: Nodes, *arrays: Nodes) -> list[Nodes]
     for number in reversed(range(len(branches) - 1)):
         first = g.op("xor", g.const("b", True), int(which)) if boolean else g.op("slt", int(which), g.i(number + 1))
         chosen = [
-            t.map(lambda a, b, first=first: _choose(t, first, a, b), one, other)
+            t.map(lambda a, b, first=first: choose(g, first, a, b), one, other)
             for one, other in zip(cases[number], chosen, strict=True)
         ]
     return chosen
-
-
-def _choose(t: Tracer, mask: int, a: int, b: int) -> int:
-    g = t.graph
-    match g.kinds[a]:
-        case "f":
-            return g.op("select", mask, a, b)
-        case "i":
-            return g.op("iselect", mask, a, b)
-    return g.op("or", g.op("and", mask, a), g.op("and", g.op("xor", g.const("b", True), mask), b))
 
 
 @primitive("scan")
@@ -70,6 +64,8 @@ def _scan(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
     body = params["jaxpr"]
     if not rows and len(equation.outvars) == carries and length > 0:
         return t.keep_loop(length, lambda carry: t.closed(body, [*shared, *carry]), carry)
+    if length > MOST_TRIPS:
+        raise UnsupportedError(f"a scan of {length:,} steps that reads or writes at each")
     stacked: list[list[Nodes]] = [[] for _ in range(len(equation.outvars) - carries)]
     order = reversed(range(length)) if params["reverse"] else range(length)
     for trip in order:
@@ -91,7 +87,7 @@ def _while(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
     in_condition, in_body = params["cond_nconsts"], params["body_nconsts"]
     for_condition, for_body = arrays[:in_condition], arrays[in_condition : in_condition + in_body]
     carry = list(arrays[in_condition + in_body :])
-    while True:
+    for _ in range(MOST_TRIPS):
         (go_on,) = t.closed(params["cond_jaxpr"], [*for_condition, *carry])
         value = t.values(go_on)
         if value is None:
@@ -99,3 +95,4 @@ def _while(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
         if not value:
             return carry
         carry = t.closed(params["body_jaxpr"], [*for_body, *carry])
+    raise UnsupportedError(f"a while loop of more than {MOST_TRIPS:,} trips")

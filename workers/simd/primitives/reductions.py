@@ -21,19 +21,28 @@ def _reduce(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Rule
         axes = tuple(int(axis) for axis in equation.params["axes"])
         kept = [axis for axis in range(x.ndim) if axis not in axes]
         shape = tuple(x.shape[axis] for axis in kept)
-        rows = np.transpose(x, [*kept, *axes]).reshape(int(np.prod(shape)), -1)
+        rows = np.transpose(x, [*kept, *axes]).reshape(int(np.prod(shape)), int(np.prod([x.shape[a] for a in axes])))
         function = combine(t, equation)
         found = []
         for row in rows.tolist():
-            if not row:
-                raise UnsupportedError(f"{equation.primitive.name} of nothing")
-            total = row[0]
+            total = row[0] if row else _of_nothing(t, equation)
             for node in row[1:]:
                 total = function(total, node)
             found.append(total)
         return np.array(found, np.int64).reshape(shape)
 
     return rule
+
+
+def _of_nothing(t: Tracer, equation: Any) -> int:
+    """What a reduction of no elements gives."""
+    name, kind = equation.primitive.name, kind_of(dtype_in(equation))
+    neutral = {"reduce_sum": 0, "reduce_prod": 1, "reduce_and": True, "reduce_or": False}
+    if kind == "f":
+        neutral |= {"reduce_max": -np.inf, "reduce_min": np.inf}
+    if name not in neutral:
+        raise UnsupportedError(f"{name} of no {dtype_in(equation)}")
+    return t.graph.const(kind, neutral[name])
 
 
 def _adder(t: Tracer, equation: Any) -> Callable[[int, int], int]:
@@ -89,6 +98,8 @@ def _cumulate(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Ru
         function = combine(t, equation)
         rows = np.moveaxis(x, equation.params["axis"], 0)
         rows = rows[::-1] if equation.params["reverse"] else rows
+        if not len(rows):
+            return x
         found = [rows[0]]
         for row in rows[1:]:
             found.append(t.map(function, found[-1], row))
@@ -116,8 +127,10 @@ def _dot_general(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
     shape = [a.shape[axis] for axis in (*batch_a, *free_a)] + [b.shape[axis] for axis in free_b]
     batch = int(np.prod([a.shape[axis] for axis in batch_a]))
     inner = int(np.prod([a.shape[axis] for axis in contract_a]))
-    rows_a = np.transpose(a, (*batch_a, *free_a, *contract_a)).reshape(batch, -1, inner)
-    rows_b = np.transpose(b, (*batch_b, *free_b, *contract_b)).reshape(batch, -1, inner)
+    rows_a, rows_b = (
+        np.transpose(x, (*first, *free, *last)).reshape(batch, int(np.prod([x.shape[axis] for axis in free])), inner)
+        for x, first, free, last in ((a, batch_a, free_a, contract_a), (b, batch_b, free_b, contract_b))
+    )
     g, found = t.graph, []
     for left, right in zip(rows_a.tolist(), rows_b.tolist(), strict=True):
         for row in left:

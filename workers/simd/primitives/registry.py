@@ -32,7 +32,7 @@ def primitive(*names: str) -> Callable[[Rule], Rule]:
 def kind_of(dtype: Any) -> str:
     """Kind of node that holds values of a dtype. Raises UnsupportedError for any but float32, int32, uint32 and bool.
 
-    uint8 is let through for conversions: JAX counts bits in it.
+    And uint8, in which JAX counts bits: `check_bytes` sees that it is only converted and moved.
     """
     match str(dtype):
         case "float32":
@@ -42,6 +42,23 @@ def kind_of(dtype: Any) -> str:
         case "bool":
             return "b"
     raise UnsupportedError(f"values of type {dtype}: only float32, int32, uint32 and bool are compiled")
+
+
+BYTES = {"convert_element_type", "population_count", "broadcast_in_dim", "reshape", "squeeze", "slice", "transpose",
+         "concatenate", "stack", "copy", "jit"}  # fmt: skip
+"""Primitives that may have uint8 in or out: nothing in them wraps around."""
+
+
+def check_bytes(equation: Any) -> None:
+    """Raise UnsupportedError for arithmetic of uint8."""
+    dtypes = {str(aval_of(atom).dtype) for atom in (*equation.invars, *equation.outvars)}
+    if "uint8" in dtypes and equation.primitive.name not in BYTES:
+        raise UnsupportedError(f"{equation.primitive.name} of uint8")
+
+
+def aval_of(atom: Any) -> Any:
+    """Shape and dtype of a variable or literal."""
+    return atom.aval
 
 
 def dtype_in(equation: Any, position: int = 0) -> str:

@@ -78,8 +78,8 @@ def _pad(t: Tracer, equation: Any, x: Nodes, value: Nodes) -> Nodes:
         spread = np.full(((len(x) - 1) * (inner + 1) + 1 if len(x) else 0, *x.shape[1:]), value[()], np.int64)
         spread[:: inner + 1] = x
         edges = [np.full((max(0, width), *x.shape[1:]), value[()], np.int64) for width in (low, high)]
-        spread = spread[max(0, -low) : len(spread) - max(0, -high)]
-        x = np.moveaxis(np.concatenate([edges[0], spread, edges[1]]), 0, axis)
+        spread = np.concatenate([edges[0], spread, edges[1]])
+        x = np.moveaxis(spread[max(0, -low) : len(spread) - max(0, -high)], 0, axis)
     return x
 
 
@@ -143,12 +143,10 @@ def _gather(t: Tracer, equation: Any, x: Nodes, indices: Nodes) -> Nodes:
 
 
 def _fill(t: Tracer, equation: Any) -> int:
-    """What a gather from outside gives: the value it names, or NaN, the least integer, true."""
+    """What a gather from outside gives: the value it names, or NaN, the least int32, the greatest uint32, true."""
     dtype, value = np.dtype(equation.outvars[0].aval.dtype), equation.params["fill_value"]
     if value is None:
-        value = {"f": np.nan, "i": np.iinfo(dtype).min if dtype.kind == "i" else -1, "b": True}[kind_of(dtype)]
-        if dtype.kind == "u":
-            value = np.iinfo(dtype).max
+        value = {"float32": np.nan, "int32": -(2**31), "uint32": 2**32 - 1, "bool": True}[str(dtype)]
     return int(t.constants(np.asarray(value).astype(dtype))[()])
 
 
