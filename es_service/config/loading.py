@@ -266,6 +266,8 @@ def _bad_value(name: str, value: object) -> str:
     hint = ""
     if value is None:
         hint = "; leave the key out for its default"
+    elif (name, value) == ("compute.rollout", "simd"):
+        hint = "; simd computes single steps so far (es-service bench rollouts), xla whole episodes"
     elif isinstance(value, str) and "number" in allowed and _is_number(value):
         hint = f"; remove the quotes around {value}"
     elif isinstance(value, float) and "whole number" in allowed and value.is_integer() and 1 <= value < 2**53:
