@@ -6,7 +6,6 @@ Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by S
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -18,7 +17,8 @@ import typer
 from rich.console import Console
 
 from es_service import api, digest, jobs
-from es_service.config.resolution import config_warnings, one_of
+from es_service.cli_bench import bench
+from es_service.config.resolution import config_warnings
 from es_service.errors import ConfigError, EvaluationError, Interrupted, NotInRunError, ServiceError
 from es_service.report.catalogue import print_catalogue
 from es_service.report.progress import Row, show_progress
@@ -242,50 +242,7 @@ def stop(job: JobArgument, address: JobsOption) -> None:
     _print_note(f"{job} {jobs.stop(job, address).lower()}")
 
 
-bench = typer.Typer(help="Measure this machine.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
-
-
-@bench.callback()
-def _bench() -> None:
-    """Keeps `rollouts` a command of its own while it is the only one."""
-
-
-@bench.command()
-def rollouts(
-    task: Annotated[list[str] | None, typer.Option("--task", help="Task to measure; default: all of ours.")] = None,
-    policy: Annotated[str | None, typer.Option("--policy", help="on or off; default: both.")] = None,
-    rollout: Annotated[
-        str, typer.Option("--rollout", help="xla, simd (our own compiler, physics alone so far), or both.")
-    ] = "xla,simd",
-    batch: Annotated[
-        list[int] | None, typer.Option("--batch", min=2, help="Episodes that step together, an even number.")
-    ] = None,
-    seconds: Annotated[float, typer.Option("--seconds", min=0.0, help="To measure for, each.")] = 3.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a list of rows as JSON.")] = False,
-) -> None:
-    """Environment steps a second: physics alone and with policies, on one core and on all, beside the paper's."""
-    from es_service import bench as measured
-
-    policies = {None: (False, True), "on": (True,), "off": (False,)}.get(policy)
-    rollouts = rollout.split(",")
-    if policies is None:
-        raise ConfigError(f"--policy {policy}: must be on or off")
-    if not set(rollouts) <= set(measured.ROLLOUTS):
-        raise ConfigError(
-            f"--rollout {rollout}: must be {one_of(measured.ROLLOUTS)}, or both with a comma between them"
-        )
-    if any(number % 2 for number in batch or ()):
-        raise ConfigError("--batch: must be even, for whole pairs")
-    rows = measured.bench_rollouts(
-        task or (), policies=policies, rollouts=rollouts, batches=batch or (), seconds=seconds
-    )
-    if as_json:
-        print(json.dumps(list(rows), indent=1))
-        return
-    print(measured.HEADER)
-    for row in rows:
-        print(measured.line(row), flush=True)
 
 
 @app.command()

@@ -9,6 +9,7 @@ after hangs on. What hangs on no carry lies outside by itself.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -145,3 +146,32 @@ class Graph:
         """What a node is the negative of, or None."""
         key = self.keys[node]
         return key[1] if key[0] == "neg" else None
+
+
+def live(graph: Graph, outputs: Iterable[int]) -> set[int]:
+    """Nodes that outputs hang on. A loop's carry is among them only where somebody needs it."""
+    found: set[int] = set()
+    waiting = list(outputs)
+    while waiting:
+        node = waiting.pop()
+        if node not in found:
+            found.add(node)
+            waiting += graph.needs(node)
+    return found
+
+
+def depending(graph: Graph, loop: Loop) -> set[int]:
+    """Nodes of a loop's body: what is made of its carries, but for its results and what comes after."""
+    found = set(loop.carries)
+    size = 0
+    while len(found) != size:  # an inner loop's carries come before their ends: look again
+        size = len(found)
+        for node in range(min(found, default=0), len(graph.keys)):
+            if node not in found and not found.isdisjoint(graph.needs(node)):
+                key = graph.keys[node]
+                if key[0] != "result" or key[2] != loop.number:
+                    found.add(node)
+        # A loop is inside with all its carries, or not at all.
+        numbers = {graph.keys[node][2] for node in found if graph.keys[node][0] == "carry"}
+        found.update(carry for number in numbers for carry in graph.loops[number].carries)
+    return found

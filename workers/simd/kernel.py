@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from workers.simd import cache as kernel_cache
 from workers.simd import loops
 from workers.simd.emit import emit
+from workers.simd.graph import live
 from workers.simd.operations import OPERATIONS
 from workers.simd.target import Target, compile_object, compiler_version, host_target, load_object
 from workers.simd.trace import trace_jaxpr
@@ -184,7 +185,7 @@ def _compile(closed: ClosedJaxpr, target: Target, jaxpr_s: float) -> tuple[bytes
     emitted = time.perf_counter()
     code = compile_object(text, target)
     compiled = time.perf_counter()
-    computed = sum(graph.keys[node][0] in OPERATIONS for node in loops.live(graph, outputs))
+    computed = sum(graph.keys[node][0] in OPERATIONS for node in live(graph, outputs))
     seconds = (jaxpr_s, traced - started, emitted - traced, compiled - emitted)
     return code, Facts(*seconds, graph.asked, computed, len(code), False)
 

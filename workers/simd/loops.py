@@ -9,9 +9,9 @@ A carry is not needed where it stays what it was, and where its end is made of o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-from workers.simd.graph import Graph, Loop
+from workers.simd.graph import Graph, Loop, depending, live
 from workers.simd.primitives.registry import UnsupportedError
 
 Body = Callable[[list[int]], list[int]]
@@ -96,35 +96,6 @@ def _sort(graph: Graph, loop: Loop, outs: Sequence[int]) -> tuple[list[int], lis
         else:
             kept.append(k)
     return kept, derived, late, list(first_with.values())
-
-
-def live(graph: Graph, outputs: Iterable[int]) -> set[int]:
-    """Nodes that outputs hang on. A loop's carry is among them only where somebody needs it."""
-    found: set[int] = set()
-    waiting = list(outputs)
-    while waiting:
-        node = waiting.pop()
-        if node not in found:
-            found.add(node)
-            waiting += graph.needs(node)
-    return found
-
-
-def depending(graph: Graph, loop: Loop) -> set[int]:
-    """Nodes of a loop's body: what is made of its carries, but for its results and what comes after."""
-    found = set(loop.carries)
-    size = 0
-    while len(found) != size:  # an inner loop's carries come before their ends: look again
-        size = len(found)
-        for node in range(min(found, default=0), len(graph.keys)):
-            if node not in found and not found.isdisjoint(graph.needs(node)):
-                key = graph.keys[node]
-                if key[0] != "result" or key[2] != loop.number:
-                    found.add(node)
-        # A loop is inside with all its carries, or not at all.
-        numbers = {graph.keys[node][2] for node in found if graph.keys[node][0] == "carry"}
-        found.update(carry for number in numbers for carry in graph.loops[number].carries)
-    return found
 
 
 def _made_of(graph: Graph, node: int, ends: set[int], inside: set[int]) -> bool:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from jax import lax
 
 from workers.simd import loops
-from workers.simd.graph import Graph
+from workers.simd.graph import Graph, depending, live
 from workers.simd.kernel import compile_kernel
 from workers.simd.schedule import Region, schedule
 from workers.simd.trace import trace_jaxpr
@@ -303,5 +303,5 @@ def test_depending_nodes_are_those_of_the_body() -> None:
     outside = graph.op("mul", x, x)
     (result,) = graph.close(loop, [inside])
     after = graph.op("add", result, outside)
-    assert loops.depending(graph, loop) == {loop.carries[0], inside}
-    assert {x, inside, outside, after, result, loop.carries[0]} == loops.live(graph, [after])
+    assert depending(graph, loop) == {loop.carries[0], inside}
+    assert {x, inside, outside, after, result, loop.carries[0]} == live(graph, [after])
