@@ -74,7 +74,7 @@ def measure(
         steps += call(calls := calls + 1)
     return {
         "steps_per_second": round(steps / (now - ready)),
-        "compile_seconds": round(ready - started, 1),
+        "compile_seconds": round(ready - started, 2),
         "peak_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
     }
 

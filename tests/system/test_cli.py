@@ -89,7 +89,7 @@ def test_bench_rollouts_prints_a_row_per_policy_batch_and_number_of_cores():
     assert {row["policy"] for row in rows} == {"on", "off"}
     assert {(row["policy"], row["rollout"]) for row in rows} == {("on", "xla"), ("off", "xla"), ("off", "simd")}
     assert {(row["task"], row["batch"]) for row in rows} == {("point_maze", 8)}
-    assert all(row["steps_per_second"] > 0 and row["compile_seconds"] > 0 for row in rows)
+    assert all(row["steps_per_second"] > 0 and row["compile_seconds"] >= 0 for row in rows)
     for wrong, message in (
         (("--batch", 7), "must be even"),
         (("--policy", "maybe"), "--policy maybe: must be on or off"),
