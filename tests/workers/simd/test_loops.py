@@ -66,31 +66,18 @@ def derived(x):
     return jnp.sum(x * x)
 
 
-def test_what_is_a_function_of_other_carries_is_not_carried() -> None:
+@pytest.mark.parametrize(("start", "carried"), [(derived, 3), (lambda x: x[0] * 0.5, 4)])
+def test_a_function_of_other_carries_is_carried_only_where_it_did_not_start_as_that(start, carried: int) -> None:
     def function(x):
         def trip(_, carry):
             x, size = carry
             x = settle(x) / (1.0 + size)
             return x, derived(x)
 
-        return lax.fori_loop(0, 20, trip, (x, derived(x)))
+        return lax.fori_loop(0, 20, trip, (x, start(x)))
 
     (loop,) = regions(function, X[0])
-    assert len(loop.carried) == 3
-    check(function)
-
-
-def test_it_is_carried_where_it_did_not_start_as_that_function() -> None:
-    def function(x):
-        def trip(_, carry):
-            x, size = carry
-            x = settle(x) / (1.0 + size)
-            return x, derived(x)
-
-        return lax.fori_loop(0, 20, trip, (x, x[0] * 0.5))
-
-    (loop,) = regions(function, X[0])
-    assert len(loop.carried) == 4
+    assert len(loop.carried) == carried
     check(function)
 
 
@@ -176,6 +163,14 @@ def test_one_loop_after_another_and_products_from_before_them() -> None:
         scaled = x * 0.3
         first = lax.fori_loop(0, 5, lambda _, y: settle(y) + scaled, x)
         return lax.fori_loop(0, 5, lambda _, y: settle(y) + scaled * first, first)
+
+    check(function)
+
+
+def test_a_product_from_before_a_loop_is_not_fused_with_a_sum_inside() -> None:
+    def function(x):
+        product = jnp.sin(x) * jnp.cos(x)
+        return lax.fori_loop(0, 5, lambda _, y: settle(y) + product, x)
 
     check(function)
 

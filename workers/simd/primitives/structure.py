@@ -122,24 +122,28 @@ def _gather(t: Tracer, equation: Any, x: Nodes, indices: Nodes) -> Nodes:
     batch_shape = starts.shape[:-1]
     out_shape = equation.outvars[0].aval.shape
     batch_axes = [axis for axis in range(len(out_shape)) if axis not in numbers.offset_dims]
-    removed = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    batched = numbers.operand_batching_dims
+    removed = (*numbers.collapsed_slice_dims, *batched)
     kept = [axis for axis in range(x.ndim) if axis not in removed]
     found = np.empty([*batch_shape, *(sizes[axis] for axis in kept)], np.int64)
     for place in np.ndindex(*batch_shape):
-        at = np.zeros(x.ndim, np.int64)
-        for axis, start in zip(numbers.start_index_map, starts[place], strict=True):
-            at[axis] = start
-        for axis, along in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
-            at[axis] = place[along]
-        most = np.array(x.shape) - sizes
-        if ((at < 0) | (at > most)).any() and mode == lax.GatherScatterMode.FILL_OR_DROP:
-            found[place] = _fill(t, equation)
-            continue
-        at = np.clip(at, 0, most)
-        part = x[tuple(slice(start, start + size) for start, size in zip(at, sizes, strict=True))]
-        found[place] = part.reshape([sizes[axis] for axis in kept])
+        batch = {axis: place[k] for axis, k in zip(batched, numbers.start_indices_batching_dims, strict=True)}
+        corner = dict(zip(numbers.start_index_map, starts[place], strict=True)) | batch
+        window = _window(x, corner, sizes, mode)
+        found[place] = _fill(t, equation) if window is None else x[window].reshape([sizes[axis] for axis in kept])
     order = [*batch_axes, *numbers.offset_dims]
     return np.transpose(found, np.argsort(order)).reshape(out_shape)
+
+
+def _window(x: Nodes, corner: dict[int, int], sizes: Any, mode: Any) -> tuple[slice, ...] | None:
+    """The part of x that begins at a corner (axis -> index, 0 for others); what is not wholly inside is moved there, or
+    is None, as the mode says."""
+    at = np.array([corner.get(axis, 0) for axis in range(x.ndim)], np.int64)
+    most = np.array(x.shape, np.int64) - np.array(sizes, np.int64)
+    if ((at < 0) | (at > most)).any() and mode == lax.GatherScatterMode.FILL_OR_DROP:
+        return None
+    at = np.clip(at, 0, most)
+    return tuple(slice(start, start + size) for start, size in zip(at, sizes, strict=True))
 
 
 def _fill(t: Tracer, equation: Any) -> int:
@@ -161,23 +165,18 @@ def _scatter(t: Tracer, equation: Any, x: Nodes, indices: Nodes, updates: Nodes)
     window_axes = list(numbers.update_window_dims)
     batch_axes = [axis for axis in range(updates.ndim) if axis not in window_axes]
     rows = np.transpose(updates, [*batch_axes, *window_axes])
-    removed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
+    batched = numbers.operand_batching_dims
+    removed = (*numbers.inserted_window_dims, *batched)
     kept = [axis for axis in range(x.ndim) if axis not in removed]
     sizes = np.ones(x.ndim, np.int64)
     sizes[kept] = [updates.shape[axis] for axis in window_axes]
     found = x.copy()
     for place in np.ndindex(*starts.shape[:-1]):
-        at = np.zeros(x.ndim, np.int64)
-        for axis, start in zip(numbers.scatter_dims_to_operand_dims, starts[place], strict=True):
-            at[axis] = start
-        for axis, along in zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True):
-            at[axis] = place[along]
-        most = np.array(x.shape) - sizes
-        if ((at < 0) | (at > most)).any():
-            if mode == lax.GatherScatterMode.FILL_OR_DROP:
-                continue
-            at = np.clip(at, 0, most)
-        window = tuple(slice(start, start + size) for start, size in zip(at, sizes, strict=True))
+        batch = {axis: place[k] for axis, k in zip(batched, numbers.scatter_indices_batching_dims, strict=True)}
+        corner = dict(zip(numbers.scatter_dims_to_operand_dims, starts[place], strict=True)) | batch
+        window = _window(x, corner, sizes, mode)
+        if window is None:
+            continue
         update = rows[place].reshape(sizes)
         found[window] = update if name is None else t.ops(name, found[window], update)
     return found
