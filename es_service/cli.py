@@ -23,6 +23,7 @@ from es_service.errors import ConfigError, EvaluationError, Interrupted, NotInRu
 from es_service.report.catalogue import print_catalogue
 from es_service.report.progress import Row, show_progress
 from es_service.report.status import follow_status, print_status, print_summary
+from es_service.session import task_of
 from es_service.store.folder import DATABASE
 from workers.environments import TASKS
 
@@ -85,7 +86,7 @@ def run(
         raise ConfigError("--or-resume needs --out: without it every run has a folder of its own")
     begun = or_resume and out is not None and (out / DATABASE).exists()
     loaded = api.load_config(config, overrides, new=not begun)
-    for warning in config_warnings(loaded):
+    for warning in config_warnings(loaded, task_of(loaded)):
         _print_note(f"note: {warning}")
     folder = out if out is not None else api.default_folder(loaded)
     _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder))

@@ -22,9 +22,7 @@ def _bench() -> None:
 def rollouts(
     task: Annotated[list[str] | None, typer.Option("--task", help="Task to measure; default: all of ours.")] = None,
     policy: Annotated[str | None, typer.Option("--policy", help="on or off; default: both.")] = None,
-    rollout: Annotated[
-        str, typer.Option("--rollout", help="xla, simd (our own compiler, physics alone so far), or both.")
-    ] = "xla,simd",
+    rollout: Annotated[str, typer.Option("--rollout", help="xla, simd (our own compiler), or both.")] = "xla,simd",
     batch: Annotated[
         list[int] | None, typer.Option("--batch", min=2, help="Episodes that step together, an even number.")
     ] = None,

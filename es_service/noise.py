@@ -46,6 +46,7 @@ class Domain(IntEnum):
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1, _MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_MASK = 2**64 - 1
 _WEYL, _MUL_1, _MUL_2, _MUL_3, _MUL_4 = (
     np.uint32(word) for word in (0x9E3779B9, 0x21F0AAAD, 0xD35A2D97, 0x85EBCA6B, 0xC2B2AE35)
 )
@@ -59,16 +60,25 @@ def _mix64(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return x ^ (x >> np.uint64(31))
 
 
+def _mix(x: int) -> int:
+    """The same of one word, as a whole number: NumPy takes longer to begin than this to end."""
+    x = (x ^ (x >> 30)) * int(_MIX_1) & _MASK
+    x = (x ^ (x >> 27)) * int(_MIX_2) & _MASK
+    return x ^ (x >> 31)
+
+
 def stream_keys(seed: int, domain: Domain, generation: int, *ids: Any) -> Keys:
     """Keys of the streams (seed, domain, generation, *ids); ids are ints or integer arrays that broadcast together.
 
     Returns:
         uint32 array of the broadcast shape of `ids` + (4,). Streams that differ only in the last field never collide.
     """
-    fields = [np.uint64(seed), np.uint64(domain), np.uint64(generation), *(np.asarray(i, np.uint64) for i in ids)]
-    state = np.zeros((1,), np.uint64)
-    for field in fields:
-        state = _mix64((state ^ field) + _GOLDEN)
+    prefix = 0
+    for field in (int(seed), int(domain), int(generation)):
+        prefix = _mix((prefix ^ field) + int(_GOLDEN) & _MASK)
+    state = np.full((1,), prefix, np.uint64)
+    for field in ids:
+        state = _mix64((state ^ np.asarray(field, np.uint64)) + _GOLDEN)
     state = state.reshape(np.broadcast_shapes(*(np.shape(i) for i in ids)) if ids else ())[..., None]
     halves = _mix64(state + _GOLDEN * np.arange(1, 3, dtype=np.uint64))
     low, high = halves.astype(np.uint32), (halves >> np.uint64(32)).astype(np.uint32)

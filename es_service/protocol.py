@@ -52,6 +52,8 @@ class TaskSpec:
     """How near the middle of a wall no descriptor can come."""
     least_reward: float | None = None
     """A reward below which none is expected: what a QD-score counts from. None where nobody says."""
+    no_simd: str = ""
+    """Why simd cannot run its episodes on this machine; empty where it can."""
 
 
 def with_options(task: TaskSpec, options: Mapping[str, str]) -> TaskSpec:
@@ -97,9 +99,12 @@ class WorkerSpec:
     chunk_pairs: int
     """Pairs in a training chunk: its compiled shape."""
     rollout_block_pairs: int
-    """Pairs that step together inside a chunk; divides `chunk_pairs`. Few enough for their weights to stay in cache."""
+    """With xla, pairs that step together inside a chunk; divides `chunk_pairs`. Few enough for their weights to stay in
+    cache."""
     gradient_block_pairs: int
     """Pairs whose weighted noise is summed into one partial gradient."""
+    rollout: Literal["xla", "simd"] = "xla"
+    """What computes episodes and gradients."""
 
 
 class WorkerPlace(NamedTuple):

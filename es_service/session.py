@@ -101,7 +101,7 @@ def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) 
     """What runs the workers, as configured; they are starting."""
     spec, compute, scheduling = worker_spec(config, task_of(config)), config.compute, scheduling_policy(config)
     if compute.engine == "inline":
-        return inline_engine(spec, scheduling, should_stop, log=log)
+        return inline_engine(spec, scheduling, should_stop, threads=compute.inline_workers == "threads", log=log)
     from es_service.dispatch.ray_cluster import Claim
     from es_service.dispatch.ray_engine import ray_engine
 

@@ -10,11 +10,13 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import cache
 
 from es_service.errors import ConfigError
 from es_service.protocol import TaskSpec, worker_environment
 from workers.environments import TASKS
+from workers.simd.target import NoVectorsError, host_target
 
 DESCRIBE_S = 120.0
 """Longest wait for a description; the first import of Brax on a slow disk takes a while."""
@@ -25,7 +27,7 @@ class Tasks(Mapping[str, TaskSpec]):
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is none of ours, ConfigError for another that cannot be had."""
-        return _described(name) if ":" in name else TASKS[name]
+        return _described(name) if ":" in name else replace(TASKS[name], no_simd=_no_vectors())
 
     def __iter__(self) -> Iterator[str]:
         return iter(TASKS)
@@ -38,6 +40,16 @@ def child_environment() -> dict[str, str]:
     """Environment variables for a process like a worker's that imports what this one can import."""
     path = os.pathsep.join(path or os.getcwd() for path in sys.path)
     return worker_environment(os.environ) | {"PYTHONPATH": path}
+
+
+@cache
+def _no_vectors() -> str:
+    """Why this processor cannot run code for vectors; empty if it can."""
+    try:
+        host_target()
+    except NoVectorsError as error:
+        return str(error)
+    return ""
 
 
 @cache

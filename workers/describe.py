@@ -12,11 +12,13 @@ import json
 import sys
 
 from workers.environments import TaskError, describe_environment
+from workers.simd.rollout import why_not
 
 
 def main(name: str) -> None:
     try:
-        answer = {"task": dataclasses.asdict(describe_environment(name))}
+        task = describe_environment(name)
+        answer = {"task": dataclasses.asdict(dataclasses.replace(task, no_simd=why_not(task)))}
     except TaskError as error:
         answer = {"problem": str(error)}
     print(json.dumps(answer))

@@ -24,12 +24,13 @@ from es_service.protocol import PolicyShape, WorkerSpec
 from workers.environments import TASKS, Environment, describe_environment, make_environment
 from workers.policy import initial_parameters
 from workers.rollout import make_training_rollout
+from workers.simd import rollout as simd_rollout
 from workers.simd.kernel import compile_kernel
 from workers.simd.primitives import UnsupportedError
 from workers.simd.target import NoVectorsError
 
-STEPS = 50
-"""Control steps of one call."""
+STEPS, STEPS_WITH_POLICY = 50, 200
+"""Control steps of one call. With a policy each call also makes the noise of its members, as a chunk of a run does."""
 
 
 def measure(
@@ -49,7 +50,7 @@ def measure(
         policy: with a policy of its own weights for each member, noise and statistics; else random actions alone.
         batch: episodes that step together; with a policy, both members of batch / 2 pairs.
         seconds: to measure for.
-        rollout: what computes the steps, "xla" or "simd"; the latter without a policy so far.
+        rollout: what computes the steps, "xla" or "simd".
 
     Returns:
         steps_per_second, compile_seconds (without that of resets, where there is no policy), peak_mib; or the problem,
@@ -60,13 +61,13 @@ def measure(
     shape = PolicyShape((size.observation_size, *hidden, size.action_size))
     states = None if policy else _after_reset(environment, batch)
     started = time.perf_counter()
-    if policy:
-        call = _with_policy(environment, shape, task, batch)
-    else:
-        try:
+    try:
+        if policy:
+            call = _with_policy(environment, shape, task, batch, rollout)
+        else:
             call = _without_policy(environment, shape, states, rollout)
-        except (UnsupportedError, NoVectorsError) as error:
-            return {"problem": str(error)}
+    except (UnsupportedError, NoVectorsError) as error:
+        return {"problem": str(error)}
     call(0)
     ready = time.perf_counter()
     steps = calls = 0
@@ -79,13 +80,13 @@ def measure(
     }
 
 
-def _with_policy(environment: Environment, shape: PolicyShape, task: str, batch: int) -> Any:
+def _with_policy(environment: Environment, shape: PolicyShape, task: str, batch: int, rollout: str) -> Any:
     pairs = batch // 2
     spec = WorkerSpec(
         seed=0,
         environment=task,
         environment_options={},
-        episode_steps=STEPS,
+        episode_steps=STEPS_WITH_POLICY,
         fitness="sum",
         episodes_per_member=1,
         policy=shape,
@@ -96,7 +97,8 @@ def _with_policy(environment: Environment, shape: PolicyShape, task: str, batch:
         rollout_block_pairs=pairs,
         gradient_block_pairs=pairs,
     )
-    rollout = make_training_rollout(environment, spec)
+    make = simd_rollout.make_training_rollout if rollout == "simd" else make_training_rollout
+    episodes = make(environment, spec)
     centre_D = initial_parameters(shape, "unit_columns", 0)
     mean_O, std_O = np.zeros(shape.widths[0], np.float32), np.ones(shape.widths[0], np.float32)
 
@@ -104,7 +106,7 @@ def _with_policy(environment: Environment, shape: PolicyShape, task: str, batch:
         noise_keys_P = stream_keys(0, Domain.PARAMETER_NOISE, number, np.arange(pairs))
         keys_P_S_E = np.broadcast_to(noise_keys_P[:, None, None], (pairs, 2, 1, 4))
         unit = np.float32(0.02 / NORMAL_STD)
-        return int(np.sum(rollout(centre_D, unit, mean_O, std_O, noise_keys_P, keys_P_S_E, keys_P_S_E).steps))
+        return int(np.sum(episodes(centre_D, unit, mean_O, std_O, noise_keys_P, keys_P_S_E, keys_P_S_E).steps))
 
     return call
 

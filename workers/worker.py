@@ -25,16 +25,19 @@ from es_service.protocol import (
     WorkerSpec,
 )
 from workers.environments import make_environment
-from workers.gradient import make_gradient_sum
-from workers.rollout import Episodes, make_evaluation_rollout, make_training_rollout
+from workers.episode import Episodes
 
 
 def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
     """Build the compiled functions of a run (compiled on first use) and return what runs its chunks."""
     environment = make_environment(spec.environment, spec.environment_options)
-    training_rollout = make_training_rollout(environment, spec)
-    evaluation_rollout = make_evaluation_rollout(environment, spec)
-    gradient_sum = make_gradient_sum(spec.policy.parameters)
+    if spec.rollout == "simd":
+        from workers.simd import rollout as made_by
+    else:
+        from workers import rollout as made_by
+    training_rollout = made_by.make_training_rollout(environment, spec)
+    evaluation_rollout = made_by.make_evaluation_rollout(environment, spec)
+    gradient_sum = made_by.make_gradient_sum(spec.policy.parameters)
 
     def train(centre: Centre, chunk: TrainingChunk) -> EpisodesResult:
         pairs_P = chunk.chunk_id * spec.chunk_pairs + np.arange(spec.chunk_pairs)
@@ -47,7 +50,7 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
             episode_keys(spec, Domain.TRAINING_RESET, chunk.generation, pairs_P),
             episode_keys(spec, Domain.ACTION_NOISE, chunk.generation, pairs_P),
         )
-        return _episodes_result(episodes, centre.observation_mean_O)
+        return _training_result(episodes, centre.observation_mean_O)
 
     def evaluate(centre: Centre, chunk: EvaluationChunk) -> EpisodesResult:
         episodes_E = chunk.chunk_id * EVALUATION_EPISODES_PER_CHUNK + np.arange(EVALUATION_EPISODES_PER_CHUNK)
@@ -57,7 +60,7 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
             centre.observation_std_O,
             stream_keys(spec.seed, Domain.EVALUATION_RESET, chunk.generation, episodes_E),
         )
-        return _episodes_result(episodes, None)
+        return _evaluation_result(episodes)
 
     def gradient(chunk: GradientChunk) -> GradientResult:
         pairs_P = chunk.chunk_id * spec.gradient_block_pairs + np.arange(spec.gradient_block_pairs)
@@ -83,17 +86,31 @@ def episode_keys(spec: WorkerSpec, domain: Domain, generation: int, pairs_P: Any
     return stream_keys(spec.seed, domain, generation, pairs_P[:, None, None], sign_S[None, :, None], episode_E)
 
 
-def _episodes_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
-    """Copy a finished batch to the host, and reduce its observation sums in float64."""
-    host = Episodes(*(None if x is None else np.array(x) for x in episodes))
+def _training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
+    """What a chunk's episodes, axes [P, S, E], say of its members: means over E, least distances, totals of steps."""
+    host = Episodes(*map(np.asarray, episodes))
+    distance = np.stack([host.goal_distance[..., 0].mean(axis=2), host.goal_distance[..., 1].min(axis=2)], axis=-1)
+    return EpisodesResult(
+        fitness=host.fitness.mean(axis=2),
+        returns=host.returns.mean(axis=2),
+        descriptor=host.descriptor.mean(axis=2),
+        steps=host.steps.sum(axis=2, dtype=np.int32),
+        goal_distance=distance,
+        moments=_moments(host, shift_O),
+    )
+
+
+def _evaluation_result(episodes: Episodes) -> EpisodesResult:
+    """What each episode says, axis [E], and the way of the first; copied, since JAX's memory is not ours to keep."""
+    host = Episodes(*map(np.array, episodes))
     return EpisodesResult(
         fitness=host.fitness,
         returns=host.returns,
         descriptor=host.descriptor,
         steps=host.steps,
         goal_distance=host.goal_distance,
-        moments=None if shift_O is None else _moments(host, shift_O),
-        trace_T_B=host.trace_T_B,
+        moments=None,
+        trace_T_B=host.trace_T_B[0].copy(),
     )
 
 

@@ -27,6 +27,7 @@ from es_service.config.resolution import (
     member_problems,
     one_of,
     resolve,
+    rollout_problems,
     shape_problems,
     task_problems,
 )
@@ -136,7 +137,8 @@ def _load(
         task = None
         problems.append(f"task.environment: {error}")
     values = resolve(values, left_open, task)
-    problems += task_problems(values, task) + map_problems(values, task) if task else []
+    if task is not None:
+        problems += task_problems(values, task) + map_problems(values, task) + rollout_problems(values, task)
     problems += member_problems(values) + shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & _BUDGET and all(values.get(key) is None for key in _BUDGET):
@@ -266,8 +268,6 @@ def _bad_value(name: str, value: object) -> str:
     hint = ""
     if value is None:
         hint = "; leave the key out for its default"
-    elif (name, value) == ("compute.rollout", "simd"):
-        hint = "; simd computes single steps so far (es-service bench rollouts), xla whole episodes"
     elif isinstance(value, str) and "number" in allowed and _is_number(value):
         hint = f"; remove the quotes around {value}"
     elif isinstance(value, float) and "whole number" in allowed and value.is_integer() and 1 <= value < 2**53:

@@ -229,6 +229,10 @@ class ComputeConfig(_Section):
         "ray",
         description="What runs the workers. ray: actors, here or in a cluster. inline: this program's child processes.",
     )
+    inline_workers: Literal["processes", "threads"] = Field(
+        "processes",
+        description="With engine inline, what workers are: processes; or threads of one, for rollout simd.",
+    )
     address: Text | None = Field(
         None,
         description="With engine ray: a cluster to join, HOST:PORT, or auto for the one on this machine; null starts a "
@@ -242,7 +246,10 @@ class ComputeConfig(_Section):
         default_factory=lambda: WorkerResources(cpu=1, gpu=0.0),
         description="What one worker takes of a node, with engine ray.",
     )
-    rollout: Literal["xla"] = Field(description="What computes episodes. auto: xla.")
+    rollout: Literal["xla", "simd"] = Field(
+        description="What computes episodes. simd: code compiled for this kind of processor, some twenty times faster; "
+        "xla: JAX, for GPUs and for tasks that simd cannot compile. auto: simd where that can be."
+    )
     chunk_pairs: Count = Field(
         description="Pairs in one unit of work; divides search.pairs. auto: the largest divisor of it not above "
         "an eighth of it, within 16 to 64, a multiple of 8 if there is one."
@@ -355,4 +362,5 @@ def worker_spec(config: RunConfig, task: TaskSpec) -> WorkerSpec:
         chunk_pairs=compute.chunk_pairs,
         rollout_block_pairs=compute.rollout_block_pairs,
         gradient_block_pairs=compute.gradient_block_pairs,
+        rollout=compute.rollout,
     )

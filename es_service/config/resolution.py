@@ -110,8 +110,9 @@ def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpe
             values["map.qd_offset"] = default_qd_offset(values, task)
     if "search.members" in left_open and "search.algorithm" in values:
         values["search.members"] = 1 if values["search.algorithm"] in SINGLE_MEMBER else MEMBERS
-    if "compute.rollout" in left_open:
-        values["compute.rollout"] = "xla"
+    if "compute.rollout" in left_open and task is not None:
+        on_gpu = values.get(f"{RESOURCES}gpu", 0.0) > 0
+        values["compute.rollout"] = "xla" if on_gpu or task.no_simd else "simd"
     pairs = values.get("search.pairs")
     if pairs is not None and "compute.chunk_pairs" in left_open:
         values["compute.chunk_pairs"] = default_chunk_pairs(pairs)
@@ -197,10 +198,27 @@ def engine_problems(values: Mapping[str, Any]) -> list[str]:
             for name, without in needy.items()
             if values.get(name, without) != without
         ]
+    inline, threads = values.get("compute.engine") == "inline", values.get("compute.inline_workers") == "threads"
+    if threads and not (inline and values.get("compute.rollout", "simd") == "simd"):
+        problems.append(
+            "compute.inline_workers: threads needs compute.engine = inline and compute.rollout = simd, in whose code "
+            "threads do not wait for each other; must be processes"
+        )
     gpus = values.get(f"{RESOURCES}gpu", 0.0)
     if gpus > 1 and gpus != int(gpus):
         problems.append(f"{RESOURCES}gpu: {show(gpus)} is not allowed; must be a whole number or a fraction below 1")
     return problems
+
+
+def rollout_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
+    """Where simd is asked for and cannot be had."""
+    if values.get("compute.rollout") != "simd":
+        return []
+    if values.get(f"{RESOURCES}gpu", 0.0) > 0:
+        return [f"compute.rollout: simd runs on CPUs, and {RESOURCES}gpu is not 0; must be auto or xla"]
+    if task.no_simd:
+        return [f"compute.rollout: simd cannot run {task.name}: {task.no_simd}; must be auto or xla"]
+    return []
 
 
 def folder_problems(values: Mapping[str, Any]) -> list[str]:
@@ -212,9 +230,11 @@ def folder_problems(values: Mapping[str, Any]) -> list[str]:
     return [f"search.init_from: {folder} {what}; must be the folder of another run, or null"]
 
 
-def config_warnings(config: RunConfig) -> list[str]:
+def config_warnings(config: RunConfig, task: TaskSpec) -> list[str]:
     """What is legal and probably not meant; one line each, for the command line to print before the run starts."""
     warnings = []
+    if config.compute.rollout == "xla" and task.no_simd:
+        warnings.append(f"compute.rollout: xla, since simd cannot run {task.name}: {task.no_simd}")
     pairs, chunk = config.search.pairs, config.compute.chunk_pairs
     if chunk < FEW_CHUNK_PAIRS and pairs > MOST_CHUNK_PAIRS:
         near = round(pairs / MOST_CHUNK_PAIRS) * MOST_CHUNK_PAIRS

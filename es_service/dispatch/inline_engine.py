@@ -1,8 +1,8 @@
-"""The inline engine: workers are child processes of this one, talked to over pipes.
+"""The inline engine: workers are child processes of this one, or threads of one child, talked to over pipes.
 
 Children are started by exec with fixed settings (one XLA thread, CPU), never forked, so whatever the caller has done
-with JAX changes nothing. Each child has one thread here that reads its answers and one that writes to it: a child that
-is stopped in mid-message then blocks nobody but its own threads.
+with JAX changes nothing; that is why threads are not this process's own. Each child has one thread here that reads its
+answers and one that writes to it: a child that is stopped in mid-message then blocks nobody but its own threads.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections import deque
 from collections.abc import Callable, Hashable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import IO, Any
@@ -31,51 +32,67 @@ JOIN_S = 1.0
 
 
 def inline_engine(
-    spec: WorkerSpec, policy: Policy, should_stop: Callable[[], int | None] = lambda: None, *, log: Log = no_log
+    spec: WorkerSpec,
+    policy: Policy,
+    should_stop: Callable[[], int | None] = lambda: None,
+    *,
+    threads: bool = False,
+    log: Log = no_log,
 ) -> Engine[ChildProcesses]:
-    """An Evaluator on this machine, its `policy.workers` child processes starting."""
-    return Engine(ChildProcesses(spec), policy, should_stop, log)
+    """An Evaluator on this machine, its `policy.workers` workers starting.
+
+    Args:
+        threads: of one child, instead of a child each: less memory, and one that is lost takes the others with it.
+    """
+    return Engine(ChildProcesses(spec, threads=threads), policy, should_stop, log)
 
 
-@dataclass
+@dataclass(eq=False)
 class _Child:
-    """One worker process and the plumbing to it."""
+    """One process, of one worker or of all, and the plumbing to it."""
 
     process: subprocess.Popen[bytes]
     log: IO[bytes]
     """What it wrote to stdout and stderr."""
-    reader: threading.Thread
     outbox: queue.SimpleQueue[bytes | None]
     """Pickled messages to write to it, in order; None: no more."""
+    reader: threading.Thread = field(init=False)
     centre: Centre | None = None
     """The one it was sent last."""
 
 
 class ChildProcesses:
-    """A Transport whose workers are child processes."""
+    """A Transport whose workers are child processes, or threads of one."""
 
-    def __init__(self, spec: WorkerSpec) -> None:
-        self._spec = spec
+    def __init__(self, spec: WorkerSpec, *, threads: bool = False) -> None:
+        self._spec, self._threads = spec, threads
         self._children: dict[int, _Child] = {}
-        self._inbox: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
+        """By worker; with threads, the same for all of them."""
+        self._inbox: queue.SimpleQueue[tuple[_Child | int, Any]] = queue.SimpleQueue()
+        self._lost: deque[Message] = deque()
 
     def process_ids(self) -> dict[int, int]:
         """Worker id -> process id of the children not known to be dead; for diagnosis and for tests that kill them."""
         return {worker: child.process.pid for worker, child in self._children.items()}
 
     def start(self, worker: int) -> None:
-        """Start a child and tell it the constants of the run."""
-        try:
-            child = _start_child(worker, self._inbox)
-        except OSError as error:  # no process, no file descriptor or no disk space to be had
-            self._inbox.put((worker, ("broken", f"worker {worker} cannot be started: {error}")))
-            return
+        """Start a child and tell it the constants of the run; or have the one that there is start a thread."""
+        child = next(iter(self._children.values()), None) if self._threads else None
+        if child is None:
+            try:
+                child = _start_child(worker, self._inbox)
+            except OSError as error:  # no process, no file descriptor or no disk space to be had
+                self._inbox.put((worker, ("broken", f"worker {worker} cannot be started: {error}")))
+                return
+            child.outbox.put(pickle.dumps(self._spec, pickle.HIGHEST_PROTOCOL))
         self._children[worker] = child
-        child.outbox.put(pickle.dumps(self._spec, pickle.HIGHEST_PROTOCOL))
+        child.outbox.put(pickle.dumps(("start", worker), pickle.HIGHEST_PROTOCOL))
 
     def kill(self, worker: int) -> None:
-        """Kill a child, wait for it, free its descriptors and end its threads."""
-        self._end(worker)
+        """Kill a worker's child, wait for it, free its descriptors and end its threads; its other workers are lost."""
+        child = self._children.pop(worker, None)
+        if child is not None:
+            self._lose(child)
 
     def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunk: Chunk) -> None:
         """Queue the chunk for the child's writer, behind the centre if the child does not know it."""
@@ -83,39 +100,48 @@ class ChildProcesses:
         if child.centre is not centre:
             child.centre = centre
             child.outbox.put(pickle.dumps(("centre", centre), pickle.HIGHEST_PROTOCOL))
-        child.outbox.put(pickle.dumps(("chunk", key, attempt, chunk), pickle.HIGHEST_PROTOCOL))
+        child.outbox.put(pickle.dumps(("chunk", worker, key, attempt, chunk), pickle.HIGHEST_PROTOCOL))
 
     def receive(self, timeout_s: float) -> Message | None:
         """The next message of any child; one that broke or closed its pipe is killed before it is reported lost."""
+        if self._lost:
+            return self._lost.popleft()
         try:
-            worker, said = self._inbox.get(timeout=timeout_s) if timeout_s else self._inbox.get_nowait()
+            who, said = self._inbox.get(timeout=timeout_s) if timeout_s else self._inbox.get_nowait()
         except queue.Empty:
             return None
         match said:
-            case ("up", _):
+            case ("up", worker):
                 return WorkerUp(worker)
-            case ("result", key, attempt, result):
+            case ("result", worker, key, attempt, result):
                 return Answer(worker, key, attempt, result)
-            case ("failure", key, attempt, text):
+            case ("failure", worker, key, attempt, text):
                 return Failure(worker, key, attempt, text)
+            case ("broken", text) if isinstance(who, int):
+                return WorkerLost(who, text)
             case ("broken", text):
-                self._end(worker)
-                return WorkerLost(worker, text)
+                self._lose(who, text)
             case _:
-                return WorkerLost(worker, self._end(worker))
+                self._lose(who)
+        return self._lost.popleft() if self._lost else None
 
     def close(self) -> None:
         """Kill all children and wait for them."""
         for child in self._children.values():
             child.process.kill()  # all at once: each takes a while to give its memory back
         for worker in list(self._children):
-            self._end(worker)
+            self.kill(worker)
 
-    def _end(self, worker: int) -> str:
-        """Kill a child for good; how it ended and what it said last, as a reason."""
-        child = self._children.pop(worker, None)
-        if child is None:
-            return "killed before"
+    def _lose(self, child: _Child | int, reason: str = "") -> None:
+        """Kill a child for good, and report its workers lost; nothing more happens to one that was killed before."""
+        workers = [worker for worker, one in self._children.items() if one is child]
+        for worker in workers:
+            del self._children[worker]
+        how = self._end(child, workers) if isinstance(child, _Child) and not child.log.closed else ""
+        self._lost.extend(WorkerLost(worker, reason or how) for worker in workers)
+
+    def _end(self, child: _Child, workers: list[int]) -> str:
+        """Kill a child; how it ended and what it said last, as a reason."""
         child.process.kill()
         code = child.process.wait()
         child.reader.join(JOIN_S)
@@ -123,12 +149,11 @@ class ChildProcesses:
         last_words = child.log.read()[-2000:].decode(errors="replace").strip()
         child.log.close()
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
-        return f"worker {worker} (pid {child.process.pid}) ended with {how}" + (
-            f":\n{last_words}" if last_words else ""
-        )
+        whose = f"worker {', '.join(map(str, workers))}"
+        return f"{whose} (pid {child.process.pid}) ended with {how}" + (f":\n{last_words}" if last_words else "")
 
 
-def _start_child(worker: int, inbox: queue.SimpleQueue[tuple[int, Any]]) -> _Child:
+def _start_child(worker: int, inbox: queue.SimpleQueue[tuple[_Child | int, Any]]) -> _Child:
     environment = worker_environment(os.environ)
     environment["PYTHONSAFEPATH"] = "1"
     environment["PYTHONPATH"] = os.pathsep.join(path or os.getcwd() for path in sys.path)
@@ -148,29 +173,25 @@ def _start_child(worker: int, inbox: queue.SimpleQueue[tuple[int, Any]]) -> _Chi
             )
         undo.pop_all()
     outbox: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-    reader = threading.Thread(target=_read, args=(worker, ours, outbox, inbox), daemon=True, name=f"worker-{worker}")
-    reader.start()
-    return _Child(process, log, reader, outbox)
+    child = _Child(process, log, outbox)
+    child.reader = threading.Thread(target=_read, args=(child, ours, inbox), daemon=True, name=f"worker-{worker}")
+    child.reader.start()
+    return child
 
 
-def _read(
-    worker: int,
-    connection: Connection,
-    outbox: queue.SimpleQueue[bytes | None],
-    inbox: queue.SimpleQueue[tuple[int, Any]],
-) -> None:
+def _read(child: _Child, connection: Connection, inbox: queue.SimpleQueue[tuple[_Child | int, Any]]) -> None:
     """Pass on what the child says until it is dead; then close the connection, once nobody uses it any more.
 
     Closing it from elsewhere could let a thread read or write a new connection that was given the same number.
     """
-    writer = threading.Thread(target=_write, args=(connection, outbox), daemon=True, name=f"to-worker-{worker}")
+    writer = threading.Thread(target=_write, args=(connection, child.outbox), daemon=True, name="to-a-worker")
     writer.start()
     try:
         while True:
-            inbox.put((worker, connection.recv()))
+            inbox.put((child, connection.recv()))
     except Exception:  # end of file, or a message cut short by a kill
-        inbox.put((worker, ("lost",)))  # first of all: the writer may be blocked until the child is killed for it
-        outbox.put(None)
+        inbox.put((child, ("lost",)))  # first of all: the writer may be blocked until the child is killed for it
+        child.outbox.put(None)
         writer.join()
         connection.close()
 

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys
-from workers.gradient import make_gradient_sum
+from workers.rollout import make_gradient_sum
 
 PAIRS = 64
 UNIT = np.float32(1 / NORMAL_STD)

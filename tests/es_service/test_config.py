@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import string
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -60,7 +61,7 @@ def test_minimal_config_resolves_every_value():
     assert (config.policy.init, config.policy.observation_clip) == ("unit_columns", 5.0)
     assert (config.search.pairs, config.search.common_random_numbers) == (512, True)
     assert (config.search.sigma, config.search.learning_rate, config.search.l2) == (0.02, 0.01, 0.005)
-    assert (config.compute.rollout, config.compute.workers, config.compute.engine) == ("xla", "auto", "ray")
+    assert (config.compute.rollout, config.compute.workers, config.compute.engine) == ("simd", "auto", "ray")
     assert (config.compute.chunk_pairs, config.compute.rollout_block_pairs) == (64, 32)
     assert config.compute.gradient_block_pairs == 512
     assert config.seed == 0
@@ -122,14 +123,37 @@ def test_default_rollout_block_pairs(chunk, parameters, block):
 
 
 def test_awkward_populations_load_with_a_warning():
-    assert config_warnings(load()) == []
-    (warning,) = config_warnings(load(MINIMAL, "search.pairs=127"))
+    assert config_warnings(load(), POINT_MAZE) == []
+    (warning,) = config_warnings(load(MINIMAL, "search.pairs=127"), POINT_MAZE)
     assert warning.startswith("compute.chunk_pairs: 1 makes 127 small chunks")
     assert "search.pairs = 128" in warning
-    (warning,) = config_warnings(load(MINIMAL, "compute.chunk_pairs=4"))
+    (warning,) = config_warnings(load(MINIMAL, "compute.chunk_pairs=4"), POINT_MAZE)
     assert "auto would be 64" in warning
-    (warning,) = config_warnings(load(MINIMAL, "budget.generations=null", "budget.target_fitness=-25"))
+    endless = load(MINIMAL, "budget.generations=null", "budget.target_fitness=-25")
+    (warning,) = config_warnings(endless, POINT_MAZE)
     assert "target_fitness (-25.0)" in warning
+
+
+def test_simd_is_what_auto_chooses_where_it_can_be_had():
+    assert load().compute.rollout == "simd"
+    assert load(MINIMAL, "compute.worker_resources.gpu=1").compute.rollout == "xla"
+    with pytest.raises(ConfigError, match=r"simd runs on CPUs, and compute.worker_resources.gpu is not 0"):
+        load(MINIMAL, "compute.worker_resources.gpu=1", "compute.rollout=simd")
+    no_simd = replace(POINT_MAZE, no_simd="the processor (i486) has no AVX2")
+    here = {"point_maze": no_simd}
+    config = load_config(MINIMAL, tasks=here, algorithms=ALGORITHMS)
+    assert config.compute.rollout == "xla"
+    (warning,) = config_warnings(config, no_simd)
+    assert warning == "compute.rollout: xla, since simd cannot run point_maze: the processor (i486) has no AVX2"
+    with pytest.raises(ConfigError, match=r"simd cannot run point_maze: the processor .* must be auto or xla"):
+        load_config(MINIMAL, ("compute.rollout=simd",), tasks=here, algorithms=ALGORITHMS)
+
+
+def test_threads_are_for_simd_inside_one_process():
+    for overrides in (("compute.engine=ray",), ("compute.engine=inline", "compute.rollout=xla")):
+        with pytest.raises(ConfigError, match=r"inline_workers: threads needs compute.engine = inline and .*simd"):
+            load(MINIMAL, "compute.inline_workers=threads", *overrides)
+    assert load(MINIMAL, "compute.inline_workers=threads", "compute.engine=inline").compute.inline_workers == "threads"
 
 
 def test_overrides_win_over_the_file_and_later_ones_over_earlier(file):
@@ -179,7 +203,7 @@ def test_config_is_frozen():
 def test_shipped_configs_load_and_are_named_after_task_and_algorithm(path):
     config = load_config(path, tasks=ALL_TASKS, algorithms=ALGORITHMS)
     assert path.stem == f"{config.task.environment.replace(':', '_')}_{config.search.algorithm}"
-    assert config_warnings(config) == []
+    assert config_warnings(config, ALL_TASKS[config.task.environment]) == []
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)

@@ -80,7 +80,7 @@ def file(tmp_path):
         ("policy.observation_normalization=1", "1 ... must be true or false"),
         ("policy.observation_clip=0", "0 ... must be a number above 0 or null"),
         ("compute.engine=rey", "rey ... must be ray or inline; did you mean ray?"),
-        ("compute.rollout=simd", "simd ... must be auto or xla; simd computes single steps so far"),
+        ("compute.rollout=sind", "sind ... must be auto or xla or simd; did you mean simd?"),
         ("compute.workers=0", "0 ... must be auto or a whole number, at least 1"),
         ("compute.chunk_pairs=half", "half ... must be auto or a whole number"),
         ("search.init_from=/no/such/run", "/no/such/run does not exist; must be the folder of another run"),

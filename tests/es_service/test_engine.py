@@ -314,9 +314,10 @@ def test_a_loss_is_reported_while_the_writer_is_still_blocked():
         end.shutdown(socket.SHUT_WR)
         outbox, inbox = queue.SimpleQueue(), queue.SimpleQueue()
         outbox.put(bytes(5_000_000))
-        reader = threading.Thread(target=inline_module._read, args=(7, ours, outbox, inbox), daemon=True)
+        child: Any = SimpleNamespace(outbox=outbox)
+        reader = threading.Thread(target=inline_module._read, args=(child, ours, inbox), daemon=True)
         reader.start()
-        assert inbox.get(timeout=5.0) == (7, ("lost",))
+        assert inbox.get(timeout=5.0) == (child, ("lost",))
         time.sleep(0.05)
         assert not ours.closed
     reader.join(5.0)

@@ -12,11 +12,12 @@ import pytest
 from es_service.noise import NORMAL_STD, Domain, normals, stream_keys
 from es_service.protocol import SIGNS, PolicyShape
 from tests.helpers import SPEC
+from workers import rollout as xla
 from workers.environments import TASKS, make_environment
 from workers.environments.ant import STEP_S, Ant, contact_forces, expand, load_system, make_ant, observe, physics_step
 from workers.environments.brax_parts import pipeline
 from workers.policy import act, initial_parameters, split_layers
-from workers.rollout import make_training_rollout
+from workers.simd import rollout as simd
 from workers.worker import episode_keys
 
 pytestmark = [
@@ -66,7 +67,8 @@ def test_a_control_step_is_ten_of_brax_s(ant):
         np.testing.assert_allclose(state.qd, full.qd, atol=2e-6 * np.abs(full.qd).max())
 
 
-def test_a_compiled_episode_is_brax_s_after_one_step():
+@pytest.mark.parametrize("make_training_rollout", [xla.make_training_rollout, simd.make_training_rollout])
+def test_a_compiled_episode_is_brax_s_after_one_step(make_training_rollout):
     """The whole rollout, policy and all, beside Brax's own reset and ten of its substeps, far from any wall."""
     shape = PolicyShape((29, 16, 8))
     spec = replace(SPEC, environment="ant_maze", policy=shape, episode_steps=2, action_noise=0.0, observation_clip=None)
@@ -96,11 +98,12 @@ def test_a_compiled_episode_is_brax_s_after_one_step():
         x_y = (np.asarray(full.q)[:, :2] - 2.5) / 37.5
         second_P_O = np.concatenate([x_y, np.asarray(full.q)[:, 2:], np.asarray(full.qd)], axis=1)
         # Two observations are summed in an episode of two steps; what is not the first is that after one step.
-        ours = np.asarray(found.shifted_sum_O[:, s], np.float64) - first_P_O
+        ours = np.asarray(found.shifted_sum_O[:, s, 0], np.float64) - first_P_O
         np.testing.assert_allclose(ours[:, :15], second_P_O[:, :15], rtol=1e-6, atol=1e-6)
-        # A foot that lands magnifies the last bit: most ants are within 1e-6 of the greatest velocity, one within 2e-5.
+        # A foot that lands magnifies the last bit: most ants are within 1e-6 of the greatest velocity (simd, whose sums
+        # have another order, 3e-6), one within 2e-5.
         off_P = np.abs(ours - second_P_O)[:, 15:].max(1) / np.abs(second_P_O[:, 15:]).max()
-        assert np.median(off_P) < 1e-6
+        assert np.median(off_P) < (1e-6 if make_training_rollout is xla.make_training_rollout else 5e-6)
         assert off_P.max() < 3e-5
 
 

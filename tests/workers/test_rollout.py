@@ -1,6 +1,7 @@
 """Compiled episodes against a step-by-step NumPy episode, and the ways episodes have silently gone wrong elsewhere."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,8 @@ from es_service.protocol import (
 )
 from es_service.run_view import Policy
 from es_service.statistics import merge_moments, no_observations
-from tests.helpers import PARAMETERS, centre, random_parameters, spec
+from tests import helpers
+from tests.helpers import PARAMETERS, centre, random_parameters
 from tests.twins import noise as noise_twin
 from tests.twins import point_maze as maze_twin
 from workers.environments import Environment, make_environment
@@ -29,6 +31,12 @@ from workers.worker import episode_keys, make_worker
 
 SHAPE = PolicyShape((2, 8, 8, 2))
 MEAN, STD = np.float32([0.1, -0.4]), np.float32([0.3, 0.6])
+
+
+@pytest.fixture(params=["xla", "simd"])
+def spec(request):
+    """The tiny spec with changes, for each kind of rollout."""
+    return partial(helpers.spec, rollout=request.param)
 
 
 def numpy_episode(parameters_D, reset_key, action_key, action_noise, steps=200):
@@ -55,7 +63,7 @@ def run(chunk, worker_spec, parameters_D, sigma=0.1):
     return make_worker(worker_spec)(point, chunk)
 
 
-def test_training_chunk_equals_numpy_episodes():
+def test_training_chunk_equals_numpy_episodes(spec):
     worker_spec, parameters_D = spec(), random_parameters(1)
     result = run(TrainingChunk(1, 2), worker_spec, parameters_D)
     assert isinstance(result, EpisodesResult)
@@ -79,7 +87,7 @@ def test_training_chunk_equals_numpy_episodes():
     np.testing.assert_allclose(result.moments.m2_O / len(seen), seen.var(0), rtol=1e-3)
 
 
-def test_evaluation_chunk_equals_numpy_episodes_and_has_no_noise():
+def test_evaluation_chunk_equals_numpy_episodes_and_has_no_noise(spec):
     parameters_D = random_parameters(2)
     result = run(EvaluationChunk(4, 1), spec(action_noise=0.5), parameters_D)
     assert isinstance(result, EpisodesResult)
@@ -92,7 +100,7 @@ def test_evaluation_chunk_equals_numpy_episodes_and_has_no_noise():
         np.testing.assert_allclose(result.descriptor[e], end, atol=1e-3)
 
 
-def test_gradient_chunk_is_the_weighted_sum_of_the_rollout_s_noise():
+def test_gradient_chunk_is_the_weighted_sum_of_the_rollout_s_noise(spec):
     weights = np.random.default_rng(0).normal(size=8).astype(np.float32)
     result = run(GradientChunk(1, 3, weights), spec(), random_parameters())
     assert isinstance(result, GradientResult)
@@ -101,7 +109,7 @@ def test_gradient_chunk_is_the_weighted_sum_of_the_rollout_s_noise():
     np.testing.assert_allclose(result.sum_D, weights.astype(float) @ integers / NORMAL_STD, rtol=1e-5, atol=1e-5)
 
 
-def test_common_random_numbers_share_starts_within_a_pair_only():
+def test_common_random_numbers_share_starts_within_a_pair_only(spec):
     """With sigma 0 and a common start both signs are the same episode; without, they differ; pairs always differ."""
     for common in (True, False):
         result = run(TrainingChunk(1, 0), spec(common_random_numbers=common), random_parameters(1), sigma=0.0)
@@ -110,7 +118,7 @@ def test_common_random_numbers_share_starts_within_a_pair_only():
         assert len(np.unique(result.fitness[:, 0])) == 8
 
 
-def test_episodes_per_member_average():
+def test_episodes_per_member_average(spec):
     """Fitness and descriptor are means over the member's episodes, steps their sum, episodes start differently."""
     parameters_D = random_parameters(1)
     three = run(TrainingChunk(1, 0), spec(episodes_per_member=3), parameters_D)
@@ -133,7 +141,7 @@ def test_episodes_per_member_average():
         assert three.steps[p, 0] == sum(singles[e][p][1] for e in range(3))
 
 
-def test_results_do_not_alias_each_other():
+def test_results_do_not_alias_each_other(spec):
     """The fault this guards: descriptors that are views of memory which the next rollout overwrites."""
     worker = make_worker(spec())
     first = worker(centre(random_parameters(1)), TrainingChunk(1, 0))
@@ -144,7 +152,7 @@ def test_results_do_not_alias_each_other():
     assert first.descriptor.flags.owndata
 
 
-def test_running_a_chunk_again_gives_the_same_bits():
+def test_running_a_chunk_again_gives_the_same_bits(spec):
     worker, point = make_worker(spec()), centre(random_parameters(1))
     for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
         first, second = worker(point, chunk), worker(point, chunk)
@@ -175,7 +183,7 @@ def counting_environment(lifetimes, poison_after_done: bool) -> Environment:
 
 
 @pytest.mark.parametrize("fitness", ["sum", "final"])
-def test_steps_after_done_never_count(monkeypatch, fitness):
+def test_steps_after_done_never_count(spec, monkeypatch, fitness):
     """Nothing after `done` reaches return, descriptor, distances or statistics, even if it is NaN."""
     environment = counting_environment([1, 5, 17, 1000], poison_after_done=True)
     monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: environment)
@@ -195,7 +203,7 @@ def test_steps_after_done_never_count(monkeypatch, fitness):
     assert result.moments.m2_O[1] == pytest.approx(counted.var() * counted.size, rel=1e-5)
 
 
-def test_a_chunk_stops_when_all_its_members_are_done(monkeypatch):
+def test_a_chunk_stops_when_all_its_members_are_done(spec, monkeypatch):
     environment = counting_environment([1, 5, 17], poison_after_done=False)
     monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: environment)
     endless = spec(episode_steps=2_000_000_000)  # hours, if it did not
@@ -204,11 +212,11 @@ def test_a_chunk_stops_when_all_its_members_are_done(monkeypatch):
     assert result.steps.max() == 17
 
 
-def test_memory_does_not_grow_with_the_length_of_episodes():
+def test_memory_of_xla_does_not_grow_with_the_length_of_episodes():
     """What XLA sets aside for a chunk is the same for 200 steps and for 20,000."""
     sizes = []
     for steps in (200, 20_000):
-        worker_spec = spec(episode_steps=steps)
+        worker_spec = helpers.spec(episode_steps=steps)
         rollout = make_training_rollout(make_environment("point_maze", {}), worker_spec)
         pairs = np.arange(8)
         keys = stream_keys(0, Domain.PARAMETER_NOISE, 1, pairs)
@@ -219,7 +227,7 @@ def test_memory_does_not_grow_with_the_length_of_episodes():
     assert sizes[0] == sizes[1] > 0
 
 
-def test_every_function_is_traced_once(monkeypatch):
+def test_every_function_is_traced_once(spec, monkeypatch):
     """Recompiling for a new generation, chunk or centre would cost more than the rollout."""
     traces = []
     original = make_environment("point_maze", {})
@@ -240,7 +248,7 @@ def test_every_function_is_traced_once(monkeypatch):
     assert len(traces) == first
 
 
-def test_a_member_that_returns_nan_is_seen_and_does_not_poison_the_statistics(monkeypatch):
+def test_a_member_that_returns_nan_is_seen_and_does_not_poison_the_statistics(spec, monkeypatch):
     environment = counting_environment([1, 5, 17, 1000], poison_after_done=False)
     broken = Environment(
         reset=environment.reset,
@@ -259,7 +267,7 @@ def test_a_member_that_returns_nan_is_seen_and_does_not_poison_the_statistics(mo
     assert result.moments.count == result.steps[~invalid].sum()
 
 
-def test_numpy_policy_equals_the_rollout_s(monkeypatch):
+def test_numpy_policy_equals_the_rollout_s(spec, monkeypatch):
     """One step of an environment whose reward is its first action: the exported policy says the same."""
     one_step = Environment(
         reset=lambda key: jnp.stack([(key[0] % 7).astype(jnp.float32) - 3.0, jnp.float32(0.5)]),

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
-from numpy.typing import NDArray
 
 from workers.simd import cache as kernel_cache
 from workers.simd import loops
@@ -22,10 +21,8 @@ from workers.simd.graph import live
 from workers.simd.operations import OPERATIONS
 from workers.simd.target import Target, compile_object, compiler_version, host_target, load_object
 from workers.simd.trace import trace_jaxpr
+from workers.simd.words import ALIGNMENT, Words, aligned, pack, unpack, words_of
 
-Words = NDArray[np.uint32]
-"""[block, word, lane]: what kernels read and write; floats and integers by their bits, truth as 0 or 1."""
-ALIGNMENT = 64
 OWN_VERSION = hashlib.sha256(
     b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py")))
 ).hexdigest()
@@ -66,12 +63,12 @@ class Kernel:
     @property
     def words_in(self) -> int:
         """Words of a lane that go in: all elements of all leaves."""
-        return sum(int(np.prod(aval.shape)) for aval in self.in_avals)
+        return sum(map(words_of, self.in_avals))
 
     @property
     def words_out(self) -> int:
         """Words of a lane that come out."""
-        return sum(int(np.prod(aval.shape)) for aval in self.out_avals)
+        return sum(map(words_of, self.out_avals))
 
     def run(self, words: Words, out: Words) -> None:
         """Compute [block, words_in, width] -> [block, words_out, width]; both aligned to 64 bytes, as `aligned` makes
@@ -92,46 +89,14 @@ class Kernel:
         leaves, tree = jax.tree.flatten(arguments)
         assert tree == self.in_tree, f"{tree} is not what was compiled for: {self.in_tree}"
         lanes = len(leaves[0]) if leaves else 1
-        words = self.pack(leaves, lanes)
-        out = aligned((len(words), self.words_out, self.target.width))
-        self.run(words, out)
-        return jax.tree.unflatten(self.out_tree, self.unpack(out, lanes))
-
-    def pack(self, leaves: list[Any], lanes: int) -> Words:
-        """Leaves [lane, ...] as words; lanes that fill the last block repeat the last."""
-        width = self.target.width
-        blocks = -(-lanes // width)
-        columns = []
         for leaf, aval in zip(leaves, self.in_avals, strict=True):
             array = np.asarray(leaf)
             assert array.dtype == aval.dtype, (array.dtype, aval)
             assert array.shape == (lanes, *aval.shape), (array.shape, aval)
-            array = array.astype(np.uint32) if array.itemsize < 4 else np.ascontiguousarray(array).view(np.uint32)
-            columns.append(array.reshape(lanes, int(np.prod(aval.shape))))
-        rows = np.concatenate([np.zeros((lanes, 0), np.uint32), *columns], axis=1)
-        filled = rows[np.minimum(np.arange(blocks * width), lanes - 1)] if lanes else rows
-        words = aligned((blocks, rows.shape[1], width))
-        words[:] = filled.reshape(blocks, width, -1).transpose(0, 2, 1)
-        return words
-
-    def unpack(self, out: Words, lanes: int) -> list[NDArray]:
-        """Leaves [lane, ...] of words that came out."""
-        rows = out.transpose(0, 2, 1).reshape(len(out) * out.shape[2], out.shape[1])[:lanes]
-        ends = np.cumsum([int(np.prod(aval.shape)) for aval in self.out_avals], dtype=np.int64)
-        found = []
-        for column, aval in zip(np.split(rows, ends, axis=1)[:-1], self.out_avals, strict=True):
-            column = np.ascontiguousarray(column)
-            array = column.astype(aval.dtype) if aval.dtype.itemsize < 4 else column.view(aval.dtype)
-            found.append(array.reshape(lanes, *aval.shape))
-        return found
-
-
-def aligned(shape: tuple[int, ...]) -> Words:
-    """An empty array of words that vectors can be read from."""
-    size = 4 * int(np.prod(shape))
-    memory = np.empty(size + ALIGNMENT, np.uint8)
-    start = -memory.ctypes.data % ALIGNMENT
-    return memory[start : start + size].view(np.uint32).reshape(shape)
+        words = pack(leaves, self.target.width)
+        out = aligned((len(words), self.words_out, self.target.width))
+        self.run(words, out)
+        return jax.tree.unflatten(self.out_tree, unpack(out, self.out_avals, lanes))
 
 
 def compile_kernel(
@@ -149,20 +114,20 @@ def compile_kernel(
             AVX2 or FMA.
     """
     target = target or host_target()
-    folder = folder or kernel_cache.cache_folder()
     started = time.perf_counter()
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     jaxpr_s = time.perf_counter() - started
-    started = time.perf_counter()
-    versions = f"{target} {compiler_version()} {OWN_VERSION} {loops.UNROLLED_OPERATIONS}"
-    key = hashlib.sha256(f"{jaxpr_digest(closed)} {versions}".encode()).hexdigest()
-    code = kernel_cache.load(folder, key) if folder else None
-    facts = Facts(jaxpr_s, 0.0, 0.0, time.perf_counter() - started, 0, 0, len(code or b""), True)
-    if code is None:
+    facts = Facts(jaxpr_s, 0.0, 0.0, 0.0, 0, 0, 0, True)
+
+    def compile_now() -> bytes:
+        nonlocal facts
         code, facts = _compile(closed, target, jaxpr_s)
-        if folder:
-            kernel_cache.save(folder, key, code)
-    address, alive = load_object(code, target)
+        return code
+
+    started = time.perf_counter()
+    code, address, alive = _cached(jaxpr_digest(closed), compile_now, target, folder)
+    if facts.cached:
+        facts = facts._replace(compile_s=time.perf_counter() - started, code_bytes=len(code))
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(address)
     leaves, out_tree = jax.tree.flatten(shape)
     return Kernel(
@@ -175,6 +140,30 @@ def compile_kernel(
         _function=call,
         _alive=alive,
     )
+
+
+def load_compiled(name: str, text: Callable[[], str], target: Target, folder: Path | None = None) -> tuple[int, object]:
+    """(address of `kernel`, what must stay alive as long as it is used) of code given as LLVM IR.
+
+    Args:
+        name: tells what it computes, in full: what has the same name is not compiled again.
+        folder: of compiled kernels; the user's cache if None.
+    """
+    return _cached(name, lambda: compile_object(text(), target), target, folder)[1:]
+
+
+def _cached(
+    name: str, compile_now: Callable[[], bytes], target: Target, folder: Path | None
+) -> tuple[bytes, int, object]:
+    folder = folder or kernel_cache.cache_folder()
+    versions = f"{target} {compiler_version()} {OWN_VERSION} {loops.UNROLLED_OPERATIONS}"
+    key = hashlib.sha256(f"{name} {versions}".encode()).hexdigest()
+    code = kernel_cache.load(folder, key) if folder else None
+    if code is None:
+        code = compile_now()
+        if folder:
+            kernel_cache.save(folder, key, code)
+    return code, *load_object(code, target)
 
 
 def _compile(closed: ClosedJaxpr, target: Target, jaxpr_s: float) -> tuple[bytes, Facts]:

@@ -14,10 +14,11 @@ from jax import lax
 from tests.twins.scalar_graph import evaluate
 from workers.environments import make_environment
 from workers.simd import target
-from workers.simd.kernel import Kernel, aligned, compile_kernel, jaxpr_digest
+from workers.simd.kernel import Kernel, compile_kernel, jaxpr_digest
 from workers.simd.operations import OPERATIONS
 from workers.simd.target import WIDTHS, host_target
 from workers.simd.trace import trace_jaxpr
+from workers.simd.words import aligned, pack
 
 LANES = 100
 
@@ -111,7 +112,7 @@ def test_a_lane_does_not_know_its_neighbours() -> None:
 def test_threads_share_a_kernel_and_release_the_lock() -> None:
     x = np.random.default_rng(0).normal(size=(2**17, 3)).astype(np.float32)
     kernel = compile_kernel(swing, one_of(x))
-    words = kernel.pack([x], len(x))
+    words = pack([x], kernel.target.width)
     outs = [aligned((len(words), kernel.words_out, kernel.target.width)) for _ in range(3)]
     kernel.run(words, outs[0])
     threads = [threading.Thread(target=kernel.run, args=(words, out)) for out in outs[1:]]

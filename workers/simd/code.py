@@ -1,0 +1,188 @@
+"""Text of LLVM functions on vectors: names, loops and conditions, for the emitter of graphs and for code by hand.
+
+    void kernel(...)        what is called from outside: rounds to nearest, denormal numbers are zeros
+    void anything(...)      what kernels call
+
+Floating-point instructions carry no flags: nothing is reassociated, and fused only where it says so, so the bits of a
+lane do not depend on the width of the vectors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+MXCSR = 0x9FC0
+"""Round to nearest, no traps, denormal results and operands are zeros: as XLA computes, and five times faster."""
+SCALARS = {"f": "float", "i": "i32", "b": "i1"}
+
+KERNEL = """\
+define void @kernel({parameters}) #0 {{
+entry:
+  %before = alloca i32
+  %during = alloca i32
+  call void @llvm.x86.sse.stmxcsr(ptr %before)
+  store i32 {mxcsr}, ptr %during
+  call void @llvm.x86.sse.ldmxcsr(ptr %during)
+  call void @inside({arguments})
+  call void @llvm.x86.sse.ldmxcsr(ptr %before)
+  ret void
+}}
+
+declare void @llvm.x86.sse.stmxcsr(ptr)
+declare void @llvm.x86.sse.ldmxcsr(ptr)
+{declarations}
+
+attributes #0 = {{ nounwind "prefer-vector-width"="512" "min-legal-vector-width"="{bits}" }}
+"""
+
+Values = list[str]
+
+
+class Code:
+    """The body of one function, written line by line. Values are names; each is given once."""
+
+    def __init__(self, name: str, parameters: Sequence[str], width: int) -> None:
+        """Begin `void @name(parameters)`, each "type %name", for vectors of `width` lanes."""
+        self.name, self.parameters, self.width = name, list(parameters), width
+        self.vector = {kind: f"<{width} x {scalar}>" for kind, scalar in SCALARS.items()}
+        self.lines: list[str] = []
+        self.memory: list[str] = []
+        """Lines that reserve memory, which stand first."""
+        self.declarations: set[str] = set()
+        self._label = "entry"
+        self._names = 0
+
+    def do(self, instruction: str) -> None:
+        """Add an instruction without a value."""
+        self.lines.append(f"  {instruction}")
+
+    def value(self, instruction: str) -> str:
+        """Add an instruction; returns the name of its value."""
+        self._names += 1
+        self.lines.append(f"  %v{self._names} = {instruction}")
+        return f"%v{self._names}"
+
+    def call(self, kind: str, intrinsic: str, *arguments: tuple[str, str]) -> str:
+        """Value of an intrinsic, which is declared, of (type, value)s."""
+        self.declarations.add(f"declare {kind} @{intrinsic}({', '.join(type_ for type_, _ in arguments)})")
+        return self.value(f"call {kind} @{intrinsic}({', '.join(map(' '.join, arguments))})")
+
+    def reserve(self, vectors: int) -> str:
+        """Memory on the stack, aligned for vectors."""
+        self._names += 1
+        self.memory.append(f"  %m{self._names} = alloca [{vectors} x {self.vector['i']}], align 64")
+        return f"%m{self._names}"
+
+    def at(self, pointer: str, index: str | int, kind: str) -> str:
+        """A pointer `index` elements of a type further on."""
+        return self.value(f"getelementptr {kind}, ptr {pointer}, i64 {index}")
+
+    def load(self, kind: str, pointer: str, index: str | int = 0, align: int | None = None) -> str:
+        """Element `index` of a type in memory; vectors of 32-bit words are aligned."""
+        place = self.at(pointer, index, kind)
+        return self.value(f"load {kind}, ptr {place}, align {align or self._alignment(kind)}")
+
+    def store(self, kind: str, value: str, pointer: str, index: str | int = 0, align: int | None = None) -> None:
+        """Put a value into element `index` of a type in memory."""
+        place = self.at(pointer, index, kind)
+        self.do(f"store {kind} {value}, ptr {place}, align {align or self._alignment(kind)}")
+
+    def _alignment(self, kind: str) -> int:
+        if kind == self.vector["f"] or kind == self.vector["i"]:
+            return 4 * self.width
+        return {"i8": 1, "i64": 8}.get(kind, 1 if kind.endswith("x i8>") else 4)
+
+    def index(self, *terms: tuple[str | int, int]) -> str:
+        """Sum of (i64 value, factor)."""
+        total = "0"
+        for value, factor in terms:
+            part = str(value) if factor == 1 else self.value(f"mul i64 {value}, {factor}")
+            total = part if total == "0" else self.value(f"add i64 {total}, {part}")
+        return total
+
+    def splat(self, scalar: str, kind: str = "f") -> str:
+        """A scalar in all lanes."""
+        vector = self.vector[kind]
+        first = self.value(f"insertelement {vector} poison, {SCALARS[kind]} {scalar}, i64 0")
+        return self.value(f"shufflevector {vector} {first}, {vector} poison, <{self.width} x i32> zeroinitializer")
+
+    def fma(self, a: str, b: str, c: str) -> str:
+        """a * b + c of float vectors, rounded once."""
+        kind = self.vector["f"]
+        return self.call(kind, f"llvm.fma.v{self.width}f32", (kind, a), (kind, b), (kind, c))
+
+    def label(self, name: str) -> None:
+        """Begin a block; the one before has ended with a branch."""
+        self.lines.append(f"{name}:")
+        self._label = name
+
+    def loop(
+        self,
+        trips: str | int,
+        body: Callable[[str, Values], Iterable[str]],
+        carries: Sequence[tuple[str, str]] = (),
+        until: Callable[[], str] | None = None,
+    ) -> Values:
+        """Repeat, at least once: body(number of the trip, carried values) -> what they are in the next trip, or in the
+        end, which is returned.
+
+        Args:
+            carries: (type, first value).
+            until: asked at the end of each trip; an i1 that ends the loop early.
+        """
+        self._names += 1
+        label, before = f"loop{self._names}", self._label
+        self.do(f"br label %{label}")
+        self.label(label)
+        place = len(self.lines)
+        names = [f"%{label}_c{k}" for k in range(len(carries))]
+        outs = list(body(f"%{label}_trip", names))
+        stop = until() if until else "false"
+        self.do(f"br label %{label}_end")
+        self.label(f"{label}_end")
+        phis = [f"  %{label}_trip = phi i64 [ 0, %{before} ], [ %{label}_next, %{label}_end ]"]
+        for (kind, first), name, out in zip(carries, names, outs, strict=True):
+            phis.append(f"  {name} = phi {kind} [ {first}, %{before} ], [ {out}, %{label}_end ]")
+        self.lines[place:place] = phis
+        self.do(f"%{label}_next = add i64 %{label}_trip, 1")
+        self.do(f"%{label}_more = icmp slt i64 %{label}_next, {trips}")
+        self.do(f"%{label}_again = select i1 {stop}, i1 false, i1 %{label}_more")
+        self.do(f"br i1 %{label}_again, label %{label}, label %{label}_after")
+        self.label(f"{label}_after")
+        return outs
+
+    def any(self, words: str, lanes: int | None = None) -> str:
+        """Whether any word of an integer vector is not 0, an i1."""
+        kind = f"<{lanes or self.width} x i32>"
+        found = self.call("i32", f"llvm.vector.reduce.or.v{lanes or self.width}i32", (kind, words))
+        return self.value(f"icmp ne i32 {found}, 0")
+
+    def when(self, condition: str, body: Callable[[], object]) -> None:
+        """Do something if an i1 is true."""
+        self._names += 1
+        label = f"when{self._names}"
+        self.do(f"br i1 {condition}, label %{label}, label %{label}_after")
+        self.label(label)
+        body()
+        self.do(f"br label %{label}_after")
+        self.label(f"{label}_after")
+
+    def text(self) -> str:
+        """The finished function."""
+        lines = [f"define internal void @{self.name}({', '.join(self.parameters)}) noinline #0 {{", "entry:"]
+        return "\n".join([*lines, *self.memory, *self.lines, "  ret void", "}", ""])
+
+
+def module(functions: Sequence[Code]) -> str:
+    """LLVM IR of functions and of @kernel, which calls the last of them, named "inside"."""
+    inside = functions[-1]
+    assert inside.name == "inside"
+    parameters = [parameter.replace(" noalias", "") for parameter in inside.parameters]
+    frame = KERNEL.format(
+        parameters=", ".join(parameters),
+        arguments=", ".join(parameters),
+        mxcsr=MXCSR,
+        declarations="\n".join(sorted(set().union(*(function.declarations for function in functions)))),
+        bits=32 * inside.width,
+    )
+    return "\n".join([*(function.text() for function in functions), frame])

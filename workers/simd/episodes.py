@@ -1,0 +1,209 @@
+"""Whole episodes as one kernel: reset to end, observation, policy, physics and sums, a block of lanes after the other.
+
+Both members of a pair are neighbouring lanes. What a block needs stays in the cache of its core: the noise of its pairs
+(a byte a parameter), the centre, and what its episodes carry.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+
+from es_service.noise import KEY_WORDS
+from es_service.protocol import WorkerSpec
+from workers.environments import Environment
+from workers.episode import Carry, Episodes, EpisodeSteps, episode_steps
+from workers.simd.code import Code, Values, module
+from workers.simd.emit import graph_function
+from workers.simd.kernel import Kernel, aligned, compile_kernel, jaxpr_digest, load_compiled
+from workers.simd.network import Network, plan, policy_function
+from workers.simd.noise import fill_function
+from workers.simd.primitives import UnsupportedError
+from workers.simd.target import Target, host_target
+from workers.simd.trace import trace_jaxpr
+from workers.simd.words import pack, unpack, words_of
+
+
+@dataclass(frozen=True)
+class EpisodeKernel:
+    """Compiled episodes: of both members of pairs, with noise; or of the centre, without."""
+
+    training: bool
+    spec: WorkerSpec
+    inputs_O: np.ndarray
+    """Inputs of the policy that are computed."""
+    network: Network
+    begin: Callable[[np.ndarray], np.ndarray]
+    """Reset keys [lane, 4] -> words of carries [block, word, lane]."""
+    carry_avals: Carry
+    alive_word: int
+    _call: Callable[..., None]
+    _alive: Any
+
+    def run(
+        self,
+        weights: np.ndarray,
+        unit: float,
+        mean_O: np.ndarray,
+        std_O: np.ndarray,
+        noise_keys_P: np.ndarray | None,
+        reset_keys_L: np.ndarray,
+        action_keys_L: np.ndarray,
+    ) -> Episodes:
+        """Episodes [L] of NumPy arrays; weights as `network.pack` makes them."""
+        width, lanes = self.network.width, len(reset_keys_L)
+        carries = self.begin(reset_keys_L)
+        blocks = len(carries)
+        carries[-1, self.alive_word, lanes - width * (blocks - 1) :] = 0  # nobody is there
+        actions = pack([action_keys_L], width)
+        constants = np.concatenate([mean_O[self.inputs_O], std_O[self.inputs_O]]).astype(np.float32)
+        splats = aligned((len(constants), width))
+        splats[:] = constants.view(np.uint32)[:, None]
+        keys, noise = np.zeros((0, KEY_WORDS), np.uint32), np.zeros(0, np.int8)
+        if noise_keys_P is not None:
+            pairs = width // 2
+            keys = noise_keys_P[np.minimum(np.arange(blocks * pairs), len(noise_keys_P) - 1)]
+            noise = np.empty(pairs * self.network.starts_V.size * width, np.int8)
+        pointers = [
+            array.ctypes.data for array in (carries, actions, splats, weights, keys, self.network.starts_V, noise)
+        ]
+        self._call(*pointers, np.float32(2.0 * unit), blocks, self.spec.episode_steps)
+        return self._episodes(carries, lanes)
+
+    def _episodes(self, carries: np.ndarray, lanes: int) -> Episodes:
+        leaves = jax.tree.leaves(self.carry_avals)
+        # Those of an episode are the last of a carry's.
+        count = len(jax.tree.leaves(self.carry_avals.episode))
+        words = sum(words_of(aval) for aval in leaves[-count:])
+        found = Episodes(*unpack(carries[:, -words:], leaves[-count:], lanes))
+        if not self.training or len(self.inputs_O) == self.spec.policy.widths[0]:
+            return found
+        sums = [np.zeros((lanes, self.spec.policy.widths[0]), np.float32) for _ in range(2)]
+        sums[0][:, self.inputs_O], sums[1][:, self.inputs_O] = found.shifted_sum_O, found.shifted_square_sum_O
+        return found._replace(shifted_sum_O=sums[0], shifted_square_sum_O=sums[1])
+
+
+def compile_episodes(
+    environment: Environment,
+    spec: WorkerSpec,
+    inputs_O: np.ndarray,
+    *,
+    training: bool,
+    target: Target | None = None,
+    folder: Path | None = None,
+) -> EpisodeKernel:
+    """Compile a run's episodes.
+
+    Raises:
+        UnsupportedError: a step of the environment cannot be compiled. NoVectorsError: this processor cannot run it.
+    """
+    target = target or host_target()
+    steps = episode_steps(environment, spec, training=training, inputs_O=inputs_O)
+    network = plan(spec.policy, inputs_O, target.width)
+    key, inputs = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32), jax.ShapeDtypeStruct((len(inputs_O),), jnp.float32)
+    action = jax.ShapeDtypeStruct((spec.policy.widths[-1],), jnp.float32)
+    carry = jax.eval_shape(steps.begin, key)
+    look, move = (
+        jax.make_jaxpr(steps.look)(carry, inputs, inputs),
+        jax.make_jaxpr(steps.move)(carry, inputs, action, key),
+    )
+    leaves = jax.tree.leaves(carry)
+    alive_word = sum(words_of(aval) for aval in jax.tree.leaves(carry.state))
+    words = sum(map(words_of, leaves))
+
+    def text() -> str:
+        return _module(look, move, network, words, alive_word, training=training)
+
+    name = f"episodes {jaxpr_digest(look)} {jaxpr_digest(move)} {spec.policy} {inputs_O.tolist()} {training}"
+    address, alive = load_compiled(name, text, target, folder)
+    signature = [*[ctypes.c_void_p] * 7, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
+    return EpisodeKernel(
+        training=training,
+        spec=spec,
+        inputs_O=inputs_O,
+        network=network,
+        begin=_begin(steps, leaves, target, folder),
+        carry_avals=carry,
+        alive_word=alive_word,
+        _call=ctypes.CFUNCTYPE(None, *signature)(address),
+        _alive=alive,
+    )
+
+
+def _begin(
+    steps: EpisodeSteps, leaves: list[Any], target: Target, folder: Path | None
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Resets, compiled; or by JAX, where they cannot be: they are few beside the steps."""
+    key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
+    try:
+        kernel: Kernel = compile_kernel(steps.begin, key, target=target, folder=folder)
+    except UnsupportedError:
+        resets = jax.jit(jax.vmap(steps.begin))
+        return lambda keys_L: pack([np.asarray(leaf) for leaf in jax.tree.leaves(resets(keys_L))], target.width)
+
+    def begin(keys_L: np.ndarray) -> np.ndarray:
+        keys = pack([keys_L], target.width)
+        out = aligned((len(keys), sum(map(words_of, leaves)), target.width))
+        kernel.run(keys, out)
+        return out
+
+    return begin
+
+
+def _module(
+    look: ClosedJaxpr, move: ClosedJaxpr, network: Network, words: int, alive_word: int, *, training: bool
+) -> str:
+    """LLVM IR of
+
+    void kernel(ptr carries, ptr action_keys, ptr constants, ptr centre, ptr keys, ptr starts, ptr noise, float unit,
+                i64 blocks, i64 steps)
+    """
+    width, inputs = network.width, network.layers[0].inputs
+    actions = network.layers[-1].outputs
+    graph, _, outputs = trace_jaxpr(look)
+    sources = [("carry", words), ("constants", inputs), ("constants", inputs)]
+    look_code = graph_function("look", graph, outputs, sources, "seen", width)
+    graph, _, outputs = trace_jaxpr(move)
+    sources = [("carry", words), ("constants", inputs), ("action", actions), ("action_key", KEY_WORDS)]
+    move_code = graph_function("move", graph, outputs, sources, "carry", width)
+    policy_code = policy_function(network, noisy=training)
+    fill_code = fill_function(len(network.starts_V), width // 2, width)
+
+    pointers = ["carries", "action_keys", "constants", "centre", "keys", "starts", "noise"]
+    code = Code(
+        "inside", [*(f"ptr noalias %{name}" for name in pointers), "float %unit", "i64 %blocks", "i64 %steps"], width
+    )
+    seen, action = code.reserve(inputs), code.reserve(actions)
+    vector = code.vector["i"]
+
+    def block(number: str, _: Values) -> Values:
+        carry = code.at("%carries", code.index((number, words)), vector)
+        action_key = code.at("%action_keys", code.index((number, KEY_WORDS)), vector)
+        alive = code.at(carry, alive_word, vector)
+        if training:
+            keys = code.at("%keys", code.index((number, KEY_WORDS * width // 2)), "i32")
+            code.do(f"call void @fill(ptr {keys}, ptr %starts, ptr %noise)")
+
+        def step(_: str, __: Values) -> Values:
+            code.do(f"call void @look(ptr {carry}, ptr %constants, ptr {seen})")
+            noise = "ptr %noise, float %unit, " if training else ""
+            code.do(f"call void @policy(ptr {seen}, ptr {alive}, ptr %centre, {noise}ptr {action})")
+            code.do(f"call void @move(ptr {carry}, ptr %constants, ptr {action}, ptr {action_key})")
+            return []
+
+        def all_done() -> str:
+            return code.value(f"xor i1 {code.any(code.load(vector, alive))}, true")
+
+        code.loop("%steps", step, until=all_done)
+        return []
+
+    code.loop("%blocks", block)
+    return module([look_code, move_code, policy_code, *([fill_code] if training else []), code])

@@ -1,0 +1,115 @@
+"""Code of the noise, at some three numbers a nanosecond: the generator of `es_service.noise`, word for word."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from es_service.noise import KEY_WORDS, NORMAL_STD, normal_integers
+from workers.simd.code import Code, Values, module
+from workers.simd.emit import inline
+from workers.simd.graph import Graph
+from workers.simd.trace import trace_jaxpr
+
+UNROLLED = 4
+"""Vectors made at once."""
+
+
+def _graph() -> tuple[Graph, int]:
+    """k of (key, coordinate), as a graph of five inputs and one output."""
+    word = jax.ShapeDtypeStruct((), jnp.uint32)
+    key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
+    graph, _, (output,) = trace_jaxpr(jax.make_jaxpr(lambda key, at: normal_integers(jnp, key, at))(key, word))
+    return graph, output
+
+
+def noise_of(code: Code, key: Values, coordinate: str, *, halved: bool) -> str:
+    """k of vectors of key words and coordinates, as integers; or j, where k = 2 j + 1."""
+    graph, output = _graph()
+    if halved:
+        output = graph.op("ashr", graph.op("isub", output, graph.i(1)), graph.i(1))
+    given = {graph.input("i", place): name for place, name in enumerate([*key, coordinate])}
+    return inline(code, graph, [output], given)[0]
+
+
+def load_key(code: Code, keys: str, pair: str) -> Values:
+    """The words of key number `pair`, each in all lanes."""
+    words = [code.load("i32", keys, code.index((pair, KEY_WORDS), (word, 1))) for word in range(KEY_WORDS)]
+    return [code.splat(word, "i") for word in words]
+
+
+def lanes(code: Code) -> str:
+    """0, 1, 2, ... as a constant vector."""
+    return f"<{', '.join(f'i32 {lane}' for lane in range(code.width))}>"
+
+
+def fill_function(vectors: int, pairs: int, width: int) -> Code:
+    """`void fill(ptr keys, ptr starts, ptr noise)`: j of each pair at the coordinates of each vector, as bytes.
+
+    noise is [pair, vector, lane]; starts[vector] the coordinate of a vector's first lane.
+    """
+    code = Code("fill", ["ptr noalias %keys", "ptr noalias %starts", "ptr noalias %noise"], width)
+
+    def pair(number: str, _: Values) -> Values:
+        key = load_key(code, "%keys", number)
+
+        def vector(at: str, _: Values) -> Values:
+            start = code.splat(code.load("i32", "%starts", at), "i")
+            coordinate = code.value(f"add {code.vector['i']} {start}, {lanes(code)}")
+            j = noise_of(code, key, coordinate, halved=True)
+            byte = code.value(f"trunc {code.vector['i']} {j} to <{width} x i8>")
+            code.store(f"<{width} x i8>", byte, "%noise", code.index((number, vectors), (at, 1)))
+            return []
+
+        code.loop(vectors, vector)
+        return []
+
+    code.loop(pairs, pair)
+    return code
+
+
+def gradient_module(width: int) -> str:
+    """LLVM IR of `void kernel(ptr weights, ptr keys, i64 pairs, ptr sums, i64 groups)`.
+
+    sums, groups of UNROLLED vectors, become the sum over pairs of weight * noise, one pair after the other, in units of
+    weight x standard normal.
+    """
+    parameters = ["ptr noalias %weights", "ptr noalias %keys", "i64 %pairs", "ptr noalias %sums", "i64 %groups"]
+    code = Code("inside", parameters, width)
+    floats = code.vector["f"]
+
+    def group(number: str, _: Values) -> Values:
+        first = code.value(f"trunc i64 {code.index((number, UNROLLED * width))} to i32")
+        start = code.value(f"add {code.vector['i']} {code.splat(first, 'i')}, {lanes(code)}")
+        coordinates = [
+            code.value(f"add {code.vector['i']} {start}, splat (i32 {vector * width})") for vector in range(UNROLLED)
+        ]
+
+        def add(pair: str, sums: Values) -> Values:
+            key = load_key(code, "%keys", pair)
+            weight = code.splat(code.load("float", "%weights", pair))
+            found = []
+            for coordinate, one in zip(coordinates, sums, strict=True):
+                k = noise_of(code, key, coordinate, halved=False)
+                found.append(code.fma(weight, code.value(f"sitofp {code.vector['i']} {k} to {floats}"), one))
+            return found
+
+        scale = code.splat(_float(np.float32(1.0 / NORMAL_STD)))
+        for vector, one in enumerate(code.loop("%pairs", add, [(floats, "zeroinitializer")] * UNROLLED)):
+            scaled = code.value(f"fmul {floats} {one}, {scale}")
+            code.store(floats, scaled, "%sums", code.index((number, UNROLLED), (vector, 1)))
+        return []
+
+    code.loop("%groups", group)
+    return module([code])
+
+
+def _float(value: np.float32) -> str:
+    """A float32 as LLVM writes it."""
+    return f"0x{np.float64(value).view(np.uint64):016X}"
+
+
+Gradient = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -1,0 +1,122 @@
+"""What a worker computes with simd, beside `workers.rollout`: the same functions, and why a task may not have them."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from es_service.noise import KEY_WORDS
+from es_service.protocol import TaskSpec, WorkerSpec
+from workers.environments import Environment, make_environment
+from workers.episode import Episodes
+from workers.simd.episodes import EpisodeKernel, compile_episodes
+from workers.simd.kernel import load_compiled
+from workers.simd.noise import UNROLLED, gradient_module
+from workers.simd.primitives import UnsupportedError
+from workers.simd.target import NoVectorsError, Target, host_target
+from workers.simd.trace import trace_jaxpr
+from workers.simd.words import aligned
+
+
+def why_not(task: TaskSpec) -> str:
+    """Why simd cannot run a task's episodes here; empty if it can. Traces its functions, with its default options."""
+    environment = make_environment(task.name, {name: values[0] for name, values in task.options.items()})
+    state = jax.eval_shape(environment.reset, jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32))
+    action = jax.ShapeDtypeStruct((task.action_size,), jnp.float32)
+    try:
+        host_target()
+        trace_jaxpr(jax.make_jaxpr(environment.step)(state, action))
+        for function in (environment.observe, environment.descriptor, environment.goal_distance):
+            trace_jaxpr(jax.make_jaxpr(function)(state))
+    except (UnsupportedError, NoVectorsError) as error:
+        return str(error)
+    return ""
+
+
+def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
+    """As `workers.rollout.make_training_rollout`."""
+    kernels = _Kernels(environment, spec, training=True)
+
+    def rollout(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
+        kernel, weights = kernels.for_centre(centre_D, mean_O)
+        by_episode = []
+        for episode in range(spec.episodes_per_member):
+            keys = (keys_P_S_E[:, :, episode] for keys_P_S_E in (reset_keys_P_S_E, action_keys_P_S_E))
+            lanes = (keys_P_S.reshape(-1, KEY_WORDS) for keys_P_S in keys)
+            by_episode.append(kernel.run(weights, unit, mean_O, std_O, noise_keys_P, *lanes))
+        pairs = len(noise_keys_P)
+        return Episodes(
+            *(
+                np.stack(leaves, axis=1).reshape(pairs, 2, spec.episodes_per_member, *leaves[0].shape[1:])
+                for leaves in zip(*by_episode, strict=True)
+            )
+        )
+
+    return rollout
+
+
+def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
+    """As `workers.rollout.make_evaluation_rollout`."""
+    kernels = _Kernels(environment, spec, training=False)
+
+    def rollout(centre_D, mean_O, std_O, reset_keys_E):
+        kernel, weights = kernels.for_centre(centre_D, mean_O)
+        return kernel.run(weights, 0.0, mean_O, std_O, None, reset_keys_E, reset_keys_E)
+
+    return rollout
+
+
+class _Kernels:
+    """Kernels of a run: one that leaves out what is always zero, and one with all inputs, should statistics want it."""
+
+    def __init__(self, environment: Environment, spec: WorkerSpec, *, training: bool) -> None:
+        self._environment, self._spec, self._training = environment, spec, training
+        self._zero_O = always_zero(environment)
+        if self._zero_O.all():
+            self._zero_O[0] = False
+        self._compiled: dict[bool, EpisodeKernel] = {}
+        self._kernel(True)
+        self._packed: tuple[bool, np.ndarray, np.ndarray] | None = None
+
+    def _kernel(self, short: bool) -> EpisodeKernel:
+        if short not in self._compiled:
+            inputs_O = np.flatnonzero(~self._zero_O) if short else np.arange(self._zero_O.size)
+            self._compiled[short] = compile_episodes(self._environment, self._spec, inputs_O, training=self._training)
+        return self._compiled[short]
+
+    def for_centre(self, centre_D: np.ndarray, mean_O: np.ndarray) -> tuple[EpisodeKernel, np.ndarray]:
+        """(kernel, packed weights), those of the last centre being kept."""
+        short = not mean_O[self._zero_O].any()  # (0 - mean) / std is 0 then, and adds nothing
+        kernel, last = self._kernel(short), self._packed
+        if last is None or last[0] != short or not np.array_equal(last[1], centre_D):
+            last = self._packed = (short, centre_D.copy(), kernel.network.pack(centre_D))
+        return kernel, last[2]
+
+
+def make_gradient_sum(parameters: int, target: Target | None = None) -> Callable:
+    """As `workers.rollout.make_gradient_sum`."""
+    target = target or host_target()
+    address, alive = load_compiled("gradient", lambda: gradient_module(target.width), target)
+    call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 2, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64)(address)
+    group = UNROLLED * target.width
+    groups = -(-parameters // group)
+
+    def gradient_sum(weights_P: np.ndarray, noise_keys_P: np.ndarray) -> np.ndarray:
+        assert alive
+        weights_P, keys_P = np.ascontiguousarray(weights_P, np.float32), np.ascontiguousarray(noise_keys_P)
+        sums = aligned((groups, group)).view(np.float32)
+        call(weights_P.ctypes.data, keys_P.ctypes.data, len(weights_P), sums.ctypes.data, groups)
+        return sums.reshape(-1)[:parameters]
+
+    return gradient_sum
+
+
+def always_zero(environment: Environment) -> np.ndarray:
+    """Which observations are 0 whatever the state, [O]."""
+    state = jax.eval_shape(environment.reset, jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32))
+    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(environment.observe)(state))
+    return np.array([graph.constant(node) == 0.0 for node in outputs])
