@@ -1,14 +1,16 @@
 """Where does a generation's time go, and what memory does a run take?
 
-    python -m tests.benchmarks.generation_time [--algorithm es] [--engine inline ray]
+    python -m tests.benchmarks.generation_time [--task point_maze] [--algorithm es] [--engine inline ray]
 
-PointMaze with two workers at 512 and 4,096 pairs, medians over the generations after the first ten; the engines take
-turns. Memory is that of this process and everything it started, shared pages divided among those who share them.
+Two workers; PointMaze with 64, 512 and 4,096 pairs, ants with 64 and 5,000; medians over the generations, but for the
+first ten if there are more; the engines take turns. Memory is that of this process and everything it started, shared
+pages divided among those who share them.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import tempfile
@@ -17,6 +19,9 @@ from pathlib import Path
 
 from es_service import api
 
+POINT_MAZE_SIZES = ((64, 500), (512, 150), (4096, 40))
+ANT_SIZES = ((64, 20), (5000, 1))
+"""(pairs, generations)."""
 PARTS = ("rollout", "gradient", "evaluation", "driver", "store")
 
 
@@ -42,11 +47,12 @@ def family_mib() -> dict[str, float]:
     return mib
 
 
-def measure(algorithm: str, engine: str, pairs: int, generations: int, folder: Path) -> dict[str, object]:
+def measure(task: str, algorithm: str, engine: str, pairs: int, generations: int, folder: Path) -> dict[str, object]:
     """One run; milliseconds by part, rates, memory of driver and workers."""
     config = api.load_config(
         {
-            "task": {"environment": "point_maze"},
+            "task": {"environment": task},
+            "policy": {"hidden": [64, 64] if task == "point_maze" else [256, 256]},
             "search": {"algorithm": algorithm, "pairs": pairs},
             "budget": {"generations": generations},
             "compute": {"workers": 2, "engine": engine},
@@ -59,13 +65,15 @@ def measure(algorithm: str, engine: str, pairs: int, generations: int, folder: P
         nonlocal first_generation_s, mib
         if row["generation"] == 1:
             first_generation_s = time.perf_counter() - started
-        if row["generation"] == generations - 1:
+        if row["generation"] == max(1, generations - 1):
             mib = family_mib()
 
-    history = api.run(config, folder, on_generation=look).run.history.iloc[10:]
+    history = api.run(config, folder, on_generation=look).run.history
+    history = history.iloc[10:] if generations > 10 else history
     parts = {part: float(history[f"seconds_{part}"].median() * 1000) for part in PARTS}
     whole = sum(parts.values())
     return {
+        "task": task,
         "algorithm": algorithm,
         "engine": engine,
         "pairs": pairs,
@@ -82,14 +90,16 @@ def measure(algorithm: str, engine: str, pairs: int, generations: int, folder: P
 
 def main() -> None:
     parser = argparse.ArgumentParser()
+    parser.add_argument("--task", default="point_maze")
     parser.add_argument("--algorithm", default="es")
     parser.add_argument("--engine", nargs="+", default=["inline", "ray"])
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        for pairs, generations in ((512, 150), (4096, 40)):
-            for engine in arguments.engine:
-                row = measure(arguments.algorithm, engine, pairs, generations, Path(folder) / f"{engine}{pairs}")
-                print(json.dumps(row), flush=True)
+        sizes = POINT_MAZE_SIZES if arguments.task == "point_maze" else ANT_SIZES
+        for (pairs, generations), engine in itertools.product(sizes, arguments.engine):
+            run = Path(folder) / f"{engine}{pairs}"
+            row = measure(arguments.task, arguments.algorithm, engine, pairs, generations, run)
+            print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":

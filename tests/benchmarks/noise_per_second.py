@@ -22,6 +22,7 @@ import numpy as np
 
 from es_service.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys
 from workers.rollout import make_gradient_sum
+from workers.simd import rollout as simd
 
 PAIRS = 64
 UNIT = np.float32(1 / NORMAL_STD)
@@ -57,6 +58,7 @@ def main() -> None:
             "ours_fill": count / best_seconds(jax.jit(ours), keys),
             "ours_weighted_sum": count / best_seconds(make_gradient_sum(parameters), weights, keys),
             "ours_numpy": parameters / best_seconds(normals, keys[0], parameters),
+            "simd_weighted_sum": count / best_seconds(simd.make_gradient_sum(parameters), weights, keys),
             "jax_threefry_fill": count / best_seconds(jax.jit(threefry), jax_keys),
         }
         row: dict[str, object] = {name: f"{rate / 1e6:.0f} M/s" for name, rate in rates.items()}

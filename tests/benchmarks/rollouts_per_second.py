@@ -1,34 +1,44 @@
-"""How many environment steps a second do the workers make, policy and noise in the loop, and what does a second add?
+"""How many environment steps a second do the workers make, policy and noise in the loop; simd beside xla, two workers
+beside one?
 
-    python -m tests.benchmarks.rollouts_per_second [--seconds 5]
+    python -m tests.benchmarks.rollouts_per_second [--tasks ant_maze ...] [--seconds 5] [--threads]
 
-Rounds of one worker and of two alternate, so that both see the same machine; the ratio is what counts. Full 200-step
-PointMaze episodes, 64x64 policy with its own weights per member, action noise, 512 pairs in chunks of 64.
+Rounds alternate, so that all see the same machine; the ratios count. Policies are the paper's (64x64, ants 256x256)
+with weights of their own per member, action noise and statistics; the inline engine, 512 pairs of whole PointMaze
+episodes, 64 pairs of ants for 500 steps. xla's batch is its best: a block of pairs whose weights stay in cache.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import statistics
 import time
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from es_service import api
 from es_service.config.model import worker_spec
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy
 from es_service.protocol import EpisodesResult, Evaluator, TrainingChunk
+from es_service.session import task_of
 from tests.helpers import centre
-from workers.environments import TASKS
 from workers.policy import initial_parameters
 
+ROUNDS = 3
+PAIRS = {"point_maze": 512}
+ANT_PAIRS, ANT_STEPS = 64, 500
 
-def measure(engine: Evaluator, point, seconds: float) -> float:
+
+def measure(engine: Evaluator, point: Any, chunks: int, seconds: float) -> float:
     """Steps per second over whole populations for about `seconds`."""
     steps, start = 0, time.perf_counter()
     while time.perf_counter() - start < seconds:
-        results = engine.evaluate(point, [TrainingChunk(point.generation, chunk) for chunk in range(8)])
+        results = engine.evaluate(point, [TrainingChunk(point.generation, chunk) for chunk in range(chunks)])
         steps += sum(int(result.steps.sum()) for result in results if isinstance(result, EpisodesResult))
     return steps / (time.perf_counter() - start)
 
@@ -38,37 +48,54 @@ def resident_mib(pid: int) -> float:
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seconds", type=float, default=5.0, help="length of each of three rounds per worker count")
-    seconds = parser.parse_args().seconds
+def compare(task: str, seconds: float, *, threads: bool) -> dict[str, Any]:
+    """A row: medians of the rounds, ratios of medians."""
+    maze = task == "point_maze"
     config = api.load_config(
         {
-            "task": {"environment": "point_maze"},
-            "search": {"algorithm": "es"},
+            "task": {"environment": task, "episode_steps": None if maze else ANT_STEPS},
+            "policy": {"hidden": [64, 64] if maze else [256, 256]},
+            "search": {"algorithm": "es", "pairs": PAIRS.get(task, ANT_PAIRS)},
             "budget": {"generations": 1},
         }
     )
-    spec = worker_spec(config, TASKS["point_maze"])
-    point = centre(initial_parameters(spec.policy, "unit_columns", 0), sigma=0.02)
-    rates: dict[int, list[float]] = {1: [], 2: []}
-    with inline_engine(spec, Policy(1)) as one, inline_engine(spec, Policy(2)) as two:
-        for engine in (one, two):
-            measure(engine, point, 1.0)  # compiles
-        for _ in range(3):
-            for workers, engine in ((1, one), (2, two)):
-                rates[workers].append(measure(engine, point, seconds))
-        memory = max(resident_mib(pid) for pid in two.transport.process_ids().values())
-    one_rate, two_rate = (statistics.median(rates[workers]) for workers in (1, 2))
-    row = {
-        "task": "point_maze",
-        "policy": "64x64",
-        "steps_per_second_1_worker": round(one_rate),
-        "steps_per_second_2_workers": round(two_rate),
-        "ratio": round(two_rate / one_rate, 2),
-        "worker_peak_mib": round(memory),
+    spec = worker_spec(config, task_of(config))
+    chunks = config.search.pairs // spec.chunk_pairs
+    size = spec.policy.widths[0]
+    point = centre(initial_parameters(spec.policy, "unit_columns", 0), sigma=0.02, observation_size=size)
+    rates: dict[tuple[str, int], list[float]] = {}
+    with ExitStack() as stack:
+        engines = {}
+        for rollout, workers in itertools.product(("xla", "simd"), (1, 2)):
+            used = threads and rollout == "simd"
+            made = inline_engine(replace(spec, rollout=rollout), Policy(workers), threads=used)
+            engine = engines[rollout, workers] = stack.enter_context(made)
+            measure(engine, point, chunks, 0.0)  # compiles
+        for _ in range(ROUNDS):
+            for kind, engine in engines.items():
+                rates.setdefault(kind, []).append(measure(engine, point, chunks, seconds))
+        memory = {
+            rollout: max(resident_mib(pid) for pid in engines[rollout, 2].transport.process_ids().values())
+            for rollout in ("xla", "simd")
+        }
+    rate = {kind: statistics.median(found) for kind, found in rates.items()}
+    return {
+        "task": task,
+        **{f"{rollout}_{workers}": round(found) for (rollout, workers), found in rate.items()},
+        "simd_over_xla": [round(rate["simd", workers] / rate["xla", workers], 1) for workers in (1, 2)],
+        "two_over_one": {rollout: round(rate[rollout, 2] / rate[rollout, 1], 2) for rollout in ("xla", "simd")},
+        "worker_peak_mib": {rollout: round(mib) for rollout, mib in memory.items()},
     }
-    print(json.dumps(row, indent=1))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--tasks", nargs="+", default=["point_maze", "ant_maze", "ant_trap"])
+    parser.add_argument("--seconds", type=float, default=5.0, help="length of each round")
+    parser.add_argument("--threads", action="store_true", help="workers of simd are threads of one process")
+    arguments = parser.parse_args()
+    for task in arguments.tasks:
+        print(json.dumps(compare(task, arguments.seconds, threads=arguments.threads)), flush=True)
 
 
 if __name__ == "__main__":

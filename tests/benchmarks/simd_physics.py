@@ -91,8 +91,8 @@ def peak() -> float:
     """GFLOP/s of independent fused operations, 24 in flight, on vectors of this machine's width."""
     from workers.simd.emit import emit
     from workers.simd.graph import Graph
-    from workers.simd.kernel import aligned
     from workers.simd.target import compile_object, host_target, load_object
+    from workers.simd.words import aligned
 
     graph, trips, lanes = Graph(), 100_000, host_target().width
     loop = graph.loop(trips, [graph.input("f", k) for k in range(24)])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import tracemalloc
+from functools import partial
 
 import numpy as np
 import pytest
@@ -31,6 +32,8 @@ from tests.helpers import DirectEvaluator, MemoryStore, centre
 from tests.twins import es as twin
 from workers.environments import TASKS
 from workers.policy import initial_parameters
+from workers.simd import episodes, target
+from workers.simd import rollout as simd_rollout
 
 SHAPE = PolicyShape((2, 8, 8, 2))
 fitness_arrays = hnp.arrays(
@@ -147,6 +150,21 @@ def test_same_config_same_bits_other_seed_other_bits(finished):
     np.testing.assert_array_equal(again.search.members[0].centre_D, state.search.members[0].centre_D)
     other, *_ = run_in_memory(config.model_copy(update={"seed": 1}))
     assert not np.array_equal(other.search.members[0].centre_D, state.search.members[0].centre_D)
+
+
+@pytest.mark.parametrize("kind", ["avx2", "four"])
+def test_vectors_of_another_width_give_the_same_run(finished, monkeypatch, kind):
+    """What a processor without AVX-512 computes: everything that is kept has the same bits."""
+    config, state, store, _, _ = finished
+    assert config.compute.rollout == "simd"
+    for module in (simd_rollout, episodes):
+        monkeypatch.setattr(module, "host_target", partial(target.host_target, kind))
+    again, other, _, _ = run_in_memory(config)
+    assert again.generation == state.generation
+    assert other.parts.keys() == store.parts.keys()
+    for name, part in store.parts.items():
+        for key, array in part.items():
+            np.testing.assert_array_equal(other.parts[name][key], array, err_msg=f"{name} {key}")
 
 
 @pytest.mark.parametrize(

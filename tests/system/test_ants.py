@@ -18,9 +18,9 @@ pytestmark = pytest.mark.slow
 
 def run(folder: Path, environment: str, workers: int, on_generation=lambda row: None, on_notice=pytest.fail):
     config = {
-        "task": {"environment": environment, "episode_steps": 25},
-        "policy": {"hidden": [8]},
-        "search": {"algorithm": "nsra_es", "pairs": 8, "evaluation_episodes": 4, "members": 2},
+        "task": {"environment": environment, "episode_steps": 1000},
+        "policy": {"hidden": [64, 64]},
+        "search": {"algorithm": "nsra_es", "pairs": 32, "evaluation_episodes": 4, "members": 2},
         "budget": {"generations": 6},
         "compute": {
             "engine": "inline",

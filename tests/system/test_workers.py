@@ -23,13 +23,13 @@ from tests.system.session import ROOT
 
 CONFIG = {
     "task": {"environment": "point_maze"},
-    "search": {"algorithm": "nsra_es", "pairs": 256, "evaluation_episodes": 20, "fitness_weight_patience": 2},
+    "search": {"algorithm": "nsra_es", "pairs": 1024, "evaluation_episodes": 20, "fitness_weight_patience": 2},
     "budget": {"generations": 12},
     "compute": {
         "engine": "inline",
         "workers": 2,
         "chunk_pairs": 32,
-        "gradient_block_pairs": 32,
+        "gradient_block_pairs": 128,
         "chunk_timeout_s": 1.0,
     },
 }
@@ -62,10 +62,33 @@ def children() -> list[int]:
     return sorted(found)
 
 
+@pytest.mark.parametrize("kind", ["processes", "threads"])
 @pytest.mark.parametrize("workers", [2, 3])
-def test_number_of_workers(tmp_path, reference, workers):
-    run(tmp_path / "run", workers=workers)
+def test_number_and_kind_of_workers(tmp_path, reference, workers, kind):
+    seen = []
+    run(tmp_path / "run", lambda row: seen.append(len(children())), workers=workers, inline_workers=kind)
     assert digest_parts(tmp_path / "run") == reference
+    assert set(seen) == {workers if kind == "processes" else 1}
+
+
+def test_bits_of_xla_are_others_and_as_independent_of_workers(tmp_path, reference):
+    for workers in (1, 2):
+        run(tmp_path / str(workers), rollout="xla", workers=workers)
+    assert digest_parts(tmp_path / "1") == digest_parts(tmp_path / "2") != reference
+
+
+def test_a_child_that_is_killed_takes_its_threads_with_it_and_changes_nothing(tmp_path, reference):
+    notices = []
+
+    def strike(row):
+        if row["generation"] == 4:
+            threading.Timer(0.01, os.kill, (children()[-1], signal.SIGKILL)).start()
+
+    outcome = run(tmp_path / "run", strike, notices.append, inline_workers="threads")
+    assert [notice.partition(";")[0] for notice in notices] == ["generation 5: lost 2 workers"]
+    assert outcome.run.history["retries"].sum() >= 2
+    assert digest_parts(tmp_path / "run") == reference
+    assert children() == []
 
 
 def test_order_of_chunks(tmp_path, reference, monkeypatch):
