@@ -75,6 +75,8 @@ def stream_keys(seed: int, domain: Domain, generation: int, *ids: Any) -> Keys:
     """
     prefix = 0
     for field in (int(seed), int(domain), int(generation)):
+        if not 0 <= field <= _MASK:
+            raise OverflowError(f"{field} is not a field of 64 bits")
         prefix = _mix((prefix ^ field) + int(_GOLDEN) & _MASK)
     state = np.full((1,), prefix, np.uint64)
     for field in ids:

@@ -6,7 +6,7 @@ import platform
 from importlib import metadata
 from pathlib import Path
 
-PACKAGES = ("es-service", "jax", "jaxlib", "numpy", "brax", "mujoco", "mujoco-mjx")
+PACKAGES = ("es-service", "jax", "jaxlib", "numpy", "brax", "mujoco", "mujoco-mjx", "llvmlite")
 """Packages whose version can change a bit of a result."""
 
 

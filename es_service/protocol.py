@@ -53,7 +53,9 @@ class TaskSpec:
     least_reward: float | None = None
     """A reward below which none is expected: what a QD-score counts from. None where nobody says."""
     no_simd: str = ""
-    """Why simd cannot run its episodes on this machine; empty where it can."""
+    """Why simd cannot compile its episodes; empty where it can."""
+    no_vectors: str = ""
+    """Why this machine's processor cannot run what simd compiles; empty where it can."""
 
 
 def with_options(task: TaskSpec, options: Mapping[str, str]) -> TaskSpec:

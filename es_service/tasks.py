@@ -27,7 +27,7 @@ class Tasks(Mapping[str, TaskSpec]):
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is none of ours, ConfigError for another that cannot be had."""
-        return _described(name) if ":" in name else replace(TASKS[name], no_simd=_no_vectors())
+        return replace(_described(name) if ":" in name else TASKS[name], no_vectors=_no_vectors())
 
     def __iter__(self) -> Iterator[str]:
         return iter(TASKS)

@@ -69,13 +69,14 @@ def episode_steps(
     action_size = spec.policy.widths[-1]
     noisy = training and spec.action_noise > 0.0
     points = min(TRACE_POINTS, spec.episode_steps + 1)
+    last_steps_T = (np.arange(points) * spec.episode_steps // (points - 1)).astype(np.int32)
 
     def observe(state: Any) -> Any:
         return environment.observe(state)[inputs_O]
 
     def begin(reset_key: Any) -> Carry:
         state = environment.reset(reset_key)
-        start_B = environment.descriptor(state)
+        start_B = jnp.asarray(environment.descriptor(state), jnp.float32)
         zero = jnp.float32(0.0)
         sums_O = jnp.zeros(observe(state).shape if training else (0,), jnp.float32)
         trace_T_B = jnp.broadcast_to(start_B, (0 if training else points, *start_B.shape))
@@ -100,7 +101,7 @@ def episode_steps(
 
     def traced(trace_T_B: Any, steps: Any, descriptor_B: Any) -> Any:
         """Point k and all later ones are here for now, from the step on that is k / (points - 1) of them."""
-        reached_T = (steps + 1) * (points - 1) <= jnp.arange(points) * spec.episode_steps
+        reached_T = steps + 1 <= last_steps_T
         return jnp.where(reached_T[:, None], descriptor_B, trace_T_B)
 
     def move(carry: Carry, mean_O: Any, action_A: Any, action_key: Any) -> Carry:
@@ -108,8 +109,8 @@ def episode_steps(
         if noisy:
             action_A = action_A + action_noise(action_key, before.steps)  # those of a living episode are its step
         state, reward, done = environment.step(carry.state, action_A)
-        distance = environment.goal_distance(state)
-        descriptor_B = environment.descriptor(state)
+        distance = jnp.asarray(environment.goal_distance(state), jnp.float32)
+        descriptor_B = jnp.asarray(environment.descriptor(state), jnp.float32)
         last_reward, returns = reward, before.returns + reward
         shifted_O = observe(carry.state) - mean_O if training else before.shifted_sum_O
         after = Episodes(

@@ -231,7 +231,8 @@ class ComputeConfig(_Section):
     )
     inline_workers: Literal["processes", "threads"] = Field(
         "processes",
-        description="With engine inline, what workers are: processes; or threads of one, for rollout simd.",
+        description="With engine inline, what workers are: processes; or threads of one, for rollout simd, which takes "
+        "less memory, and loses all of them with one.",
     )
     address: Text | None = Field(
         None,

@@ -1,8 +1,9 @@
 """What a config leaves open, and whether its sections fit together.
 
 Every rule here is a function of the config and the task alone, never of the machine: the shapes it fixes decide which
-floating-point results a run gets. Values travel as one flat mapping, "search.sigma" -> 0.02; a key that is missing from
-it was invalid and has been reported already, so rules that need it keep silent.
+floating-point results a run gets. (One looks at the processor: `compute.rollout: auto` is xla where simd's code cannot
+run; what it chose stays with the run.) Values travel as one flat mapping, "search.sigma" -> 0.02; a key that is missing
+from it was invalid and has been reported already, so rules that need it keep silent.
 """
 
 from __future__ import annotations
@@ -111,8 +112,7 @@ def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpe
     if "search.members" in left_open and "search.algorithm" in values:
         values["search.members"] = 1 if values["search.algorithm"] in SINGLE_MEMBER else MEMBERS
     if "compute.rollout" in left_open and task is not None:
-        on_gpu = values.get(f"{RESOURCES}gpu", 0.0) > 0
-        values["compute.rollout"] = "xla" if on_gpu or task.no_simd else "simd"
+        values["compute.rollout"] = "xla" if _on_gpu(values) or _why_no_simd(values, task) else "simd"
     pairs = values.get("search.pairs")
     if pairs is not None and "compute.chunk_pairs" in left_open:
         values["compute.chunk_pairs"] = default_chunk_pairs(pairs)
@@ -210,11 +210,20 @@ def engine_problems(values: Mapping[str, Any]) -> list[str]:
     return problems
 
 
+def _on_gpu(values: Mapping[str, Any]) -> bool:
+    return values.get(f"{RESOURCES}gpu", 0.0) > 0
+
+
+def _why_no_simd(values: Mapping[str, Any], task: TaskSpec) -> str:
+    """Why a new run cannot have simd; in a cluster this machine's processor says nothing."""
+    return task.no_simd or (task.no_vectors if values.get("compute.address") is None else "")
+
+
 def rollout_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
     """Where simd is asked for and cannot be had."""
     if values.get("compute.rollout") != "simd":
         return []
-    if values.get(f"{RESOURCES}gpu", 0.0) > 0:
+    if _on_gpu(values):
         return [f"compute.rollout: simd runs on CPUs, and {RESOURCES}gpu is not 0; must be auto or xla"]
     if task.no_simd:
         return [f"compute.rollout: simd cannot run {task.name}: {task.no_simd}; must be auto or xla"]
@@ -233,8 +242,9 @@ def folder_problems(values: Mapping[str, Any]) -> list[str]:
 def config_warnings(config: RunConfig, task: TaskSpec) -> list[str]:
     """What is legal and probably not meant; one line each, for the command line to print before the run starts."""
     warnings = []
-    if config.compute.rollout == "xla" and task.no_simd:
-        warnings.append(f"compute.rollout: xla, since simd cannot run {task.name}: {task.no_simd}")
+    values = {"compute.address": config.compute.address}
+    if config.compute.rollout == "xla" and (why := _why_no_simd(values, task)):
+        warnings.append(f"compute.rollout: xla, since simd cannot run {task.name}: {why}")
     pairs, chunk = config.search.pairs, config.compute.chunk_pairs
     if chunk < FEW_CHUNK_PAIRS and pairs > MOST_CHUNK_PAIRS:
         near = round(pairs / MOST_CHUNK_PAIRS) * MOST_CHUNK_PAIRS

@@ -92,11 +92,13 @@ class ChildProcesses:
         """Kill a worker's child, wait for it, free its descriptors and end its threads; its other workers are lost."""
         child = self._children.pop(worker, None)
         if child is not None:
-            self._lose(child)
+            self._lose(child, f"worker {worker}, a thread of the same process, had to be killed", bystanders=True)
 
     def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunk: Chunk) -> None:
         """Queue the chunk for the child's writer, behind the centre if the child does not know it."""
-        child = self._children[worker]
+        child = self._children.get(worker)
+        if child is None:
+            return  # lost with another thread of its child; that is on its way to the scheduler
         if child.centre is not centre:
             child.centre = centre
             child.outbox.put(pickle.dumps(("centre", centre), pickle.HIGHEST_PROTOCOL))
@@ -104,12 +106,18 @@ class ChildProcesses:
 
     def receive(self, timeout_s: float) -> Message | None:
         """The next message of any child; one that broke or closed its pipe is killed before it is reported lost."""
-        if self._lost:
-            return self._lost.popleft()
-        try:
-            who, said = self._inbox.get(timeout=timeout_s) if timeout_s else self._inbox.get_nowait()
-        except queue.Empty:
-            return None
+        while True:
+            if self._lost:
+                return self._lost.popleft()
+            try:
+                who, said = self._inbox.get(timeout=timeout_s) if timeout_s else self._inbox.get_nowait()
+            except queue.Empty:
+                return None
+            if (message := self._message(who, said)) is not None:
+                return message
+
+    def _message(self, who: _Child | int, said: Any) -> Message | None:
+        """What a child said; None of one that is known to be dead, or whose workers are among the lost from now on."""
         match said:
             case ("up", worker):
                 return WorkerUp(worker)
@@ -123,7 +131,7 @@ class ChildProcesses:
                 self._lose(who, text)
             case _:
                 self._lose(who)
-        return self._lost.popleft() if self._lost else None
+        return None
 
     def close(self) -> None:
         """Kill all children and wait for them."""
@@ -132,13 +140,13 @@ class ChildProcesses:
         for worker in list(self._children):
             self.kill(worker)
 
-    def _lose(self, child: _Child | int, reason: str = "") -> None:
+    def _lose(self, child: _Child | int, reason: str = "", *, bystanders: bool = False) -> None:
         """Kill a child for good, and report its workers lost; nothing more happens to one that was killed before."""
         workers = [worker for worker, one in self._children.items() if one is child]
         for worker in workers:
             del self._children[worker]
         how = self._end(child, workers) if isinstance(child, _Child) and not child.log.closed else ""
-        self._lost.extend(WorkerLost(worker, reason or how) for worker in workers)
+        self._lost.extend(WorkerLost(worker, reason or how, bystander=bystanders) for worker in workers)
 
     def _end(self, child: _Child, workers: list[int]) -> str:
         """Kill a child; how it ended and what it said last, as a reason."""

@@ -72,6 +72,8 @@ class WorkerLost:
 
     worker: int
     reason: str
+    bystander: bool = False
+    """Whether it was lost with another: then what it was computing is not to blame."""
 
 
 @dataclass(frozen=True)

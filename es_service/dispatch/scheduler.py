@@ -168,8 +168,8 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
             if s.starting.pop(worker, None) is not None:
                 s.up[worker] = _Worker()
                 s = replace(s, start_failures=0)
-        case WorkerLost(worker, reason):
-            s = _lose(s, out, worker, reason, now, fault=worker not in s.draining)
+        case WorkerLost(worker, reason, bystander):
+            s = _lose(s, out, worker, reason, now, fault=worker not in s.draining, charge=not bystander)
         case Result(worker, key, attempt):
             s = _result(s, out, worker, key, attempt, now)
         case Failure():

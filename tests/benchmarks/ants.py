@@ -101,7 +101,8 @@ def best_way(run: Run) -> np.ndarray | None:
     best = history.loc[history.centre_fitness_mean.idxmax()]
     if "cell" not in history or not np.isfinite(best.cell):
         return None
-    return np.asarray(run.elite(int(best.cell)).trace_T_B)
+    _, elites = run.elites([int(best.cell)])
+    return np.asarray(elites[int(best.cell)].trace_T_B)
 
 
 def draw(runs: dict[str, Run], path: Path) -> None:

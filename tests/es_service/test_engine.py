@@ -337,3 +337,33 @@ def test_children_that_cannot_be_started_are_lost_workers_and_leave_nothing_behi
     ):
         engine.evaluate(FIRST, CHUNKS)
     assert footprint() == before
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
+    """One chunk and two threads: what is sent to a thread whose child is gone is sent again, to the next."""
+    before = footprint()
+    long = spec(rollout="simd", episode_steps=200_000)
+    policy = Policy(workers=2, min_deadline_s=1.0, restart_backoff_s=0.01)
+    with inline_engine(long, policy, threads=True) as engine:
+        expected = engine.evaluate(FIRST, CHUNKS[:1])
+        (victim,) = set(engine.transport.process_ids().values())
+        timer = threading.Timer(0.02, os.kill, (victim, number))
+        timer.start()
+        for _ in range(3):
+            assert_same(engine.evaluate(FIRST, CHUNKS[:1]), expected)
+        timer.join()
+        assert_same(engine.evaluate(FIRST, CHUNKS[:4])[:1], expected)
+        assert engine.counts.lost_workers == 2
+        assert victim not in engine.transport.process_ids().values()
+        assert len(set(engine.transport.process_ids().values())) == 1
+    assert footprint() == before
+
+
+def test_what_a_dead_child_said_last_hides_nothing_that_came_after_it():
+    transport = inline_module.ChildProcesses(SPEC)
+    dead: Any = SimpleNamespace(log=SimpleNamespace(closed=True))
+    transport._inbox.put((dead, ("lost",)))
+    transport._inbox.put((dead, ("up", 5)))
+    assert transport.receive(0.0) == WorkerUp(5)
+    assert transport.receive(0.0) is None

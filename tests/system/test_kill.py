@@ -16,7 +16,7 @@ from es_service.store.reader import read_generation
 from tests.system.session import SMALL, finish, start
 
 SEARCH = {"algorithm": "me_es", "pairs": 16, "evaluation_episodes": 4, "block_generations": 5}
-LONG = SMALL | {"search": SEARCH, "budget": {"generations": 400}}
+LONG = SMALL | {"search": SEARCH, "budget": {"generations": 3000}}
 """ME-ES: a map, an elite drawn from the store every five generations, a fresh optimiser for each block."""
 
 
@@ -118,7 +118,9 @@ def test_killed_fifty_times_in_one_run(tmp_path):
         process.communicate()
         between += committed(folder) is not None
     assert between >= 40
-    print(f"{between} of 50 kills fell between the first commit and the end, at generation {committed(folder)} of 400")
+    print(
+        f"{between} of 50 kills fell between the first commit and the end, at generation {committed(folder)} of 3,000"
+    )
     assert finish(folder) == 0
     assert digest_parts(folder) == digest_parts(undisturbed)
 

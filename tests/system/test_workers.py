@@ -127,8 +127,14 @@ def test_a_worker_killed_or_stopped_in_mid_generation(tmp_path, reference, numbe
     assert children() == []
 
 
-def test_run_from_a_process_that_already_used_jax(tmp_path, reference):
+@pytest.mark.parametrize("rollout", ["simd", "xla"])
+def test_run_from_a_process_that_already_used_jax(tmp_path, reference, rollout):
     """The caller's JAX has other threads, 64-bit types and flags; rollouts never see them."""
+    expected = reference
+    if rollout == "xla":
+        run(tmp_path / "xla", rollout="xla")
+        expected = digest_parts(tmp_path / "xla")
+    config = CONFIG | {"compute": CONFIG["compute"] | {"rollout": rollout}}
     script = f"""
 import os
 os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=true --xla_backend_optimization_level=0"
@@ -137,11 +143,11 @@ import jax
 jax.config.update("jax_enable_x64", True)
 assert (jax.numpy.ones(5) @ jax.numpy.ones(5)) == 5
 from es_service import load_config, run
-run(load_config({CONFIG!r}), {str(tmp_path / "run")!r})
+run(load_config({config!r}), {str(tmp_path / "run")!r})
 """
     environment = {k: v for k, v in os.environ.items() if k not in ("PJRT_NPROC", "JAX_PLATFORMS")}
     subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path, env=environment, timeout=120)
-    assert digest_parts(tmp_path / "run") == reference
+    assert digest_parts(tmp_path / "run") == expected
 
 
 def test_a_chunk_that_fails_everywhere_ends_the_run_with_its_error(tmp_path, monkeypatch):
@@ -164,7 +170,7 @@ def test_workers_that_cannot_start_end_the_run_with_their_last_words(tmp_path, m
     broken = {**os.environ, "JAX_PLATFORMS": "no_such_platform"}
     monkeypatch.setattr(inline_engine, "worker_environment", lambda environment: broken.copy())
     with pytest.raises(EvaluationError, match="no_such_platform"):
-        run(tmp_path / "run")
+        run(tmp_path / "run", rollout="xla")  # simd needs none
     assert children() == []
 
 

@@ -2,9 +2,14 @@
 
     trace.py      jaxpr -> scalar graph    (primitives/, elementary.py; graph.py, folding.py, loops.py)
     schedule.py   which order, which loop, which products are fused with their sums
-    emit.py       graph -> LLVM IR         (operations.py)
+    emit.py       graph -> LLVM IR         (operations.py; code.py)
     target.py     LLVM IR -> machine code, in process
-    kernel.py     all of it, with cache.py before
+    kernel.py     all of it, with cache.py before; words.py
+
+    noise.py      the generator, and weighted sums of it
+    network.py    the policy, around noise that is never added to the centre
+    episodes.py   whole episodes: these, and what the task does between, in one kernel
+    rollout.py    what workers call
 
 Each lane of a vector is one environment. Environments stay written once, in JAX; `xla` is what this is held against.
 """

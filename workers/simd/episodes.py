@@ -25,11 +25,11 @@ from workers.simd.code import Code, Values, module
 from workers.simd.emit import graph_function
 from workers.simd.kernel import Kernel, aligned, compile_kernel, jaxpr_digest, load_compiled
 from workers.simd.network import Network, plan, policy_function
-from workers.simd.noise import fill_function
+from workers.simd.noise import definition, fill_function
 from workers.simd.primitives import UnsupportedError
 from workers.simd.target import Target, host_target
 from workers.simd.trace import trace_jaxpr
-from workers.simd.words import pack, unpack, words_of
+from workers.simd.words import ALIGNMENT, pack, unpack, words_of
 
 
 @dataclass(frozen=True)
@@ -66,15 +66,19 @@ class EpisodeKernel:
         actions = pack([action_keys_L], width)
         constants = np.concatenate([mean_O[self.inputs_O], std_O[self.inputs_O]]).astype(np.float32)
         splats = aligned((len(constants), width))
+        room = aligned((len(self.inputs_O) + self.network.layers[-1].outputs + self.network.hidden_vectors, width))
         splats[:] = constants.view(np.uint32)[:, None]
         keys, noise = np.zeros((0, KEY_WORDS), np.uint32), np.zeros(0, np.int8)
         if noise_keys_P is not None:
             pairs = width // 2
             keys = noise_keys_P[np.minimum(np.arange(blocks * pairs), len(noise_keys_P) - 1)]
             noise = np.empty(pairs * self.network.starts_V.size * width, np.int8)
-        pointers = [
-            array.ctypes.data for array in (carries, actions, splats, weights, keys, self.network.starts_V, noise)
-        ]
+        arrays = (carries, actions, splats, weights, keys, self.network.starts_V, noise, room)
+        assert [array.dtype.char for array in arrays] == list("IIIfIIbI")
+        assert all(array.flags.c_contiguous for array in arrays)
+        assert weights.ctypes.data % ALIGNMENT == 0
+        assert weights.shape == (self.network.starts_V.size, width)
+        pointers = [array.ctypes.data for array in arrays]
         self._call(*pointers, np.float32(2.0 * unit), blocks, self.spec.episode_steps)
         return self._episodes(carries, lanes)
 
@@ -116,15 +120,18 @@ def compile_episodes(
         jax.make_jaxpr(steps.move)(carry, inputs, action, key),
     )
     leaves = jax.tree.leaves(carry)
+    if [(aval.shape, aval.dtype) for aval in move.out_avals] != [(aval.shape, aval.dtype) for aval in leaves]:
+        raise TypeError(f"a step makes other arrays than a reset: {move.out_avals} after {leaves}")
     alive_word = sum(words_of(aval) for aval in jax.tree.leaves(carry.state))
     words = sum(map(words_of, leaves))
 
     def text() -> str:
         return _module(look, move, network, words, alive_word, training=training)
 
-    name = f"episodes {jaxpr_digest(look)} {jaxpr_digest(move)} {spec.policy} {inputs_O.tolist()} {training}"
+    digests = f"{definition()} {jaxpr_digest(look)} {jaxpr_digest(move)}"
+    name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {training}"
     address, alive = load_compiled(name, text, target, folder)
-    signature = [*[ctypes.c_void_p] * 7, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
+    signature = [*[ctypes.c_void_p] * 8, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
     return EpisodeKernel(
         training=training,
         spec=spec,
@@ -141,7 +148,8 @@ def compile_episodes(
 def _begin(
     steps: EpisodeSteps, leaves: list[Any], target: Target, folder: Path | None
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Resets, compiled; or by JAX, where they cannot be: they are few beside the steps."""
+    """Resets, compiled; or by JAX, where they cannot be, as those of Brax's own environments: few beside the steps, but
+    their bits are those of XLA on one kind of processor."""
     key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
     try:
         kernel: Kernel = compile_kernel(steps.begin, key, target=target, folder=folder)
@@ -163,8 +171,8 @@ def _module(
 ) -> str:
     """LLVM IR of
 
-    void kernel(ptr carries, ptr action_keys, ptr constants, ptr centre, ptr keys, ptr starts, ptr noise, float unit,
-                i64 blocks, i64 steps)
+    void kernel(ptr carries, ptr action_keys, ptr constants, ptr centre, ptr keys, ptr starts, ptr noise, ptr room,
+                float unit, i64 blocks, i64 steps)
     """
     width, inputs = network.width, network.layers[0].inputs
     actions = network.layers[-1].outputs
@@ -177,12 +185,13 @@ def _module(
     policy_code = policy_function(network, noisy=training)
     fill_code = fill_function(len(network.starts_V), width // 2, width)
 
-    pointers = ["carries", "action_keys", "constants", "centre", "keys", "starts", "noise"]
+    pointers = ["carries", "action_keys", "constants", "centre", "keys", "starts", "noise", "room"]
     code = Code(
         "inside", [*(f"ptr noalias %{name}" for name in pointers), "float %unit", "i64 %blocks", "i64 %steps"], width
     )
-    seen, action = code.reserve(inputs), code.reserve(actions)
     vector = code.vector["i"]
+    seen, action = "%room", code.at("%room", inputs, vector)
+    hidden = code.at("%room", inputs + actions, vector)
 
     def block(number: str, _: Values) -> Values:
         carry = code.at("%carries", code.index((number, words)), vector)
@@ -195,7 +204,7 @@ def _module(
         def step(_: str, __: Values) -> Values:
             code.do(f"call void @look(ptr {carry}, ptr %constants, ptr {seen})")
             noise = "ptr %noise, float %unit, " if training else ""
-            code.do(f"call void @policy(ptr {seen}, ptr {alive}, ptr %centre, {noise}ptr {action})")
+            code.do(f"call void @policy(ptr {seen}, ptr {alive}, ptr %centre, {noise}ptr {hidden}, ptr {action})")
             code.do(f"call void @move(ptr {carry}, ptr %constants, ptr {action}, ptr {action_key})")
             return []
 

@@ -47,6 +47,11 @@ class Network(NamedTuple):
     starts_V: NDArray[np.uint32]
     width: int
 
+    @property
+    def hidden_vectors(self) -> int:
+        """Vectors that the outputs of two layers take, of as many members as there are lanes."""
+        return 2 * self.width * max(layer.tiles * layer.tile for layer in self.layers)
+
     def pack(self, parameters_D: NDArray[np.float32]) -> NDArray[np.float32]:
         """The vectors of weights, [V, width]."""
         padded_D = np.concatenate([parameters_D, np.zeros(self.width, np.float32)])
@@ -67,11 +72,11 @@ def plan(shape: PolicyShape, inputs_O: NDArray[np.intp], width: int) -> Network:
         inputs_O: the inputs of the first layer that are not always zero.
     """
     layers, starts, coordinate = [], [], 0
-    most = sums_at_once(width) // 4
+    most = sums_at_once(width) // 4  # tiles are powers of 2, so that as many members as fit divide the width
     for number, (inputs, outputs) in enumerate(shape.layers):
         rows = inputs_O.tolist() if number == 0 else list(range(inputs))
         vectors = -(-outputs // width)
-        tile = max(size for size in range(1, most + 1) if vectors % size == 0)
+        tile = max(size for size in (1, 2, 4) if size <= most and vectors % size == 0)
         layers.append(Layer(len(rows), outputs, vectors // tile, tile, len(starts)))
         for first in range(0, vectors, tile):
             for row in [*rows, inputs]:
@@ -89,18 +94,17 @@ class View(NamedTuple):
 
 
 def policy_function(network: Network, *, noisy: bool) -> Code:
-    """`void policy(ptr x, ptr alive, ptr centre[, ptr noise, float unit], ptr action)`.
+    """`void policy(ptr x, ptr alive, ptr centre[, ptr noise, float unit], ptr hidden, ptr action)`.
 
     x and action are [input, lane] and [output, lane]; `alive` a word for each lane: members of whom all are dead around
     them are not computed. centre is as `Network.pack` makes it; noise [pair, vector, lane] of bytes; unit twice that of
-    the noise.
+    the noise; hidden is room for `network.hidden_vectors`.
     """
     width = network.width
     parameters = ["ptr noalias %x", "ptr noalias %alive", "ptr noalias %centre"]
     parameters += ["ptr noalias %noise", "float %unit"] if noisy else []
-    code = Code("policy", [*parameters, "ptr noalias %action"], width)
-    widest = max(layer.tiles * layer.tile for layer in network.layers)
-    buffers = [code.reserve(width * widest) for _ in range(2)]
+    code = Code("policy", [*parameters, "ptr noalias %hidden", "ptr noalias %action"], width)
+    buffers = [code.at("%hidden", half * network.hidden_vectors // 2, code.vector["f"]) for half in range(2)]
     view = View("%x", 1, width)
     for number, layer in enumerate(network.layers):
         out = View(buffers[number % 2], layer.tiles * layer.tile * width, 1)
@@ -124,6 +128,7 @@ def _shared(code: Code, layer: Layer, x: View, out: View, *, last: bool) -> None
     """out = centre x, for some members at once; if that is all, tanh of it."""
     floats = code.vector["f"]
     members = min(code.width, sums_at_once(code.width) // layer.tile)
+    assert code.width % members == 0
 
     def block(number: str, _: Values) -> Values:
         first = code.index((number, members))
@@ -158,6 +163,7 @@ def _own(code: Code, network: Network, layer: Layer, x: View, out: View) -> None
     """out = tanh(out +- unit (j x + (sum of x) / 2)), for some pairs at once."""
     floats, size = code.vector["f"], len(network.starts_V)
     pairs = max(1, min(code.width // 2, sums_at_once(code.width) // 2 // (2 * layer.tile)))
+    assert code.width % (2 * pairs) == 0
     bytes_ = f"<{code.width} x i8>"
     half, zero = "splat (float 0.5)", "zeroinitializer"
 

@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 
 from es_service.noise import KEY_WORDS, NORMAL_STD, normal_integers
 from workers.simd.code import Code, Values, module
 from workers.simd.emit import inline
-from workers.simd.graph import Graph
+from workers.simd.kernel import jaxpr_digest
 from workers.simd.trace import trace_jaxpr
 
 UNROLLED = 4
 """Vectors made at once."""
 
 
-def _graph() -> tuple[Graph, int]:
-    """k of (key, coordinate), as a graph of five inputs and one output."""
+def _jaxpr() -> ClosedJaxpr:
+    """k of (key, coordinate)."""
     word = jax.ShapeDtypeStruct((), jnp.uint32)
     key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
-    graph, _, (output,) = trace_jaxpr(jax.make_jaxpr(lambda key, at: normal_integers(jnp, key, at))(key, word))
-    return graph, output
+    return jax.make_jaxpr(lambda key, at: normal_integers(jnp, key, at))(key, word)
+
+
+def definition() -> str:
+    """A text that changes with the generator: what was compiled for another is not used."""
+    return f"{jaxpr_digest(_jaxpr())} {NORMAL_STD}"
 
 
 def noise_of(code: Code, key: Values, coordinate: str, *, halved: bool) -> str:
     """k of vectors of key words and coordinates, as integers; or j, where k = 2 j + 1."""
-    graph, output = _graph()
+    graph, _, (output,) = trace_jaxpr(_jaxpr())
     if halved:
         output = graph.op("ashr", graph.op("isub", output, graph.i(1)), graph.i(1))
     given = {graph.input("i", place): name for place, name in enumerate([*key, coordinate])}
@@ -110,6 +113,3 @@ def gradient_module(width: int) -> str:
 def _float(value: np.float32) -> str:
     """A float32 as LLVM writes it."""
     return f"0x{np.float64(value).view(np.uint64):016X}"
-
-
-Gradient = Callable[[np.ndarray, np.ndarray], np.ndarray]

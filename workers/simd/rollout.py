@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections.abc import Callable
 
 import jax
@@ -15,9 +16,9 @@ from workers.environments import Environment, make_environment
 from workers.episode import Episodes
 from workers.simd.episodes import EpisodeKernel, compile_episodes
 from workers.simd.kernel import load_compiled
-from workers.simd.noise import UNROLLED, gradient_module
+from workers.simd.noise import UNROLLED, definition, gradient_module
 from workers.simd.primitives import UnsupportedError
-from workers.simd.target import NoVectorsError, Target, host_target
+from workers.simd.target import Target, host_target
 from workers.simd.trace import trace_jaxpr
 from workers.simd.words import aligned
 
@@ -28,12 +29,13 @@ def why_not(task: TaskSpec) -> str:
     state = jax.eval_shape(environment.reset, jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32))
     action = jax.ShapeDtypeStruct((task.action_size,), jnp.float32)
     try:
-        host_target()
         trace_jaxpr(jax.make_jaxpr(environment.step)(state, action))
         for function in (environment.observe, environment.descriptor, environment.goal_distance):
             trace_jaxpr(jax.make_jaxpr(function)(state))
-    except (UnsupportedError, NoVectorsError) as error:
+    except UnsupportedError as error:
         return str(error)
+    except Exception as error:  # whatever is wrong with the compiler, xla is there
+        return f"{type(error).__name__}: {error}"
     return ""
 
 
@@ -79,13 +81,18 @@ class _Kernels:
         if self._zero_O.all():
             self._zero_O[0] = False
         self._compiled: dict[bool, EpisodeKernel] = {}
-        self._kernel(True)
+        self._lock = threading.Lock()
         self._packed: tuple[bool, np.ndarray, np.ndarray] | None = None
 
     def _kernel(self, short: bool) -> EpisodeKernel:
-        if short not in self._compiled:
-            inputs_O = np.flatnonzero(~self._zero_O) if short else np.arange(self._zero_O.size)
-            self._compiled[short] = compile_episodes(self._environment, self._spec, inputs_O, training=self._training)
+        with self._lock:  # threads share it
+            if short not in self._compiled:
+                inputs_O = np.flatnonzero(~self._zero_O) if short else np.arange(self._zero_O.size)
+                try:
+                    kernel = compile_episodes(self._environment, self._spec, inputs_O, training=self._training)
+                except UnsupportedError as error:  # with options that nobody asked about before
+                    raise UnsupportedError(f"{error}. compute.rollout=xla runs it") from error
+                self._compiled[short] = kernel
         return self._compiled[short]
 
     def for_centre(self, centre_D: np.ndarray, mean_O: np.ndarray) -> tuple[EpisodeKernel, np.ndarray]:
@@ -100,7 +107,7 @@ class _Kernels:
 def make_gradient_sum(parameters: int, target: Target | None = None) -> Callable:
     """As `workers.rollout.make_gradient_sum`."""
     target = target or host_target()
-    address, alive = load_compiled("gradient", lambda: gradient_module(target.width), target)
+    address, alive = load_compiled(f"gradient {definition()}", lambda: gradient_module(target.width), target)
     call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 2, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64)(address)
     group = UNROLLED * target.width
     groups = -(-parameters // group)
@@ -108,6 +115,8 @@ def make_gradient_sum(parameters: int, target: Target | None = None) -> Callable
     def gradient_sum(weights_P: np.ndarray, noise_keys_P: np.ndarray) -> np.ndarray:
         assert alive
         weights_P, keys_P = np.ascontiguousarray(weights_P, np.float32), np.ascontiguousarray(noise_keys_P)
+        assert keys_P.dtype == np.uint32
+        assert keys_P.shape == (len(weights_P), KEY_WORDS)
         sums = aligned((groups, group)).view(np.float32)
         call(weights_P.ctypes.data, keys_P.ctypes.data, len(weights_P), sums.ctypes.data, groups)
         return sums.reshape(-1)[:parameters]

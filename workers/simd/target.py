@@ -53,7 +53,9 @@ def host_target(kind: str | None = None) -> Target:
     cpu, features = _host()
     lacks = [name for name in ("avx2", "fma") if not features.get(name)]
     if lacks:
-        raise NoVectorsError(f"the processor ({cpu}) has no {' and no '.join(name.upper() for name in lacks)}")
+        raise NoVectorsError(
+            f"the processor ({cpu}) has no {' and no '.join(name.upper() for name in lacks)}, which simd needs"
+        )
     has_512 = all(features.get(name) for name in ("avx512f", "avx512dq", "avx512vl", "avx512bw"))
     if kind is None:
         kind = "avx512" if has_512 else "avx2"

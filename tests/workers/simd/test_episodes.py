@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ from tests.helpers import random_parameters, spec
 from workers.environments import TASKS, describe_environment, make_environment
 from workers.episode import Episodes
 from workers.policy import initial_parameters
-from workers.simd import rollout
+from workers.simd import noise, rollout
 from workers.simd.code import Code, module
 from workers.simd.episodes import compile_episodes
 from workers.simd.kernel import load_compiled
@@ -113,13 +114,26 @@ def test_a_few_steps_of_the_ants_are_xlas(task: str):
 
 
 @pytest.mark.parametrize(
-    ("task", "training", "pairs"),
-    [("point_maze", True, 8), ("point_maze", True, 3), ("point_maze", False, 3), ("ant_trap", True, 5)],
+    ("task", "training", "pairs", "hidden"),
+    [
+        ("point_maze", True, 8, (64, 64)),
+        ("point_maze", True, 3, (64, 64)),
+        ("point_maze", False, 3, (64, 64)),
+        ("point_maze", True, 8, (48, 33)),
+        ("point_maze", False, 8, (96,)),
+        ("point_maze", True, 8, (5, 144)),
+        ("point_maze", True, 8, (1,)),
+        ("point_maze", True, 8, ()),
+        ("point_maze", True, 8, (80, 112)),
+        ("ant_trap", True, 5, (256, 256)),
+    ],
 )
-def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int):
+def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int, hidden: tuple[int, ...]):
     """AVX-512 and AVX2 give one digest; and an episode does not see who is beside it, or that a lane is empty."""
     environment = make_environment(task, {})
     worker_spec = dataclasses.replace(task_spec(task), episode_steps=20)
+    shape = PolicyShape((worker_spec.policy.widths[0], *hidden, worker_spec.policy.widths[-1]))
+    worker_spec = dataclasses.replace(worker_spec, policy=shape)
     centre_D, unit, mean_O, std_O, keys, resets, actions = arguments(worker_spec, 3.0)
     found = []
     for target in targets():
@@ -129,6 +143,10 @@ def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int)
         found.append(kernel.run(weights, float(unit), mean_O, std_O, keys if training else None, *lanes))
     assert len(found[0].returns) == 2 * pairs
     assert len(np.unique(found[0].returns)) > pairs
+    if training and pairs == worker_spec.chunk_pairs:
+        theirs = workers.rollout.make_training_rollout(environment, worker_spec)
+        theirs = theirs(centre_D, unit, mean_O, std_O, keys, resets, actions)
+        np.testing.assert_allclose(found[0].returns, np.asarray(theirs.returns).ravel(), rtol=1e-3)
     for other in found[1:]:
         jax.tree.map(np.testing.assert_array_equal, found[0], other)
 
@@ -157,14 +175,14 @@ def test_inputs_that_are_always_zero_are_left_out_and_missed_by_nobody():
 
 
 @pytest.mark.parametrize("kind", WIDTHS)
-def test_noise_is_the_published_generator_s(kind: str):
+def test_noise_is_the_published_generator_s(kind: str, tmp_path: Path):
     if kind not in [target.kind for target in targets()]:
         pytest.skip(f"no {kind}")
     target = host_target(kind)
     fill = fill_function(3, 2, target.width)
     code = Code("inside", fill.parameters, target.width)
     code.do("call void @fill(ptr %keys, ptr %starts, ptr %noise)")
-    address, alive = load_compiled(f"noise {kind}", lambda: module([fill, code]), target)
+    address, alive = load_compiled(f"noise {kind}", lambda: module([fill, code]), target, tmp_path)
     for (seed, domain, generation, ids), expected in TEST_VECTORS:
         key = stream_keys(seed, domain, generation, *ids)
         keys = np.stack([key, stream_keys(1, Domain.SELECTION, 2, 3)])
@@ -217,6 +235,25 @@ def test_a_centre_that_changes_in_place_is_seen():
     np.testing.assert_array_equal(
         second.returns, rollout.make_training_rollout(environment, worker_spec)(*given).returns
     )
+
+
+def test_another_generator_is_not_what_was_compiled(monkeypatch: pytest.MonkeyPatch):
+    """Kernels are kept on disk; the noise's definition stands outside of the compiler's own files."""
+    weights_P, keys_P = np.ones(1, np.float32), stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(1))
+    before = rollout.make_gradient_sum(50)(weights_P, keys_P)
+    monkeypatch.setattr(noise, "normal_integers", lambda xp, key, at: 3 * normal_integers(xp, key, at))
+    np.testing.assert_allclose(rollout.make_gradient_sum(50)(weights_P, keys_P), 3 * before, rtol=1e-6)
+
+
+def test_a_step_that_makes_other_arrays_than_a_reset_is_refused():
+    wider = dataclasses.replace(
+        make_environment("point_maze", {}),
+        observe=lambda state: state[:2],
+        descriptor=lambda state: state[:2],
+        step=lambda state, action: (jnp.zeros(3), jnp.float32(0.0), jnp.array(False)),
+    )
+    with pytest.raises(TypeError, match="other arrays than a reset"):
+        compile_episodes(wider, spec(), np.arange(2), training=True)
 
 
 def test_why_a_task_cannot_have_it():
