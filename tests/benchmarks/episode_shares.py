@@ -116,15 +116,15 @@ def measure(task: str) -> dict[str, float]:
     parts = {}
     call = "call void @look(ptr %carry, ptr %constants, ptr %seen)"
     parts["look"] = run_of([look], call, ["carry", "constants", "seen"])(carries, constants, seen)
-    names = ["seen", "alive", "centre", "noise", "action"]
-    arrays = (seen, alive, centre, noise, acted)
+    names = ["seen", "alive", "centre", "noise", "hidden", "action"]
+    arrays = (seen, alive, centre, noise, aligned((network.hidden_vectors, width)), acted)
     fill = fill_function(network.starts_V.size, pairs, width)
     call = "call void @fill(ptr %keys, ptr %starts, ptr %noise)"
     pair_keys = stream_keys(0, Domain.PARAMETER_NOISE, 0, np.arange(pairs))
     filled = run_of([fill], call, ["keys", "starts", "noise"])(pair_keys, network.starts_V, noise, times=20)
-    call = "call void @policy(ptr %seen, ptr %alive, ptr %centre, ptr %action)"
+    call = "call void @policy(ptr %seen, ptr %alive, ptr %centre, ptr %hidden, ptr %action)"
     shared = run_of([policy_function(network, noisy=False)], call, names)(*arrays)
-    call = "call void @policy(ptr %seen, ptr %alive, ptr %centre, ptr %noise, float %unit, ptr %action)"
+    call = "call void @policy(ptr %seen, ptr %alive, ptr %centre, ptr %noise, float %unit, ptr %hidden, ptr %action)"
     whole = run_of([policy_function(network, noisy=True)], call, names)(*arrays, unit=unit)
     parts["policy_shared"], parts["policy_own"] = shared, whole - shared
     call = "call void @move(ptr %carry, ptr %constants, ptr %action, ptr %keys)"

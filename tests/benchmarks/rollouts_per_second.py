@@ -30,7 +30,7 @@ from tests.helpers import centre
 from workers.policy import initial_parameters
 
 ROUNDS = 3
-PAIRS = {"point_maze": 512}
+PAIRS = {"point_maze": 4096}
 ANT_PAIRS, ANT_STEPS = 64, 500
 
 

@@ -344,7 +344,7 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
     """One chunk and two threads: what is sent to a thread whose child is gone is sent again, to the next."""
     before = footprint()
     long = spec(rollout="simd", episode_steps=200_000)
-    policy = Policy(workers=2, min_deadline_s=1.0, restart_backoff_s=0.01)
+    policy = Policy(workers=2, first_deadline_s=5.0, min_deadline_s=1.0, restart_backoff_s=0.01)
     with inline_engine(long, policy, threads=True) as engine:
         expected = engine.evaluate(FIRST, CHUNKS[:1])
         (victim,) = set(engine.transport.process_ids().values())

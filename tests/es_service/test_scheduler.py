@@ -482,6 +482,19 @@ def test_a_lost_worker_is_replaced_and_only_its_running_task_is_charged():
     assert (state.lost_workers, state.retries) == (1, 2)
 
 
+def test_what_a_bystander_was_computing_is_not_to_blame():
+    """A worker lost only because another was: its task goes back, and no number of such losses makes it poison."""
+    state = ready(1)
+    state, _ = play(state, (1.0, tasks("a")))
+    for worker in range(5):
+        state, _ = step(state, WorkerLost(worker, "its process was killed", bystander=True), 100.0 * worker + 2.0)
+        state, _ = step(state, Tick(), 100.0 * worker + 60.0)
+        state, commands = step(state, WorkerUp(worker + 1), 100.0 * worker + 61.0)
+        assert commands == [Assign(worker + 1, "a", 1)]
+    assert state.failed is None
+    assert state.lost_workers == 5
+
+
 def test_a_task_that_raised_waits_for_another_worker():
     state, commands = play(ready(in_flight=1), (1.0, tasks("abcd")), (2.0, Failure(0, "a", 1, "no")))
     assert commands == [Assign(0, "c", 1)]
