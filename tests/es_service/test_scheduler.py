@@ -487,9 +487,10 @@ def test_what_a_bystander_was_computing_is_not_to_blame():
     state = ready(1)
     state, _ = play(state, (1.0, tasks("a")))
     for worker in range(5):
-        state, _ = step(state, WorkerLost(worker, "its process was killed", bystander=True), 100.0 * worker + 2.0)
-        state, _ = step(state, Tick(), 100.0 * worker + 60.0)
-        state, commands = step(state, WorkerUp(worker + 1), 100.0 * worker + 61.0)
+        now = 100.0 * worker + 2.0
+        lost = WorkerLost(worker, "its process was killed", bystander=True)
+        state, _ = play(state, (now, lost), (now + 20.0, Tick()))  # after its wait, the next is started
+        state, commands = step(state, WorkerUp(worker + 1), now + 21.0)
         assert commands == [Assign(worker + 1, "a", 1)]
     assert state.failed is None
     assert state.lost_workers == 5
