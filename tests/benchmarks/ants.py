@@ -107,7 +107,7 @@ def best_way(run: Run) -> np.ndarray | None:
 
 def draw(runs: dict[str, Run], path: Path) -> None:
     """A maze per run."""
-    columns = min(4, len(runs))
+    columns = min(3, len(runs))
     rows = -(-len(runs) // columns)
     figure, all_axes = plt.subplots(
         rows, columns, figsize=(4.2 * columns, 4.4 * rows), squeeze=False, layout="constrained"
