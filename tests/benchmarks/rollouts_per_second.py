@@ -4,7 +4,7 @@ beside one?
     python -m tests.benchmarks.rollouts_per_second [--tasks ant_maze ...] [--seconds 5] [--threads]
 
 Rounds alternate, so that all see the same machine; the ratios count. Policies are the paper's (64x64, ants 256x256)
-with weights of their own per member, action noise and statistics; the inline engine, 512 pairs of whole PointMaze
+with weights of their own per member, action noise and statistics; the inline engine, 4,096 pairs of whole PointMaze
 episodes, 64 pairs of ants for 500 steps. xla's batch is its best: a block of pairs whose weights stay in cache.
 """
 

@@ -47,7 +47,7 @@ class Code:
         self.vector = {kind: f"<{width} x {scalar}>" for kind, scalar in SCALARS.items()}
         self.lines: list[str] = []
         self.memory: list[str] = []
-        """Lines that reserve memory, which stand first."""
+        """Lines that reserve memory on the stack, which stand first."""
         self.declarations: set[str] = set()
         self._label = "entry"
         self._names = 0
@@ -66,12 +66,6 @@ class Code:
         """Value of an intrinsic, which is declared, of (type, value)s."""
         self.declarations.add(f"declare {kind} @{intrinsic}({', '.join(type_ for type_, _ in arguments)})")
         return self.value(f"call {kind} @{intrinsic}({', '.join(map(' '.join, arguments))})")
-
-    def reserve(self, vectors: int) -> str:
-        """Memory on the stack, aligned for vectors."""
-        self._names += 1
-        self.memory.append(f"  %m{self._names} = alloca [{vectors} x {self.vector['i']}], align 64")
-        return f"%m{self._names}"
 
     def at(self, pointer: str, index: str | int, kind: str) -> str:
         """A pointer `index` elements of a type further on."""

@@ -89,22 +89,17 @@ class _Writer:
         self.slots: dict[int, int] = {}
         """Node -> its place in the memory of the block: carries, and what loops look at."""
         self.slot_count = 0
-        self.memory = ""
+        self.memory = "%slots"
         self.values: dict[int, str] = {}
         """Node -> its name in the present block; what is loaded once stays known."""
 
     def compute_all(self, outputs: Sequence[int]) -> Sequence[int]:
         """All instructions, in order; gives the outputs back."""
-        if self.graph.loops:
-            self.code.memory.append("")  # where the size of the slots' memory is known last
-            place = len(self.code.memory) - 1
-            self.memory = "%slots"
-            self.region(self.schedule.region)
-            if self.slot_count > MOST_SLOTS:
-                raise UnsupportedError(f"{self.slot_count:,} values that loops carry and look at")
-            self.code.memory[place] = f"  %slots = alloca [{max(1, self.slot_count)} x {self.words['I']}], align 64"
-        else:
-            self.region(self.schedule.region)
+        self.region(self.schedule.region)
+        if self.slot_count > MOST_SLOTS:
+            raise UnsupportedError(f"{self.slot_count:,} values that loops carry and look at")
+        if self.slot_count:
+            self.code.memory.append(f"  {self.memory} = alloca [{self.slot_count} x {self.words['I']}], align 64")
         return outputs
 
     def region(self, region: Region) -> None:

@@ -96,9 +96,9 @@ class View(NamedTuple):
 def policy_function(network: Network, *, noisy: bool) -> Code:
     """`void policy(ptr x, ptr alive, ptr centre[, ptr noise, float unit], ptr hidden, ptr action)`.
 
-    x and action are [input, lane] and [output, lane]; `alive` a word for each lane: members of whom all are dead around
-    them are not computed. centre is as `Network.pack` makes it; noise [pair, vector, lane] of bytes; unit twice that of
-    the noise; hidden is room for `network.hidden_vectors`.
+    x and action are [input, lane] and [output, lane]; `alive` a word for each lane: neighbours who are all dead are not
+    computed. centre is as `Network.pack` makes it; noise [pair, vector, lane] of bytes; unit twice that of the noise;
+    hidden is room for `network.hidden_vectors`.
     """
     width = network.width
     parameters = ["ptr noalias %x", "ptr noalias %alive", "ptr noalias %centre"]
