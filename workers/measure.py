@@ -66,9 +66,9 @@ def measure(
             call = _with_policy(environment, shape, task, batch, rollout)
         else:
             call = _without_policy(environment, shape, states, rollout)
+        call(0)  # the first compiles
     except (UnsupportedError, NoVectorsError) as error:
         return {"problem": str(error)}
-    call(0)
     ready = time.perf_counter()
     steps = calls = 0
     while (now := time.perf_counter()) - ready < seconds or calls == 0:

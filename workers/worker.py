@@ -33,9 +33,6 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
     environment = make_environment(spec.environment, spec.environment_options)
     if spec.rollout == "simd":
         from workers.simd import rollout as made_by
-        from workers.simd.target import host_target
-
-        host_target()
     else:
         from workers import rollout as made_by
     training_rollout = made_by.make_training_rollout(environment, spec)
