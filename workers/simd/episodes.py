@@ -23,13 +23,13 @@ from workers.environments import Environment
 from workers.episode import Carry, Episodes, EpisodeSteps, episode_steps
 from workers.simd.code import Code, Values, module
 from workers.simd.emit import graph_function
-from workers.simd.kernel import Kernel, aligned, compile_kernel, jaxpr_digest, load_compiled
+from workers.simd.kernel import Kernel, compile_kernel, jaxpr_digest, load_compiled
 from workers.simd.network import Network, plan, policy_function
 from workers.simd.noise import definition, fill_function
 from workers.simd.primitives import UnsupportedError
 from workers.simd.target import Target, host_target
 from workers.simd.trace import trace_jaxpr
-from workers.simd.words import ALIGNMENT, pack, unpack, words_of
+from workers.simd.words import ALIGNMENT, aligned, pack, unpack, words_of
 
 
 @dataclass(frozen=True)
