@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 
 Distance = Literal["euclidean", "squared_euclidean"]
 
-TREE_STEP = 512
+TREE_STEP = 256
 """Entries between two trees. Those after the newest tree are compared one by one."""
+LEAST_ROOM = 256
+"""Entries that an archive's arrays have room for, at first."""
 SPARE_CANDIDATES = 6
 """Neighbours asked of the tree beyond those wanted, so that rounding inside it can be noticed."""
 TREE_ROUNDING = 1e-9
@@ -27,6 +29,17 @@ TREE_ROUNDING = 1e-9
 BLOCK_PREFIX = "novelty_"
 BLOCK_ENTRIES = 256
 """Entries in one part of the run store: a generation rewrites the last part and no other."""
+
+
+@dataclass
+class _Room:
+    """Arrays longer than what they hold. An entry is written once, behind all others, so archives that are the first
+    entries of the same room never see a change, and a generation costs nothing of what came before."""
+
+    descriptor_B: NDArray[np.float64]
+    generation: NDArray[np.int64]
+    member: NDArray[np.int64]
+    used: int
 
 
 @dataclass(frozen=True)
@@ -40,6 +53,8 @@ class NoveltyArchive:
     """Of which member each was the centre."""
     tree: KDTree | None = None
     """Over the first entries, a multiple of TREE_STEP of them; follows from `descriptor_N_B`."""
+    room: _Room | None = None
+    """What the arrays are the beginning of, if there is space behind them."""
 
     @property
     def size(self) -> int:
@@ -54,13 +69,12 @@ def empty_archive(dimensions: int) -> NoveltyArchive:
 
 def extended(archive: NoveltyArchive, descriptor_B: ArrayLike, generation: int, member: int) -> NoveltyArchive:
     """The archive with one entry more; the old one stays as it is."""
-    entry_B = np.asarray(descriptor_B, np.float64)
-    return _with_tree(
-        np.concatenate([archive.descriptor_N_B, entry_B[None]]),
-        np.append(archive.generation_N, np.int64(generation)),
-        np.append(archive.member_N, np.int64(member)),
-        archive.tree,
-    )
+    size, room = archive.size, archive.room
+    if room is None or room.used != size or room.used == room.generation.size:
+        room = _copied(archive)
+    room.descriptor_B[size], room.generation[size], room.member[size] = descriptor_B, generation, member
+    room.used = size + 1
+    return _with_tree(room, archive.tree)
 
 
 def novelty(
@@ -121,22 +135,31 @@ def archive_from_parts(parts: Mapping[str, Mapping[str, np.ndarray]], dimensions
     descriptor_N_B, generation_N, member_N = (
         np.concatenate([block[name] for block in blocks]) for name in ("descriptor_N_B", "generation_N", "member_N")
     )
-    return _with_tree(descriptor_N_B, generation_N, member_N, None)
+    return _with_tree(_Room(descriptor_N_B, generation_N, member_N, generation_N.size), None)
 
 
-def _with_tree(
-    descriptor_N_B: NDArray[np.float64],
-    generation_N: NDArray[np.int64],
-    member_N: NDArray[np.int64],
-    tree: KDTree | None,
-) -> NoveltyArchive:
-    """An archive with a tree over as many entries as its size asks for: `tree` if it is that one, else a new one."""
-    covered = len(descriptor_N_B) // TREE_STEP * TREE_STEP
+def _copied(archive: NoveltyArchive) -> _Room:
+    """A room of its own for an archive, with as much space again behind it."""
+    size = archive.size
+    capacity = max(2 * size, LEAST_ROOM)
+    room = _Room(
+        np.empty((capacity, archive.descriptor_N_B.shape[1])), np.empty(capacity, int), np.empty(capacity, int), size
+    )
+    room.descriptor_B[:size], room.generation[:size] = archive.descriptor_N_B, archive.generation_N
+    room.member[:size] = archive.member_N
+    return room
+
+
+def _with_tree(room: _Room, tree: KDTree | None) -> NoveltyArchive:
+    """The archive of what a room holds, with a tree over as many entries as its size asks for: `tree` if it is that
+    one, else a new one."""
+    descriptor_N_B = room.descriptor_B[: room.used]
+    covered = room.used // TREE_STEP * TREE_STEP
     if covered and (tree is None or tree.n != covered):
         from scipy.spatial import KDTree  # a quarter of a second that most runs need not spend
 
         tree = KDTree(descriptor_N_B[:covered])
-    return NoveltyArchive(descriptor_N_B, generation_N, member_N, tree)
+    return NoveltyArchive(descriptor_N_B, room.generation[: room.used], room.member[: room.used], tree, room)
 
 
 def _mean_nearest(

@@ -1,13 +1,14 @@
 """What do ES, NS-ES, NSR-ES, NSRA-ES and ME-ES find on PointMaze? The shipped configs, seeds 0 to 4, all reported.
 
-    python -m tests.benchmarks.science                 # 35 runs of 500 M steps: two hours on two cores
+    python -m tests.benchmarks.science                 # 35 runs of 5 G steps: some five hours on two cores
+    python -m tests.benchmarks.science --env-steps 500_000_000            # the same, a tenth as long
     python -m tests.benchmarks.science --methods nsra_es --seeds 100 --env-steps 100_000_000 \\
         --set search.sigma=0.1                         # a trial: printed only
 
-Of runs with the usual seeds, steps and settings each finished one becomes a line of results/point_maze_runs.jsonl.gz;
-those that have one are not repeated (delete the file to begin again). In the end results/point_maze.csv, a row per run,
-and results/point_maze.png are written from it. One run per core, each with one worker: the engine and the number of
-workers change no result.
+Of runs with the usual seeds, settings and one of the two lengths each finished one becomes a line of
+results/NAME_runs.jsonl.gz, NAME as in RECORDED; those that have one are not repeated (delete the file to begin again),
+those that were interrupted go on where they were. In the end results/NAME.csv, a row per run, and results/NAME.png are
+written from it. One run per core, each with one worker: the engine and the number of workers change no result.
 """
 
 from __future__ import annotations
@@ -16,8 +17,7 @@ import argparse
 import gzip
 import json
 import os
-import tempfile
-import time
+import shutil
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -32,7 +32,8 @@ from es_service.run_view import Policy, Run
 from tests.benchmarks import science_picture
 
 RESULTS = Path(__file__).parent / "results"
-RUNS = RESULTS / "point_maze_runs.jsonl.gz"
+RUNS = Path("runs") / "science"
+"""Folder of the run folders that are not finished."""
 CONFIGS = Path(__file__).parents[2] / "configs"
 METHODS: dict[str, tuple[str, ...]] = {
     "es": (),
@@ -44,7 +45,9 @@ METHODS: dict[str, tuple[str, ...]] = {
     "me_es exploit": ("search.mode=exploit",),
 }
 """Name, of which the first word is that of the algorithm and its config -> settings besides the config's."""
-SEEDS, ENV_STEPS = range(5), 500_000_000
+SEEDS = range(5)
+RECORDED = {500_000_000: "point_maze", 5_000_000_000: "point_maze_5g"}
+"""Environment steps of a run -> name of its results."""
 CHAMBER_EDGES = (-0.495, 0.205)
 """y that separates the first chamber (start), the second (dead end) and the third (goal): the middles of the walls."""
 SOLVED = -30.0
@@ -83,20 +86,19 @@ def chamber_shares(y: np.ndarray) -> list[float]:
 
 
 def run_one(method: str, seed: int, env_steps: int, settings: tuple[str, ...]) -> dict[str, Any]:
-    """One run from its config to what is kept of it."""
+    """One run from its config, or from where it was interrupted, to what is kept of it."""
     budget = [f"budget.env_steps={env_steps}", "budget.generations=100_000_000"]
     config = api.load_config(
         CONFIGS / f"point_maze_{method.split()[0]}.yaml",
         [*budget, "compute.engine=inline", "compute.workers=1", f"seed={seed}", *METHODS[method], *settings],
     )
-    started = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
-        run = api.run(config, Path(folder) / "run").run
-        seconds = time.perf_counter() - started
-        return _read(run, method, seed, seconds)
+    folder = RUNS / "_".join([*method.split(), str(seed), str(env_steps), *settings]).replace("/", "_")
+    found = _read(api.run_or_resume(config, folder).run, method, seed)
+    shutil.rmtree(folder)
+    return found
 
 
-def _read(run: Run, method: str, seed: int, seconds: float) -> dict[str, Any]:
+def _read(run: Run, method: str, seed: int) -> dict[str, Any]:
     """{"row": of the table, "ends": where centres ended, "curve": steps, best return, cells, "way": of the best}."""
     history, ends = run.history, run.novelty[["x", "y"]].to_numpy()
     best = history["centre_return_mean"].cummax()
@@ -118,7 +120,7 @@ def _read(run: Run, method: str, seed: int, seconds: float) -> dict[str, Any]:
         **{f"chamber_{number}_percent": share for number, share in enumerate(shares, 1)},
         "least_goal_distance": round(float(history["goal_distance"].min()), 3),
         "fitness_weight_median": round(float(history["fitness_weight"].median()), 2),
-        "seconds": round(seconds),
+        "seconds": round(history["wall_clock_s"].iloc[-1]),
         "cpu": cpu_kind(),
     }
     counts, _, _ = np.histogram2d(*ends.T, bins=BINS, range=((-1, 1), (-1, 1)))
@@ -154,9 +156,9 @@ def quartiles(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows).T
 
 
-def kept_runs() -> list[dict[str, Any]]:
+def kept_runs(kept: Path) -> list[dict[str, Any]]:
     """What is known, in the order of METHODS and seeds."""
-    lines = gzip.decompress(RUNS.read_bytes()).splitlines() if RUNS.exists() else []
+    lines = gzip.decompress(kept.read_bytes()).splitlines() if kept.exists() else []
     found = [json.loads(line) for line in lines]
     return sorted(found, key=lambda one: (list(METHODS).index(one["row"]["method"]), one["row"]["seed"]))
 
@@ -165,17 +167,20 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
-    parser.add_argument("--env-steps", type=int, default=ENV_STEPS)
+    parser.add_argument("--env-steps", type=int, default=max(RECORDED))
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     arguments = parser.parse_args()
-    trial = bool(arguments.set) or arguments.env_steps != ENV_STEPS or not set(arguments.seeds) <= set(SEEDS)
-    known = set() if trial else {(one["row"]["method"], one["row"]["seed"]) for one in kept_runs()}
+    name = RECORDED.get(arguments.env_steps)
+    trial = bool(arguments.set) or name is None or not set(arguments.seeds) <= set(SEEDS)
+    kept = RESULTS / f"{name}_runs.jsonl.gz"
+    known = set() if trial else {(one["row"]["method"], one["row"]["seed"]) for one in kept_runs(kept)}
+    RUNS.mkdir(parents=True, exist_ok=True)
     cores = len(os.sched_getaffinity(0))
     with ProcessPoolExecutor(cores, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         pending = [
             pool.submit(run_one, method, seed, arguments.env_steps, tuple(arguments.set))
-            for method in arguments.methods
             for seed in arguments.seeds
+            for method in arguments.methods
             if (method, seed) not in known
         ]
         found = []
@@ -183,16 +188,14 @@ def main() -> None:
             found.append(future.result())
             print(json.dumps(found[-1]["row"]), flush=True)
             if not trial:
-                with gzip.open(RUNS, "at") as file:
+                with gzip.open(kept, "at") as file:
                     file.write(json.dumps(found[-1], separators=(",", ":")) + "\n")
-    found = found if trial else kept_runs()
+    found = found if trial else kept_runs(kept)
     table = pd.DataFrame([one["row"] for one in found])
     print(quartiles(table).to_string())
     if not trial:
-        table.astype({"steps_to_minus_30": "Int64"}).to_csv(
-            RESULTS / "point_maze.csv", index=False, lineterminator="\n"
-        )
-        science_picture.draw(found, RESULTS / "point_maze.png")
+        table.astype({"steps_to_minus_30": "Int64"}).to_csv(RESULTS / f"{name}.csv", index=False, lineterminator="\n")
+        science_picture.draw(found, RESULTS / f"{name}.png")
 
 
 if __name__ == "__main__":

@@ -88,6 +88,18 @@ def test_an_archive_never_changes():
     assert second.member_N.tolist() == [0, 3]
 
 
+def test_archives_that_share_room_do_not_see_each_others_entries():
+    """An archive is never changed by what is added to it, twice over, or to one that came from it."""
+    old = many([(float(n), 0.0) for n in range(3)])
+    left, right = extended(old, (9.0, 9.0), 3, 0), extended(old, (7.0, 7.0), 3, 1)
+    longer = extended(left, (8.0, 8.0), 4, 0)
+    assert old.descriptor_N_B[:, 0].tolist() == [0.0, 1.0, 2.0]
+    assert left.descriptor_N_B[:, 0].tolist() == [0.0, 1.0, 2.0, 9.0]
+    assert right.descriptor_N_B[:, 0].tolist() == [0.0, 1.0, 2.0, 7.0]
+    assert longer.descriptor_N_B[:, 0].tolist() == [0.0, 1.0, 2.0, 9.0, 8.0]
+    assert (left.member_N[-1], right.member_N[-1], longer.generation_N[-1]) == (0, 1, 4)
+
+
 @given(st.lists(points, max_size=40), st.lists(points, min_size=1, max_size=5), st.integers(1, 12))
 def test_equals_the_twin_bit_by_bit(entries, queries, neighbours):
     archive = archive_of(entries)
@@ -121,7 +133,7 @@ def test_the_tree_changes_no_bit(dimensions, scatter, monkeypatch):
 
 def test_a_tree_that_rounds_otherwise_changes_no_bit(monkeypatch):
     """Were the tree's distances off in their last bits, queries it cannot decide are compared with every entry."""
-    archive = many(np.random.default_rng(1).integers(0, 6, (TREE_STEP, 2)) / 7.0)
+    archive = many(np.random.default_rng(1).integers(0, 6, (2 * TREE_STEP, 2)) / 7.0)
     queries = archive.descriptor_N_B[:50] + 1 / 3
     expected = of(NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.member_N), queries, 3)
     compared = []
