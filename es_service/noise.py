@@ -46,6 +46,7 @@ class Domain(IntEnum):
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1, _MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_HALVES = _GOLDEN * np.arange(1, 3, dtype=np.uint64)
 _MASK = 2**64 - 1
 _WEYL, _MUL_1, _MUL_2, _MUL_3, _MUL_4 = (
     np.uint32(word) for word in (0x9E3779B9, 0x21F0AAAD, 0xD35A2D97, 0x85EBCA6B, 0xC2B2AE35)
@@ -78,13 +79,12 @@ def stream_keys(seed: int, domain: Domain, generation: int, *ids: Any) -> Keys:
         if not 0 <= field <= _MASK:
             raise OverflowError(f"{field} is not a field of 64 bits")
         prefix = _mix((prefix ^ field) + int(_GOLDEN) & _MASK)
-    state = np.full((1,), prefix, np.uint64)
+    state = np.full((1,), prefix, np.uint64)  # NumPy warns where a scalar wraps around, but not where an array does
     for field in ids:
         state = _mix64((state ^ np.asarray(field, np.uint64)) + _GOLDEN)
-    state = state.reshape(np.broadcast_shapes(*(np.shape(i) for i in ids)) if ids else ())[..., None]
-    halves = _mix64(state + _GOLDEN * np.arange(1, 3, dtype=np.uint64))
-    low, high = halves.astype(np.uint32), (halves >> np.uint64(32)).astype(np.uint32)
-    return np.stack([low, high], axis=-1).reshape(*halves.shape[:-1], KEY_WORDS)
+    halves = _mix64(state[..., None] + _HALVES)
+    words = halves.astype("<u8", copy=False).view("<u4")  # the lower half of each comes first
+    return words if any(map(np.ndim, ids)) else words[0]
 
 
 def hash_words(key: Any, coordinate: Any) -> tuple[Any, Any]:

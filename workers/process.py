@@ -1,5 +1,5 @@
-"""Workers as threads of a child process, most often one: chunks in, results out, over the pipe it was given. Started by
-the inline engine.
+"""Workers as threads of a child process, most often one: chunks in, results out, each over a socket of its own. Started
+by the inline engine.
 
 The parent sets the environment (one XLA thread, CPU) before this interpreter starts, so the numbers never depend on
 what else the parent has done with JAX.
@@ -9,75 +9,77 @@ from __future__ import annotations
 
 import ctypes
 import os
-import queue
 import signal
+import socket
 import sys
 import threading
 import traceback
 from collections.abc import Callable
-from multiprocessing.connection import Connection
 from typing import Any
 
+from es_service.wire import framed, receive
+
 PR_SET_PDEATHSIG = 1
-Say = Callable[[tuple[Any, ...]], None]
 
 
 def main(descriptor: int, parent: int) -> None:
-    """Serve until the parent closes the pipe.
+    """Serve until the parent closes its end.
 
-    In: the WorkerSpec, then ("start", worker), ("centre", Centre) and ("chunk", worker, key, attempt, Chunk).
-    Out: ("broken", text), or for each worker ("up", worker), then ("result", worker, key, attempt, ChunkResult) or
-    ("failure", worker, key, attempt, text).
+    Over the socket `descriptor`: the WorkerSpec, then a byte with the descriptor of a socket for each worker. Over a
+    worker's, in: ("centre", Centre) and ("chunk", key, attempt, Chunk). Out: ("broken", text), or ("up",) and then
+    ("result", key, attempt, ChunkResult) or ("failure", key, attempt, text).
     """
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # a killed driver leaves no orphans computing
     if os.getppid() != parent:
         return
-    connection = Connection(descriptor)
-    try:
-        _serve(connection)
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        os._exit(0)  # without waiting for threads, which may be in the middle of a chunk
+    with socket.socket(fileno=descriptor) as control:
+        try:
+            run_chunk = _make_run_chunk(receive(control))
+            while True:
+                _, descriptors, _, _ = socket.recv_fds(control, 1, 1, socket.MSG_CMSG_CLOEXEC)
+                if not descriptors:
+                    break
+                worker = socket.socket(fileno=descriptors[0])
+                threading.Thread(target=_work, args=(worker, run_chunk), daemon=True).start()
+        except (EOFError, OSError):
+            pass
+    os._exit(0)  # without waiting for threads, which may be in the middle of a chunk
 
 
-def _serve(connection: Connection) -> None:
-    lock = threading.Lock()
-
-    def say(message: tuple[Any, ...]) -> None:
-        with lock:
-            connection.send(message)
-
+def _make_run_chunk(spec: Any) -> Callable[..., Any] | str:
+    """What runs the chunks, or why there is nothing that could."""
     try:
         from workers.worker import make_worker
 
-        run_chunk = make_worker(connection.recv())
-    except EOFError:
-        raise
+        return make_worker(spec)
     except Exception:
-        say(("broken", traceback.format_exc()))
+        return traceback.format_exc()
+
+
+def _work(parent: socket.socket, run_chunk: Callable[..., Any] | str) -> None:
+    try:
+        _serve(parent, run_chunk)
+    except (EOFError, OSError):
+        parent.close()  # whether others of this process go on is the parent's business
+
+
+def _serve(parent: socket.socket, run_chunk: Callable[..., Any] | str) -> None:
+    if isinstance(run_chunk, str):
+        parent.sendall(framed(("broken", run_chunk)))
         return
-    queues: dict[int, queue.SimpleQueue[Any]] = {}
+    parent.sendall(framed(("up",)))
     centre = None
     while True:
-        match connection.recv():
-            case ("start", worker):
-                chunks = queues[worker] = queue.SimpleQueue()
-                threading.Thread(target=_work, args=(worker, run_chunk, chunks, say), daemon=True).start()
+        match receive(parent):
             case ("centre", centre):
                 pass
-            case ("chunk", worker, key, attempt, chunk):
-                queues[worker].put((centre, key, attempt, chunk))
-
-
-def _work(worker: int, run_chunk: Callable[..., Any], chunks: queue.SimpleQueue[Any], say: Say) -> None:
-    say(("up", worker))
-    while True:
-        centre, key, attempt, chunk = chunks.get()
-        try:
-            assert centre is not None, "the engine sends the centre first"
-            answer = ("result", worker, key, attempt, run_chunk(centre, chunk))
-        except Exception:
-            answer = ("failure", worker, key, attempt, traceback.format_exc())
-        say(answer)
+            case ("chunk", key, attempt, chunk):
+                try:
+                    assert centre is not None, "the engine sends the centre first"
+                    answer = ("result", key, attempt, run_chunk(centre, chunk))
+                except Exception:
+                    answer = ("failure", key, attempt, traceback.format_exc())
+                parent.sendall(framed(answer))
 
 
 if __name__ == "__main__":

@@ -89,13 +89,17 @@ def episode_keys(spec: WorkerSpec, domain: Domain, generation: int, pairs_P: Any
 def _training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
     """What a chunk's episodes, axes [P, S, E], say of its members: means over E, least distances, totals of steps."""
     host = Episodes(*map(np.asarray, episodes))
-    distance = np.stack([host.goal_distance[..., 0].mean(axis=2), host.goal_distance[..., 1].min(axis=2)], axis=-1)
+
+    def mean(x_P_S_E: Any) -> Any:
+        return x_P_S_E.mean(axis=2) if x_P_S_E.shape[2] > 1 else x_P_S_E[:, :, 0].copy()
+
+    distance_P_S_E = host.goal_distance
     return EpisodesResult(
-        fitness=host.fitness.mean(axis=2),
-        returns=host.returns.mean(axis=2),
-        descriptor=host.descriptor.mean(axis=2),
+        fitness=mean(host.fitness),
+        returns=mean(host.returns),
+        descriptor=mean(host.descriptor),
         steps=host.steps.sum(axis=2, dtype=np.int32),
-        goal_distance=distance,
+        goal_distance=np.stack([mean(distance_P_S_E[..., 0]), distance_P_S_E[..., 1].min(axis=2)], axis=-1),
         moments=_moments(host, shift_O),
     )
 
@@ -118,7 +122,7 @@ def _moments(host: Episodes, shift_O: Any) -> Moments:
     """Moments of all counted observations; an episode whose sums are not finite is left out."""
     size = host.shifted_sum_O.shape[-1]
     sums, squares = (x.reshape(-1, size).astype(np.float64) for x in (host.shifted_sum_O, host.shifted_square_sum_O))
-    finite = np.isfinite(sums).all(axis=1) & np.isfinite(squares).all(axis=1)
+    finite = np.isfinite(sums + squares).all(axis=1)
     count = float(host.steps.reshape(-1)[finite].sum())
     if count == 0.0:
         return Moments(0.0, np.zeros(size), np.zeros(size))

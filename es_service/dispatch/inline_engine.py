@@ -1,34 +1,30 @@
-"""The inline engine: workers are child processes of this one, or threads of one child, talked to over pipes.
+"""The inline engine: workers are child processes of this one, or threads of one child, talked to over sockets.
 
 Children are started by exec with fixed settings (one XLA thread, CPU), never forked, so whatever the caller has done
-with JAX changes nothing; that is why threads are not this process's own. Each child has one thread here that reads its
-answers and one that writes to it: a child that is stopped in mid-message then blocks nobody but its own threads.
+with JAX changes nothing; that is why threads are not this process's own. There are no threads here either: sockets are
+polled, and neither a child that is stopped in mid-message nor one that does not read can block anybody.
 """
 
 from __future__ import annotations
 
 import os
-import pickle
-import queue
+import select
+import socket
 import subprocess
 import sys
 import tempfile
-import threading
+import time
 from collections import deque
 from collections.abc import Callable, Hashable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection
-from typing import IO, Any
+from dataclasses import dataclass
+from typing import IO
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
 from es_service.protocol import Centre, Chunk, WorkerSpec, worker_environment
-
-JOIN_S = 1.0
-"""Longest wait for the threads of a child that is dead; they end at once unless a stray process holds its pipe."""
+from es_service.wire import Channel, framed
 
 
 def inline_engine(
@@ -49,14 +45,19 @@ def inline_engine(
 
 @dataclass(eq=False)
 class _Child:
-    """One process, of one worker or of all, and the plumbing to it."""
+    """One process, of one worker or of all."""
 
     process: subprocess.Popen[bytes]
     log: IO[bytes]
     """What it wrote to stdout and stderr."""
-    outbox: queue.SimpleQueue[bytes | None]
-    """Pickled messages to write to it, in order; None: no more."""
-    reader: threading.Thread = field(init=False)
+    control: socket.socket
+    """Over which it is given the sockets of its workers."""
+
+
+@dataclass(eq=False)
+class _Worker:
+    child: _Child
+    channel: Channel
     centre: Centre | None = None
     """The one it was sent last."""
 
@@ -65,148 +66,147 @@ class ChildProcesses:
     """A Transport whose workers are child processes, or threads of one."""
 
     def __init__(self, spec: WorkerSpec, *, threads: bool = False) -> None:
-        self._spec, self._threads = spec, threads
-        self._children: dict[int, _Child] = {}
-        """By worker; with threads, the same for all of them."""
-        self._inbox: queue.SimpleQueue[tuple[_Child | int, Any]] = queue.SimpleQueue()
-        self._lost: deque[Message] = deque()
+        self._spec, self._threads = framed(spec), threads
+        self._workers: dict[int, _Worker] = {}
+        self._by_descriptor: dict[int, int] = {}
+        self._poll = select.poll()
+        self._ready: deque[Message] = deque()
+        self._centre: tuple[Centre | None, bytes] = None, b""
 
     def process_ids(self) -> dict[int, int]:
         """Worker id -> process id of the children not known to be dead; for diagnosis and for tests that kill them."""
-        return {worker: child.process.pid for worker, child in self._children.items()}
+        return {number: worker.child.process.pid for number, worker in self._workers.items()}
 
     def start(self, worker: int) -> None:
         """Start a child and tell it the constants of the run; or have the one that there is start a thread."""
-        child = next(iter(self._children.values()), None) if self._threads else None
-        if child is None:
+        with ExitStack() as undo:
             try:
-                child = _start_child(worker, self._inbox)
-            except OSError as error:  # no process, no file descriptor or no disk space to be had
-                self._inbox.put((worker, ("broken", f"worker {worker} cannot be started: {error}")))
+                ours, theirs = map(undo.enter_context, socket.socketpair())
+                running = next(iter(self._workers.values()), None) if self._threads else None
+                child = running.child if running is not None else _start_child(self._spec, undo)
+                socket.send_fds(child.control, [b"w"], [theirs.fileno()])
+            except OSError as error:  # no process, no file descriptor or no disk space to be had; or it has just ended
+                self._ready.append(WorkerLost(worker, f"worker {worker} cannot be started: {error}"))
                 return
-            child.outbox.put(pickle.dumps(self._spec, pickle.HIGHEST_PROTOCOL))
-        self._children[worker] = child
-        child.outbox.put(pickle.dumps(("start", worker), pickle.HIGHEST_PROTOCOL))
+            undo.pop_all()
+        theirs.close()
+        self._workers[worker] = _Worker(child, Channel(ours))
+        self._by_descriptor[ours.fileno()] = worker
+        self._poll.register(ours, select.POLLIN)
 
     def kill(self, worker: int) -> None:
-        """Kill a worker's child, wait for it, free its descriptors and end its threads; its other workers are lost."""
-        child = self._children.pop(worker, None)
-        if child is not None:
+        """Kill a worker's child, wait for it and free its descriptors; its other workers are lost."""
+        if worker in self._workers:
+            child = self._forget(worker)
             self._lose(child, f"worker {worker}, a thread of the same process, had to be killed", bystanders=True)
 
     def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunk: Chunk) -> None:
-        """Queue the chunk for the child's writer, behind the centre if the child does not know it."""
-        child = self._children.get(worker)
-        if child is None:
+        """Send the chunk, behind the centre if the worker does not know it."""
+        to = self._workers.get(worker)
+        if to is None:
             return  # lost with another thread of its child; that is on its way to the scheduler
-        if child.centre is not centre:
-            child.centre = centre
-            child.outbox.put(pickle.dumps(("centre", centre), pickle.HIGHEST_PROTOCOL))
-        child.outbox.put(pickle.dumps(("chunk", worker, key, attempt, chunk), pickle.HIGHEST_PROTOCOL))
+        if self._centre[0] is not centre:
+            self._centre = centre, framed(("centre", centre))
+        frames = [framed(("chunk", key, attempt, chunk))]
+        if to.centre is not centre:
+            to.centre = centre
+            frames.insert(0, self._centre[1])
+        to.channel.send(*frames)
+        self._watch(to.channel)
 
     def receive(self, timeout_s: float) -> Message | None:
-        """The next message of any child; one that broke or closed its pipe is killed before it is reported lost."""
-        while True:
-            if self._lost:
-                return self._lost.popleft()
-            try:
-                who, said = self._inbox.get(timeout=timeout_s) if timeout_s else self._inbox.get_nowait()
-            except queue.Empty:
+        """The next message of any worker; a child that closed a socket is killed before it is reported lost."""
+        until = time.monotonic() + timeout_s
+        while not self._ready:
+            wait_s = max(0.0, until - time.monotonic())
+            for descriptor, events in self._poll.poll(wait_s * 1000.0):
+                if descriptor in self._by_descriptor:  # else lost a moment ago, with another
+                    self._serve(self._by_descriptor[descriptor], events)
+            if not wait_s and not self._ready:
                 return None
-            if (message := self._message(who, said)) is not None:
-                return message
-
-    def _message(self, who: _Child | int, said: Any) -> Message | None:
-        """What a child said; None of one that is known to be dead, or whose workers are among the lost from now on."""
-        match said:
-            case ("up", worker):
-                return WorkerUp(worker)
-            case ("result", worker, key, attempt, result):
-                return Answer(worker, key, attempt, result)
-            case ("failure", worker, key, attempt, text):
-                return Failure(worker, key, attempt, text)
-            case ("broken", text) if isinstance(who, int):
-                return WorkerLost(who, text)
-            case ("broken", text):
-                self._lose(who, text)
-            case _:
-                self._lose(who)
-        return None
+        return self._ready.popleft()
 
     def close(self) -> None:
         """Kill all children and wait for them."""
-        for child in self._children.values():
-            child.process.kill()  # all at once: each takes a while to give its memory back
-        for worker in list(self._children):
+        for worker in self._workers.values():
+            worker.child.process.kill()  # all at once: each takes a while to give its memory back
+        for worker in list(self._workers):
             self.kill(worker)
 
-    def _lose(self, child: _Child | int, reason: str = "", *, bystanders: bool = False) -> None:
-        """Kill a child for good, and report its workers lost; nothing more happens to one that was killed before."""
-        workers = [worker for worker, one in self._children.items() if one is child]
-        for worker in workers:
-            del self._children[worker]
-        how = self._end(child, workers) if isinstance(child, _Child) and not child.log.closed else ""
-        self._lost.extend(WorkerLost(worker, reason or how, bystander=bystanders) for worker in workers)
+    def _watch(self, channel: Channel) -> None:
+        self._poll.modify(channel, select.POLLIN | (select.POLLOUT if channel.is_full else 0))
 
-    def _end(self, child: _Child, workers: list[int]) -> str:
-        """Kill a child; how it ended and what it said last, as a reason."""
-        child.process.kill()
-        code = child.process.wait()
-        child.reader.join(JOIN_S)
-        child.log.seek(0)
-        last_words = child.log.read()[-2000:].decode(errors="replace").strip()
-        child.log.close()
-        how = f"signal {-code}" if code < 0 else f"exit code {code}"
-        whose = f"worker {', '.join(map(str, workers))}"
-        return f"{whose} (pid {child.process.pid}) ended with {how}" + (f":\n{last_words}" if last_words else "")
+    def _serve(self, number: int, events: int) -> None:
+        """Read what a worker says, write what waits for it."""
+        worker = self._workers[number]
+        if events & select.POLLOUT:
+            worker.channel.flush()
+            self._watch(worker.channel)
+        if not events & ~select.POLLOUT:
+            return
+        messages, is_open = worker.channel.receive()
+        for said in messages:
+            match said:
+                case ("up",):
+                    self._ready.append(WorkerUp(number))
+                case ("result", key, attempt, result):
+                    self._ready.append(Answer(number, key, attempt, result))
+                case ("failure", key, attempt, text):
+                    self._ready.append(Failure(number, key, attempt, text))
+                case ("broken", text):
+                    self._lose(worker.child, text)
+                    return
+        if not is_open:
+            self._lose(worker.child)
+
+    def _forget(self, number: int) -> _Child:
+        worker = self._workers.pop(number)
+        self._poll.unregister(worker.channel)
+        del self._by_descriptor[worker.channel.fileno()]
+        worker.channel.close()
+        return worker.child
+
+    def _lose(self, child: _Child, reason: str = "", *, bystanders: bool = False) -> None:
+        """Kill a child for good, and report those of its workers lost that are not forgotten."""
+        numbers = [number for number, worker in self._workers.items() if worker.child is child]
+        for number in numbers:
+            self._forget(number)
+        how = _end(child, numbers)
+        self._ready.extend(WorkerLost(number, reason or how, bystander=bystanders) for number in numbers)
 
 
-def _start_child(worker: int, inbox: queue.SimpleQueue[tuple[_Child | int, Any]]) -> _Child:
+def _end(child: _Child, numbers: list[int]) -> str:
+    """Kill a child; how it ended and what it said last, as a reason."""
+    child.process.kill()
+    code = child.process.wait()
+    child.control.close()
+    child.log.seek(0)
+    last_words = child.log.read()[-2000:].decode(errors="replace").strip()
+    child.log.close()
+    how = f"signal {-code}" if code < 0 else f"exit code {code}"
+    whose = f"worker {', '.join(map(str, numbers))}"
+    return f"{whose} (pid {child.process.pid}) ended with {how}" + (f":\n{last_words}" if last_words else "")
+
+
+def _start_child(spec: bytes, undo: ExitStack) -> _Child:
+    """A process that knows its constants; `undo` ends it again, should anything else fail."""
     environment = worker_environment(os.environ)
     environment["PYTHONSAFEPATH"] = "1"
     environment["PYTHONPATH"] = os.pathsep.join(path or os.getcwd() for path in sys.path)
-    with ExitStack() as undo:
-        log = undo.enter_context(tempfile.TemporaryFile())
-        ours, theirs = Pipe(duplex=True)
-        undo.enter_context(ours)
-        with theirs:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "workers.process", str(theirs.fileno()), str(os.getpid())],
-                env=environment,
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-            )
-        undo.pop_all()
-    outbox: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-    child = _Child(process, log, outbox)
-    child.reader = threading.Thread(target=_read, args=(child, ours, inbox), daemon=True, name=f"worker-{worker}")
-    child.reader.start()
-    return child
-
-
-def _read(child: _Child, connection: Connection, inbox: queue.SimpleQueue[tuple[_Child | int, Any]]) -> None:
-    """Pass on what the child says until it is dead; then close the connection, once nobody uses it any more.
-
-    Closing it from elsewhere could let a thread read or write a new connection that was given the same number.
-    """
-    writer = threading.Thread(target=_write, args=(connection, child.outbox), daemon=True, name="to-a-worker")
-    writer.start()
-    try:
-        while True:
-            inbox.put((child, connection.recv()))
-    except Exception:  # end of file, or a message cut short by a kill
-        inbox.put((child, ("lost",)))  # first of all: the writer may be blocked until the child is killed for it
-        child.outbox.put(None)
-        writer.join()
-        connection.close()
-
-
-def _write(connection: Connection, outbox: queue.SimpleQueue[bytes | None]) -> None:
-    while (message := outbox.get()) is not None:
-        try:
-            connection.send_bytes(message)
-        except OSError:
-            return  # gone; the reader reports it
+    undo.enter_context(log := tempfile.TemporaryFile())  # noqa: SIM115
+    ours, theirs = socket.socketpair()
+    undo.enter_context(ours)
+    with theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "workers.process", str(theirs.fileno()), str(os.getpid())],
+            env=environment,
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
+    undo.callback(process.wait)
+    undo.callback(process.kill)
+    ours.sendall(spec)
+    return _Child(process, log, ours)

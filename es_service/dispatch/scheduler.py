@@ -24,7 +24,7 @@ import math
 import statistics
 from collections import deque
 from collections.abc import Hashable
-from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from es_service.dispatch.messages import (
     Assign,
@@ -52,8 +52,7 @@ RECENT_DURATIONS = 31
 # State.
 
 
-@dataclass(frozen=True)
-class _Waiting:
+class _Waiting(NamedTuple):
     """A task that has not been delivered."""
 
     task: Task
@@ -64,14 +63,12 @@ class _Waiting:
     """The worker it came back from; None before that."""
 
 
-@dataclass(frozen=True)
-class _Slot:
+class _Slot(NamedTuple):
     task: Task
     attempt: int
 
 
-@dataclass(frozen=True)
-class _Worker:
+class _Worker(NamedTuple):
     """A worker that came up. `slots` is what it has not answered yet, in the order sent; it runs the first."""
 
     slots: tuple[_Slot, ...] = ()
@@ -84,20 +81,19 @@ class _Worker:
     failures_in_a_row: int = 0
 
 
-@dataclass(frozen=True)
-class SchedulerState:
+class SchedulerState(NamedTuple):
     """Everything the scheduler remembers. Treat the containers as read-only; times are in the seconds of `now`."""
 
     policy: Policy
     wanted: int
-    starting: dict[int, float] = field(default_factory=dict)
+    starting: dict[int, float]
     """Deadline of each worker that has not come up yet."""
-    up: dict[int, _Worker] = field(default_factory=dict)
-    draining: dict[int, _Worker] = field(default_factory=dict)
-    tasks: dict[Hashable, _Waiting] = field(default_factory=dict)
-    queue: deque[Hashable] = field(default_factory=deque)
+    up: dict[int, _Worker]
+    draining: dict[int, _Worker]
+    tasks: dict[Hashable, _Waiting]
+    queue: deque[Hashable]
     """Keys to assign, next first."""
-    durations_s: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    durations_s: dict[str, tuple[float, ...]]
     """Recent durations per kind, without those that include compiling."""
     next_worker: int = 0
     start_at_s: float = -math.inf
@@ -119,7 +115,7 @@ class SchedulerState:
 
 def initial_state(policy: Policy) -> SchedulerState:
     """No task and no worker yet; the first step, whatever its event, starts the workers."""
-    return SchedulerState(policy, policy.workers)
+    return SchedulerState(policy, policy.workers, {}, {}, {}, {}, deque(), {})
 
 
 def pending(state: SchedulerState) -> int:
@@ -151,8 +147,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
     if state.failed is not None or (isinstance(event, Tick) and now < next_deadline(state)):
         return state, []
     # The containers of `s` belong to this step alone until it returns; only they are changed in place.
-    s = replace(
-        state,
+    s = state._replace(
         starting=state.starting.copy(),
         up=state.up.copy(),
         draining=state.draining.copy(),
@@ -167,7 +162,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
         case WorkerUp(worker):
             if s.starting.pop(worker, None) is not None:
                 s.up[worker] = _Worker()
-                s = replace(s, start_failures=0)
+                s = s._replace(start_failures=0)
         case WorkerLost(worker, reason, bystander):
             s = _lose(s, out, worker, reason, now, fault=worker not in s.draining, charge=not bystander)
         case Result(worker, key, attempt):
@@ -181,7 +176,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
         case SetWorkers(wanted):
             if wanted < 1:
                 raise ValueError(f"SetWorkers({wanted}): at least one worker is needed")
-            s = replace(s, wanted=wanted)
+            s = s._replace(wanted=wanted)
             for worker in sorted([*s.starting, *s.up])[wanted:]:
                 _drain(s, out, worker)
     if s.failed is None:
@@ -189,7 +184,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
         s = _assign(s, out, now)
         down = bool(s.tasks) and not s.up and not s.draining
         if down != (s.down_since_s is not None):
-            s = replace(s, down_since_s=now if down else None)
+            s = s._replace(down_since_s=now if down else None)
     return s, out
 
 
@@ -206,14 +201,14 @@ def _result(
 ) -> SchedulerState:
     record = s.up.get(worker) or s.draining.get(worker)
     if record is None:
-        return replace(s, duplicates=s.duplicates + 1)
+        return s._replace(duplicates=s.duplicates + 1)
     if key in s.tasks:
         if s.tasks.pop(key).holder is None:
             s.queue.remove(key)
         out.append(Deliver(key))
-        s = replace(s, losses_in_a_row=0)
+        s = s._replace(losses_in_a_row=0)
     else:
-        s = replace(s, duplicates=s.duplicates + 1)
+        s = s._replace(duplicates=s.duplicates + 1)
     index = _find_slot(record, key, attempt)
     if index is not None:
         kind = record.slots[index].task.kind
@@ -221,7 +216,7 @@ def _result(
         if index == 0 and kind in record.warm:
             s.durations_s[kind] = (*s.durations_s.get(kind, ()), now - record.started_s)[-RECENT_DURATIONS:]
         warm = record.warm | {kind} if index == 0 else record.warm
-        record = replace(record, warm=warm, failures_in_a_row=0)
+        record = record._replace(warm=warm, failures_in_a_row=0)
         _close_slot(s, out, worker, record, index, now)
     return s
 
@@ -231,8 +226,8 @@ def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) 
     record = s.up.get(worker) or s.draining.get(worker)
     index = _find_slot(record, key, event.attempt) if record is not None else None
     if record is None or index is None:
-        return replace(s, duplicates=s.duplicates + 1)
-    record = replace(record, failures_in_a_row=record.failures_in_a_row + 1)
+        return s._replace(duplicates=s.duplicates + 1)
+    record = record._replace(failures_in_a_row=record.failures_in_a_row + 1)
     _close_slot(s, out, worker, record, index, now)
     if worker in s.up and record.failures_in_a_row >= s.policy.max_failures_in_a_row:
         reason = f"{record.failures_in_a_row} tasks in a row raised; the last: {event.message}"
@@ -241,7 +236,7 @@ def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) 
         s = _lose(s, out, worker, reason, now, charge=False)
     waiting = s.tasks.get(key)
     if waiting is None or waiting.holder != worker:
-        return replace(s, duplicates=s.duplicates + 1)
+        return s._replace(duplicates=s.duplicates + 1)
     _requeue(s, worker, key)
     return _charge(s, out, key, f"it raised on worker {worker}: {event.message}")
 
@@ -255,7 +250,7 @@ def _find_slot(record: _Worker, key: Hashable, attempt: int) -> int | None:
 
 def _close_slot(s: SchedulerState, out: list[Command], worker: int, record: _Worker, index: int, now: float) -> None:
     """Store the worker without that slot, start the clock of the next one; a drained worker is stopped."""
-    record = replace(record, slots=record.slots[:index] + record.slots[index + 1 :])
+    record = record._replace(slots=record.slots[:index] + record.slots[index + 1 :])
     if index == 0:
         record = _begin_first_slot(s, record, now)
     if worker in s.up:
@@ -269,14 +264,14 @@ def _close_slot(s: SchedulerState, out: list[Command], worker: int, record: _Wor
 
 def _begin_first_slot(s: SchedulerState, record: _Worker, now: float) -> _Worker:
     if not record.slots:
-        return replace(record, deadline_s=math.inf)
+        return record._replace(deadline_s=math.inf)
     kind = record.slots[0].task.kind
     durations_s = s.durations_s.get(kind)
     if kind in record.warm and durations_s:
         limit_s = max(s.policy.min_deadline_s, s.policy.deadline_factor * statistics.median(durations_s))
     else:
         limit_s = s.policy.first_deadline_s
-    return replace(record, started_s=now, deadline_s=now + limit_s)
+    return record._replace(started_s=now, deadline_s=now + limit_s)
 
 
 def _lose(
@@ -301,8 +296,7 @@ def _lose(
             _requeue(s, worker, slot.task.key)
     if not fault:
         return s
-    s = replace(
-        s,
+    s = s._replace(
         lost_workers=s.lost_workers + 1,
         start_failures=s.start_failures + starting,
         last_loss=f"worker {worker}: {reason}",
@@ -310,7 +304,7 @@ def _lose(
     if now >= s.start_at_s:  # else a replacement already waits, and this one with it
         doublings = min(s.losses_in_a_row - 1, 30)
         wait_s = min(s.policy.max_backoff_s, s.policy.restart_backoff_s * 2**doublings) if doublings >= 0 else 0.0
-        s = replace(s, losses_in_a_row=s.losses_in_a_row + 1, start_at_s=now + wait_s)
+        s = s._replace(losses_in_a_row=s.losses_in_a_row + 1, start_at_s=now + wait_s)
     if starting and s.start_failures >= s.policy.max_start_failures and not s.up and not s.draining:
         return _fail(s, out, f"{s.start_failures} workers in a row did not come up; the last, {s.last_loss}")
     if running is not None and charge:
@@ -324,13 +318,13 @@ def _holds(s: SchedulerState, worker: int, key: Hashable) -> bool:
 
 
 def _requeue(s: SchedulerState, worker: int, key: Hashable) -> None:
-    s.tasks[key] = replace(s.tasks[key], holder=None, last_holder=worker)
+    s.tasks[key] = s.tasks[key]._replace(holder=None, last_holder=worker)
     s.queue.appendleft(key)
 
 
 def _charge(s: SchedulerState, out: list[Command], key: Hashable, message: str) -> SchedulerState:
     """One fault more for this task; too many fail the run."""
-    waiting = s.tasks[key] = replace(s.tasks[key], faults=s.tasks[key].faults + 1)
+    waiting = s.tasks[key] = s.tasks[key]._replace(faults=s.tasks[key].faults + 1)
     if waiting.faults < s.policy.max_attempts:
         return s
     return _fail(s, out, f"task {key} failed in {waiting.faults} attempts; the last time {message}")
@@ -339,7 +333,7 @@ def _charge(s: SchedulerState, out: list[Command], key: Hashable, message: str) 
 def _fail(s: SchedulerState, out: list[Command], message: str) -> SchedulerState:
     out.append(Fail(message))
     out.extend(StopWorker(worker, "the run failed") for worker in sorted([*s.starting, *s.up, *s.draining]))
-    return replace(s, failed=message, starting={}, up={}, draining={}, queue=deque())
+    return s._replace(failed=message, starting={}, up={}, draining={}, queue=deque())
 
 
 def _expire(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
@@ -376,7 +370,7 @@ def _start_workers(s: SchedulerState, out: list[Command], now: float) -> Schedul
     for worker in range(s.next_worker, s.next_worker + missing):
         s.starting[worker] = now + s.policy.start_deadline_s
         out.append(StartWorker(worker))
-    return replace(s, next_worker=s.next_worker + missing)
+    return s._replace(next_worker=s.next_worker + missing)
 
 
 def _assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
@@ -392,13 +386,13 @@ def _assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState
             key = s.queue[index]
             del s.queue[index]
             waiting, record = s.tasks[key], s.up[worker]
-            s.tasks[key] = replace(waiting, holder=worker)
+            s.tasks[key] = waiting._replace(holder=worker)
             retries += waiting.last_holder is not None
             slot = _Slot(waiting.task, waiting.faults + 1)
-            record = replace(record, slots=(*record.slots, slot))
+            record = record._replace(slots=(*record.slots, slot))
             s.up[worker] = _begin_first_slot(s, record, now) if load == 0 else record
             out.append(Assign(worker, key, slot.attempt))
-    return s if retries == s.retries else replace(s, retries=retries)
+    return s if retries == s.retries else s._replace(retries=retries)
 
 
 def _next_for(s: SchedulerState, worker: int) -> int | None:

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import os
-import queue
 import random
 import signal
-import socket
 import subprocess
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from multiprocessing import Pipe
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +18,6 @@ import numpy as np
 import pytest
 
 from es_service.dispatch import engine as engine_module
-from es_service.dispatch import inline_engine as inline_module
 from es_service.dispatch.engine import POLL_S, Answer, Engine
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
@@ -257,10 +252,8 @@ def assert_same(results, others) -> None:
     np.testing.assert_equal([asdict(result) for result in results], [asdict(other) for other in others])
 
 
-def test_killed_children_change_no_result_and_leave_nothing_behind(monkeypatch):
-    """Eight in a row, by turns between two calls and in the middle of one. Slow threads are waited for."""
-    read = inline_module._read
-    monkeypatch.setattr(inline_module, "_read", lambda *arguments: (read(*arguments), time.sleep(0.05)))
+def test_killed_children_change_no_result_and_leave_nothing_behind():
+    """Eight in a row, by turns between two calls and in the middle of one."""
     before = footprint()
     chunks = [EvaluationChunk(1, chunk_id) for chunk_id in range(8)]
     countdown, victim = 0, 0
@@ -289,7 +282,7 @@ def test_killed_children_change_no_result_and_leave_nothing_behind(monkeypatch):
 
 @pytest.mark.timeout(60)
 def test_a_child_stopped_in_mid_message_blocks_nobody():
-    """Its pipe holds a fraction of a 5 MB centre. The deadline passes, it is replaced, the result is right."""
+    """Its socket holds a fraction of a 5 MB centre. The deadline passes, it is replaced, the result is right."""
     wide = spec(policy=PolicyShape((2, 1120, 1120, 2)), episode_steps=2)
     one, other = (centre(random_parameters(seed, wide.policy.parameters, 0.03)) for seed in (0, 1))
     assert one.parameters_D.nbytes > 5_000_000
@@ -305,24 +298,6 @@ def test_a_child_stopped_in_mid_message_blocks_nobody():
         assert engine.counts.lost_workers == 1
         assert victim not in engine.transport.process_ids().values()
     assert footprint() == before
-
-
-def test_a_loss_is_reported_while_the_writer_is_still_blocked():
-    """A child that says no more and reads no more, but lives: it is killed only because of this message."""
-    ours, theirs = Pipe()
-    with theirs, socket.socket(fileno=os.dup(theirs.fileno())) as end:
-        end.shutdown(socket.SHUT_WR)
-        outbox, inbox = queue.SimpleQueue(), queue.SimpleQueue()
-        outbox.put(bytes(5_000_000))
-        child: Any = SimpleNamespace(outbox=outbox)
-        reader = threading.Thread(target=inline_module._read, args=(child, ours, inbox), daemon=True)
-        reader.start()
-        assert inbox.get(timeout=5.0) == (child, ("lost",))
-        time.sleep(0.05)
-        assert not ours.closed
-    reader.join(5.0)
-    assert not reader.is_alive()
-    assert ours.closed
 
 
 def test_children_that_cannot_be_started_are_lost_workers_and_leave_nothing_behind(monkeypatch):
@@ -358,12 +333,3 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
         assert victim not in engine.transport.process_ids().values()
         assert len(set(engine.transport.process_ids().values())) == 1
     assert footprint() == before
-
-
-def test_what_a_dead_child_said_last_hides_nothing_that_came_after_it():
-    transport = inline_module.ChildProcesses(SPEC)
-    dead: Any = SimpleNamespace(log=SimpleNamespace(closed=True))
-    transport._inbox.put((dead, ("lost",)))
-    transport._inbox.put((dead, ("up", 5)))
-    assert transport.receive(0.0) == WorkerUp(5)
-    assert transport.receive(0.0) is None

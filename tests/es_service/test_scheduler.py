@@ -682,7 +682,7 @@ def test_stale_answers_are_dropped_and_counted():
     ):
         before = state
         state, commands = step(state, event, 3.0 + now)
-        assert (commands, state) == ([], replace(before, duplicates=now + 1))
+        assert (commands, state) == ([], before._replace(duplicates=now + 1))
 
 
 def test_a_late_result_of_a_superseded_attempt_is_accepted():

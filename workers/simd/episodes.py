@@ -20,7 +20,7 @@ from jax.extend.core import ClosedJaxpr
 from es_service.noise import KEY_WORDS
 from es_service.protocol import WorkerSpec
 from workers.environments import Environment
-from workers.episode import Carry, Episodes, EpisodeSteps, episode_steps
+from workers.episode import Episodes, EpisodeSteps, episode_steps
 from workers.simd.code import Code, Values, module
 from workers.simd.emit import graph_function
 from workers.simd.kernel import Kernel, compile_kernel, jaxpr_digest, load_compiled
@@ -29,7 +29,7 @@ from workers.simd.noise import definition, fill_function
 from workers.simd.primitives import UnsupportedError
 from workers.simd.target import Target, host_target
 from workers.simd.trace import trace_jaxpr
-from workers.simd.words import ALIGNMENT, aligned, pack, unpack, words_of
+from workers.simd.words import ALIGNMENT, aligned, filled, pack, unpack, words_of
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,9 @@ class EpisodeKernel:
     network: Network
     begin: Callable[[np.ndarray], np.ndarray]
     """Reset keys [lane, 4] -> words of carries [block, word, lane]."""
-    carry_avals: Carry
     alive_word: int
+    episode_avals: Episodes
+    episode_words: int
     _call: Callable[..., None]
     _alive: Any
 
@@ -65,13 +66,14 @@ class EpisodeKernel:
         carries[-1, self.alive_word, lanes - width * (blocks - 1) :] = 0  # nobody is there
         actions = pack([action_keys_L], width)
         constants = np.concatenate([mean_O[self.inputs_O], std_O[self.inputs_O]]).astype(np.float32)
-        splats = aligned((len(constants), width))
-        room = aligned((len(self.inputs_O) + self.network.layers[-1].outputs + self.network.hidden_vectors, width))
+        seen_and_done = len(self.inputs_O) + self.network.layers[-1].outputs
+        memory = aligned((len(constants) + seen_and_done + self.network.hidden_vectors, width))
+        splats, room = memory[: len(constants)], memory[len(constants) :]
         splats[:] = constants.view(np.uint32)[:, None]
         keys, noise = np.zeros((0, KEY_WORDS), np.uint32), np.zeros(0, np.int8)
         if noise_keys_P is not None:
             pairs = width // 2
-            keys = noise_keys_P[np.minimum(np.arange(blocks * pairs), len(noise_keys_P) - 1)]
+            keys = filled(noise_keys_P, blocks * pairs)
             noise = np.empty(pairs * self.network.starts_V.size * width, np.int8)
         arrays = (carries, actions, splats, weights, keys, self.network.starts_V, noise, room)
         assert [array.dtype.char for array in arrays] == list("IIIfIIbI")
@@ -80,14 +82,8 @@ class EpisodeKernel:
         assert weights.shape == (self.network.starts_V.size, width)
         pointers = [array.ctypes.data for array in arrays]
         self._call(*pointers, np.float32(2.0 * unit), blocks, self.spec.episode_steps)
-        return self._episodes(carries, lanes)
-
-    def _episodes(self, carries: np.ndarray, lanes: int) -> Episodes:
-        leaves = jax.tree.leaves(self.carry_avals)
-        # Those of an episode are the last of a carry's.
-        count = len(jax.tree.leaves(self.carry_avals.episode))
-        words = sum(words_of(aval) for aval in leaves[-count:])
-        found = Episodes(*unpack(carries[:, -words:], leaves[-count:], lanes))
+        # An episode's words are the last of a carry's.
+        found = Episodes(*unpack(carries[:, -self.episode_words :], self.episode_avals, lanes))
         if not self.training or len(self.inputs_O) == self.spec.policy.widths[0]:
             return found
         sums = [np.zeros((lanes, self.spec.policy.widths[0]), np.float32) for _ in range(2)]
@@ -138,8 +134,9 @@ def compile_episodes(
         inputs_O=inputs_O,
         network=network,
         begin=_begin(steps, leaves, target, folder),
-        carry_avals=carry,
         alive_word=alive_word,
+        episode_avals=carry.episode,
+        episode_words=sum(map(words_of, carry.episode)),
         _call=ctypes.CFUNCTYPE(None, *signature)(address),
         _alive=alive,
     )

@@ -50,12 +50,11 @@ def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Callabl
             keys = (keys_P_S_E[:, :, episode] for keys_P_S_E in (reset_keys_P_S_E, action_keys_P_S_E))
             lanes = (keys_P_S.reshape(-1, KEY_WORDS) for keys_P_S in keys)
             by_episode.append(kernel.run(weights, unit, mean_O, std_O, noise_keys_P, *lanes))
-        pairs = len(noise_keys_P)
+        axes = (len(noise_keys_P), 2, spec.episodes_per_member)
+        if len(by_episode) == 1:
+            return Episodes(*(leaf.reshape(*axes, *leaf.shape[1:]) for leaf in by_episode[0]))
         return Episodes(
-            *(
-                np.stack(leaves, axis=1).reshape(pairs, 2, spec.episodes_per_member, *leaves[0].shape[1:])
-                for leaves in zip(*by_episode, strict=True)
-            )
+            *(np.stack(leaves, axis=1).reshape(*axes, *leaves[0].shape[1:]) for leaves in zip(*by_episode, strict=True))
         )
 
     return rollout

@@ -37,20 +37,24 @@ def pack(leaves: Sequence[Any], width: int) -> Words:
         assert len(array) == lanes, (array.shape, lanes)
         array = array.astype(np.uint32) if array.itemsize < 4 else np.ascontiguousarray(array).view(np.uint32)
         columns.append(array.reshape(lanes, math.prod(array.shape[1:])))
-    rows = np.concatenate([np.zeros((lanes, 0), np.uint32), *columns], axis=1)
-    filled = rows[np.minimum(np.arange(blocks * width), lanes - 1)] if lanes else rows
+    rows = columns[0] if len(columns) == 1 else np.concatenate([np.zeros((lanes, 0), np.uint32), *columns], axis=1)
     words = aligned((blocks, rows.shape[1], width))
-    words[:] = filled.reshape(blocks, width, -1).transpose(0, 2, 1)
+    words[:] = filled(rows, blocks * width).reshape(blocks, width, -1).transpose(0, 2, 1)
     return words
 
 
+def filled(rows: NDArray, count: int) -> NDArray:
+    """As many rows, those that are missing being the last one."""
+    return rows if len(rows) == count else rows[np.minimum(np.arange(count), len(rows) - 1)]
+
+
 def unpack(words: Words, avals: Sequence[Any], lanes: int) -> list[NDArray]:
-    """The arrays [lane, ...] that words are, with the shapes and types of one lane's."""
-    rows = words.transpose(0, 2, 1).reshape(len(words) * words.shape[2], words.shape[1])[:lanes]
+    """Copies of the arrays [lane, ...] that words are, with the shapes and types of one lane's."""
+    rows = words.transpose(0, 2, 1).copy().reshape(len(words) * words.shape[2], words.shape[1])[:lanes]
     found, end = [], 0
     for aval in avals:
         start, end = end, end + words_of(aval)
-        column = np.ascontiguousarray(rows[:, start:end])
+        column = rows[:, start:end]
         array = column.astype(aval.dtype) if aval.dtype.itemsize < 4 else column.view(aval.dtype)
         found.append(array.reshape(lanes, *aval.shape))
     return found
