@@ -2,9 +2,9 @@
 
     python -m tests.benchmarks.episode_shares        # two minutes, one core
 
-Of a block of full vectors, each part called by itself on the same memory: what the policy sees (look), the policy's
-shared part (its centre) and own part (its noise, and tanh), physics and bookkeeping (move), and the noise of the
-block's pairs, once per episode. Ceilings: fused multiply-adds with all in registers, and reading as many bytes as the
+Of a block of full vectors, each part called by itself on the same memory: what the policy sees (look), the policy,
+physics and bookkeeping (move), and the noise of the block's pairs, once per episode. Beside them the policy without
+noise, as evaluations have it. Ceilings: fused multiply-adds with all in registers, and reading as many bytes as the
 block's weights are, again and again, from wherever they fit.
 """
 
@@ -110,37 +110,37 @@ def measure(task: str) -> dict[str, float]:
     acted[:] = rng.uniform(-1, 1, acted.shape)
     alive = np.ones(width, np.int32)
     centre = network.pack(initial_parameters(spec.policy, "unit_columns", 0))
-    noise = aligned((pairs * network.starts_V.size * width // 4,)).view(np.int8)
-    unit = float(np.float32(2 * 0.02 / NORMAL_STD))
+    noise = aligned((-(-network.noise_bytes // 4),)).view(np.int8)
+    unit = float(np.float32(0.02 / NORMAL_STD))
 
     parts = {}
     call = "call void @look(ptr %carry, ptr %constants, ptr %seen)"
     parts["look"] = run_of([look], call, ["carry", "constants", "seen"])(carries, constants, seen)
     names = ["seen", "alive", "centre", "noise", "hidden", "action"]
     arrays = (seen, alive, centre, noise, aligned((network.hidden_vectors, width)), acted)
-    fill = fill_function(network.starts_V.size, pairs, width)
-    call = "call void @fill(ptr %keys, ptr %starts, ptr %noise)"
+    fill = fill_function(network.vectors, len(network.places) - network.vectors, width)
+    call = "call void @fill(ptr %keys, ptr %places, ptr %noise)"
     pair_keys = stream_keys(0, Domain.PARAMETER_NOISE, 0, np.arange(pairs))
-    filled = run_of([fill], call, ["keys", "starts", "noise"])(pair_keys, network.starts_V, noise, times=20)
+    filled = run_of([fill], call, ["keys", "places", "noise"])(pair_keys, network.places, noise, times=20)
     call = "call void @policy(ptr %seen, ptr %alive, ptr %centre, ptr %hidden, ptr %action)"
-    shared = run_of([policy_function(network, noisy=False)], call, names)(*arrays)
+    without_noise = run_of([policy_function(network, noisy=False)], call, names)(*arrays)
     call = "call void @policy(ptr %seen, ptr %alive, ptr %centre, ptr %noise, float %unit, ptr %hidden, ptr %action)"
-    whole = run_of([policy_function(network, noisy=True)], call, names)(*arrays, unit=unit)
-    parts["policy_shared"], parts["policy_own"] = shared, whole - shared
+    parts["policy"] = run_of([policy_function(network, noisy=True)], call, names)(*arrays, unit=unit)
     call = "call void @move(ptr %carry, ptr %constants, ptr %action, ptr %keys)"
     parts["move"] = run_of([move], call, ["carry", "constants", "action", "keys"])(
         carries, constants, acted, keys, times=200
     )
     parts["noise"] = filled / spec.episode_steps
-    weights = pairs * network.starts_V.size * width
+    weights = network.noise_bytes
     total = sum(parts.values())
     row = {f"{name}_us": round(1e6 * seconds / width, 3) for name, seconds in parts.items()}
     row |= {f"{name}_percent": round(100 * seconds / total, 1) for name, seconds in parts.items()}
-    useful = sum((layer.inputs + 1) * layer.outputs for layer in network.layers)
+    useful = len(network.places) - network.vectors + sum((layer.inputs + 1) * layer.outputs for layer in network.hidden)
     return row | {
         "total_us": round(1e6 * total / width, 3),
-        "policy_gflops": round(2 * 2 * useful * width / whole / 1e9, 1),
-        "policy_gbytes_per_s": round((weights + centre.nbytes) / whole / 1e9, 1),
+        "policy_without_noise_us": round(1e6 * without_noise / width, 3),
+        "policy_gflops": round(2 * 2 * useful * width / parts["policy"] / 1e9, 1),
+        "policy_gbytes_per_s": round((weights + centre.nbytes) / parts["policy"] / 1e9, 1),
         "weights_kib_of_block": round((weights + centre.nbytes) / 1024),
         "normals_per_s": round(weights / filled),
     }

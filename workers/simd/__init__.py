@@ -7,7 +7,7 @@
     kernel.py     all of it, with cache.py before; words.py
 
     noise.py      the generator, and weighted sums of it
-    network.py    the policy, around noise that is never added to the centre
+    network.py    the policy, whose members' weights are made where they are used
     episodes.py   whole episodes: these, and what the task does between, in one kernel
     rollout.py    what workers call
 

@@ -66,7 +66,7 @@ class EpisodeKernel:
         carries[-1, self.alive_word, lanes - width * (blocks - 1) :] = 0  # nobody is there
         actions = pack([action_keys_L], width)
         constants = np.concatenate([mean_O[self.inputs_O], std_O[self.inputs_O]]).astype(np.float32)
-        seen_and_done = len(self.inputs_O) + self.network.layers[-1].outputs
+        seen_and_done = len(self.inputs_O) + self.network.outputs
         memory = aligned((len(constants) + seen_and_done + self.network.hidden_vectors, width))
         splats, room = memory[: len(constants)], memory[len(constants) :]
         splats[:] = constants.view(np.uint32)[:, None]
@@ -74,14 +74,14 @@ class EpisodeKernel:
         if noise_keys_P is not None:
             pairs = width // 2
             keys = filled(noise_keys_P, blocks * pairs)
-            noise = np.empty(pairs * self.network.starts_V.size * width, np.int8)
-        arrays = (carries, actions, splats, weights, keys, self.network.starts_V, noise, room)
+            noise = np.empty(self.network.noise_bytes, np.int8)
+        arrays = (carries, actions, splats, weights, keys, self.network.places, noise, room)
         assert [array.dtype.char for array in arrays] == list("IIIfIIbI")
         assert all(array.flags.c_contiguous for array in arrays)
         assert weights.ctypes.data % ALIGNMENT == 0
-        assert weights.shape == (self.network.starts_V.size, width)
+        assert weights.size >= len(self.network.places)
         pointers = [array.ctypes.data for array in arrays]
-        self._call(*pointers, np.float32(2.0 * unit), blocks, self.spec.episode_steps)
+        self._call(*pointers, np.float32(unit), blocks, self.spec.episode_steps)
         # An episode's words are the last of a carry's.
         found = Episodes(*unpack(carries[:, -self.episode_words :], self.episode_avals, lanes))
         if not self.training or len(self.inputs_O) == self.spec.policy.widths[0]:
@@ -122,7 +122,7 @@ def compile_episodes(
     words = sum(map(words_of, leaves))
 
     def text() -> str:
-        return _module(look, move, network, words, alive_word, training=training)
+        return _module(look, move, network, len(inputs_O), words, alive_word, training=training)
 
     digests = f"{definition()} {jaxpr_digest(look)} {jaxpr_digest(move)}"
     name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {training}"
@@ -164,15 +164,15 @@ def _begin(
 
 
 def _module(
-    look: ClosedJaxpr, move: ClosedJaxpr, network: Network, words: int, alive_word: int, *, training: bool
+    look: ClosedJaxpr, move: ClosedJaxpr, network: Network, inputs: int, words: int, alive_word: int, *, training: bool
 ) -> str:
     """LLVM IR of
 
-    void kernel(ptr carries, ptr action_keys, ptr constants, ptr centre, ptr keys, ptr starts, ptr noise, ptr room,
+    void kernel(ptr carries, ptr action_keys, ptr constants, ptr centre, ptr keys, ptr places, ptr noise, ptr room,
                 float unit, i64 blocks, i64 steps)
     """
-    width, inputs = network.width, network.layers[0].inputs
-    actions = network.layers[-1].outputs
+    width = network.width
+    actions = network.outputs
     graph, _, outputs = trace_jaxpr(look)
     sources = [("carry", words), ("constants", inputs), ("constants", inputs)]
     look_code = graph_function("look", graph, outputs, sources, "seen", width)
@@ -180,9 +180,9 @@ def _module(
     sources = [("carry", words), ("constants", inputs), ("action", actions), ("action_key", KEY_WORDS)]
     move_code = graph_function("move", graph, outputs, sources, "carry", width)
     policy_code = policy_function(network, noisy=training)
-    fill_code = fill_function(len(network.starts_V), width // 2, width)
+    fill_code = fill_function(network.vectors, len(network.places) - network.vectors, width)
 
-    pointers = ["carries", "action_keys", "constants", "centre", "keys", "starts", "noise", "room"]
+    pointers = ["carries", "action_keys", "constants", "centre", "keys", "places", "noise", "room"]
     code = Code(
         "inside", [*(f"ptr noalias %{name}" for name in pointers), "float %unit", "i64 %blocks", "i64 %steps"], width
     )
@@ -196,7 +196,7 @@ def _module(
         alive = code.at(carry, alive_word, vector)
         if training:
             keys = code.at("%keys", code.index((number, KEY_WORDS * width // 2)), "i32")
-            code.do(f"call void @fill(ptr {keys}, ptr %starts, ptr %noise)")
+            code.do(f"call void @fill(ptr {keys}, ptr %places, ptr %noise)")
 
         def step(_: str, __: Values) -> Values:
             code.do(f"call void @look(ptr {carry}, ptr %constants, ptr {seen})")

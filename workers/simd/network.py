@@ -1,17 +1,16 @@
 """Code of the policy: what each lane's member does with what it sees, for a block of as many members as vectors have
 lanes, two by two the + and - of a pair.
 
-A member's weights are never made. With noise k = 2 j + 1 (j is a byte) a layer is
+A member's weights are made where they are used: centre +- unit k, each product and sum rounded as it stands here. The
+centre is shared by all members and stays in cache; the noise k = 2 j + 1 is a byte j a weight and shared by a pair.
 
-    centre x +- 2 unit (j x + (sum of x) / 2)
-
-biases as weights of an input 1. `centre` is shared by all members and stays in cache; j, a byte a weight, is shared by
-a pair. Vectors go along outputs; each output is one sum in the order of the inputs, whatever the width.
+In hidden layers vectors go along outputs, member by member; in the last one, which has few outputs, along members.
+Every output is one sum in the order of the inputs, beginning with the bias, whatever the width.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,9 +23,13 @@ from workers.simd.emit import inline
 from workers.simd.graph import Graph
 from workers.simd.words import aligned
 
+OUTPUTS_AT_ONCE = 4
+"""Of the last layer."""
+
 
 class Layer(NamedTuple):
-    """Where a layer's weights are: by tiles of outputs, in each by inputs (and last the biases), in each by outputs."""
+    """Where a hidden layer's weights are: by tiles of outputs, in each by inputs (and last the biases), in each by
+    outputs."""
 
     inputs: int
     outputs: int
@@ -38,25 +41,39 @@ class Layer(NamedTuple):
 
 
 class Network(NamedTuple):
-    """A policy's layers, and the place in the flat vector of parameters at which each vector of weights starts.
+    """A policy's layers, and the place of each weight in the flat vector of parameters.
 
-    What a vector has beyond a row's end belongs to the next and is never looked at.
+    Weights are vectors of the hidden layers, of which only the first lane's place is given, the others following it
+    (what a vector has beyond a row's end belongs to the next and is never looked at), and single weights of the last
+    layer, by inputs (and last the biases), in each by outputs.
     """
 
-    layers: tuple[Layer, ...]
-    starts_V: NDArray[np.uint32]
+    hidden: tuple[Layer, ...]
+    inputs: int
+    """Of the last layer."""
+    outputs: int
+    vectors: int
+    places: NDArray[np.uint32]
+    """Of the vectors, then of the single weights."""
     width: int
 
     @property
     def hidden_vectors(self) -> int:
         """Vectors that the outputs of two layers take, of as many members as there are lanes."""
-        return 2 * self.width * max(layer.tiles * layer.tile for layer in self.layers)
+        return 2 * self.width * max((layer.tiles * layer.tile for layer in self.hidden), default=0)
+
+    @property
+    def noise_bytes(self) -> int:
+        """Bytes of the noise of a block of members."""
+        return self.width // 2 * self.vectors * self.width + (len(self.places) - self.vectors) * self.width
 
     def pack(self, parameters_D: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The vectors of weights, [V, width]."""
+        """The vectors of weights, then the single ones, [rows, width]."""
         padded_D = np.concatenate([parameters_D, np.zeros(self.width, np.float32)])
-        weights = aligned((self.starts_V.size, self.width)).view(np.float32)
-        weights[:] = padded_D[self.starts_V[:, None] + np.arange(self.width, dtype=np.uint32)]
+        of_vectors, single = self.places[: self.vectors], self.places[self.vectors :]
+        weights = aligned((self.vectors - -len(single) // self.width, self.width)).view(np.float32)
+        weights[: self.vectors] = padded_D[of_vectors[:, None] + np.arange(self.width, dtype=np.uint32)]
+        weights.reshape(-1)[self.vectors * self.width :][: len(single)] = padded_D[single]
         return weights
 
 
@@ -71,18 +88,21 @@ def plan(shape: PolicyShape, inputs_O: NDArray[np.intp], width: int) -> Network:
     Args:
         inputs_O: the inputs of the first layer that are not always zero.
     """
-    layers, starts, coordinate = [], [], 0
+    layers, places, coordinate = [], [], 0
     most = sums_at_once(width) // 4  # tiles are powers of 2, so that as many members as fit divide the width
-    for number, (inputs, outputs) in enumerate(shape.layers):
-        rows = inputs_O.tolist() if number == 0 else list(range(inputs))
-        vectors = -(-outputs // width)
+    rows, (*hidden, (inputs, outputs)) = inputs_O.tolist(), shape.layers
+    for given, wanted in hidden:
+        vectors = -(-wanted // width)
         tile = max(size for size in (1, 2, 4) if size <= most and vectors % size == 0)
-        layers.append(Layer(len(rows), outputs, vectors // tile, tile, len(starts)))
+        layers.append(Layer(len(rows), wanted, vectors // tile, tile, len(places)))
         for first in range(0, vectors, tile):
-            for row in [*rows, inputs]:
-                starts += [coordinate + row * outputs + (first + v) * width for v in range(tile)]
-        coordinate += (inputs + 1) * outputs
-    return Network(tuple(layers), np.array(starts, np.uint32), width)
+            for row in [*rows, given]:
+                places += [coordinate + row * wanted + (first + v) * width for v in range(tile)]
+        coordinate += (given + 1) * wanted
+        rows = list(range(wanted))
+    vectors = len(places)
+    places += [coordinate + row * outputs + output for row in [*rows, inputs] for output in range(outputs)]
+    return Network(tuple(layers), len(rows), outputs, vectors, np.array(places, np.uint32), width)
 
 
 class View(NamedTuple):
@@ -96,9 +116,9 @@ class View(NamedTuple):
 def policy_function(network: Network, *, noisy: bool) -> Code:
     """`void policy(ptr x, ptr alive, ptr centre[, ptr noise, float unit], ptr hidden, ptr action)`.
 
-    x and action are [input, lane] and [output, lane]; `alive` a word for each lane: neighbours who are all dead are not
-    computed. centre is as `Network.pack` makes it; noise [pair, vector, lane] of bytes; unit twice that of the noise;
-    hidden is room for `network.hidden_vectors`.
+    x and action are [input, lane] and [output, lane]; `alive` a word for each lane: hidden layers of neighbours who are
+    all dead are not computed. centre is as `Network.pack` makes it; noise as `noise.fill_function` does; hidden is room
+    for `network.hidden_vectors`.
     """
     width = network.width
     parameters = ["ptr noalias %x", "ptr noalias %alive", "ptr noalias %centre"]
@@ -106,121 +126,187 @@ def policy_function(network: Network, *, noisy: bool) -> Code:
     code = Code("policy", [*parameters, "ptr noalias %hidden", "ptr noalias %action"], width)
     buffers = [code.at("%hidden", half * network.hidden_vectors // 2, code.vector["f"]) for half in range(2)]
     view = View("%x", 1, width)
-    for number, layer in enumerate(network.layers):
+    for number, layer in enumerate(network.hidden):
         out = View(buffers[number % 2], layer.tiles * layer.tile * width, 1)
-        _shared(code, layer, view, out, last=not noisy)
         if noisy:
-            _own(code, network, layer, view, out)
+            _noisy(code, network, layer, view, out)
+        else:
+            _shared(code, layer, view, out)
         view = out
-    outputs = network.layers[-1].outputs
-
-    def copy(member: str, _: Values) -> Values:
-        for output in range(outputs):
-            value = code.load("float", view.pointer, code.index((member, view.by_member), (output, 1)))
-            code.store("float", value, "%action", code.index((member, 1), (output * width, 1)))
-        return []
-
-    code.loop(width, copy)
+    if network.hidden:
+        view = _transposed(code, view, network.inputs, buffers[len(network.hidden) % 2])
+    for first in range(0, network.outputs, OUTPUTS_AT_ONCE):
+        _last(code, network, view.pointer, range(first, min(first + OUTPUTS_AT_ONCE, network.outputs)), noisy=noisy)
     return code
 
 
-def _shared(code: Code, layer: Layer, x: View, out: View, *, last: bool) -> None:
-    """out = centre x, for some members at once; if that is all, tanh of it."""
+def _shared(code: Code, layer: Layer, x: View, out: View) -> None:
+    """out = tanh(centre x), for some members at once."""
     floats = code.vector["f"]
     members = min(code.width, sums_at_once(code.width) // layer.tile)
     assert code.width % members == 0
 
-    def block(number: str, _: Values) -> Values:
-        first = code.index((number, members))
-        code.when(_any_alive(code, first, members), lambda: code.loop(layer.tiles, lambda t, _: tile(first, t)))
-        return []
-
     def tile(first: str, number: str) -> Values:
         weights = code.index((number, (layer.inputs + 1) * layer.tile), (layer.first, 1))
-        biases = [code.load(floats, "%centre", code.index((weights, 1), (layer.inputs * layer.tile + v, 1)))
-                  for v in range(layer.tile)]  # fmt: skip
+
+        def centre(row: str | int) -> Values:
+            at = code.index((weights, 1), (row, layer.tile))
+            return [code.load(floats, "%centre", code.index((at, 1), (v, 1))) for v in range(layer.tile)]
 
         def add(row: str, sums: Values) -> Values:
-            at = code.index((weights, 1), (row, layer.tile))
-            vectors = [code.load(floats, "%centre", code.index((at, 1), (v, 1))) for v in range(layer.tile)]
-            found = []
+            vectors, found = centre(row), []
             for member in range(members):
                 seen = _seen(code, x, first, member, row)
                 mine = sums[member * layer.tile : (member + 1) * layer.tile]
                 found += [code.fma(seen, vector, one) for vector, one in zip(vectors, mine, strict=True)]
             return found
 
-        sums = code.loop(layer.inputs, add, [(floats, one) for one in biases * members])
+        sums = code.loop(layer.inputs, add, [(floats, one) for one in centre(layer.inputs) * members])
         for member in range(members):
-            mine = sums[member * layer.tile : (member + 1) * layer.tile]
-            _put(code, layer, out, first, member, number, _tanh(code, mine) if last else mine)
+            _put(code, layer, out, first, member, number, sums[member * layer.tile : (member + 1) * layer.tile])
+        return []
+
+    _by_members(code, layer, members, tile)
+
+
+def _noisy(code: Code, network: Network, layer: Layer, x: View, out: View) -> None:
+    """out = tanh((centre +- unit k) x), for some pairs at once."""
+    floats = code.vector["f"]
+    pairs = min(code.width // 2, max(1, sums_at_once(code.width) // (2 * layer.tile)))
+    assert code.width % (2 * pairs) == 0
+    unit, twice = _units(code)
+
+    def tile(first: str, number: str) -> Values:
+        weights = code.index((number, (layer.inputs + 1) * layer.tile), (layer.first, 1))
+        first_pair = code.value(f"lshr i64 {first}, 1")
+
+        def member_weights(row: str | int, v: int) -> list[tuple[str, str]]:
+            """Of each pair, those of + and -."""
+            at = code.index((weights, 1), (row, layer.tile), (v, 1))
+            centre = code.load(floats, "%centre", at)
+            found = []
+            for pair in range(pairs):
+                place = code.index((first_pair, network.vectors), (pair * network.vectors, 1), (at, 1))
+                moved = code.fma(_noise(code, "%noise", place), twice, unit)
+                found.append(
+                    (code.value(f"fadd {floats} {centre}, {moved}"), code.value(f"fsub {floats} {centre}, {moved}"))
+                )
+            return found
+
+        def add(row: str, sums: Values) -> Values:
+            seen = [_seen(code, x, first, member, row) for member in range(2 * pairs)]
+            found = list(sums)
+            for v in range(layer.tile):
+                for pair, of_signs in enumerate(member_weights(row, v)):
+                    for sign, weight in enumerate(of_signs):
+                        place = (2 * pair + sign) * layer.tile + v
+                        found[place] = code.fma(seen[2 * pair + sign], weight, sums[place])
+            return found
+
+        biases = [""] * (2 * pairs * layer.tile)
+        for v in range(layer.tile):
+            for pair, of_signs in enumerate(member_weights(layer.inputs, v)):
+                for sign, weight in enumerate(of_signs):
+                    biases[(2 * pair + sign) * layer.tile + v] = weight
+        sums = code.loop(layer.inputs, add, [(floats, one) for one in biases])
+        for member in range(2 * pairs):
+            _put(code, layer, out, first, member, number, sums[member * layer.tile : (member + 1) * layer.tile])
+        return []
+
+    _by_members(code, layer, 2 * pairs, tile)
+
+
+def _by_members(code: Code, layer: Layer, members: int, tile: Callable[[str, str], Values]) -> None:
+    """`tile(first member, number of the tile)` of neighbours of whom one is alive."""
+
+    def block(number: str, _: Values) -> Values:
+        first = code.index((number, members))
+        code.when(_any_alive(code, first, members), lambda: code.loop(layer.tiles, lambda t, _: tile(first, t)))
         return []
 
     code.loop(code.width // members, block)
 
 
-def _own(code: Code, network: Network, layer: Layer, x: View, out: View) -> None:
-    """out = tanh(out +- unit (j x + (sum of x) / 2)), for some pairs at once."""
-    floats, size = code.vector["f"], len(network.starts_V)
-    pairs = max(1, min(code.width // 2, sums_at_once(code.width) // 2 // (2 * layer.tile)))
-    assert code.width % (2 * pairs) == 0
-    bytes_ = f"<{code.width} x i8>"
-    half, zero = "splat (float 0.5)", "zeroinitializer"
+def _last(code: Code, network: Network, x: str, outputs: range, *, noisy: bool) -> None:
+    """action = tanh(weights x) of some outputs; vectors go along members."""
+    floats, count = code.vector["f"], network.outputs
+    singles = code.at("%centre", network.vectors * code.width, "float")
 
-    def noise(index: str) -> str:
-        byte = code.load(bytes_, "%noise", index)
-        words = code.value(f"sext {bytes_} {byte} to {code.vector['i']}")
-        return code.value(f"sitofp {code.vector['i']} {words} to {floats}")
+    def centre(row: str | int) -> Values:
+        return [code.splat(code.load("float", singles, code.index((row, count), (output, 1)))) for output in outputs]
 
-    def block(number: str, _: Values) -> Values:
-        first = code.index((number, pairs))
-        member = code.index((first, 2))
-        code.when(
-            _any_alive(code, member, 2 * pairs),
-            lambda: code.loop(layer.tiles, lambda t, _: tile(first, member, t)),
-        )
-        return []
+    weights = centre
+    if noisy:
+        noise = code.at("%noise", network.vectors * (code.width // 2) * code.width, "i8")
+        unit, twice = (_by_sign(code, one) for one in _units(code))
 
-    def tile(first: str, member: str, number: str) -> Values:
-        weights = [
-            code.index((first, size), (number, (layer.inputs + 1) * layer.tile), (pair * size + layer.first, 1))
-            for pair in range(pairs)
-        ]
-        carries = []
-        for pair in range(pairs):
-            biases = [
-                noise(code.index((weights[pair], 1), (layer.inputs * layer.tile + v, 1))) for v in range(layer.tile)
+        def weights(row: str | int) -> Values:
+            js = [_noise(code, noise, code.index((row, count), (output, 1))) for output in outputs]
+            return [
+                code.value(f"fadd {floats} {one}, {code.fma(j, twice, unit)}")
+                for one, j in zip(centre(row), js, strict=True)
             ]
-            carries += [(floats, one) for one in biases * 2] + [(floats, zero)] * 2
-        each = 2 * layer.tile + 2
 
-        def add(row: str, sums: Values) -> Values:
-            found = []
-            for pair in range(pairs):
-                mine = sums[pair * each : (pair + 1) * each]
-                at = code.index((weights[pair], 1), (row, layer.tile))
-                vectors = [noise(code.index((at, 1), (v, 1))) for v in range(layer.tile)]
-                seen = [_seen(code, x, member, 2 * pair + sign, row) for sign in range(2)]
-                for sign in range(2):
-                    of_sign = mine[sign * layer.tile : (sign + 1) * layer.tile]
-                    found += [code.fma(seen[sign], vector, one) for vector, one in zip(vectors, of_sign, strict=True)]
-                found += [code.value(f"fadd {floats} {mine[2 * layer.tile + sign]}, {seen[sign]}") for sign in range(2)]
-            return found
+    def add(row: str, sums: Values) -> Values:
+        seen = code.load(floats, x, row)
+        return [code.fma(seen, weight, one) for weight, one in zip(weights(row), sums, strict=True)]
 
-        sums = code.loop(layer.inputs, add, carries)
-        for pair in range(pairs):
-            mine = sums[pair * each : (pair + 1) * each]
-            for sign in range(2):
-                rest = code.fma(half, mine[2 * layer.tile + sign], half)
-                unit = code.splat("%unit" if sign == 0 else code.value("fneg float %unit"))
-                values = []
-                for v, one in enumerate(mine[sign * layer.tile : (sign + 1) * layer.tile]):
-                    shared = code.load(floats, *_place(code, layer, out, member, 2 * pair + sign, number, v))
-                    values.append(code.fma(unit, code.value(f"fadd {floats} {one}, {rest}"), shared))
-                _put(code, layer, out, member, 2 * pair + sign, number, _tanh(code, values))
+    sums = code.loop(network.inputs, add, [(floats, one) for one in weights(network.inputs)])
+    for output, value in zip(outputs, _tanh(code, sums), strict=True):
+        code.store(floats, value, "%action", output)
+
+
+def _transposed(code: Code, x: View, inputs: int, to: str) -> View:
+    """What members give the inputs, [input, lane]; a square of as many inputs as lanes after the other."""
+    floats, width = code.vector["f"], code.width
+
+    def square(number: str, _: Values) -> Values:
+        rows = [
+            code.load(floats, x.pointer, code.index((number, 1), (member * x.by_member // width, 1)))
+            for member in range(width)
+        ]
+        half = 1
+        while half < width:  # swap the blocks beside the diagonal, of one, two, four ... rows and columns
+            for row in range(width):
+                if not row & half:
+                    rows[row], rows[row + half] = _swapped(code, rows[row], rows[row + half], half)
+            half *= 2
+        for row, value in enumerate(rows):
+            code.store(floats, value, to, code.index((number, width), (row, 1)))
         return []
 
-    code.loop(code.width // (2 * pairs), block)
+    code.loop(-(-inputs // width), square)
+    return View(to, 1, width)
+
+
+def _swapped(code: Code, upper: str, lower: str, half: int) -> tuple[str, str]:
+    """Two rows after the exchange of the upper's odd blocks of `half` columns with the lower's even ones."""
+    floats, width = code.vector["f"], code.width
+    even = [lane if not lane & half else width + lane - half for lane in range(width)]
+    odd = [lane + half if not lane & half else width + lane for lane in range(width)]
+    masks = (", ".join(f"i32 {place}" for place in places) for places in (even, odd))
+    first, second = (
+        code.value(f"shufflevector {floats} {upper}, {floats} {lower}, <{width} x i32> <{mask}>") for mask in masks
+    )
+    return first, second
+
+
+def _units(code: Code) -> tuple[str, str]:
+    """unit and 2 unit in all lanes: unit k is j times the second plus the first."""
+    return code.splat("%unit"), code.splat(code.value("fadd float %unit, %unit"))
+
+
+def _by_sign(code: Code, value: str) -> str:
+    """Minus the value in the lanes of members whose sign is -."""
+    signs = ", ".join(f"float {-1.0 if lane % 2 else 1.0}" for lane in range(code.width))
+    return code.value(f"fmul {code.vector['f']} {value}, <{signs}>")
+
+
+def _noise(code: Code, noise: str, vector: str) -> str:
+    """j of a vector of weights."""
+    kind = f"<{code.width} x i8>"
+    words = code.value(f"sext {kind} {code.load(kind, noise, vector)} to {code.vector['i']}")
+    return code.value(f"sitofp {code.vector['i']} {words} to {code.vector['f']}")
 
 
 def _seen(code: Code, x: View, first: str, member: int, row: str) -> str:
@@ -229,15 +315,12 @@ def _seen(code: Code, x: View, first: str, member: int, row: str) -> str:
     return code.splat(code.load("float", x.pointer, index))
 
 
-def _place(code: Code, layer: Layer, out: View, first: str, member: int, tile: str, vector: int) -> tuple[str, str]:
-    """(pointer, number of the vector) of outputs of a member."""
+def _put(code: Code, layer: Layer, out: View, first: str, member: int, tile: str, sums: Sequence[str]) -> None:
+    """Store tanh of a member's sums."""
     vectors = layer.tiles * layer.tile
-    return out.pointer, code.index((first, vectors), (tile, layer.tile), (member * vectors + vector, 1))
-
-
-def _put(code: Code, layer: Layer, out: View, first: str, member: int, tile: str, values: Sequence[str]) -> None:
-    for vector, value in enumerate(values):
-        code.store(code.vector["f"], value, *_place(code, layer, out, first, member, tile, vector))
+    for v, value in enumerate(_tanh(code, sums)):
+        place = code.index((first, vectors), (tile, layer.tile), (member * vectors + v, 1))
+        code.store(code.vector["f"], value, out.pointer, place)
 
 
 def _any_alive(code: Code, first: str, members: int) -> str:

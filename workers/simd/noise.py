@@ -44,33 +44,57 @@ def load_key(code: Code, keys: str, pair: str) -> Values:
     return [code.splat(word, "i") for word in words]
 
 
+def keys_of_members(code: Code, keys: str) -> Values:
+    """The words of the keys of as many members as there are lanes, neighbours having that of their pair."""
+    words = []
+    for word in range(KEY_WORDS):
+        vector = "poison"
+        for lane in range(code.width):
+            one = code.load("i32", keys, lane // 2 * KEY_WORDS + word)
+            vector = code.value(f"insertelement {code.vector['i']} {vector}, i32 {one}, i64 {lane}")
+        words.append(vector)
+    return words
+
+
 def lanes(code: Code) -> str:
     """0, 1, 2, ... as a constant vector."""
     return f"<{', '.join(f'i32 {lane}' for lane in range(code.width))}>"
 
 
-def fill_function(vectors: int, pairs: int, width: int) -> Code:
-    """`void fill(ptr keys, ptr starts, ptr noise)`: j of each pair at the coordinates of each vector, as bytes.
+def fill_function(vectors: int, singles: int, width: int) -> Code:
+    """`void fill(ptr keys, ptr places, ptr noise)`: j of each pair of a block of members, as bytes.
 
-    noise is [pair, vector, lane]; starts[vector] the coordinate of a vector's first lane.
+    noise is [pair, vector, lane] of the vectors, each along coordinates, of which `places` has the first; behind it
+    [single, member] of the single coordinates, whose places follow, the members of a pair having the same.
     """
-    code = Code("fill", ["ptr noalias %keys", "ptr noalias %starts", "ptr noalias %noise"], width)
+    code = Code("fill", ["ptr noalias %keys", "ptr noalias %places", "ptr noalias %noise"], width)
+    bytes_ = f"<{width} x i8>"
 
     def pair(number: str, _: Values) -> Values:
         key = load_key(code, "%keys", number)
 
         def vector(at: str, _: Values) -> Values:
-            start = code.splat(code.load("i32", "%starts", at), "i")
+            start = code.splat(code.load("i32", "%places", at), "i")
             coordinate = code.value(f"add {code.vector['i']} {start}, {lanes(code)}")
-            j = noise_of(code, key, coordinate, halved=True)
-            byte = code.value(f"trunc {code.vector['i']} {j} to <{width} x i8>")
-            code.store(f"<{width} x i8>", byte, "%noise", code.index((number, vectors), (at, 1)))
+            keep(noise_of(code, key, coordinate, halved=True), code.index((number, vectors), (at, 1)))
             return []
 
         code.loop(vectors, vector)
         return []
 
-    code.loop(pairs, pair)
+    def keep(j: str, at: str) -> None:
+        code.store(bytes_, code.value(f"trunc {code.vector['i']} {j} to {bytes_}"), "%noise", at)
+
+    if vectors:
+        code.loop(width // 2, pair)
+    key = keys_of_members(code, "%keys")
+
+    def single(number: str, _: Values) -> Values:
+        coordinate = code.splat(code.load("i32", "%places", code.index((number, 1), (vectors, 1))), "i")
+        keep(noise_of(code, key, coordinate, halved=True), code.index((number, 1), (width // 2 * vectors, 1)))
+        return []
+
+    code.loop(singles, single)
     return code
 
 

@@ -42,7 +42,7 @@ CASES: dict[str, tuple[Callable, Callable, float, float, float]] = {
     "expm1": (jnp.expm1, np.expm1, -86.5, 88.72, 3.0),
     "log": (jnp.log, np.log, TINY, 3e38, 2.0),
     "log1p": (jnp.log1p, np.log1p, -0.999999, 1e30, 3.0),
-    "tanh": (jnp.tanh, np.tanh, -20.0, 20.0, 3.0),
+    "tanh": (jnp.tanh, np.tanh, -20.0, 20.0, 6.0),
     "logistic": (jax.nn.sigmoid, lambda x: 1 / (1 + np.exp(-x)), -86.0, 80.0, 4.0),
     "asin": (jnp.arcsin, np.arcsin, -1.0, 1.0, 3.0),
     "acos": (jnp.arccos, np.arccos, -1.0, 1.0, 3.0),

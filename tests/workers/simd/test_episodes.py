@@ -166,7 +166,7 @@ def test_inputs_that_are_always_zero_are_left_out_and_missed_by_nobody():
         lanes = (keys.reshape(-1, 4) for keys in (resets, actions))
         found.append(kernel.run(kernel.network.pack(centre_D), float(unit), mean_O, std_O, keys, *lanes))
     jax.tree.map(np.testing.assert_array_equal, *found)
-    assert plan(worker_spec.policy, np.flatnonzero(~zero_O), 16).layers[0].inputs == 59
+    assert plan(worker_spec.policy, np.flatnonzero(~zero_O), 16).hidden[0].inputs == 59
     # Statistics from elsewhere, for which 0 is not the mean: then those inputs count.
     mean_O[zero_O] = 1.0
     ours, theirs = both(worker_spec, centre_D, unit, mean_O, std_O, keys, resets, actions)
@@ -179,21 +179,27 @@ def test_noise_is_the_published_generator_s(kind: str, tmp_path: Path):
     if kind not in [target.kind for target in targets()]:
         pytest.skip(f"no {kind}")
     target = host_target(kind)
-    fill = fill_function(3, 2, target.width)
+    pairs, singles = target.width // 2, 5
+    fill = fill_function(3, singles, target.width)
     code = Code("inside", fill.parameters, target.width)
-    code.do("call void @fill(ptr %keys, ptr %starts, ptr %noise)")
+    code.do("call void @fill(ptr %keys, ptr %places, ptr %noise)")
     address, alive = load_compiled(f"noise {kind}", lambda: module([fill, code]), target, tmp_path)
+    places = np.array([0, 1000, 2**32 - 5, 0, 1, 2, 77, 2**32 - 1], np.uint32)
     for (seed, domain, generation, ids), expected in TEST_VECTORS:
-        key = stream_keys(seed, domain, generation, *ids)
-        keys = np.stack([key, stream_keys(1, Domain.SELECTION, 2, 3)])
-        starts = np.array([0, 1000, 2**32 - 5], np.uint32)
-        noise = np.zeros((2, 3, target.width), np.int8)
-        ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3)(address)(keys.ctypes.data, starts.ctypes.data, noise.ctypes.data)
+        keys = stream_keys(1, Domain.SELECTION, 2, np.arange(pairs))
+        keys[0] = stream_keys(seed, domain, generation, *ids)
+        noise = np.zeros((3 * pairs + singles) * target.width, np.int8)
+        pointers = [array.ctypes.data for array in (keys, places, noise)]
+        ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3)(address)(*pointers)
         k = 2 * noise.astype(int) + 1
-        assert tuple(k[0, 0, :3]) == expected
-        coordinates = starts[:, None] + np.arange(target.width, dtype=np.uint32)
-        for pair in range(2):
-            np.testing.assert_array_equal(k[pair], normal_integers(np, keys[pair], coordinates))
+        of_vectors = k[: 3 * pairs * target.width].reshape(pairs, 3, target.width)
+        of_singles = k[of_vectors.size :].reshape(singles, target.width)
+        assert tuple(of_vectors[0, 0, :3]) == tuple(of_singles[:3, 0]) == tuple(of_singles[:3, 1]) == expected
+        coordinates = places[:3, None] + np.arange(target.width, dtype=np.uint32)
+        for member in range(target.width):
+            key = keys[member // 2]
+            np.testing.assert_array_equal(of_vectors[member // 2], normal_integers(np, key, coordinates))
+            np.testing.assert_array_equal(of_singles[:, member], normal_integers(np, key, places[3:]))
     assert alive
 
 
