@@ -1,0 +1,109 @@
+"""The policy's code by itself: what it computes for networks of all shapes, and what it does not compute for the dead."""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from es_service.noise import NORMAL_STD, Domain, normals, stream_keys
+from es_service.protocol import PolicyShape
+from tests.helpers import random_parameters
+from tests.workers.simd.test_episodes import WIDTHS, targets
+from workers.simd.code import Code, module
+from workers.simd.kernel import load_compiled
+from workers.simd.network import Network, plan, policy_function
+from workers.simd.noise import fill_function
+from workers.simd.target import Target
+from workers.simd.words import aligned
+
+SIGMA = 0.1
+UNTOUCHED = 7.0
+
+
+def run(
+    network: Network, target: Target, folder: Path, centre_D: np.ndarray, x: np.ndarray, alive: np.ndarray, keys: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """(actions [lane, output], hidden room after them) of a block of members; of the centre for keys None."""
+    noisy = keys is not None
+    arguments = ["x", "alive", "centre", "keys", "places", "noise", "hidden", "action"]
+    code = Code("inside", [*(f"ptr noalias %{name}" for name in arguments), "float %unit"], network.width)
+    fill = fill_function(network.vectors, len(network.places) - network.vectors, network.width)
+    if noisy:
+        code.do("call void @fill(ptr %keys, ptr %places, ptr %noise)")
+    given = "ptr %noise, float %unit, " if noisy else ""
+    code.do(f"call void @policy(ptr %x, ptr %alive, ptr %centre, {given}ptr %hidden, ptr %action)")
+    functions = [fill, policy_function(network, noisy=noisy), code]
+    address, alive_code = load_compiled(f"policy {network} {noisy}", lambda: module(functions), target, folder)
+    lanes = aligned((network.inputs if not network.hidden else network.hidden[0].inputs, network.width))
+    lanes.view(np.float32)[:] = x.T
+    hidden = aligned((max(1, network.hidden_vectors), network.width)).view(np.float32)
+    hidden[:] = UNTOUCHED
+    action = aligned((network.outputs, network.width))
+    given_keys = keys if noisy else np.zeros((1, 4), np.uint32)
+    noise = np.zeros(network.noise_bytes, np.int8)
+    arrays = (lanes, alive, network.pack(centre_D), given_keys, network.places, noise, hidden, action)
+    call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * len(arrays), ctypes.c_float)(address)
+    call(*(array.ctypes.data for array in arrays), SIGMA / NORMAL_STD)
+    assert alive_code
+    return action.view(np.float32).T.copy(), hidden.reshape(-1)
+
+
+def actions_of(shape: PolicyShape, parameters_D: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The twin, in float64."""
+    values, start = x.astype(float), 0
+    for inputs, outputs in shape.layers:
+        weights = parameters_D[start : start + inputs * outputs].reshape(inputs, outputs)
+        biases = parameters_D[start + inputs * outputs :][:outputs]
+        values, start = np.tanh(values @ weights + biases), start + (inputs + 1) * outputs
+    return values
+
+
+@pytest.mark.parametrize("kind", WIDTHS)
+@pytest.mark.parametrize(
+    "widths", [(3, 1), (2, 16, 2), (5, 64, 17), (4, 33, 48, 5), (29, 20, 8), (1, 1, 1), (7, 144, 3), (6, 40)]
+)
+def test_actions_are_those_of_members_with_their_own_weights(widths: tuple[int, ...], kind: str, tmp_path: Path):
+    (target,) = [one for one in targets() if one.kind == kind] or [None]
+    if target is None:
+        pytest.skip(f"no {kind}")
+    shape = PolicyShape(widths)
+    centre_D = random_parameters(4, shape.parameters, 0.5)
+    x = np.random.default_rng(0).normal(size=(target.width, widths[0])).astype(np.float32)
+    keys = stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(target.width // 2))
+    network = plan(shape, np.arange(widths[0]), target.width)
+    alive = np.ones(target.width, np.int32)
+    found, _ = run(network, target, tmp_path, centre_D, x, alive, keys)
+    for member in range(target.width):
+        noise_D = normals(keys[member // 2], shape.parameters)
+        weights_D = centre_D + (1 - 2 * (member % 2)) * SIGMA * noise_D.astype(float)
+        np.testing.assert_allclose(found[member], actions_of(shape, weights_D, x[member]), atol=3e-6)
+    found, _ = run(network, target, tmp_path, centre_D, x, alive, None)
+    np.testing.assert_allclose(found, actions_of(shape, centre_D.astype(float), x), atol=3e-6)
+
+
+@pytest.mark.parametrize("noisy", [True, False])
+def test_the_dead_cost_nothing(noisy: bool, tmp_path: Path):
+    """Hidden layers of four neighbours who are all dead are not computed, and the others' actions are what they were."""
+    target = next(iter(targets()), None)
+    if target is None:
+        pytest.skip("no vectors")
+    shape = PolicyShape((3, 64, 64, 2))
+    network = plan(shape, np.arange(3), target.width)
+    centre_D, x = random_parameters(4, shape.parameters, 0.5), np.ones((target.width, 3), np.float32)
+    keys = stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(target.width // 2)) if noisy else None
+    alive = np.ones(target.width, np.int32)
+    everyone, _ = run(network, target, tmp_path, centre_D, x, alive, keys)
+    alive[4:] = 0
+    alive[target.width - 1] = 1  # who keeps its neighbours company
+    found, room = run(network, target, tmp_path, centre_D, x, alive, keys)
+    np.testing.assert_array_equal(found[:4], everyone[:4])
+    np.testing.assert_array_equal(found[-1], everyone[-1])
+    # That of the first is used again, for what the last one sees.
+    second_layer = room[room.size // 2 :].reshape(target.width, -1)
+    assert (second_layer[4:-4] == UNTOUCHED).all()
+    assert (second_layer[:4] != UNTOUCHED).any(axis=1).all()
+    assert (second_layer[-4:] != UNTOUCHED).any(axis=1).all()
