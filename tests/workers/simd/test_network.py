@@ -1,4 +1,4 @@
-"""The policy's code by itself: what it computes for networks of all shapes, and what it does not compute for the dead."""
+"""The policy's code by itself: what it computes for networks of all shapes, and what it leaves out for the dead."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_actions_are_those_of_members_with_their_own_weights(widths: tuple[int, 
 
 @pytest.mark.parametrize("noisy", [True, False])
 def test_the_dead_cost_nothing(noisy: bool, tmp_path: Path):
-    """Hidden layers of four neighbours who are all dead are not computed, and the others' actions are what they were."""
+    """Hidden layers of four neighbours all dead are not computed, and the others' actions are what they were."""
     target = next(iter(targets()), None)
     if target is None:
         pytest.skip("no vectors")
