@@ -1,11 +1,14 @@
 """Code of the policy: what each lane's member does with what it sees, for a block of as many members as vectors have
 lanes, two by two the + and - of a pair.
 
-A member's weights are made where they are used: centre +- unit k, each product and sum rounded as it stands here. The
-centre is shared by all members and stays in cache; the noise k = 2 j + 1 is a byte j a weight and shared by a pair.
+A member's weights are made where they are used: centre +- unit k. The centre is shared by all members and stays in
+cache; the noise k = 2 j + 1 is a byte j a weight and shared by a pair. In float32, with fused products:
 
-In hidden layers vectors go along outputs, member by member; in the last one, which has few outputs, along members.
-Every output is one sum in the order of the inputs, beginning with the bias, whatever the width.
+    + is (centre + unit) + 2 unit j and - is 2 centre less that, its mirror image
+
+In hidden layers vectors go along outputs, member by member; in the last one, which has few outputs, along members, each
+with a unit of its own sign. Every output is one sum in the order of the inputs, beginning with the bias, whatever the
+width.
 """
 
 from __future__ import annotations
@@ -170,7 +173,7 @@ def _shared(code: Code, layer: Layer, x: View, out: View) -> None:
 
 
 def _noisy(code: Code, network: Network, layer: Layer, x: View, out: View) -> None:
-    """out = tanh((centre +- unit k) x), for some pairs at once."""
+    """out = tanh((centre +- unit k) x), for some pairs at once. Additions are what the multipliers leave time for."""
     floats = code.vector["f"]
     pairs = min(code.width // 2, max(1, sums_at_once(code.width) // (2 * layer.tile)))
     assert code.width % (2 * pairs) == 0
@@ -184,13 +187,12 @@ def _noisy(code: Code, network: Network, layer: Layer, x: View, out: View) -> No
             """Of each pair, those of + and -."""
             at = code.index((weights, 1), (row, layer.tile), (v, 1))
             centre = code.load(floats, "%centre", at)
+            moved, doubled = (code.value(f"fadd {floats} {centre}, {one}") for one in (unit, centre))
             found = []
             for pair in range(pairs):
                 place = code.index((first_pair, network.vectors), (pair * network.vectors, 1), (at, 1))
-                moved = code.fma(_noise(code, "%noise", place), twice, unit)
-                found.append(
-                    (code.value(f"fadd {floats} {centre}, {moved}"), code.value(f"fsub {floats} {centre}, {moved}"))
-                )
+                plus = code.fma(_noise(code, "%noise", place), twice, moved)
+                found.append((plus, code.value(f"fsub {floats} {doubled}, {plus}")))
             return found
 
         def add(row: str, sums: Values) -> Values:
@@ -242,10 +244,8 @@ def _last(code: Code, network: Network, x: str, outputs: range, *, noisy: bool) 
 
         def weights(row: str | int) -> Values:
             js = [_noise(code, noise, code.index((row, count), (output, 1))) for output in outputs]
-            return [
-                code.value(f"fadd {floats} {one}, {code.fma(j, twice, unit)}")
-                for one, j in zip(centre(row), js, strict=True)
-            ]
+            moved = [code.value(f"fadd {floats} {one}, {unit}") for one in centre(row)]
+            return [code.fma(j, twice, one) for j, one in zip(js, moved, strict=True)]
 
     def add(row: str, sums: Values) -> Values:
         seen = code.load(floats, x, row)
