@@ -53,6 +53,9 @@ METHODS: dict[str, tuple[str, ...]] = {
 SEEDS = range(5)
 RECORDED = {500_000_000: "point_maze", 5_000_000_000: "point_maze_5g"}
 """Environment steps of a run -> name of its results."""
+STEPS_AT_LEAST = 25_000
+"""Environment steps that a generation counts for when a run is to end; it takes 31,600 until episodes begin to end at
+the goal. A search that stays there would need five times the generations of the others."""
 CHAMBER_EDGES = (-0.495, 0.205)
 """y that separates the first chamber (start), the second (dead end) and the third (goal): the middles of the walls."""
 SOLVED = -30.0
@@ -115,7 +118,7 @@ def run_one(method: str, seed: int, env_steps: int, settings: tuple[str, ...], e
     if not engine:
         os.environ.update(worker_environment(os.environ))  # before JAX is imported
         session._engine = in_this_process  # type: ignore[assignment]
-    budget = [f"budget.env_steps={env_steps}", "budget.generations=100_000_000"]
+    budget = [f"budget.env_steps={env_steps}", f"budget.generations={env_steps // STEPS_AT_LEAST}"]
     config = api.load_config(
         CONFIGS / f"point_maze_{method.split()[0]}.yaml",
         [*budget, "compute.engine=inline", "compute.workers=1", f"seed={seed}", *METHODS[method], *settings],
