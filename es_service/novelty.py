@@ -34,7 +34,7 @@ BLOCK_ENTRIES = 256
 @dataclass
 class _Room:
     """Arrays longer than what they hold. An entry is written once, behind all others, so archives that are the first
-    entries of the same room never see a change, and a generation costs nothing of what came before."""
+    entries of the same room never see a change, and a generation copies nothing of what came before."""
 
     descriptor_B: NDArray[np.float64]
     generation: NDArray[np.int64]
@@ -54,7 +54,7 @@ class NoveltyArchive:
     tree: KDTree | None = None
     """Over the first entries, a multiple of TREE_STEP of them; follows from `descriptor_N_B`."""
     room: _Room | None = None
-    """What the arrays are the beginning of, if there is space behind them."""
+    """What the arrays are the beginning of."""
 
     @property
     def size(self) -> int:
@@ -70,6 +70,8 @@ def empty_archive(dimensions: int) -> NoveltyArchive:
 def extended(archive: NoveltyArchive, descriptor_B: ArrayLike, generation: int, member: int) -> NoveltyArchive:
     """The archive with one entry more; the old one stays as it is."""
     size, room = archive.size, archive.room
+    if np.shape(descriptor_B) != archive.descriptor_N_B.shape[1:]:
+        raise ValueError(f"a descriptor of {np.shape(descriptor_B)} for an archive of {archive.descriptor_N_B.shape}")
     if room is None or room.used != size or room.used == room.generation.size:
         room = _copied(archive)
     room.descriptor_B[size], room.generation[size], room.member[size] = descriptor_B, generation, member

@@ -9,10 +9,13 @@ import pickle
 import socket
 import struct
 from collections import deque
+from contextlib import suppress
 from typing import Any
 
 _LENGTH = struct.Struct("!Q")
 _READ_BYTES = 1 << 18
+BUFFER_BYTES = 1 << 20
+"""What sockets are asked to hold, so that most messages are sent at once; the system may grant less."""
 
 
 def framed(message: Any) -> bytes:
@@ -67,7 +70,7 @@ class Channel:
         self.flush()
 
     def flush(self) -> None:
-        """Send as much as the socket takes. To one that broke nothing is sent; `receive` tells."""
+        """Send as much as the socket takes. If that fails the connection is at an end, as `receive` tells."""
         try:
             while self._to_send:
                 sent = self._end.send(self._to_send[0])
@@ -77,11 +80,22 @@ class Channel:
                     self._to_send.popleft()
         except BlockingIOError:
             pass
-        except OSError:
+        except OSError:  # perhaps in the middle of a message, so that nothing more can be said
             self._to_send.clear()
+            with suppress(OSError):
+                self._end.shutdown(socket.SHUT_RDWR)
+
+    @property
+    def is_halfway(self) -> bool:
+        """Whether a message has begun to come."""
+        return bool(self._read)
 
     def receive(self) -> tuple[list[Any], bool]:
-        """(whole messages that have come, whether there may be more): no more once the other end is closed."""
+        """(whole messages that have come, whether there may be more): no more once the other end is closed.
+
+        Raises:
+            Exception: whatever unpickling a message raises.
+        """
         is_open = True
         try:
             while data := self._end.recv(_READ_BYTES):

@@ -35,15 +35,23 @@ def main(descriptor: int, parent: int) -> None:
     with socket.socket(fileno=descriptor) as control:
         try:
             run_chunk = _make_run_chunk(receive(control))
-            while True:
-                _, descriptors, _, _ = socket.recv_fds(control, 1, 1, socket.MSG_CMSG_CLOEXEC)
-                if not descriptors:
-                    break
-                worker = socket.socket(fileno=descriptors[0])
-                threading.Thread(target=_work, args=(worker, run_chunk), daemon=True).start()
-        except (EOFError, OSError):
-            pass
+            while (given := _descriptor(control)) is not None:
+                threading.Thread(target=_work, args=(given, run_chunk), daemon=True).start()
+        except Exception:
+            traceback.print_exc()
     os._exit(0)  # without waiting for threads, which may be in the middle of a chunk
+
+
+def _descriptor(control: socket.socket) -> int | None:
+    """Of the next worker's socket; None when the parent has closed its end.
+
+    Raises:
+        OSError: there is none to be had.
+    """
+    byte, descriptors, _, _ = socket.recv_fds(control, 1, 1, socket.MSG_CMSG_CLOEXEC)
+    if byte and not descriptors:
+        raise OSError("no file descriptor for a worker's socket")
+    return descriptors[0] if descriptors else None
 
 
 def _make_run_chunk(spec: Any) -> Callable[..., Any] | str:
@@ -56,11 +64,15 @@ def _make_run_chunk(spec: Any) -> Callable[..., Any] | str:
         return traceback.format_exc()
 
 
-def _work(parent: socket.socket, run_chunk: Callable[..., Any] | str) -> None:
-    try:
-        _serve(parent, run_chunk)
-    except (EOFError, OSError):
-        parent.close()  # whether others of this process go on is the parent's business
+def _work(descriptor: int, run_chunk: Callable[..., Any] | str) -> None:
+    """A worker until the parent closes its end. However it ends otherwise, the parent sees that and why."""
+    with socket.socket(fileno=descriptor) as parent:
+        try:
+            _serve(parent, run_chunk)
+        except (EOFError, ConnectionError):
+            pass
+        except Exception:
+            traceback.print_exc()
 
 
 def _serve(parent: socket.socket, run_chunk: Callable[..., Any] | str) -> None:
@@ -77,7 +89,7 @@ def _serve(parent: socket.socket, run_chunk: Callable[..., Any] | str) -> None:
                 try:
                     assert centre is not None, "the engine sends the centre first"
                     answer = ("result", key, attempt, run_chunk(centre, chunk))
-                except Exception:
+                except BaseException:  # sys.exit in an environment, too
                     answer = ("failure", key, attempt, traceback.format_exc())
                 parent.sendall(framed(answer))
 

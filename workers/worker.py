@@ -122,7 +122,7 @@ def _moments(host: Episodes, shift_O: Any) -> Moments:
     """Moments of all counted observations; an episode whose sums are not finite is left out."""
     size = host.shifted_sum_O.shape[-1]
     sums, squares = (x.reshape(-1, size).astype(np.float64) for x in (host.shifted_sum_O, host.shifted_square_sum_O))
-    finite = np.isfinite(sums + squares).all(axis=1)
+    finite = (np.isfinite(sums) & np.isfinite(squares)).all(axis=1)
     count = float(host.steps.reshape(-1)[finite].sum())
     if count == 0.0:
         return Moments(0.0, np.zeros(size), np.zeros(size))

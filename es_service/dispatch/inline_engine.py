@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Hashable
 from contextlib import ExitStack
@@ -24,7 +25,10 @@ from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
 from es_service.protocol import Centre, Chunk, WorkerSpec, worker_environment
-from es_service.wire import Channel, framed
+from es_service.wire import BUFFER_BYTES, Channel, framed
+
+PIECE_S = 0.1
+"""Longest wait for the next piece of a message that has begun to come."""
 
 
 def inline_engine(
@@ -81,7 +85,7 @@ class ChildProcesses:
         """Start a child and tell it the constants of the run; or have the one that there is start a thread."""
         with ExitStack() as undo:
             try:
-                ours, theirs = map(undo.enter_context, socket.socketpair())
+                ours, theirs = map(undo.enter_context, _socket_pair())
                 running = next(iter(self._workers.values()), None) if self._threads else None
                 child = running.child if running is not None else _start_child(self._spec, undo)
                 socket.send_fds(child.control, [b"w"], [theirs.fileno()])
@@ -90,9 +94,7 @@ class ChildProcesses:
                 return
             undo.pop_all()
         theirs.close()
-        self._workers[worker] = _Worker(child, Channel(ours))
-        self._by_descriptor[ours.fileno()] = worker
-        self._poll.register(ours, select.POLLIN)
+        self._add(worker, child, ours)
 
     def kill(self, worker: int) -> None:
         """Kill a worker's child, wait for it and free its descriptors; its other workers are lost."""
@@ -119,10 +121,13 @@ class ChildProcesses:
         until = time.monotonic() + timeout_s
         while not self._ready:
             wait_s = max(0.0, until - time.monotonic())
+            is_coming = False
             for descriptor, events in self._poll.poll(wait_s * 1000.0):
                 if descriptor in self._by_descriptor:  # else lost a moment ago, with another
-                    self._serve(self._by_descriptor[descriptor], events)
-            if not wait_s and not self._ready:
+                    is_coming |= self._serve(self._by_descriptor[descriptor], events)
+            if is_coming:  # a large message comes in pieces, and counts as there with the first
+                until = max(until, time.monotonic() + PIECE_S)
+            elif not wait_s and not self._ready:
                 return None
         return self._ready.popleft()
 
@@ -133,31 +138,46 @@ class ChildProcesses:
         for worker in list(self._workers):
             self.kill(worker)
 
+    def _add(self, number: int, child: _Child, ours: socket.socket) -> None:
+        self._workers[number] = _Worker(child, Channel(ours))
+        self._by_descriptor[ours.fileno()] = number
+        self._poll.register(ours, select.POLLIN)
+
     def _watch(self, channel: Channel) -> None:
         self._poll.modify(channel, select.POLLIN | (select.POLLOUT if channel.is_full else 0))
 
-    def _serve(self, number: int, events: int) -> None:
-        """Read what a worker says, write what waits for it."""
+    def _serve(self, number: int, events: int) -> bool:
+        """Write what waits for a worker, read what it says; whether it is in the middle of a message."""
         worker = self._workers[number]
         if events & select.POLLOUT:
             worker.channel.flush()
             self._watch(worker.channel)
         if not events & ~select.POLLOUT:
-            return
-        messages, is_open = worker.channel.receive()
-        for said in messages:
-            match said:
-                case ("up",):
-                    self._ready.append(WorkerUp(number))
-                case ("result", key, attempt, result):
-                    self._ready.append(Answer(number, key, attempt, result))
-                case ("failure", key, attempt, text):
-                    self._ready.append(Failure(number, key, attempt, text))
-                case ("broken", text):
-                    self._lose(worker.child, text)
-                    return
-        if not is_open:
-            self._lose(worker.child)
+            return False
+        if (wrong := self._hear(number)) is not None:
+            self._lose(worker.child, wrong)
+            return False
+        return worker.channel.is_halfway
+
+    def _hear(self, number: int) -> str | None:
+        """Read what a worker has said. If that was the end of it: what was wrong, "" if it does not say."""
+        try:
+            messages, is_open = self._workers[number].channel.receive()
+            for said in messages:
+                match said:
+                    case ("up",):
+                        self._ready.append(WorkerUp(number))
+                    case ("result", key, attempt, result):
+                        self._ready.append(Answer(number, key, attempt, result))
+                    case ("failure", key, attempt, text):
+                        self._ready.append(Failure(number, key, attempt, text))
+                    case ("broken", text):
+                        return text
+                    case _:
+                        return f"it said {said!r}"
+        except Exception:  # of its class, if what it said is not what was written
+            return traceback.format_exc()
+        return None if is_open else ""
 
     def _forget(self, number: int) -> _Child:
         worker = self._workers.pop(number)
@@ -167,9 +187,10 @@ class ChildProcesses:
         return worker.child
 
     def _lose(self, child: _Child, reason: str = "", *, bystanders: bool = False) -> None:
-        """Kill a child for good, and report those of its workers lost that are not forgotten."""
+        """Kill a child for good, and report those of its workers lost that are not forgotten, after what they said."""
         numbers = [number for number, worker in self._workers.items() if worker.child is child]
         for number in numbers:
+            self._hear(number)
             self._forget(number)
         how = _end(child, numbers)
         self._ready.extend(WorkerLost(number, reason or how, bystander=bystanders) for number in numbers)
@@ -194,7 +215,7 @@ def _start_child(spec: bytes, undo: ExitStack) -> _Child:
     environment["PYTHONSAFEPATH"] = "1"
     environment["PYTHONPATH"] = os.pathsep.join(path or os.getcwd() for path in sys.path)
     undo.enter_context(log := tempfile.TemporaryFile())  # noqa: SIM115
-    ours, theirs = socket.socketpair()
+    ours, theirs = _socket_pair()
     undo.enter_context(ours)
     with theirs:
         process = subprocess.Popen(
@@ -209,4 +230,14 @@ def _start_child(spec: bytes, undo: ExitStack) -> _Child:
     undo.callback(process.wait)
     undo.callback(process.kill)
     ours.sendall(spec)
+    ours.setblocking(False)  # a child that does not take its workers' sockets is none that can be started
     return _Child(process, log, ours)
+
+
+def _socket_pair() -> tuple[socket.socket, socket.socket]:
+    """Sockets that wait, whatever the default, and hold much."""
+    pair = socket.socketpair()
+    for end in pair:
+        end.setblocking(True)
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+    return pair

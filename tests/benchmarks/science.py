@@ -19,7 +19,7 @@ import gzip
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from multiprocessing import get_context
@@ -31,13 +31,14 @@ import pandas as pd
 
 from es_service import api, session
 from es_service.config.model import RunConfig, worker_spec
+from es_service.errors import Interrupted
 from es_service.platform_info import cpu_kind
 from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts, worker_environment
 from es_service.run_view import Policy, Run
 from tests.benchmarks import science_picture
 
 RESULTS = Path(__file__).parent / "results"
-RUNS = Path("runs") / "science"
+RUNS = Path(__file__).parents[2] / "runs" / "science"
 """Folder of the run folders that are not finished."""
 CONFIGS = Path(__file__).parents[2] / "configs"
 METHODS: dict[str, tuple[str, ...]] = {
@@ -98,35 +99,39 @@ class InThisProcess:
 
     counts = DispatchCounts(workers=1)
 
-    def __init__(self, config: RunConfig) -> None:
+    def __init__(self, config: RunConfig, should_stop: Callable[[], int | None]) -> None:
         from workers.worker import make_worker
 
         self._run_chunk = make_worker(worker_spec(config, session.task_of(config)))
+        self._should_stop = should_stop
 
     def evaluate(self, centre: Centre, chunks: Sequence[Chunk]) -> list[ChunkResult]:
+        if (number := self._should_stop()) is not None:
+            raise Interrupted(number)
         return [self._run_chunk(centre, chunk) for chunk in chunks]
 
 
 @contextmanager
-def in_this_process(config: RunConfig, *_: object) -> Iterator[InThisProcess]:
+def in_this_process(config: RunConfig, should_stop: Callable[[], int | None], _: object) -> Iterator[InThisProcess]:
     """In the place of `session._engine`."""
-    yield InThisProcess(config)
+    yield InThisProcess(config, should_stop)
+
+
+def folder_of(method: str, seed: int, env_steps: int, settings: tuple[str, ...]) -> Path:
+    """Of a run that is not finished, or not recorded."""
+    return RUNS / "_".join([*method.split(), str(seed), str(env_steps), *settings]).replace("/", "_")
 
 
 def run_one(method: str, seed: int, env_steps: int, settings: tuple[str, ...], engine: bool) -> dict[str, Any]:
     """One run from its config, or from where it was interrupted, to what is kept of it."""
     if not engine:
-        os.environ.update(worker_environment(os.environ))  # before JAX is imported
         session._engine = in_this_process  # type: ignore[assignment]
     budget = [f"budget.env_steps={env_steps}", f"budget.generations={env_steps // STEPS_AT_LEAST}"]
     config = api.load_config(
         CONFIGS / f"point_maze_{method.split()[0]}.yaml",
         [*budget, "compute.engine=inline", "compute.workers=1", f"seed={seed}", *METHODS[method], *settings],
     )
-    folder = RUNS / "_".join([*method.split(), str(seed), str(env_steps), *settings]).replace("/", "_")
-    found = _read(api.run_or_resume(config, folder).run, method, seed)
-    shutil.rmtree(folder)
-    return found
+    return _read(api.run_or_resume(config, folder_of(method, seed, env_steps, settings)).run, method, seed)
 
 
 def _read(run: Run, method: str, seed: int) -> dict[str, Any]:
@@ -207,21 +212,32 @@ def main() -> None:
     kept = RESULTS / f"{name}_runs.jsonl.gz"
     known = set() if trial else {(one["row"]["method"], one["row"]["seed"]) for one in kept_runs(kept)}
     RUNS.mkdir(parents=True, exist_ok=True)
+    if not arguments.engine:
+        cleaned = worker_environment(os.environ)
+        os.environ.clear()
+        os.environ.update(cleaned)  # the processes below import JAX with it
+    found = []
     cores = len(os.sched_getaffinity(0))
     with ProcessPoolExecutor(cores, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
-        pending = [
-            pool.submit(run_one, method, seed, arguments.env_steps, tuple(arguments.set), arguments.engine)
+        settings = tuple(arguments.set)
+        pending = {
+            pool.submit(run_one, method, seed, arguments.env_steps, settings, arguments.engine): (method, seed)
             for seed in arguments.seeds
             for method in arguments.methods
             if (method, seed) not in known
-        ]
-        found = []
-        for future in as_completed(pending):
-            found.append(future.result())
-            print(json.dumps(found[-1]["row"]), flush=True)
-            if not trial:
-                with gzip.open(kept, "at") as file:
-                    file.write(json.dumps(found[-1], separators=(",", ":")) + "\n")
+        }
+        try:
+            for future in as_completed(pending):
+                found.append(future.result())
+                print(json.dumps(found[-1]["row"]), flush=True)
+                if not trial:
+                    with gzip.open(kept, "at") as file:
+                        file.write(json.dumps(found[-1], separators=(",", ":")) + "\n")
+                shutil.rmtree(folder_of(*pending[future], arguments.env_steps, settings))
+        except BaseException:  # what runs now is in its folder, to go on from; nothing else begins
+            for future in pending:
+                future.cancel()
+            raise
     found = found if trial else kept_runs(kept)
     table = pd.DataFrame([one["row"] for one in found])
     print(quartiles(table).to_string())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 
 import pytest
 from hypothesis import given
@@ -53,7 +54,9 @@ def test_a_channel_never_waits_and_loses_nothing(ends):
     echoes, came = [], []
     thread = threading.Thread(target=other_end)
     thread.start()
+    until = time.monotonic() + 10.0
     while not came:
+        assert time.monotonic() < until
         channel.flush()
         came = channel.receive()[0]
     thread.join()

@@ -27,7 +27,7 @@ LOG1P = (0.3333333134651184, -0.2500081956386566, 0.20001226663589478, -0.166233
 """(log(1 + x) - x + x^2 / 2) / x^3 in x, sqrt(1/2) <= 1 + x <= sqrt(2)."""
 TANH = ((1.0, 0.13383980095386505, 0.0034989959094673395, 2.066126216959674e-05, 1.3419821698335e-08),
         (1.0, 0.4671730101108551, 0.025890206918120384, 0.00032910381560213864, 7.804729307281377e-07))  # fmt: skip
-"""(tanh x) / x as a fraction in x^2, |x| <= 9, where tanh is 1 to all bits."""
+"""(tanh x) / x as a fraction in x^2, |x| <= 9, beyond which tanh is 1 but for a last bit."""
 ROUNDER = 1.5 * 2**23
 """x + ROUNDER - ROUNDER is x rounded to a whole number, and the lowest bits of x + ROUNDER are that number."""
 HALF_PI = (1.5707963705062866, -4.371139000186241e-08, -1.7151245100058784e-15)

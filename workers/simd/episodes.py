@@ -79,7 +79,7 @@ class EpisodeKernel:
         assert [array.dtype.char for array in arrays] == list("IIIfIIbI")
         assert all(array.flags.c_contiguous for array in arrays)
         assert weights.ctypes.data % ALIGNMENT == 0
-        assert weights.size >= len(self.network.places)
+        assert weights.shape == (self.network.rows, width)
         pointers = [array.ctypes.data for array in arrays]
         self._call(*pointers, np.float32(unit), blocks, self.spec.episode_steps)
         # An episode's words are the last of a carry's.

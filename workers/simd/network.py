@@ -2,13 +2,14 @@
 lanes, two by two the + and - of a pair.
 
 A member's weights are made where they are used: centre +- unit k. The centre is shared by all members and stays in
-cache; the noise k = 2 j + 1 is a byte j a weight and shared by a pair. In float32, with fused products:
+cache; the noise k = 2 j + 1 is a byte j a weight. In float32, with fused products:
 
-    + is (centre + unit) + 2 unit j and - is 2 centre less that, its mirror image
+hidden layers: vectors go along outputs, member by member. A pair shares its bytes; the weight of + is
+    (centre + unit) + 2 unit j, that of - is 2 centre less it: its mirror image up to a rounding.
+last layer: few outputs, so vectors go along members, each with a byte, and a unit of its sign:
+    (centre +- unit) +- 2 unit j.
 
-In hidden layers vectors go along outputs, member by member; in the last one, which has few outputs, along members, each
-with a unit of its own sign. Every output is one sum in the order of the inputs, beginning with the bias, whatever the
-width.
+Every output is one sum in the order of the inputs, beginning with the bias, whatever the width.
 """
 
 from __future__ import annotations
@@ -66,6 +67,11 @@ class Network(NamedTuple):
         return 2 * self.width * max((layer.tiles * layer.tile for layer in self.hidden), default=0)
 
     @property
+    def rows(self) -> int:
+        """Vectors that all weights take."""
+        return self.vectors - -(len(self.places) - self.vectors) // self.width
+
+    @property
     def noise_bytes(self) -> int:
         """Bytes of the noise of a block of members."""
         return self.width // 2 * self.vectors * self.width + (len(self.places) - self.vectors) * self.width
@@ -74,7 +80,7 @@ class Network(NamedTuple):
         """The vectors of weights, then the single ones, [rows, width]."""
         padded_D = np.concatenate([parameters_D, np.zeros(self.width, np.float32)])
         of_vectors, single = self.places[: self.vectors], self.places[self.vectors :]
-        weights = aligned((self.vectors - -len(single) // self.width, self.width)).view(np.float32)
+        weights = aligned((self.rows, self.width)).view(np.float32)
         weights[: self.vectors] = padded_D[of_vectors[:, None] + np.arange(self.width, dtype=np.uint32)]
         weights.reshape(-1)[self.vectors * self.width :][: len(single)] = padded_D[single]
         return weights

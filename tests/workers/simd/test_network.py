@@ -37,7 +37,9 @@ def run(
     given = "ptr %noise, float %unit, " if noisy else ""
     code.do(f"call void @policy(ptr %x, ptr %alive, ptr %centre, {given}ptr %hidden, ptr %action)")
     functions = [fill, policy_function(network, noisy=noisy), code]
-    address, alive_code = load_compiled(f"policy {network} {noisy}", lambda: module(functions), target, folder)
+    address, alive_code = load_compiled(
+        f"policy {network.places.tolist()} {noisy}", lambda: module(functions), target, folder
+    )
     lanes = aligned((network.inputs if not network.hidden else network.hidden[0].inputs, network.width))
     lanes.view(np.float32)[:] = x.T
     hidden = aligned((max(1, network.hidden_vectors), network.width)).view(np.float32)
@@ -63,25 +65,31 @@ def actions_of(shape: PolicyShape, parameters_D: np.ndarray, x: np.ndarray) -> n
 
 
 @pytest.mark.parametrize("kind", WIDTHS)
+@pytest.mark.parametrize("seen", [1, 2])
 @pytest.mark.parametrize(
     "widths", [(3, 1), (2, 16, 2), (5, 64, 17), (4, 33, 48, 5), (29, 20, 8), (1, 1, 1), (7, 144, 3), (6, 40)]
 )
-def test_actions_are_those_of_members_with_their_own_weights(widths: tuple[int, ...], kind: str, tmp_path: Path):
+def test_actions_are_those_of_members_with_their_own_weights(
+    widths: tuple[int, ...], seen: int, kind: str, tmp_path: Path
+):
+    """Of every input, or of every second one, the others being zero."""
     (target,) = [one for one in targets() if one.kind == kind] or [None]
     if target is None:
         pytest.skip(f"no {kind}")
     shape = PolicyShape(widths)
     centre_D = random_parameters(4, shape.parameters, 0.5)
-    x = np.random.default_rng(0).normal(size=(target.width, widths[0])).astype(np.float32)
+    inputs_O = np.arange(0, widths[0], seen)
+    x = np.zeros((target.width, widths[0]), np.float32)
+    x[:, inputs_O] = np.random.default_rng(0).normal(size=(target.width, len(inputs_O)))
     keys = stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(target.width // 2))
-    network = plan(shape, np.arange(widths[0]), target.width)
+    network = plan(shape, inputs_O, target.width)
     alive = np.ones(target.width, np.int32)
-    found, _ = run(network, target, tmp_path, centre_D, x, alive, keys)
+    found, _ = run(network, target, tmp_path, centre_D, x[:, inputs_O], alive, keys)
     for member in range(target.width):
         noise_D = normals(keys[member // 2], shape.parameters)
         weights_D = centre_D + (1 - 2 * (member % 2)) * SIGMA * noise_D.astype(float)
         np.testing.assert_allclose(found[member], actions_of(shape, weights_D, x[member]), atol=3e-6)
-    found, _ = run(network, target, tmp_path, centre_D, x, alive, None)
+    found, _ = run(network, target, tmp_path, centre_D, x[:, inputs_O], alive, None)
     np.testing.assert_allclose(found, actions_of(shape, centre_D.astype(float), x), atol=3e-6)
 
 

@@ -1,0 +1,134 @@
+"""What the inline engine's children may say and do: broken, cut short, out of turn, or all at once."""
+
+from __future__ import annotations
+
+import re
+import signal
+import socket
+import subprocess
+import tempfile
+import threading
+import time
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+import pytest
+
+from es_service.dispatch import inline_engine as inline_module
+from es_service.dispatch.engine import Answer
+from es_service.dispatch.inline_engine import inline_engine
+from es_service.dispatch.messages import Policy, WorkerLost, WorkerUp
+from es_service.errors import EvaluationError
+from es_service.protocol import TrainingChunk
+from es_service.wire import framed
+from tests.helpers import SPEC, centre, random_parameters, spec
+
+FIRST = centre(random_parameters(0))
+CHUNKS = [TrainingChunk(3, chunk_id) for chunk_id in range(2)]
+
+
+@pytest.fixture
+def transport():
+    """Two workers, threads of one child that does nothing, and the ends that should be theirs: in the test's hands."""
+    with tempfile.TemporaryFile() as log, ExitStack() as stack:
+        process = subprocess.Popen(["sleep", "60"], stdout=log, stderr=log)
+        child = inline_module._Child(process, log, stack.enter_context(socket.socket()))
+        transport = inline_module.ChildProcesses(SPEC, threads=True)
+        ends = []
+        for worker in range(2):
+            ours, theirs = inline_module._socket_pair()
+            ends.append(stack.enter_context(theirs))
+            transport._add(worker, child, ours)
+        yield transport, ends
+        transport.close()
+        assert process.wait() == -signal.SIGKILL
+
+
+LARGE = np.arange(1_000_000)
+
+
+def test_an_answer_that_has_begun_to_come_is_there(transport):
+    """Or a driver that was away would look at the clock, and kill a worker in the middle of its answer."""
+    transport, (end, _) = transport
+    frame = framed(("result", "key", 1, LARGE))
+    sender = threading.Thread(target=end.sendall, args=(frame,))
+    sender.start()
+    time.sleep(0.05)
+    message = transport.receive(0.0)
+    sender.join()
+    assert isinstance(message, Answer)
+    np.testing.assert_array_equal(message.result, LARGE)  # type: ignore[arg-type]
+
+
+def test_a_message_that_stops_half_way_keeps_nobody_waiting(transport):
+    transport, (end, other) = transport
+    end.sendall(framed(("up",))[:-2])
+    started = time.monotonic()
+    assert transport.receive(0.0) is None
+    assert time.monotonic() - started < 5.0
+    other.sendall(framed(("up",)))
+    assert transport.receive(1.0) == WorkerUp(1)
+
+
+def test_what_threads_have_said_is_heard_before_they_are_lost_with_another(transport):
+    transport, ends = transport
+    ends[1].sendall(framed(("result", "key", 1, "theirs")))
+    ends[0].close()
+    heard = [transport.receive(1.0) for _ in range(3)]
+    assert heard[0] == Answer(1, "key", 1, "theirs")  # type: ignore[arg-type]
+    assert [message.worker for message in heard[1:] if isinstance(message, WorkerLost)] == [0, 1]
+    assert transport.receive(0.0) is None
+
+
+class Unreadable:
+    """Says how it is to be made again, in vain."""
+
+    def __reduce__(self) -> Any:
+        return int, ("no number",)
+
+
+@pytest.mark.parametrize(
+    ("said", "reason"),
+    [
+        (("broken", "no jax here"), "^no jax here$"),
+        (("result", "key", 1, Unreadable()), r"(?s)Traceback.*invalid literal for int"),
+        (("something", "else"), "it said"),
+    ],
+)
+def test_a_worker_that_says_what_nobody_can_use_is_lost(transport, said, reason):
+    transport, ends = transport
+    ends[1].sendall(framed(said))
+    first, second = transport.receive(1.0), transport.receive(1.0)
+    assert isinstance(first, WorkerLost)
+    assert isinstance(second, WorkerLost)
+    assert re.search(reason, first.reason)
+    assert transport.process_ids() == {}
+
+
+def test_a_worker_that_has_said_its_last_is_lost_while_messages_still_wait_for_it(transport):
+    transport, ends = transport
+    for key in range(40):
+        transport.send(0, centre(np.zeros(100_000, np.float32)), key, 1, CHUNKS[0])
+    assert transport._workers[0].channel.is_full
+    ends[0].shutdown(socket.SHUT_WR)
+    assert isinstance(transport.receive(1.0), WorkerLost)
+
+
+def test_a_default_timeout_of_sockets_is_not_the_workers():
+    socket.setdefaulttimeout(0.001)
+    try:
+        with inline_engine(SPEC, Policy(workers=1)) as engine:
+            engine.evaluate(FIRST, CHUNKS[:2])
+            assert engine.counts.lost_workers == 0
+    finally:
+        socket.setdefaulttimeout(None)
+
+
+def test_an_environment_that_exits_is_a_failure_with_its_traceback():
+    exits = spec(environment="tests.examples.exits:Exits")
+    with (
+        inline_engine(exits, Policy(workers=1, max_failures_in_a_row=1, max_attempts=2)) as engine,
+        pytest.raises(EvaluationError, match=r"(?s)SystemExit.*out of here"),
+    ):
+        engine.evaluate(FIRST, CHUNKS[:1])
