@@ -6,10 +6,10 @@
         --set search.sigma=0.1                         # a trial: printed only
 
 Of runs with the usual seeds, settings and one of the two lengths each finished one becomes a line of
-results/NAME_runs.jsonl.gz, NAME as in RECORDED; those that have one are not repeated (delete the file to begin again),
-those that were interrupted go on where they were. In the end results/NAME.csv, a row per run, and results/NAME.png are
-written from it. One run per core, in one process: nothing is sent, which changes no result and saves a quarter of the
-time (`--engine` runs them as everybody does).
+results/NAME_runs.jsonl.gz, NAME as in RECORDED, and a row of results/NAME.csv; those that have one are not repeated
+(delete the file to begin again), those that were interrupted go on where they were. In the end results/NAME.png is
+drawn. One run per core, in one process: nothing is sent, which changes no result and saves a quarter of the time
+(`--engine` runs them as everybody does).
 """
 
 from __future__ import annotations
@@ -192,6 +192,11 @@ def quartiles(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows).T
 
 
+def table_of(found: Sequence[dict[str, Any]]) -> pd.DataFrame:
+    """A row per run."""
+    return pd.DataFrame([one["row"] for one in found]).astype({"steps_to_minus_30": "Int64"})
+
+
 def kept_runs(kept: Path) -> list[dict[str, Any]]:
     """What is known, in the order of METHODS and seeds."""
     lines = gzip.decompress(kept.read_bytes()).splitlines() if kept.exists() else []
@@ -233,16 +238,16 @@ def main() -> None:
                 if not trial:
                     with gzip.open(kept, "at") as file:
                         file.write(json.dumps(found[-1], separators=(",", ":")) + "\n")
+                    table_of(kept_runs(kept)).to_csv(RESULTS / f"{name}.csv", index=False, lineterminator="\n")
                 shutil.rmtree(folder_of(*pending[future], arguments.env_steps, settings))
         except BaseException:  # what runs now is in its folder, to go on from; nothing else begins
             for future in pending:
                 future.cancel()
             raise
     found = found if trial else kept_runs(kept)
-    table = pd.DataFrame([one["row"] for one in found])
-    print(quartiles(table).to_string())
+    print(quartiles(table_of(found)).to_string())
     if not trial:
-        table.astype({"steps_to_minus_30": "Int64"}).to_csv(RESULTS / f"{name}.csv", index=False, lineterminator="\n")
+        table_of(found).to_csv(RESULTS / f"{name}.csv", index=False, lineterminator="\n")
         science_picture.draw(found, RESULTS / f"{name}.png")
 
 
