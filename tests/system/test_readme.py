@@ -45,13 +45,14 @@ def test_every_command_and_every_line_of_python_works(folder):
 
 
 def test_exported_policies_replayed_by_the_readme_s_lines_return_what_the_run_says(folder, monkeypatch):
-    """From the corner, so that there is no luck in an episode. Needs the commands above."""
+    """From the corner, so that there is no luck in an episode: but for last bits, which 200 steps add up. Needs the
+    commands above."""
     (code,) = [block for block in blocks("python") if "policies.npz" in block]
     monkeypatch.chdir(folder)
     names: dict = {}
     exec(code, names)
     assert len(names["returns"]) >= 8
-    np.testing.assert_allclose(names["returns"], names["file"]["fitness"], atol=1e-3)
+    np.testing.assert_allclose(names["returns"], names["file"]["fitness"], rtol=1e-5, atol=1e-3)
     names["file"].close()
 
 
