@@ -68,23 +68,31 @@ def _mix(x: int) -> int:
     return x ^ (x >> 31)
 
 
-def stream_keys(seed: int, domain: Domain, generation: int, *ids: Any) -> Keys:
+def stream_keys(seed: int, domain: Domain | tuple[Domain, ...], generation: int, *ids: Any) -> Keys:
     """Keys of the streams (seed, domain, generation, *ids); ids are ints or integer arrays that broadcast together.
 
     Returns:
-        uint32 array of the broadcast shape of `ids` + (4,). Streams that differ only in the last field never collide.
+        uint32 array of the broadcast shape of `ids` + (4,), with an axis in front for several domains. Streams that
+        differ only in the last field never collide.
     """
-    prefix = 0
-    for field in (int(seed), int(domain), int(generation)):
-        if not 0 <= field <= _MASK:
-            raise OverflowError(f"{field} is not a field of 64 bits")
-        prefix = _mix((prefix ^ field) + int(_GOLDEN) & _MASK)
-    state = np.full((1,), prefix, np.uint64)  # NumPy warns where a scalar wraps around, but not where an array does
+    domains = domain if isinstance(domain, tuple) else (domain,)
+    # An axis of domains always: NumPy warns where a scalar wraps around, but not where an array does.
+    state = np.array([_prefix(seed, one, generation) for one in domains], np.uint64)
+    state = state.reshape(-1, *[1] * max(map(np.ndim, ids), default=0))
     for field in ids:
         state = _mix64((state ^ np.asarray(field, np.uint64)) + _GOLDEN)
     halves = _mix64(state[..., None] + _HALVES)
     words = halves.astype("<u8", copy=False).view("<u4")  # the lower half of each comes first
-    return words if any(map(np.ndim, ids)) else words[0]
+    return words if isinstance(domain, tuple) else words[0]
+
+
+def _prefix(seed: int, domain: Domain, generation: int) -> int:
+    state = 0
+    for field in (int(seed), int(domain), int(generation)):
+        if not 0 <= field <= _MASK:
+            raise OverflowError(f"{field} is not a field of 64 bits")
+        state = _mix((state ^ field) + int(_GOLDEN) & _MASK)
+    return state
 
 
 def hash_words(key: Any, coordinate: Any) -> tuple[Any, Any]:

@@ -47,8 +47,7 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
             centre.observation_mean_O,
             centre.observation_std_O,
             stream_keys(spec.seed, Domain.PARAMETER_NOISE, chunk.generation, pairs_P),
-            episode_keys(spec, Domain.TRAINING_RESET, chunk.generation, pairs_P),
-            episode_keys(spec, Domain.ACTION_NOISE, chunk.generation, pairs_P),
+            *episode_keys(spec, chunk.generation, pairs_P),
         )
         return _training_result(episodes, centre.observation_mean_O)
 
@@ -79,11 +78,13 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
     return run_chunk
 
 
-def episode_keys(spec: WorkerSpec, domain: Domain, generation: int, pairs_P: Any) -> Keys:
-    """Stream keys of training episodes, axes [P, S, E, 4]; with common random numbers both signs have the same."""
+def episode_keys(spec: WorkerSpec, generation: int, pairs_P: Any) -> Keys:
+    """Stream keys of training episodes, axes [resets or action noise, P, S, E, 4]; with common random numbers both
+    signs have the same."""
     sign_S = np.zeros(2, int) if spec.common_random_numbers else np.arange(2)
+    domains = (Domain.TRAINING_RESET, Domain.ACTION_NOISE)
     episode_E = np.arange(spec.episodes_per_member)
-    return stream_keys(spec.seed, domain, generation, pairs_P[:, None, None], sign_S[None, :, None], episode_E)
+    return stream_keys(spec.seed, domains, generation, pairs_P[:, None, None], sign_S[None, :, None], episode_E)
 
 
 def _training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:

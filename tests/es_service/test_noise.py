@@ -42,6 +42,10 @@ def test_stream_keys_broadcast_over_ids():
     keys = stream_keys(3, Domain.TRAINING_RESET, 9, pairs, signs, 7)
     assert keys.shape == (5, 2, 4)
     assert keys[4, 1].tolist() == stream_keys(3, Domain.TRAINING_RESET, 9, 4, 1, 7).tolist()
+    both = stream_keys(3, (Domain.ACTION_NOISE, Domain.TRAINING_RESET), 9, pairs, signs, 7)
+    assert both.shape == (2, 5, 2, 4)
+    assert both[1].tolist() == keys.tolist()
+    assert both[0].tolist() == stream_keys(3, Domain.ACTION_NOISE, 9, pairs, signs, 7).tolist()
 
 
 @given(key=st.lists(words, min_size=4, max_size=4), coordinate=words)

@@ -73,7 +73,7 @@ def test_a_compiled_episode_is_brax_s_after_one_step(make_training_rollout):
     shape = PolicyShape((29, 16, 8))
     spec = replace(SPEC, environment="ant_maze", policy=shape, episode_steps=2, action_noise=0.0, observation_clip=None)
     environment = make_environment("ant_maze", {})
-    keys_P_S_E = episode_keys(spec, Domain.TRAINING_RESET, 1, np.arange(8))
+    keys_P_S_E = episode_keys(spec, 1, np.arange(8))[0]
     noise_keys_P = stream_keys(spec.seed, Domain.PARAMETER_NOISE, 1, np.arange(8))
     centre_D = initial_parameters(spec.policy, "unit_columns", 0)
     sigma = 0.3

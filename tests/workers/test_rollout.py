@@ -220,7 +220,7 @@ def test_memory_of_xla_does_not_grow_with_the_length_of_episodes():
         rollout = make_training_rollout(make_environment("point_maze", {}), worker_spec)
         pairs = np.arange(8)
         keys = stream_keys(0, Domain.PARAMETER_NOISE, 1, pairs)
-        episodes = episode_keys(worker_spec, Domain.TRAINING_RESET, 1, pairs)
+        episodes = episode_keys(worker_spec, 1, pairs)[0]
         arguments = (random_parameters(), np.float32(0.1), MEAN, STD, keys, episodes, episodes)
         compiled = jax.jit(rollout).lower(*arguments).compile()
         sizes.append(compiled.memory_analysis().temp_size_in_bytes)
