@@ -142,10 +142,12 @@ def policy_function(network: Network, *, noisy: bool) -> Code:
         else:
             _shared(code, layer, view, out)
         view = out
+    seen = "%x"
     if network.hidden:
-        view = _transposed(code, view, network.inputs, buffers[len(network.hidden) % 2])
+        seen = buffers[len(network.hidden) % 2]
+        _transpose(code, view, network.inputs, seen)
     for first in range(0, network.outputs, OUTPUTS_AT_ONCE):
-        _last(code, network, view.pointer, range(first, min(first + OUTPUTS_AT_ONCE, network.outputs)), noisy=noisy)
+        _last(code, network, seen, range(first, min(first + OUTPUTS_AT_ONCE, network.outputs)), noisy=noisy)
     return code
 
 
@@ -262,8 +264,8 @@ def _last(code: Code, network: Network, x: str, outputs: range, *, noisy: bool) 
         code.store(floats, value, "%action", output)
 
 
-def _transposed(code: Code, x: View, inputs: int, to: str) -> View:
-    """What members give the inputs, [input, lane]; a square of as many inputs as lanes after the other."""
+def _transpose(code: Code, x: View, inputs: int, to: str) -> None:
+    """to = what members give the inputs, [input, lane]; a square of as many inputs as lanes after the other."""
     floats, width = code.vector["f"], code.width
 
     def square(number: str, _: Values) -> Values:
@@ -282,7 +284,6 @@ def _transposed(code: Code, x: View, inputs: int, to: str) -> View:
         return []
 
     code.loop(-(-inputs // width), square)
-    return View(to, 1, width)
 
 
 def _swapped(code: Code, upper: str, lower: str, half: int) -> tuple[str, str]:
