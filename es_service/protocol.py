@@ -189,17 +189,20 @@ class GradientChunk:
 Chunk = TrainingChunk | EvaluationChunk | GradientChunk
 
 
-class ChunkKey(NamedTuple):
-    """What engines, scheduler and workers call a chunk."""
+class TaskKey(NamedTuple):
+    """What engines, scheduler and workers call chunks that travel together."""
 
     phase: int
     """Number of the `evaluate` call, so that a late answer of an earlier call is never taken for one of this call."""
     kind: str
     generation: int
     chunk_id: int
+    """Of the first."""
+    chunks: int
 
     def __str__(self) -> str:
-        return f"{self.kind} {self.chunk_id} of generation {self.generation}"
+        others = f" and {self.chunks - 1} more" if self.chunks > 1 else ""
+        return f"{self.kind} {self.chunk_id}{others} of generation {self.generation}"
 
 
 @dataclass(frozen=True)

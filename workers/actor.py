@@ -8,7 +8,8 @@ from __future__ import annotations
 import os
 import pickle
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 
 from es_service.protocol import Centre, Chunk, ChunkResult, WorkerPlace, worker_environment
 
@@ -25,7 +26,7 @@ class WorkerActor:
             gpus: share of a GPU that Ray has given this actor; 0 for the CPU.
         """
         self._spec, self._index, self._gpus = spec, index, gpus
-        self._run_chunk: Callable[[Centre, Chunk], ChunkResult] | None = None
+        self._run_chunks: Callable[[Centre, Sequence[Chunk]], list[ChunkResult]] | None = None
 
     def __repr__(self) -> str:
         return f"worker-{self._index}@{socket.gethostname()}"
@@ -42,11 +43,11 @@ class WorkerActor:
         for name in set(os.environ) - set(environment):
             del os.environ[name]
         os.environ.update(environment)
-        from workers.worker import make_worker
+        from workers.worker import make_worker, run_chunks
 
-        self._run_chunk = make_worker(pickle.loads(self._spec))
+        self._run_chunks = partial(run_chunks, make_worker(pickle.loads(self._spec)))
 
-    def run(self, centre: bytes, chunk: bytes) -> bytes:
-        """The pickled result of a chunk around a centre."""
-        assert self._run_chunk is not None, "the engine calls build first"
-        return pickle.dumps(self._run_chunk(pickle.loads(centre), pickle.loads(chunk)), pickle.HIGHEST_PROTOCOL)
+    def run(self, centre: bytes, chunks: bytes) -> bytes:
+        """The pickled results of chunks around a centre."""
+        assert self._run_chunks is not None, "the engine calls build first"
+        return pickle.dumps(self._run_chunks(pickle.loads(centre), pickle.loads(chunks)), pickle.HIGHEST_PROTOCOL)

@@ -15,6 +15,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from es_service.wire import framed, receive
@@ -26,17 +27,17 @@ def main(descriptor: int, parent: int) -> None:
     """Serve until the parent closes its end.
 
     Over the socket `descriptor`: the WorkerSpec, then a byte with the descriptor of a socket for each worker. Over a
-    worker's, in: ("centre", Centre) and ("chunk", key, attempt, Chunk). Out: ("broken", text), or ("up",) and then
-    ("result", key, attempt, ChunkResult) or ("failure", key, attempt, text).
+    worker's, in: ("centre", Centre) and ("chunks", key, attempt, [Chunk]). Out: ("broken", text), or ("up",) and then
+    ("results", key, attempt, [ChunkResult]) or ("failure", key, attempt, text).
     """
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # a killed driver leaves no orphans computing
     if os.getppid() != parent:
         return
     with socket.socket(fileno=descriptor) as control:
         try:
-            run_chunk = _make_run_chunk(receive(control))
+            run_chunks = _make_run_chunks(receive(control))
             while (given := _descriptor(control)) is not None:
-                threading.Thread(target=_work, args=(given, run_chunk), daemon=True).start()
+                threading.Thread(target=_work, args=(given, run_chunks), daemon=True).start()
         except Exception:
             traceback.print_exc()
     os._exit(0)  # without waiting for threads, which may be in the middle of a chunk
@@ -54,30 +55,30 @@ def _descriptor(control: socket.socket) -> int | None:
     return descriptors[0] if descriptors else None
 
 
-def _make_run_chunk(spec: Any) -> Callable[..., Any] | str:
+def _make_run_chunks(spec: Any) -> Callable[..., Any] | str:
     """What runs the chunks, or why there is nothing that could."""
     try:
-        from workers.worker import make_worker
+        from workers.worker import make_worker, run_chunks
 
-        return make_worker(spec)
+        return partial(run_chunks, make_worker(spec))
     except Exception:
         return traceback.format_exc()
 
 
-def _work(descriptor: int, run_chunk: Callable[..., Any] | str) -> None:
+def _work(descriptor: int, run_chunks: Callable[..., Any] | str) -> None:
     """A worker until the parent closes its end. However it ends otherwise, the parent sees that and why."""
     with socket.socket(fileno=descriptor) as parent:
         try:
-            _serve(parent, run_chunk)
+            _serve(parent, run_chunks)
         except (EOFError, ConnectionError):
             pass
         except Exception:
             traceback.print_exc()
 
 
-def _serve(parent: socket.socket, run_chunk: Callable[..., Any] | str) -> None:
-    if isinstance(run_chunk, str):
-        parent.sendall(framed(("broken", run_chunk)))
+def _serve(parent: socket.socket, run_chunks: Callable[..., Any] | str) -> None:
+    if isinstance(run_chunks, str):
+        parent.sendall(framed(("broken", run_chunks)))
         return
     parent.sendall(framed(("up",)))
     centre = None
@@ -85,10 +86,10 @@ def _serve(parent: socket.socket, run_chunk: Callable[..., Any] | str) -> None:
         match receive(parent):
             case ("centre", centre):
                 pass
-            case ("chunk", key, attempt, chunk):
+            case ("chunks", key, attempt, chunks):
                 try:
                     assert centre is not None, "the engine sends the centre first"
-                    answer = ("result", key, attempt, run_chunk(centre, chunk))
+                    answer = ("results", key, attempt, run_chunks(centre, chunks))
                 except BaseException:  # sys.exit in an environment, too
                     answer = ("failure", key, attempt, traceback.format_exc())
                 parent.sendall(framed(answer))

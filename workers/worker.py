@@ -5,7 +5,7 @@ A worker holds nothing that a restart would lose: every result is a pure functio
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -76,6 +76,20 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
                 return gradient(chunk)
 
     return run_chunk
+
+
+def run_chunks(
+    run_chunk: Callable[[Centre, Chunk], ChunkResult], centre: Centre, chunks: Sequence[Chunk]
+) -> list[ChunkResult]:
+    """What comes of chunks that travelled together; an error says in which of them it was."""
+    results = []
+    for chunk in chunks:
+        try:
+            results.append(run_chunk(centre, chunk))
+        except BaseException as error:
+            error.add_note(f"in {type(chunk).__name__} {chunk.chunk_id} of generation {chunk.generation}")
+            raise
+    return results
 
 
 def episode_keys(spec: WorkerSpec, generation: int, pairs_P: Any) -> Keys:

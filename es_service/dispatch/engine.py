@@ -6,6 +6,7 @@ introduces them to each other and puts the results in order.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import Generic, Protocol, Self, TypeVar
 from es_service.dispatch import messages, scheduler
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol import Centre, Chunk, ChunkKey, ChunkResult, DispatchCounts
+from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts, TaskKey
 
 POLL_S = 0.1
 """Longest wait before a request to stop is noticed."""
@@ -22,12 +23,12 @@ POLL_S = 0.1
 
 @dataclass(frozen=True)
 class Answer:
-    """A worker has run a chunk: the event `Result` with what it stands for."""
+    """A worker has run the chunks of a task: the event `Result` with what it stands for."""
 
     worker: int
     key: Hashable
     attempt: int
-    result: ChunkResult
+    results: list[ChunkResult]
 
 
 Message = messages.WorkerUp | messages.WorkerLost | messages.Failure | messages.Drain | messages.SetWorkers | Answer
@@ -52,8 +53,8 @@ class Transport(Protocol):
         """
         ...
 
-    def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunk: Chunk) -> None:
-        """Have a worker that is up run the chunk around the centre, behind those it was sent before."""
+    def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
+        """Have a worker that is up run the chunks around the centre, behind those it was sent before."""
         ...
 
     def receive(self, timeout_s: float) -> Message | None:
@@ -69,6 +70,15 @@ class Transport(Protocol):
 
 
 AnyTransport = TypeVar("AnyTransport", bound=Transport)
+
+
+def task_sizes(chunks: int, workers: int, chunk_s: float | None, task_s: float) -> list[int]:
+    """How many neighbouring chunks make each task: about as many as take `task_s`, one while `chunk_s`, what one takes,
+    is not known; equal numbers, and of tasks as many for each worker."""
+    most = 1 if chunk_s is None else max(1, int(task_s / max(chunk_s, 1e-9)))
+    rounds = -(-chunks // (most * workers))
+    count = min(chunks, rounds * workers)
+    return [chunks // count + (task < chunks % count) for task in range(count)]
 
 
 class Engine(Generic[AnyTransport]):
@@ -94,8 +104,8 @@ class Engine(Generic[AnyTransport]):
         self._state = scheduler.initial_state(policy)
         self._centre: Centre | None = None
         self._phase = 0
-        self._chunks: dict[Hashable, Chunk] = {}
-        self._results: dict[Hashable, ChunkResult] = {}
+        self._chunks: dict[Hashable, Sequence[Chunk]] = {}
+        self._results: dict[Hashable, list[ChunkResult]] = {}
         self._step(messages.Tick())
 
     @property
@@ -119,9 +129,9 @@ class Engine(Generic[AnyTransport]):
         while (message := self.transport.receive(0.0)) is not None:
             self._handle(message)  # a worker lost since the last call gets no chunk, so no chunk is blamed for it
         self._phase += 1
-        keys = [ChunkKey(self._phase, type(chunk).__name__, chunk.generation, chunk.chunk_id) for chunk in chunks]
-        self._centre, self._chunks, self._results = centre, dict(zip(keys, chunks, strict=True)), {}
-        self._step(messages.Submit(tuple(messages.Task(key, key.kind) for key in keys)))
+        parts = self._parts(chunks)
+        self._centre, self._chunks, self._results = centre, dict(parts), {}
+        self._step(messages.Submit(tuple(messages.Task(key, key.kind, key.chunks) for key, _ in parts)))
         while scheduler.pending(self._state):
             if (number := self._should_stop()) is not None:
                 raise Interrupted(number)
@@ -130,7 +140,7 @@ class Engine(Generic[AnyTransport]):
                 self._handle(message)
             else:  # only now: a late look at the clock must not kill workers whose answers were waiting
                 self._step(messages.Tick())
-        return [self._results.pop(key) for key in keys]
+        return [result for key, _ in parts for result in self._results.pop(key)]
 
     def close(self) -> None:
         """Kill all workers and wait for them."""
@@ -142,11 +152,21 @@ class Engine(Generic[AnyTransport]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _parts(self, chunks: Sequence[Chunk]) -> list[tuple[TaskKey, Sequence[Chunk]]]:
+        """Chunks, all of one kind, as they are to travel. What is known of their duration never changes a result."""
+        if not chunks:
+            return []
+        kind, policy = type(chunks[0]).__name__, self._state.policy
+        sizes = task_sizes(len(chunks), self._state.wanted, scheduler.chunk_s(self._state, kind), policy.task_s)
+        ends = list(itertools.accumulate(sizes))
+        parts = [chunks[end - size : end] for end, size in zip(ends, sizes, strict=True)]
+        return [(TaskKey(self._phase, kind, part[0].generation, part[0].chunk_id, len(part)), part) for part in parts]
+
     def _handle(self, message: Message) -> None:
         if not isinstance(message, Answer):
             self._step(message)
         elif self._step(messages.Result(message.worker, message.key, message.attempt)):
-            self._results[message.key] = message.result
+            self._results[message.key] = message.results
 
     def _step(self, event: messages.Event) -> bool:
         """Feed the scheduler and do as it says; whether it accepted a result."""

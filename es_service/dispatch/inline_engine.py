@@ -16,7 +16,7 @@ import tempfile
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import IO
@@ -102,14 +102,14 @@ class ChildProcesses:
             child = self._forget(worker)
             self._lose(child, f"worker {worker}, a thread of the same process, had to be killed", bystanders=True)
 
-    def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunk: Chunk) -> None:
-        """Send the chunk, behind the centre if the worker does not know it."""
+    def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
+        """Send the chunks, behind the centre if the worker does not know it."""
         to = self._workers.get(worker)
         if to is None:
             return  # lost with another thread of its child; that is on its way to the scheduler
         if self._centre[0] is not centre:
             self._centre = centre, framed(("centre", centre))
-        frames = [framed(("chunk", key, attempt, chunk))]
+        frames = [framed(("chunks", key, attempt, chunks))]
         if to.centre is not centre:
             to.centre = centre
             frames.insert(0, self._centre[1])
@@ -167,8 +167,8 @@ class ChildProcesses:
                 match said:
                     case ("up",):
                         self._ready.append(WorkerUp(number))
-                    case ("result", key, attempt, result):
-                        self._ready.append(Answer(number, key, attempt, result))
+                    case ("results", key, attempt, results):
+                        self._ready.append(Answer(number, key, attempt, results))
                     case ("failure", key, attempt, text):
                         self._ready.append(Failure(number, key, attempt, text))
                     case ("broken", text):

@@ -12,17 +12,22 @@ class Task:
 
     key: Hashable
     kind: str
-    """Tasks of one kind compile together and take about equally long."""
+    """Tasks of one kind compile together and take about equally long, each in proportion to its size."""
+    size: int = 1
+    """Chunks in it."""
 
 
 @dataclass(frozen=True)
 class Policy:
-    """How faults are handled: config data. Raises ValueError for a count below 1."""
+    """How work is handed out and faults are handled: config data. Raises ValueError for a count below 1."""
 
     workers: int
     """Workers wanted at the start; `SetWorkers` changes it."""
     in_flight: int = 2
     """Tasks assigned to one worker at a time: the one it runs and those prefetched behind it."""
+    task_s: float = 0.03
+    """Chunks that take less travel together, as many as take this long: with Ray a message costs two milliseconds of a
+    core. What a lost worker had in hand, and what others wait for in the end, remain little."""
     max_attempts: int = 4
     """A task that raised, or lost the worker running it, this often is poison. Keep above `max_failures_in_a_row`, so
     that a single broken worker is replaced before its task is blamed."""
@@ -31,7 +36,7 @@ class Policy:
     """For the first task of a kind on a worker, which compiles, and for any task while no duration is known."""
     min_deadline_s: float = 30.0
     deadline_factor: float = 5.0
-    """Later tasks may take max(min_deadline_s, deadline_factor x median of recent durations of their kind)."""
+    """Later tasks may take max(min_deadline_s, deadline_factor x size x median of recent durations of their kind)."""
     max_failures_in_a_row: int = 3
     """A worker that raises this often in a row is killed and replaced."""
     restart_backoff_s: float = 1.0

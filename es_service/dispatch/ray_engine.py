@@ -13,7 +13,7 @@ import contextlib
 import pickle
 import time
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
@@ -131,15 +131,15 @@ class Actors:
             with contextlib.suppress(self._ray.exceptions.RayError, ValueError):
                 self._ray.kill(handle, no_restart=True)
 
-    def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunk: Chunk) -> None:
-        """Call the actor. A centre is stored once, however many chunks share it, and dropped with the next one."""
+    def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
+        """Call the actor. A centre is stored once, however many calls share it, and dropped with the next one."""
         if worker not in self._handles:
-            return  # lost a moment ago, when it was sent another chunk; that is on its way to the scheduler
+            return  # lost a moment ago, when it was sent other chunks; that is on its way to the scheduler
         try:
             if self._centre is None or self._centre[0] is not centre:
                 pickled = pickle.dumps(centre, pickle.HIGHEST_PROTOCOL)
                 self._centre = centre, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
-            ref = self._handles[worker].run.remote(self._centre[1], pickle.dumps(chunk, pickle.HIGHEST_PROTOCOL))
+            ref = self._handles[worker].run.remote(self._centre[1], pickle.dumps(chunks, pickle.HIGHEST_PROTOCOL))
         except self._ray.exceptions.RayError as error:
             self._lose(worker, _reason(error))
             return

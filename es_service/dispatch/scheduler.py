@@ -94,7 +94,7 @@ class SchedulerState(NamedTuple):
     queue: deque[Hashable]
     """Keys to assign, next first."""
     durations_s: dict[str, tuple[float, ...]]
-    """Recent durations per kind, without those that include compiling."""
+    """Recent durations of a chunk per kind, without those that include compiling."""
     next_worker: int = 0
     start_at_s: float = -math.inf
     """No worker is started before this."""
@@ -121,6 +121,12 @@ def initial_state(policy: Policy) -> SchedulerState:
 def pending(state: SchedulerState) -> int:
     """Number of tasks submitted and not delivered."""
     return len(state.tasks)
+
+
+def chunk_s(state: SchedulerState, kind: str) -> float | None:
+    """How long a chunk of this kind takes in the median; None while that is not known."""
+    durations_s = state.durations_s.get(kind)
+    return statistics.median(durations_s) if durations_s else None
 
 
 def next_deadline(state: SchedulerState) -> float:
@@ -211,10 +217,12 @@ def _result(
         s = s._replace(duplicates=s.duplicates + 1)
     index = _find_slot(record, key, attempt)
     if index is not None:
-        kind = record.slots[index].task.kind
+        task = record.slots[index].task
+        kind = task.kind
         # How long an answer out of order took is not known, nor whether its kind was compiled before.
         if index == 0 and kind in record.warm:
-            s.durations_s[kind] = (*s.durations_s.get(kind, ()), now - record.started_s)[-RECENT_DURATIONS:]
+            duration_s = (now - record.started_s) / task.size
+            s.durations_s[kind] = (*s.durations_s.get(kind, ()), duration_s)[-RECENT_DURATIONS:]
         warm = record.warm | {kind} if index == 0 else record.warm
         record = record._replace(warm=warm, failures_in_a_row=0)
         _close_slot(s, out, worker, record, index, now)
@@ -265,10 +273,10 @@ def _close_slot(s: SchedulerState, out: list[Command], worker: int, record: _Wor
 def _begin_first_slot(s: SchedulerState, record: _Worker, now: float) -> _Worker:
     if not record.slots:
         return record._replace(deadline_s=math.inf)
-    kind = record.slots[0].task.kind
-    durations_s = s.durations_s.get(kind)
-    if kind in record.warm and durations_s:
-        limit_s = max(s.policy.min_deadline_s, s.policy.deadline_factor * statistics.median(durations_s))
+    task = record.slots[0].task
+    usual_s = chunk_s(s, task.kind)
+    if task.kind in record.warm and usual_s is not None:
+        limit_s = max(s.policy.min_deadline_s, s.policy.deadline_factor * task.size * usual_s)
     else:
         limit_s = s.policy.first_deadline_s
     return record._replace(started_s=now, deadline_s=now + limit_s)

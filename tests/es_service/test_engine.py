@@ -16,9 +16,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from es_service.dispatch import engine as engine_module
-from es_service.dispatch.engine import POLL_S, Answer, Engine
+from es_service.dispatch.engine import POLL_S, Answer, Engine, task_sizes
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
 from es_service.errors import EvaluationError, Interrupted
@@ -31,16 +33,17 @@ CHUNKS = [TrainingChunk(3, chunk_id) for chunk_id in range(8)]
 
 @dataclass(frozen=True)
 class Sent:
-    """One chunk sent to a worker, and what the worker might say about it."""
+    """Chunks sent to a worker, and what the worker might say about them."""
 
     worker: int
     centre: Any
     key: Any
     attempt: int
-    chunk: Any
+    chunks: Any
 
     def answer(self) -> Answer:
-        return Answer(self.worker, self.key, self.attempt, expected(self.centre, self.chunk))
+        results = [expected(self.centre, chunk) for chunk in self.chunks]
+        return Answer(self.worker, self.key, self.attempt, results)
 
     def failure(self) -> Failure:
         return Failure(self.worker, self.key, self.attempt, "no")
@@ -69,8 +72,8 @@ class Scripted:
     def kill(self, worker):
         self.killed.append(worker)
 
-    def send(self, worker, centre, key, attempt, chunk):
-        self.sent.append(Sent(worker, centre, key, attempt, chunk))
+    def send(self, worker, centre, key, attempt, chunks):
+        self.sent.append(Sent(worker, centre, key, attempt, chunks))
         self.on_send(self.sent[-1])
 
     def receive(self, timeout_s):
@@ -108,6 +111,41 @@ def test_results_come_in_chunk_order_whatever_the_order_of_the_answers(seed):
             assert engine.evaluate(point, chunks) == [expected(point, chunk) for chunk in chunks]
         assert (engine.counts.retries, engine.counts.lost_workers, engine.counts.workers) == (0, 0, 3)
     assert transport.closed
+
+
+@given(st.integers(1, 500), st.integers(1, 70), st.floats(1e-7, 10.0))
+def test_tasks_are_of_equal_size_as_many_for_each_worker_and_none_takes_too_long(chunks, workers, chunk_s):
+    sizes = task_sizes(chunks, workers, chunk_s, 0.01)
+    assert sum(sizes) == chunks
+    assert max(sizes) - min(sizes) <= 1
+    assert max(sizes) == 1 or max(sizes) * chunk_s < 0.01001
+    assert len(sizes) % workers == 0 or len(sizes) == chunks
+    with_a_round_less = len(sizes) - workers
+    assert with_a_round_less <= 0 or -(-chunks // with_a_round_less) * chunk_s > 0.00999
+    assert task_sizes(chunks, workers, None, 0.01) == [1] * chunks
+
+
+def test_short_chunks_travel_together_once_their_duration_is_known(monkeypatch):
+    """One by one while workers are cold; after that as many as make 10 ms, or as there are for each worker. A chunk
+    takes 2 ms, since the clock does not go on for two workers at once."""
+    now, transport = [0.0], Scripted()
+    monkeypatch.setattr(engine_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+
+    def take_a_millisecond_each(sent: Sent):
+        now[0] += 1e-3 * len(sent.chunks)
+        transport.inbox.append(sent.answer())
+
+    transport.on_send = take_a_millisecond_each
+    with Engine(transport, Policy(workers=2, in_flight=1, task_s=0.01)) as engine:
+        numbers = []
+        for count in (8, 6, 200):
+            transport.sent.clear()
+            chunks = [TrainingChunk(3, chunk_id) for chunk_id in range(count)]
+            assert engine.evaluate(FIRST, chunks) == [expected(FIRST, chunk) for chunk in chunks]
+            assert [chunk for sent in transport.sent for chunk in sent.chunks] == chunks
+            numbers.append([len(sent.chunks) for sent in transport.sent])
+    assert numbers[:2] == [[1] * 8, [3, 3]]
+    assert numbers[2] == [5] * 40
 
 
 @pytest.mark.parametrize("already_there", [True, False])
@@ -164,7 +202,7 @@ def test_what_a_lost_worker_still_says_is_dropped(before):
     transport = Scripted()
 
     def contradict(sent: Sent):
-        last_words = Answer(0, sent.key, sent.attempt, "not to be trusted")  # pyright: ignore[reportArgumentType]
+        last_words = Answer(0, sent.key, sent.attempt, ["not to be trusted"])  # pyright: ignore[reportArgumentType]
         if sent.worker == 0:
             transport.inbox.extend([WorkerLost(0, "gone"), WorkerUp(0), sent.failure()])
         else:
@@ -179,7 +217,7 @@ def test_what_a_lost_worker_still_says_is_dropped(before):
 def test_a_chunk_that_fails_everywhere_is_named_and_ends_the_engine():
     transport = Scripted()
     transport.on_send = lambda sent: transport.inbox.append(
-        sent.failure() if sent.chunk.chunk_id == 2 else sent.answer()
+        sent.failure() if CHUNKS[2] in sent.chunks else sent.answer()
     )
     with Engine(transport, Policy(workers=2, restart_backoff_s=0.0)) as engine:
         for _ in range(2):  # and again, rather than wait for ever, if it is asked again
@@ -241,6 +279,14 @@ def test_the_next_deadline_bounds_the_wait(monkeypatch):
 # Child processes.
 
 
+def test_an_error_says_in_which_of_the_chunks_that_travelled_together_it_was():
+    broken = [*CHUNKS[:3], TrainingChunk(3, "four")]  # type: ignore[arg-type]
+    with inline_engine(SPEC, Policy(workers=1, restart_backoff_s=0.0)) as engine:
+        engine.evaluate(FIRST, CHUNKS)
+        with pytest.raises(EvaluationError, match=r"(?s)task TrainingChunk 0 and 3 more of.*in TrainingChunk four of"):
+            engine.evaluate(FIRST, broken)
+
+
 def footprint() -> tuple[int, int, int]:
     """What this process holds: open file descriptors, threads, child processes."""
     tasks = Path("/proc/self/task").iterdir()
@@ -264,7 +310,8 @@ def test_killed_children_change_no_result_and_leave_nothing_behind():
         if countdown == 0:
             os.kill(victim, signal.SIGKILL)
 
-    with inline_engine(SPEC, Policy(workers=1, restart_backoff_s=0.01), kill_in_the_middle) as engine:
+    policy = Policy(workers=1, task_s=0.0, restart_backoff_s=0.01)
+    with inline_engine(SPEC, policy, kill_in_the_middle) as engine:
         first = engine.evaluate(FIRST, chunks)
         settled = footprint()
         for kill in range(1, 9):

@@ -51,14 +51,14 @@ LARGE = np.arange(1_000_000)
 def test_an_answer_that_has_begun_to_come_is_there(transport):
     """Or a driver that was away would look at the clock, and kill a worker in the middle of its answer."""
     transport, (end, _) = transport
-    frame = framed(("result", "key", 1, LARGE))
+    frame = framed(("results", "key", 1, [LARGE]))
     sender = threading.Thread(target=end.sendall, args=(frame,))
     sender.start()
     time.sleep(0.05)
     message = transport.receive(0.0)
     sender.join()
     assert isinstance(message, Answer)
-    np.testing.assert_array_equal(message.result, LARGE)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(message.results, [LARGE])  # type: ignore[arg-type]
 
 
 def test_a_message_that_stops_half_way_keeps_nobody_waiting(transport):
@@ -73,10 +73,10 @@ def test_a_message_that_stops_half_way_keeps_nobody_waiting(transport):
 
 def test_what_threads_have_said_is_heard_before_they_are_lost_with_another(transport):
     transport, ends = transport
-    ends[1].sendall(framed(("result", "key", 1, "theirs")))
+    ends[1].sendall(framed(("results", "key", 1, ["theirs"])))
     ends[0].close()
     heard = [transport.receive(1.0) for _ in range(3)]
-    assert heard[0] == Answer(1, "key", 1, "theirs")  # type: ignore[arg-type]
+    assert heard[0] == Answer(1, "key", 1, ["theirs"])  # type: ignore[arg-type]
     assert [message.worker for message in heard[1:] if isinstance(message, WorkerLost)] == [0, 1]
     assert transport.receive(0.0) is None
 
@@ -92,7 +92,7 @@ class Unreadable:
     ("said", "reason"),
     [
         (("broken", "no jax here"), "^no jax here$"),
-        (("result", "key", 1, Unreadable()), r"(?s)Traceback.*invalid literal for int"),
+        (("results", "key", 1, Unreadable()), r"(?s)Traceback.*invalid literal for int"),
         (("something", "else"), "it said"),
     ],
 )
@@ -109,7 +109,7 @@ def test_a_worker_that_says_what_nobody_can_use_is_lost(transport, said, reason)
 def test_a_worker_that_has_said_its_last_is_lost_while_messages_still_wait_for_it(transport):
     transport, ends = transport
     for key in range(40):
-        transport.send(0, centre(np.zeros(100_000, np.float32)), key, 1, CHUNKS[0])
+        transport.send(0, centre(np.zeros(100_000, np.float32)), key, 1, CHUNKS[:1])
     assert transport._workers[0].channel.is_full
     ends[0].shutdown(socket.SHUT_WR)
     assert isinstance(transport.receive(1.0), WorkerLost)

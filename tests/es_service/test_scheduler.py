@@ -34,6 +34,7 @@ from es_service.dispatch.messages import (
 )
 from es_service.dispatch.scheduler import (
     SchedulerState,
+    chunk_s,
     initial_state,
     next_deadline,
     pending,
@@ -551,6 +552,17 @@ def test_deadlines_exempt_compiling_and_follow_the_median_of_their_kind():
     assert state.durations_s == {"train": (4.0, 2.0, 1.0, 1.0, 1.0)}
     state, _ = play(ready(1), *((float(n), event) for n in range(40) for event in (tasks("a"), Result(0, "a", 1))))
     assert len(state.durations_s["train"]) == 31, "a bounded window"
+
+
+def test_deadlines_and_durations_are_in_proportion_to_the_size_of_a_task():
+    sized = Submit(tuple(Task(key, "train", size) for key, size in (("a", 1), ("b", 4), ("c", 3), ("d", 1))))
+    state, _ = play(ready(1, in_flight=1), (0.0, sized), (5.0, Result(0, "a", 1)), (17.0, Result(0, "b", 1)))
+    assert chunk_s(state, "train") == 3.0
+    assert next_deadline(state) == 17.0 + 5.0 * 3 * 3.0
+    state, _ = step(state, Result(0, "c", 1), 20.0)
+    assert state.durations_s == {"train": (3.0, 1.0)}
+    assert next_deadline(state) == 20.0 + 5.0 * 1 * 2.0
+    assert chunk_s(state, "evaluate") is None
 
 
 def test_the_clock_of_a_prefetched_task_starts_when_the_one_ahead_is_done():

@@ -65,9 +65,10 @@ def repeated_episodes(folder: Path, since: float) -> int:
     repeated = 0
     for entry in entries(folder, "Assign", 0.0):
         key = tuple(entry["key"])
-        repeated += entry["time"] >= since and key in seen and key[1] != "GradientChunk"
+        if entry["time"] >= since and key in seen and key[1] != "GradientChunk":
+            repeated += key[-1] * EPISODES_PER_CHUNK
         seen.add(key)
-    return repeated * EPISODES_PER_CHUNK
+    return repeated
 
 
 def memory_in_use() -> tuple[int, int]:
