@@ -54,7 +54,9 @@ def load_config(source: loading.Source, overrides: Iterable[str] = (), *, new: b
     Raises:
         ConfigError: lists every problem found.
     """
-    return loading.load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, new=new)
+    config = loading.load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, new=new)
+    ALGORITHMS[config.search.algorithm](config)  # one of the user's own may refuse it
+    return config
 
 
 def run(

@@ -8,7 +8,7 @@ out, so that the later steps still check everything else.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -59,7 +59,7 @@ def load_config(
     overrides: Iterable[str] = (),
     *,
     tasks: Mapping[str, TaskSpec],
-    algorithms: Collection[str],
+    algorithms: Mapping[str, object],
     new: bool = True,
 ) -> RunConfig:
     """The config of a new run.
@@ -78,7 +78,7 @@ def load_config(
 
 
 def resume_config(
-    source: Source, overrides: Iterable[str] = (), *, tasks: Mapping[str, TaskSpec], algorithms: Collection[str]
+    source: Source, overrides: Iterable[str] = (), *, tasks: Mapping[str, TaskSpec], algorithms: Mapping[str, object]
 ) -> RunConfig:
     """The config of a run that exists, with what may change on resume changed: budget, engine, workers, time limits.
 
@@ -99,7 +99,12 @@ def resume_config(
 
 
 def _load(
-    source: Source, overrides: Iterable[str], tasks: Mapping[str, TaskSpec], algorithms: Collection[str], *, new: bool
+    source: Source,
+    overrides: Iterable[str],
+    tasks: Mapping[str, TaskSpec],
+    algorithms: Mapping[str, object],
+    *,
+    new: bool,
 ) -> RunConfig:
     if isinstance(source, Mapping):
         name, mapping, problems = "config", source, []
@@ -120,22 +125,24 @@ def _load(
     problems += bad.values()
     values = {key: value for key, value in values.items() if key not in bad}
 
-    for key, what, known in (("task.environment", "task", tasks), ("search.algorithm", "algorithm", algorithms)):
-        if key == "task.environment" and ":" in str(values.get(key, "")):
-            continue  # looked up below: it is not in the list of known ones
-        if key in values and values[key] not in known:
-            besides = ", or brax:NAME, or module:Class" if what == "task" else ""
+    found: dict[str, Any] = {}
+    for key, what, known, besides in (
+        ("task.environment", "task", tasks, "brax:NAME, or module:Class"),
+        ("search.algorithm", "algorithm", algorithms, "module:function"),
+    ):
+        chosen = values.get(key)
+        try:
+            found[key] = known[chosen] if chosen is not None else None
+        except KeyError:
             problems.append(
-                f"{key}: {show(values[key])} is no known {what}; must be {one_of(known)}{besides}"
-                f"{did_you_mean(values[key], known)}"
+                f"{key}: {show(chosen)} is no known {what}; must be {one_of(known)}, or {besides}"
+                f"{did_you_mean(chosen, known)}"
             )
-        elif key not in values and key not in bad and key.split(".")[0] not in unusable:
+        except ConfigError as error:
+            problems.append(f"{key}: {error}")
+        if chosen is None and key not in bad and key.split(".")[0] not in unusable:
             problems.append(f"{key}: missing; must be {one_of(known)}")
-    try:
-        task = tasks.get(values.get("task.environment", ""))
-    except ConfigError as error:
-        task = None
-        problems.append(f"task.environment: {error}")
+    task: TaskSpec | None = found.get("task.environment")
     values = resolve(values, left_open, task)
     if task is not None:
         problems += task_problems(values, task) + map_problems(values, task) + rollout_problems(values, task)

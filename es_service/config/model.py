@@ -99,7 +99,9 @@ class PolicyConfig(_Section):
 class SearchConfig(_Section):
     """The evolution strategy. Constants of the run."""
 
-    algorithm: Text = Field(description="Name of the search algorithm; `es-service list` shows them.")
+    algorithm: Text = Field(
+        description="Name of the search algorithm, `es-service list` shows them; or module:function, one of your own."
+    )
     preset: Literal["literature", "uber"] = Field(
         "literature", description="Which column of the preset table fills in the keys that the config leaves out."
     )
@@ -113,7 +115,7 @@ class SearchConfig(_Section):
     )
     members: Count = Field(
         description="Centres of the meta-population, each with its own optimiser; one is updated per generation. "
-        "auto: 1 for es, which allows no other, else 5."
+        "auto: 1 for es and me_es, which allow no other, and for one of your own, else 5."
     )
     member_choice: Literal["novelty", "round_robin", "uniform"] = Field(
         "novelty",

@@ -110,7 +110,8 @@ def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpe
         if "map.qd_offset" in left_open:
             values["map.qd_offset"] = default_qd_offset(values, task)
     if "search.members" in left_open and "search.algorithm" in values:
-        values["search.members"] = 1 if values["search.algorithm"] in SINGLE_MEMBER else MEMBERS
+        algorithm = values["search.algorithm"]
+        values["search.members"] = 1 if algorithm in SINGLE_MEMBER or ":" in algorithm else MEMBERS
     if "compute.rollout" in left_open and task is not None:
         values["compute.rollout"] = "xla" if _on_gpu(values) or _why_no_simd(values, task) else "simd"
     pairs = values.get("search.pairs")

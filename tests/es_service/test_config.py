@@ -289,7 +289,7 @@ def test_describe_changes_shows_all_and_the_fork_that_makes_them():
 def resume(*overrides: str) -> RunConfig:
     stored = parse_value(load().resolved_yaml())
     assert isinstance(stored, dict)
-    return resume_config(stored, overrides, tasks=TASKS, algorithms=("es",))
+    return resume_config(stored, overrides, tasks=TASKS, algorithms={"es": None})
 
 
 def test_resume_may_change_budget_workers_and_limits():
@@ -314,7 +314,7 @@ def test_a_run_outlives_the_run_it_started_from(tmp_path):
     (tmp_path / "old").mkdir()
     stored = parse_value(load(MINIMAL, f"search.init_from={tmp_path / 'old'}").resolved_yaml())
     (tmp_path / "old").rmdir()
-    assert resume_config(stored, tasks=TASKS, algorithms=("es",)).search.init_from == str(tmp_path / "old")
+    assert resume_config(stored, tasks=TASKS, algorithms={"es": None}).search.init_from == str(tmp_path / "old")
     with pytest.raises(ConfigError, match="old does not exist; must be the folder of another run, or null"):
         load(stored)
 

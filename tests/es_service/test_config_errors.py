@@ -25,7 +25,7 @@ WORDS = st.text(string.ascii_letters + string.digits + " .:#'\"-_+~/&*!%[]{}", m
 
 
 def load(source=MINIMAL, *overrides: str) -> RunConfig:
-    return load_config(source, overrides, tasks=TASKS, algorithms=("es",))
+    return load_config(source, overrides, tasks=TASKS, algorithms={"es": None})
 
 
 def problems(source=MINIMAL, *overrides: str) -> list[str]:
@@ -68,7 +68,7 @@ def file(tmp_path):
         ("search.l2=-1", "-1 ... must be a number, at least 0"),
         ("search.max_invalid_fraction=1.5", "1.5 ... must be a number from 0 to 1"),
         ("search.preset=litrature", "litrature ... must be literature or uber; did you mean literature?"),
-        ("search.algorithm=ess", "ess is no known algorithm; must be es; did you mean es?"),
+        ("search.algorithm=ess", "ess is no known algorithm; must be es, or module:function; did you mean es?"),
         ("task.environment=pointmaze", "pointmaze is no known task; must be point_maze or no_final, or brax:NAME, or"),
         ("task.episode_steps=auto", "auto ... must be null or a whole number, at least 1"),
         ("task.fitness=finl", "finl ... must be sum or final; did you mean final?"),
@@ -278,6 +278,6 @@ def test_a_map_that_does_not_fit_the_algorithm_or_its_kind_is_refused():
     (line,) = problems(MINIMAL, "map.kind=cvt", "map.cells=[5000]")
     assert line == "map.cells: [5000] makes 5,000 cells; must be at most 4,096 for a cvt"
     with pytest.raises(ConfigError) as caught:
-        load_config(MINIMAL, ["search.algorithm=me_es", "map.enabled=false"], tasks=TASKS, algorithms=("me_es",))
+        load_config(MINIMAL, ["search.algorithm=me_es", "map.enabled=false"], tasks=TASKS, algorithms={"me_es": None})
     (line,) = (line.strip() for line in str(caught.value).splitlines()[1:])
     assert line.startswith("map.enabled: false is not allowed for me_es, which draws its parents from the map; must be")

@@ -1,0 +1,77 @@
+"""A search of the user's own: found by its name, refused with a reason, and as safe as one of ours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from es_service import api
+from es_service.algorithms import ALGORITHMS
+from es_service.algorithms.base import Judgement, Plan
+from es_service.algorithms.steps import archived, first_state
+from es_service.errors import ConfigError
+from es_service.protocol import EpisodesResult
+from es_service.statistics import no_observations
+
+EXAMPLE = "tests.examples.minimal_criterion:minimal_criterion"
+CONFIG = {
+    "task": {"environment": "point_maze", "episode_steps": 20},
+    "policy": {"hidden": [8]},
+    "search": {"algorithm": EXAMPLE, "pairs": 16, "sigma": 0.2, "learning_rate": 0.1},
+    "budget": {"generations": 6},
+    "compute": {"engine": "inline", "workers": 1},
+}
+
+
+def test_the_example_weighs_novelty_of_the_better_half_alone():
+    config = api.load_config(CONFIG)
+    assert config.search.members == 1
+    search = ALGORITHMS[EXAMPLE](config)
+    state = first_state([np.zeros(3, np.float32)], 2, search.fitness_weight)
+    state = archived(state, Judgement(0, 0, True, 0.0, np.zeros(2)))
+    # Two pairs: the first's + is far and good, its - farther and bad; the other's + near and good, its - invalid.
+    fitness = np.array([[4.0, 1.0], [3.0, np.nan]], np.float32)
+    descriptor = np.array([[(2.0, 0.0), (9.0, 0.0)], [(1.0, 0.0), (5.0, 0.0)]], np.float32)
+    steps = np.ones((2, 2), np.int32)
+    population = EpisodesResult(fitness, fitness, descriptor, steps, descriptor, no_observations(2))
+    weights_P = search.weights(state, Plan(0, state.members[0].centre_D, 0.0), population)
+    lowest, second, best = 0.5 / 3 - 0.5, 2 / 3 - 0.5, 0.5  # two share the ranks 0 and 1
+    np.testing.assert_allclose(weights_P, [best - lowest, second - lowest], rtol=1e-6)
+
+
+def test_a_run_of_it_goes_on_where_it_was_with_the_same_bits(tmp_path):
+    whole = api.run(api.load_config(CONFIG), tmp_path / "whole").run
+    api.run(api.load_config(CONFIG, ["budget.generations=3"]), tmp_path / "parts")
+    assert api.resume(tmp_path / "parts", ["budget.generations=6"]).run.digest() == whole.digest()
+    assert api.run(api.load_config(CONFIG, ["search.algorithm=es"]), tmp_path / "es").run.digest() != whole.digest()
+    assert whole.constants["search.algorithm"] == EXAMPLE
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        (
+            "tests.examples.nothing:here",
+            r"config: 1 problem\s+search\.algorithm: cannot import tests\.examples\.nothing ",
+        ),
+        ("tests.examples.minimal_criterion:min", "has no function 'min'"),
+        (f"{__name__}:NOT_CALLABLE", "has no function 'NOT_CALLABLE'"),
+        (f"{__name__}:raises", r"raises raised KeyError: 'sigma'"),
+        (f"{__name__}:something_else", r"returned 3, which is no es_service\.algorithms\.base\.Algorithm"),
+        (".:x", "cannot import"),
+    ],
+)
+def test_what_is_no_algorithm_is_refused_with_the_reason(name, reason):
+    with pytest.raises(ConfigError, match=reason):
+        api.load_config(CONFIG, [f"search.algorithm={name}"])
+
+
+NOT_CALLABLE = 3
+
+
+def raises(config):
+    return {}["sigma"]
+
+
+def something_else(config):
+    return 3
