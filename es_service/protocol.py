@@ -157,7 +157,8 @@ class Centre:
     """Standard deviation of the parameter noise, in parameter units."""
     observation_mean_O: FloatArray
     observation_std_O: FloatArray
-    """Statistics as they were at the start of the generation; 0 and 1 where normalisation is off."""
+    """Statistics as they were at the start of the generation, or those that the member keeps from the elite it began
+    with; 0 and 1 where normalisation is off."""
 
 
 @dataclass(frozen=True)

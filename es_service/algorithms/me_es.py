@@ -13,8 +13,8 @@ highest scores in proportion to score - lowest score + 1.
 
 Our choices, in both: an elite's novelty is that of its descriptor in today's archive without its own entry (the
 released code lets it grow a generation old, and finds the own entry by distance 0), where all are 0 any elite is drawn;
-of equal elites the one in the cell that was filled first counts as better. While no centre has been valid, so that the
-map is empty, the search goes on from where it is.
+of equal elites the one in the cell that was filled first counts as better. While the map is empty, as long as no centre
+has been valid or after a fork that emptied it, the search goes on from where it is.
 """
 
 from __future__ import annotations

@@ -61,8 +61,9 @@ def first_state(
 def choose_member(state: SearchState, generation: int, config: RunConfig) -> int:
     """Index of the member to update in a generation.
 
-    novelty: with probability proportional to its novelty among all centres ever evaluated, judged now; uniform if all
-    are 0. uniform: each with the same probability. round_robin: in turn, member 0 in generation 1.
+    novelty: with probability proportional to its novelty among all centres ever evaluated, judged now, a member none of
+    whose centres was valid counting as the most novel one; uniform if all are 0. uniform: each with the same
+    probability. round_robin: in turn, member 0 in generation 1.
     """
     count, how = len(state.members), config.search.member_choice
     if count == 1:
@@ -72,6 +73,8 @@ def choose_member(state: SearchState, generation: int, config: RunConfig) -> int
     share_M = np.ones(count)
     if how == "novelty":
         novelty_M = member_novelty(state, config.novelty)
+        # Or it would be a centre fewer for good, for one bad episode at the start.
+        novelty_M[[member.entry == NO_ENTRY for member in state.members]] = novelty_M.max()
         share_M = novelty_M if novelty_M.any() else share_M
     key = stream_keys(config.seed, Domain.SELECTION, generation, MEMBER_CHOICE)
     drawn = float(uniforms(key, np.zeros(1, np.uint32))[0])

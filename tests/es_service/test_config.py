@@ -331,7 +331,7 @@ def test_worker_spec_says_what_the_config_says():
 
 
 def test_every_field_says_what_it_means():
-    for section in ("task", "policy", "search", "budget", "compute"):
+    for section in ("task", "policy", "search", "map", "novelty", "budget", "compute"):
         fields = RunConfig.model_fields[section].annotation.model_fields  # pyright: ignore
         for name, field in fields.items():
             assert field.description, f"{section}.{name}"
