@@ -97,7 +97,7 @@ class _Writer:
         """All instructions, in order; gives the outputs back."""
         self.region(self.schedule.region)
         if self.slot_count > MOST_SLOTS:
-            raise UnsupportedError(f"{self.slot_count:,} values that loops carry and look at")
+            raise UnsupportedError(f"{self.slot_count:,} values that loops carry and look at; {MOST_SLOTS:,} fit")
         if self.slot_count:
             self.code.memory.append(f"  {self.memory} = alloca [{self.slot_count} x {self.words['I']}], align 64")
         return outputs

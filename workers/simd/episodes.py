@@ -10,7 +10,7 @@ import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from jax.extend.core import ClosedJaxpr
 from es_service.noise import KEY_WORDS
 from es_service.protocol import WorkerSpec
 from workers.environments import Environment
-from workers.episode import Episodes, EpisodeSteps, episode_steps
+from workers.episode import Carry, Episodes, EpisodeSteps, episode_steps
 from workers.simd.code import Code, Values, module
 from workers.simd.emit import graph_function
 from workers.simd.kernel import Kernel, compile_kernel, jaxpr_digest, load_compiled
@@ -106,8 +106,44 @@ def compile_episodes(
         UnsupportedError: a step of the environment cannot be compiled. NoVectorsError: this processor cannot run it.
     """
     target = target or host_target()
+    written = write_episodes(environment, spec, inputs_O, target.width, training=training)
+    address, alive = load_compiled(written.name, written.text, target, folder)
+    signature = [*[ctypes.c_void_p] * 8, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
+    carry = written.carry
+    return EpisodeKernel(
+        training=training,
+        spec=spec,
+        inputs_O=inputs_O,
+        network=written.network,
+        begin=_begin(written.steps, jax.tree.leaves(carry), target, folder),
+        alive_word=written.alive_word,
+        episode_avals=carry.episode,
+        episode_words=sum(map(words_of, carry.episode)),
+        _call=ctypes.CFUNCTYPE(None, *signature)(address),
+        _alive=alive,
+    )
+
+
+class Written(NamedTuple):
+    """Episodes before they go to LLVM."""
+
+    steps: EpisodeSteps
+    carry: Carry
+    """Shapes of what an episode carries."""
+    alive_word: int
+    network: Network
+    name: str
+    """Tells what the text computes, in full."""
+    text: Callable[[], str]
+    """LLVM IR, made when it is called. Raises UnsupportedError."""
+
+
+def write_episodes(
+    environment: Environment, spec: WorkerSpec, inputs_O: np.ndarray, width: int, *, training: bool
+) -> Written:
+    """All of `compile_episodes` but LLVM's part, of no processor: what has no text cannot be compiled."""
     steps = episode_steps(environment, spec, training=training, inputs_O=inputs_O)
-    network = plan(spec.policy, inputs_O, target.width)
+    network = plan(spec.policy, inputs_O, width)
     key, inputs = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32), jax.ShapeDtypeStruct((len(inputs_O),), jnp.float32)
     action = jax.ShapeDtypeStruct((spec.policy.widths[-1],), jnp.float32)
     carry = jax.eval_shape(steps.begin, key)
@@ -126,20 +162,7 @@ def compile_episodes(
 
     digests = f"{definition()} {jaxpr_digest(look)} {jaxpr_digest(move)}"
     name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {training}"
-    address, alive = load_compiled(name, text, target, folder)
-    signature = [*[ctypes.c_void_p] * 8, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
-    return EpisodeKernel(
-        training=training,
-        spec=spec,
-        inputs_O=inputs_O,
-        network=network,
-        begin=_begin(steps, leaves, target, folder),
-        alive_word=alive_word,
-        episode_avals=carry.episode,
-        episode_words=sum(map(words_of, carry.episode)),
-        _call=ctypes.CFUNCTYPE(None, *signature)(address),
-        _alive=alive,
-    )
+    return Written(steps, carry, alive_word, network, name, text)
 
 
 def _begin(

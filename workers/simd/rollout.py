@@ -11,27 +11,43 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service.noise import KEY_WORDS
-from es_service.protocol import TaskSpec, WorkerSpec
+from es_service.protocol import PolicyShape, TaskSpec, WorkerSpec
 from workers.environments import Environment, make_environment
 from workers.episode import Episodes
-from workers.simd.episodes import EpisodeKernel, compile_episodes
+from workers.simd.episodes import EpisodeKernel, compile_episodes, write_episodes
 from workers.simd.kernel import load_compiled
 from workers.simd.noise import UNROLLED, definition, gradient_module
 from workers.simd.primitives import UnsupportedError
-from workers.simd.target import Target, host_target
+from workers.simd.target import WIDTHS, Target, host_target
 from workers.simd.trace import trace_jaxpr
 from workers.simd.words import aligned
 
 
 def why_not(task: TaskSpec) -> str:
-    """Why simd cannot run a task's episodes here; empty if it can. Traces its functions, with its default options."""
-    environment = make_environment(task.name, {name: values[0] for name, values in task.options.items()})
-    state = jax.eval_shape(environment.reset, jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32))
-    action = jax.ShapeDtypeStruct((task.action_size,), jnp.float32)
+    """Why simd cannot run a task's episodes; empty if it can.
+
+    Goes through all that compiling them does but LLVM's part, with the task's default options; of training, since
+    evaluations have nothing besides that could be refused.
+    """
+    options = {name: values[0] for name, values in task.options.items()}
+    spec = WorkerSpec(
+        seed=0,
+        environment=task.name,
+        environment_options=options,
+        policy=PolicyShape((task.observation_size, task.action_size)),
+        episode_steps=task.episode_steps,
+        fitness="sum",
+        episodes_per_member=1,
+        observation_clip=1.0,
+        action_noise=1.0,
+        common_random_numbers=True,
+        chunk_pairs=1,
+        rollout_block_pairs=1,
+        gradient_block_pairs=1,
+    )
+    environment, inputs_O = make_environment(task.name, options), np.arange(task.observation_size)
     try:
-        trace_jaxpr(jax.make_jaxpr(environment.step)(state, action))
-        for function in (environment.observe, environment.descriptor, environment.goal_distance):
-            trace_jaxpr(jax.make_jaxpr(function)(state))
+        write_episodes(environment, spec, inputs_O, WIDTHS["avx2"], training=True).text()
     except UnsupportedError as error:
         return str(error)
     except Exception as error:  # whatever is wrong with the compiler, xla is there
