@@ -70,6 +70,24 @@ def test_what_each_environment_can_tell_of_an_episode():
 
 
 @pytest.mark.parametrize(
+    ("name", "coordinates"),
+    [("ant", (7, 8)), ("halfcheetah", (3, 4)), ("inverted_pendulum", (1,)), ("reacher", (0, 1))],
+)
+def test_joints_are_not_where_the_base_is(name, coordinates):
+    """An ant's place and quaternion, a half cheetah's x, z and pitch, a cart's x come before them."""
+    environment = brax_task.make(name, descriptor="final_joints")
+    shapes = jax.eval_shape(environment.reset, jax.ShapeDtypeStruct((4,), jnp.uint32))
+    state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    physics = state.brax.pipeline_state
+    physics = physics.replace(q=jnp.arange(physics.q.size, dtype=jnp.float32))
+    numbered = state._replace(brax=state.brax.replace(pipeline_state=physics))
+    np.testing.assert_array_equal(environment.descriptor(numbered), coordinates)
+    names, bounds = brax_task.describe(name).descriptors["final_joints"]
+    assert names == ("joint_1", "joint_2")[: len(coordinates)]
+    assert len(bounds) == len(coordinates)
+
+
+@pytest.mark.parametrize(
     ("name", "message"),
     [
         ("brax:ants", r"brax:ants is not in the installed Brax, which has ant, .*; did you mean brax:ant\?"),

@@ -25,6 +25,8 @@ EPISODE_STEPS = 1000
 BACKENDS = ("spring", "generalized", "positional", "mjx")
 FAR = 30.0
 """Metres, or whatever the joint is measured in: bounds of a descriptor whose reach nobody declares."""
+JOINTS = 2
+"""That `final_joints` tells, the first of the model."""
 TOUCH = 0.005
 """Metres above the floor that still count as touching it."""
 
@@ -67,6 +69,7 @@ def make(name: str, descriptor: str | None = None, backend: str | None = None) -
     system = environment.sys
     descriptor = descriptor or next(iter(_descriptors(system)))
     feet = _feet(system) if descriptor == "feet_contact" else []
+    root = _root_coordinates(system)
 
     def reset(key: Any) -> _State:
         with quietly():
@@ -90,7 +93,7 @@ def make(name: str, descriptor: str | None = None, backend: str | None = None) -
             case "final_x":
                 return physics.x.pos[0, :1]
             case "final_joints":
-                return physics.q[:2]
+                return physics.q[root : root + JOINTS]
             case _:
                 return state.touched_F / jnp.maximum(state.steps, 1.0)
 
@@ -126,16 +129,24 @@ def _descriptors(system: Any) -> dict[str, tuple[tuple[str, ...], Bounds]]:
     """What can be said about an episode of this system: name -> (components, bounds). The first is the default."""
     found: dict[str, tuple[tuple[str, ...], Bounds]] = {}
     far = (-FAR, FAR)
-    root = system.link_types[0]
-    if root == "f":
+    root = _root_coordinates(system)
+    if system.link_types[0] == "f":
         found["final_xy"] = ("x", "y"), (far, far)
-    if root == "f" or np.asarray(system.dof.motion.vel)[: int(root), 0].any():
+    if root:
         found["final_x"] = ("x",), (far,)
     if feet := _feet(system):
         found["feet_contact"] = tuple(f"foot_{number}" for number in range(1, len(feet) + 1)), ((0.0, 1.0),) * len(feet)
-    if system.q_size() >= 2:
-        found["final_joints"] = ("joint_1", "joint_2"), (far, far)
+    if joints := min(JOINTS, system.q_size() - root):
+        found["final_joints"] = tuple(f"joint_{number}" for number in range(1, joints + 1)), (far,) * joints
     return found
+
+
+def _root_coordinates(system: Any) -> int:
+    """How many of the first coordinates say where a base is that moves about, and are no joints; 0 if it stays."""
+    kind = system.link_types[0]
+    if kind == "f":
+        return 7  # place and quaternion
+    return int(kind) if np.asarray(system.dof.motion.vel)[: int(kind), 0].any() else 0
 
 
 def _feet(system: Any) -> list[int]:
