@@ -214,7 +214,7 @@ def log1p(g: Graph, x: int) -> int:
     one_more = g.op("add", x, g.f(1.0))
     lost = g.op("sub", x, g.op("sub", one_more, g.f(1.0)))
     found = g.op("add", log(g, one_more), g.op("div", lost, one_more))
-    found = g.op("select", g.op("lt", g.op("abs", one_more), g.f(math.inf)), found, one_more)
+    found = g.op("select", g.op("lt", one_more, g.f(math.inf)), found, one_more)
     found = g.op("select", g.op("eq", one_more, g.f(0.0)), g.f(-math.inf), found)
     return g.op("select", g.op("lt", g.op("abs", x), g.f(1e-7)), x, found)
 
@@ -253,7 +253,8 @@ def whole_power(g: Graph, x: int, exponent: int) -> int:
 
 def pow(g: Graph, x: int, y: int) -> int:
     """x^y. By squaring for a constant whole y up to 64 in size, sqrt for 1/2; else e^(y log x), within
-    3 + 2 |y log x| ulp. NaN where x is negative, -inf too, unless y is whole; zeros count as +0."""
+    3 + 2 |y log x| ulp. NaN where x is negative, -inf too, unless y is whole, and infinities count as even; zeros count
+    as +0."""
     exponent = g.constant(y)
     if exponent is not None and float(exponent).is_integer() and abs(exponent) <= 64:
         return whole_power(g, x, int(exponent))
@@ -261,7 +262,7 @@ def pow(g: Graph, x: int, y: int) -> int:
         return g.op("sqrt", x)
     size = exp(g, g.op("mul", y, log(g, g.op("abs", x))))
     size = g.op("select", g.op("eq", y, g.f(0.0)), g.f(1.0), size)
-    size = g.op("select", g.op("eq", x, g.f(1.0)), g.f(1.0), size)
+    size = g.op("select", g.op("eq", g.op("abs", x), g.f(1.0)), g.f(1.0), size)
     is_whole = g.op("eq", g.op("round", y), y)
     half = g.op("mul", y, g.f(0.5))
     is_odd = g.op("ne", g.op("round", half), half)

@@ -109,7 +109,7 @@ def test_powers_are_as_stated() -> None:
         assert ulps(found, x.astype(np.float64) ** exponent).max() <= max(1.0, abs(exponent))
 
 
-@pytest.mark.parametrize("y", [2.0, 3.0, 0.5, 0.0, -1.0, 1.7, -3.0])
+@pytest.mark.parametrize("y", [2.0, 3.0, 0.5, 0.0, -1.0, 1.7, -3.0, INF, -INF, NAN])
 def test_powers_at_the_edges_are_as_numpys(y: float) -> None:
     x = np.array([-2.0, -1.0, 0.0, 1.0, 2.0, INF, NAN], np.float32)
     with np.errstate(all="ignore"):
@@ -123,7 +123,7 @@ EDGES: list[tuple[Callable, list[float], list[float]]] = [
     (jnp.exp2, [INF, -INF, NAN, 128.0, -126.0, 0.0, 10.0, -125.0], [INF, 0.0, NAN, INF, 0.0, 1.0, 1024.0, 2.0**-125]),
     (jnp.expm1, [INF, -INF, NAN, 89.0, -87.0, 0.0], [INF, -1.0, NAN, INF, -1.0, 0.0]),
     (jnp.log, [INF, 0.0, -0.0, -1.0, NAN, 1.0], [INF, -INF, -INF, NAN, NAN, 0.0]),
-    (jnp.log1p, [INF, -1.0, -2.0, NAN, 0.0], [INF, -INF, NAN, NAN, 0.0]),
+    (jnp.log1p, [INF, -INF, -1.0, -2.0, NAN, 0.0], [INF, NAN, -INF, NAN, NAN, 0.0]),
     (jnp.tanh, [INF, -INF, NAN, 0.0, 50.0], [1.0, -1.0, NAN, 0.0, 1.0]),
     (jax.nn.sigmoid, [INF, -INF, NAN, 0.0], [1.0, 0.0, NAN, 0.5]),
     (jnp.arcsin, [1.5, -1.5, NAN, 1.0, 0.0], [NAN, NAN, NAN, math.pi / 2, 0.0]),
