@@ -134,13 +134,15 @@ def _evaluation_result(episodes: Episodes) -> EpisodesResult:
 
 
 def _moments(host: Episodes, shift_O: Any) -> Moments:
-    """Moments of all counted observations; an episode whose sums are not finite is left out."""
+    """Moments of all counted observations. An episode that is invalid is left out with what it saw: one whose sums,
+    fitness or descriptor are not finite; before that its observations may have been of any size."""
     size = host.shifted_sum_O.shape[-1]
     sums, squares = (x.reshape(-1, size).astype(np.float64) for x in (host.shifted_sum_O, host.shifted_square_sum_O))
-    finite = (np.isfinite(sums) & np.isfinite(squares)).all(axis=1)
-    count = float(host.steps.reshape(-1)[finite].sum())
+    said = (sums, squares, host.fitness.reshape(-1, 1), host.descriptor.reshape(len(sums), -1))
+    valid = np.logical_and.reduce([np.isfinite(x).all(axis=1) for x in said])
+    count = float(host.steps.reshape(-1)[valid].sum())
     if count == 0.0:
         return Moments(0.0, np.zeros(size), np.zeros(size))
-    mean_O = sums[finite].sum(axis=0) / count
-    m2_O = np.maximum(squares[finite].sum(axis=0) - count * np.square(mean_O), 0.0)
+    mean_O = sums[valid].sum(axis=0) / count
+    m2_O = np.maximum(squares[valid].sum(axis=0) - count * np.square(mean_O), 0.0)
     return Moments(count, mean_O + shift_O, m2_O)

@@ -267,6 +267,37 @@ def test_a_member_that_returns_nan_is_seen_and_does_not_poison_the_statistics(sp
     assert result.moments.count == result.steps[~invalid].sum()
 
 
+@pytest.mark.parametrize("broken", ["fitness", "descriptor"])
+def test_what_an_invalid_episode_saw_is_left_out_though_it_is_finite(spec, monkeypatch, broken):
+    """A member that blows up sees 1e12 for a while: in the run's statistics that would stay."""
+    counting = counting_environment([1, 5, 17, 1000], poison_after_done=False)
+
+    def step(state, action):
+        state, reward, done = counting.step(state, action)
+        return state, jnp.where((state[0] == 5.0) & (broken == "fitness"), jnp.nan, reward), done
+
+    def descriptor(state):
+        return jnp.where((state[0] == 5.0) & (broken == "descriptor"), jnp.inf, state)
+
+    blows_up = dataclasses.replace(
+        counting,
+        observe=lambda state: jnp.where(state[0] == 5.0, 1e12 + state, state),
+        step=step,
+        descriptor=descriptor,
+    )
+    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: blows_up)
+    run_chunk = make_worker(spec(episode_steps=30, episodes_per_member=3))
+    result = run_chunk(centre(random_parameters()), TrainingChunk(1, 0))
+    assert isinstance(result, EpisodesResult)
+    assert result.moments is not None
+    assert not np.isfinite(getattr(result, broken)).all()
+    assert (np.abs(result.moments.mean_O) < 1000).all()
+    assert (result.moments.m2_O / result.moments.count < 1e6).all()
+    assert 0 < result.moments.count < result.steps.sum()
+    lifetimes = np.array([1, 5, 17, 1000])[episode_keys(spec(episodes_per_member=3), 1, np.arange(8))[0][..., 0] % 4]
+    assert result.moments.count == np.minimum(lifetimes, 30)[lifetimes != 5].sum()
+
+
 def test_numpy_policy_equals_the_rollout_s(spec, monkeypatch):
     """One step of an environment whose reward is its first action: the exported policy says the same."""
     one_step = Environment(
