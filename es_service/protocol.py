@@ -51,7 +51,7 @@ class TaskSpec:
     wall_clearance: float = 0.0
     """How near the middle of a wall no descriptor can come."""
     least_reward: float | None = None
-    """A reward below which none is expected: what a QD-score counts from. None where nobody says."""
+    """A reward below which no episode's mean is expected: what a QD-score counts from. None where nobody says."""
     no_simd: str = ""
     """Why simd cannot compile its episodes; empty where it can."""
     no_vectors: str = ""
