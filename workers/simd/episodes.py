@@ -141,7 +141,11 @@ class Written(NamedTuple):
 def write_episodes(
     environment: Environment, spec: WorkerSpec, inputs_O: np.ndarray, width: int, *, training: bool
 ) -> Written:
-    """All of `compile_episodes` but LLVM's part, of no processor: what has no text cannot be compiled."""
+    """All of `compile_episodes` but LLVM's part, and without asking what this processor can.
+
+    Raises:
+        UnsupportedError: as `compile_episodes`, here or when the text is made.
+    """
     steps = episode_steps(environment, spec, training=training, inputs_O=inputs_O)
     network = plan(spec.policy, inputs_O, width)
     key, inputs = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32), jax.ShapeDtypeStruct((len(inputs_O),), jnp.float32)
