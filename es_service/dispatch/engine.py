@@ -57,6 +57,10 @@ class Transport(Protocol):
         """Have a worker that is up run the chunks around the centre, behind those it was sent before."""
         ...
 
+    def silent(self) -> tuple[int, ...]:
+        """Workers that may have been gone already when they were sent what they should be doing."""
+        ...
+
     def receive(self, timeout_s: float) -> Message | None:
         """The next message, each worker's in order; None if none comes in `timeout_s` (0: if none is there).
 
@@ -127,7 +131,9 @@ class Engine(Generic[AnyTransport]):
                 After either, `close` is all that is left to do.
         """
         while (message := self.transport.receive(0.0)) is not None:
-            self._handle(message)  # a worker lost since the last call gets no chunk, so no chunk is blamed for it
+            # A worker known to be lost gets no chunk. One lost unseen, as idle actors are, may: that is blamed on a
+            # chunk once, since all the others are then asked first.
+            self._handle(message)
         self._phase += 1
         parts = self._parts(chunks)
         self._centre, self._chunks, self._results = centre, dict(parts), {}
@@ -139,7 +145,7 @@ class Engine(Generic[AnyTransport]):
             if (message := self.transport.receive(wait_s)) is not None:
                 self._handle(message)
             else:  # only now: a late look at the clock must not kill workers whose answers were waiting
-                self._step(messages.Tick())
+                self._step(messages.Tick(self.transport.silent()))
         return [result for key, _ in parts for result in self._results.pop(key)]
 
     def close(self) -> None:

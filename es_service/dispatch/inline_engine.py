@@ -64,6 +64,8 @@ class _Worker:
     channel: Channel
     centre: Centre | None = None
     """The one it was sent last."""
+    unanswered: int = 0
+    """Tasks that it was sent and has not answered."""
 
 
 class ChildProcesses:
@@ -113,8 +115,13 @@ class ChildProcesses:
         if to.centre is not centre:
             to.centre = centre
             frames.insert(0, self._centre[1])
+        to.unanswered += 1
         to.channel.send(*frames)
         self._watch(to.channel)
+
+    def silent(self) -> tuple[int, ...]:
+        """None: sockets tell at once that a child is gone."""
+        return ()
 
     def receive(self, timeout_s: float) -> Message | None:
         """The next message of any worker; a child that closed a socket is killed before it is reported lost."""
@@ -162,14 +169,17 @@ class ChildProcesses:
     def _hear(self, number: int) -> str | None:
         """Read what a worker has said. If that was the end of it: what was wrong, "" if it does not say."""
         try:
-            messages, is_open = self._workers[number].channel.receive()
+            worker = self._workers[number]
+            messages, is_open = worker.channel.receive()
             for said in messages:
                 match said:
                     case ("up",):
                         self._ready.append(WorkerUp(number))
                     case ("results", key, attempt, results):
+                        worker.unanswered -= 1
                         self._ready.append(Answer(number, key, attempt, results))
                     case ("failure", key, attempt, text):
+                        worker.unanswered -= 1
                         self._ready.append(Failure(number, key, attempt, text))
                     case ("broken", text):
                         return text
@@ -187,13 +197,18 @@ class ChildProcesses:
         return worker.child
 
     def _lose(self, child: _Child, reason: str = "", *, bystanders: bool = False) -> None:
-        """Kill a child for good, and report those of its workers lost that are not forgotten, after what they said."""
-        numbers = [number for number, worker in self._workers.items() if worker.child is child]
-        for number in numbers:
+        """Kill a child for good, and report those of its workers lost that are not forgotten, after what they said.
+
+        One that had nothing in hand is a bystander: the scheduler may send it what another of the child had, before it
+        comes to its loss.
+        """
+        lost = {number: worker for number, worker in self._workers.items() if worker.child is child}
+        for number in lost:
             self._hear(number)
             self._forget(number)
-        how = _end(child, numbers)
-        self._ready.extend(WorkerLost(number, reason or how, bystander=bystanders) for number in numbers)
+        how = _end(child, list(lost))
+        for number, worker in lost.items():
+            self._ready.append(WorkerLost(number, reason or how, bystander=bystanders or not worker.unanswered))
 
 
 def _end(child: _Child, numbers: list[int]) -> str:

@@ -78,7 +78,7 @@ class WorkerLost:
     worker: int
     reason: str
     bystander: bool = False
-    """Whether it was lost with another: then what it was computing is not to blame."""
+    """Whether it was lost with another, or before it had what it was sent: then that is not to blame."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,10 @@ class Failure:
 @dataclass(frozen=True)
 class Tick:
     """Time has passed."""
+
+    silent: tuple[int, ...] = ()
+    """Workers that may have been gone already when they were sent what they should be doing: if they do not answer in
+    time, that is not to blame."""
 
 
 @dataclass(frozen=True)

@@ -103,6 +103,8 @@ class Actors:
         self._calls: dict[Any, _Call] = {}
         self._places: dict[int, WorkerPlace] = {}
         self._drained: set[int] = set()
+        self._to_ask: set[int] = set()
+        """Workers to be asked for their place again before they are sent anything, since another was lost."""
         self._inbox: deque[Message] = deque()
         self._centre: tuple[Centre, Any] | None = None
         self._placed_by_s = time.monotonic() + PLACEMENT_S
@@ -127,23 +129,36 @@ class Actors:
             del self._calls[ref]
         self._places.pop(worker, None)
         handle = self._handles.pop(worker, None)
+        self._to_ask = set(self._handles)
         if handle is not None:
             with contextlib.suppress(self._ray.exceptions.RayError, ValueError):
                 self._ray.kill(handle, no_restart=True)
 
     def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
-        """Call the actor. A centre is stored once, however many calls share it, and dropped with the next one."""
+        """Call the actor. A centre is stored once, however many calls share it, and dropped with the next one.
+
+        That an idle actor is gone shows only when it is called. So after a loss, which may have been that of a node,
+        each other actor is asked for its place ahead of its next chunks: if it is gone too, it has not begun them, and
+        they are not to blame; if it answers, they are, should it die of them.
+        """
         if worker not in self._handles:
             return  # lost a moment ago, when it was sent other chunks; that is on its way to the scheduler
         try:
             if self._centre is None or self._centre[0] is not centre:
                 pickled = pickle.dumps(centre, pickle.HIGHEST_PROTOCOL)
                 self._centre = centre, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
+            if worker in self._to_ask:
+                self._to_ask.discard(worker)
+                self._calls[self._handles[worker].place.remote()] = _Call(worker, "place")
             ref = self._handles[worker].run.remote(self._centre[1], pickle.dumps(chunks, pickle.HIGHEST_PROTOCOL))
         except self._ray.exceptions.RayError as error:
             self._lose(worker, _reason(error))
             return
         self._calls[ref] = _Call(worker, "run", key, attempt)
+
+    def silent(self) -> tuple[int, ...]:
+        """Workers that have not answered where they are."""
+        return tuple(worker for worker, what in self._owed_first().items() if what == "place")
 
     def receive(self, timeout_s: float) -> Message | None:
         """The next message.
@@ -163,7 +178,7 @@ class Actors:
             ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=timeout_s)
             if not ready:
                 break
-            if (message := self._message(ready[0], self._calls.pop(ready[0]))) is not None:
+            if (message := self._message(ready[0])) is not None:
                 return message
             timeout_s = 0.0  # that was where a worker is; None would say that no answer waits behind it
         if not self._places and time.monotonic() > self._placed_by_s:
@@ -184,19 +199,19 @@ class Actors:
         self._centre = None
         disconnect(self._ray)
 
-    def _message(self, ref: Any, call: _Call) -> Message | None:
-        errors = self._ray.exceptions
+    def _message(self, ref: Any) -> Message | None:
+        call, errors = self._calls[ref], self._ray.exceptions
         try:
             value = self._ray.get(ref)
         except errors.RayTaskError as error:  # it raised, and lives
-            if call.what == "run":
-                return Failure(call.worker, call.key, call.attempt, str(error))
-            self.kill(call.worker)
-            return WorkerLost(call.worker, str(error))
+            if call.what != "run":
+                return self._lost(call.worker, str(error))
+            del self._calls[ref]
+            return Failure(call.worker, call.key, call.attempt, str(error))
         except errors.RayError as error:
             where = self._places.get(call.worker)
-            self.kill(call.worker)
-            return WorkerLost(call.worker, f"{where or 'before it had a place'}: {_reason(error)}")
+            return self._lost(call.worker, f"{where or 'before it had a place'}: {_reason(error)}")
+        del self._calls[ref]
         if call.what == "run":
             return Answer(call.worker, call.key, call.attempt, pickle.loads(value))
         if call.what == "build":
@@ -216,9 +231,20 @@ class Actors:
             self._room = now.room
             self._inbox.append(SetWorkers(now.room))
 
+    def _owed_first(self) -> dict[int, str]:
+        """Worker -> the first call that it has not answered: place, build or run."""
+        first: dict[int, str] = {}
+        for call in self._calls.values():
+            first.setdefault(call.worker, call.what)
+        return first
+
     def _lose(self, worker: int, reason: str) -> None:
+        self._inbox.append(self._lost(worker, reason))
+
+    def _lost(self, worker: int, reason: str) -> WorkerLost:
+        has_begun = self._owed_first().get(worker) == "run"
         self.kill(worker)
-        self._inbox.append(WorkerLost(worker, reason))
+        return WorkerLost(worker, reason, bystander=not has_begun)
 
 
 def _reason(error: Exception) -> str:

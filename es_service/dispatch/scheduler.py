@@ -10,9 +10,11 @@ otherwise a driver that was busy elsewhere would kill workers whose answers it h
 
 Choices. A result is a pure function of its key, so any result of a known worker for a key that still waits is accepted,
 even of a superseded attempt; a stopped worker is forgotten at once, so what it still says is dropped and counted. Only
-the task a worker was running is charged with its loss; one prefetched behind it goes back with its attempt unused. A
-task that raised waits for another worker rather than go back to the same one, as long as another is up: a broken worker
-that raises at once must not use up the attempts of good tasks. A worker lost while draining is nobody's fault.
+the task a worker was running is charged with its loss; one prefetched behind it goes back with its attempt unused. So
+does one sent to a worker that was gone already, if the transport says so: a machine that dies under many workers is one
+fault, however many of them are tried before all are known to be gone. A task that raised waits for another worker
+rather than go back to the same one, as long as another is up: a broken worker that raises at once must not use up the
+attempts of good tasks. A worker lost while draining is nobody's fault.
 
 Cost: each step makes shallow copies of the containers (C speed, a few microseconds for a thousand entries) and changes
 only the records touched; the records are frozen and shared between states.
@@ -175,8 +177,8 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
             s = _result(s, out, worker, key, attempt, now)
         case Failure():
             s = _failure(s, out, event, now)
-        case Tick():
-            s = _expire(s, out, now)
+        case Tick(silent):
+            s = _expire(s, out, now, silent)
         case Drain(worker):
             _drain(s, out, worker)
         case SetWorkers(wanted):
@@ -344,7 +346,7 @@ def _fail(s: SchedulerState, out: list[Command], message: str) -> SchedulerState
     return s._replace(failed=message, starting={}, up={}, draining={}, queue=deque())
 
 
-def _expire(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
+def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int, ...]) -> SchedulerState:
     """Stop every worker whose deadline has passed; fail if no worker was up for too long."""
     late = {w: f"did not come up in {s.policy.start_deadline_s:g} s" for w, at in s.starting.items() if now >= at}
     for worker, record in (*s.up.items(), *s.draining.items()):
@@ -354,7 +356,7 @@ def _expire(s: SchedulerState, out: list[Command], now: float) -> SchedulerState
     for worker, reason in late.items():
         if s.failed is None:
             out.append(StopWorker(worker, reason))
-            s = _lose(s, out, worker, reason, now)
+            s = _lose(s, out, worker, reason, now, charge=worker not in silent)
     if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + s.policy.no_worker_timeout_s:
         for_s = s.policy.no_worker_timeout_s
         return _fail(

@@ -81,6 +81,17 @@ def test_what_threads_have_said_is_heard_before_they_are_lost_with_another(trans
     assert transport.receive(0.0) is None
 
 
+def test_a_thread_that_has_answered_everything_is_a_bystander_of_its_child_s_end(transport):
+    transport, ends = transport
+    for worker in range(2):
+        transport.send(worker, FIRST, worker, 1, CHUNKS[:1])
+    ends[0].sendall(framed(("results", 0, 1, ["its own"])))
+    ends[1].close()
+    heard = [transport.receive(1.0) for _ in range(3)]
+    assert heard[0] == Answer(0, 0, 1, ["its own"])  # type: ignore[arg-type]
+    assert {message.worker: message.bystander for message in heard[1:]} == {0: True, 1: False}
+
+
 class Unreadable:
     """Says how it is to be made again, in vain."""
 

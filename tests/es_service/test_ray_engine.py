@@ -1,0 +1,153 @@
+"""The Ray engine on a pretended Ray in memory: nodes that die or hang under workers, and actors without a place."""
+
+from __future__ import annotations
+
+import pickle
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from es_service.dispatch.engine import Engine
+from es_service.dispatch.messages import Policy
+from es_service.dispatch.ray_cluster import ONE_CORE
+from es_service.dispatch.ray_engine import Actors
+from es_service.errors import EvaluationError
+from es_service.protocol import TrainingChunk
+from tests.helpers import SPEC, centre, random_parameters
+
+FIRST = centre(random_parameters())
+CHUNK = TrainingChunk(3, 0)
+
+
+class RayError(Exception):
+    """As in Ray."""
+
+
+class RayTaskError(RayError):
+    """As in Ray."""
+
+
+class ActorDiedError(RayError):
+    """As in Ray."""
+
+
+@dataclass(eq=False)
+class Actor:
+    """An actor that answers at once. `state`: pending (without a place), alive, hung or dead."""
+
+    number: int
+    state: str
+    owed: list[Ref] = field(default_factory=list)
+    ran: int = 0
+    """Chunks."""
+
+
+@dataclass(eq=False)
+class Ref:
+    value: Any = None
+    error: Exception | None = None
+    is_ready: bool = False
+
+
+class PretendedRay:
+    """What the engine uses of the module. `on_run` says what becomes of an actor that runs chunks."""
+
+    def __init__(self, room: int = 1000) -> None:
+        self.exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
+        self._private = SimpleNamespace(worker=SimpleNamespace())
+        self.room = room
+        self.actors: list[Actor] = []
+        self.on_run: Callable[[Actor], Any] = lambda actor: None
+
+    def remote(self, **_: Any) -> Callable[[type], Any]:
+        return lambda cls: SimpleNamespace(remote=self._start)
+
+    def wait(self, refs: list[Ref], num_returns: int, timeout: float) -> tuple[list[Ref], list[Ref]]:
+        ready = [ref for ref in refs if ref.is_ready][:num_returns]
+        if not ready:
+            time.sleep(timeout)
+        return ready, []
+
+    def get(self, ref: Ref) -> Any:
+        if ref.error is not None:
+            raise ref.error
+        return ref.value
+
+    def kill(self, actor: Any, no_restart: bool) -> None:
+        self.end(actor.itself)
+
+    def shutdown(self) -> None:
+        pass
+
+    def end(self, actor: Actor, state: str = "dead") -> None:
+        """An actor dies or hangs: nothing it owes is answered any more."""
+        actor.state = state
+        for ref in actor.owed:
+            self._settle(actor, ref)
+
+    def _start(self, spec: bytes, index: int, gpus: float) -> Any:
+        placed = sum(actor.state == "alive" for actor in self.actors)
+        actor = Actor(index, "alive" if placed < self.room else "pending")
+        self.actors.append(actor)
+        methods = {
+            "place": lambda: ("host", actor.number, "node"),
+            "build": lambda: None,
+            "run": lambda centre, chunks: pickle.dumps([f"of {chunk}" for chunk in pickle.loads(chunks)]),
+        }
+        calls = {name: SimpleNamespace(remote=self._caller(actor, name, body)) for name, body in methods.items()}
+        return SimpleNamespace(itself=actor, **calls)
+
+    def _caller(self, actor: Actor, name: str, body: Callable[..., Any]) -> Callable[..., Ref]:
+        def call(*arguments: Any) -> Ref:
+            ref = Ref(body(*arguments))
+            actor.owed.append(ref)
+            if name == "run" and actor.state == "alive":
+                actor.ran += 1
+                self.on_run(actor)
+            self._settle(actor, ref)
+            return ref
+
+        return call
+
+    def _settle(self, actor: Actor, ref: Ref) -> None:
+        if not ref.is_ready and actor.state in ("alive", "dead"):
+            ref.error = ActorDiedError("gone") if actor.state == "dead" else None
+            ref.is_ready = True
+
+
+def ray_engine(ray: PretendedRay, policy: Policy) -> Engine[Actors]:
+    actors = Actors(ray, SPEC, type(None), ONE_CORE, None, None)  # type: ignore[arg-type]
+    return Engine(actors, policy)
+
+
+@pytest.mark.parametrize("state", ["dead", "hung"])
+def test_a_node_that_dies_is_one_fault_of_what_it_ran_however_many_workers_it_held(state):
+    """One chunk, and more idle actors on its node than it has attempts: they are called, in vain, and blame nobody."""
+    ray, policy = PretendedRay(), Policy(6, min_deadline_s=0.05, first_deadline_s=0.05, restart_backoff_s=0.01)
+
+    def node_dies(actor: Actor) -> None:
+        for number in range(5):
+            ray.end(ray.actors[number], state)
+        ray.on_run = lambda actor: None
+
+    with ray_engine(ray, policy) as engine:
+        while not all(actor.ran for actor in ray.actors):  # so that all are up
+            engine.evaluate(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)])
+        ray.on_run = node_dies
+        assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
+        assert engine.counts.lost_workers == 5
+
+
+def test_a_chunk_that_kills_its_workers_is_found_out_after_as_many_as_it_has_attempts():
+    """Although all the others were asked whether they are still there: they are."""
+    ray = PretendedRay()
+    with ray_engine(ray, Policy(9)) as engine:
+        engine.evaluate(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)])
+        ray.on_run = ray.end
+        with pytest.raises(EvaluationError, match="TrainingChunk 0 of generation 3 failed in 4 attempts"):
+            engine.evaluate(FIRST, [CHUNK])
+        assert engine.counts.lost_workers == 4
