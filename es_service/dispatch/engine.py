@@ -58,7 +58,7 @@ class Transport(Protocol):
         ...
 
     def silent(self) -> tuple[int, ...]:
-        """Workers that may have been gone already when they were sent what they should be doing."""
+        """Workers without a place yet, and those that may have been gone when they were sent what they should run."""
         ...
 
     def receive(self, timeout_s: float) -> Message | None:

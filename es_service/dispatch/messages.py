@@ -44,7 +44,7 @@ class Policy:
     """Wait before replacing the second, third ... loss without a success between: restart_backoff_s, doubling up to
     max_backoff_s. The first replacement is immediate; losses during a wait share it (a node that died, say)."""
     max_start_failures: int = 3
-    """This many workers in a row lost before they came up, and none up: the environment is broken."""
+    """This many workers in a row lost before they came up, and none up meanwhile: the environment is broken."""
     no_worker_timeout_s: float = 300.0
     """Longest time with tasks waiting and no worker up; longer than `start_deadline_s` to be of any use."""
 
@@ -105,8 +105,8 @@ class Tick:
     """Time has passed."""
 
     silent: tuple[int, ...] = ()
-    """Workers that may have been gone already when they were sent what they should be doing: if they do not answer in
-    time, that is not to blame."""
+    """Workers without a place yet, and those that may have been gone already when they were sent what they should be
+    doing: if they do not answer in time, neither they nor what they were sent is to blame."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ the task a worker was running is charged with its loss; one prefetched behind it
 does one sent to a worker that was gone already, if the transport says so: a machine that dies under many workers is one
 fault, however many of them are tried before all are known to be gone. A task that raised waits for another worker
 rather than go back to the same one, as long as another is up: a broken worker that raises at once must not use up the
-attempts of good tasks. A worker lost while draining is nobody's fault.
+attempts of good tasks. A worker lost while draining is nobody's fault. One that was given no place in time is started
+anew, since one that hangs before it can say where it is looks the same, but counts as no loss.
 
 Cost: each step makes shallow copies of the containers (C speed, a few microseconds for a thousand entries) and changes
 only the records touched; the records are frozen and shared between states.
@@ -308,7 +309,7 @@ def _lose(
         return s
     s = s._replace(
         lost_workers=s.lost_workers + 1,
-        start_failures=s.start_failures + starting,
+        start_failures=0 if s.up or s.draining else s.start_failures + starting,
         last_loss=f"worker {worker}: {reason}",
     )
     if now >= s.start_at_s:  # else a replacement already waits, and this one with it
@@ -356,7 +357,9 @@ def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int
     for worker, reason in late.items():
         if s.failed is None:
             out.append(StopWorker(worker, reason))
-            s = _lose(s, out, worker, reason, now, charge=worker not in silent)
+            is_silent = worker in silent
+            has_no_place = is_silent and worker in s.starting
+            s = _lose(s, out, worker, reason, now, fault=not has_no_place, charge=not is_silent)
     if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + s.policy.no_worker_timeout_s:
         for_s = s.policy.no_worker_timeout_s
         return _fail(

@@ -90,7 +90,7 @@ class PretendedRay:
             self._settle(actor, ref)
 
     def _start(self, spec: bytes, index: int, gpus: float) -> Any:
-        placed = sum(actor.state == "alive" for actor in self.actors)
+        placed = sum(actor.state in ("alive", "hung") for actor in self.actors)
         actor = Actor(index, "alive" if placed < self.room else "pending")
         self.actors.append(actor)
         methods = {
@@ -140,6 +140,22 @@ def test_a_node_that_dies_is_one_fault_of_what_it_ran_however_many_workers_it_he
         ray.on_run = node_dies
         assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
         assert engine.counts.lost_workers == 5
+
+
+def test_an_actor_that_is_given_no_place_is_not_lost():
+    """Of three there is room for two. One of those hangs, long enough for the third to be started anew many times."""
+    ray, policy = PretendedRay(room=2), Policy(3, start_deadline_s=0.02, min_deadline_s=0.3, first_deadline_s=0.3)
+
+    def hang(actor: Actor) -> None:
+        ray.end(actor, "hung")
+        ray.on_run = lambda actor: None
+
+    with ray_engine(ray, policy) as engine:
+        ray.on_run = hang
+        assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
+        assert len(ray.actors) > 8
+        assert engine.counts.lost_workers == 1
+        assert "no answer to task" in engine.last_loss
 
 
 def test_a_chunk_that_kills_its_workers_is_found_out_after_as_many_as_it_has_attempts():

@@ -41,7 +41,7 @@ from es_service.dispatch.scheduler import (
     step,
 )
 
-START_FATES = ("start_dies", "start_hangs")
+START_FATES = ("start_dies", "start_hangs", "no_place")
 TASK_FATES = ("task_dies", "task_hangs", "task_slow", "task_raises", "contradicts")
 FAULTS = (
     *START_FATES,
@@ -90,6 +90,7 @@ class World:
         self.alive: set[int] = set()
         self.inbox: dict[int, deque[tuple[tuple, int]]] = {}
         self.busy: set[int] = set()
+        self.unplaced: set[int] = set()
         self.last_word: dict[int, float] = {}
         self.poison: dict[tuple, str] = {}
         # What a correct scheduler must know.
@@ -126,6 +127,8 @@ class World:
         self.inbox[worker], self.open[worker] = deque(), []
         if self.happens("start_dies"):
             self.at(self.random.random(), self.die, worker)
+        elif self.happens("no_place"):
+            self.unplaced.add(worker)
         elif not self.happens("start_hangs"):
             self.at(self.random.random(), self.come_up, worker)
 
@@ -171,7 +174,8 @@ class World:
         self.known.discard(worker)
         if fault:
             self.lost += 1
-            self.start_failures += worker not in self.up
+            if worker not in self.up:
+                self.start_failures = 0 if self.up else self.start_failures + 1
             running = self.open[worker][0][0] if self.open[worker] else None
             if charge and running in self.waiting:
                 self.faults[running] += 1
@@ -264,8 +268,9 @@ class World:
             self.forget(worker, fault=False, charge=False)
         elif self.failed is None:
             assert isinstance(event, Tick | Failure)
-            self.seen["quarantine" if isinstance(event, Failure) else "deadline"] += 1
-            self.forget(worker, fault=True, charge=isinstance(event, Tick))
+            has_no_place = isinstance(event, Tick) and worker in event.silent
+            self.seen["no place" if has_no_place else "quarantine" if isinstance(event, Failure) else "deadline"] += 1
+            self.forget(worker, fault=not has_no_place, charge=isinstance(event, Tick))
         self.known.discard(worker)
         self.up.discard(worker)
         self.alive.discard(worker)
@@ -326,6 +331,9 @@ class World:
 
     # The run.
 
+    def tick(self) -> None:
+        self.feed(Tick(tuple(sorted(self.unplaced))))
+
     def submit(self, generation: int) -> None:
         tasks = tuple(
             Task((kind, generation, index), kind)
@@ -347,7 +355,7 @@ class World:
         if self.happens("resize"):
             self.feed(SetWorkers(self.random.randint(1, 5)))
         if self.random.random() < 0.3:
-            self.feed(Tick())
+            self.tick()
 
     def run_until_quiet(self) -> None:
         for _ in range(20_000):
@@ -358,7 +366,7 @@ class World:
             elif due < math.inf:
                 self.now = max(self.now, due)
                 before = self.state
-                self.feed(Tick())
+                self.tick()
                 assert self.state is not before, "next_deadline announced nothing"
             else:
                 return
@@ -367,7 +375,7 @@ class World:
 
 def simulate(seed: int) -> World:
     world = World(seed)
-    world.feed(Tick())
+    world.tick()
     for generation in range(3):
         world.submit(generation)
         for _ in range(8):
@@ -416,7 +424,7 @@ def test_every_task_is_delivered_once_or_the_run_fails_for_a_reason(block, seen)
 def test_the_simulation_reached_every_rare_case(seen):
     if seen["failed"] + seen["survived faults"] + seen["untouched"] < SEEDS:
         pytest.skip("not all simulations ran")
-    rare = ("poison", "start failures", "no worker", "quarantine", "deadline", "superseded result")
+    rare = ("poison", "start failures", "no worker", "no place", "quarantine", "deadline", "superseded result")
     too_rare = {case: seen[case] for case in (*rare, "lost while draining", "survived faults") if seen[case] < 20}
     assert not too_rare
     assert seen["failed"] < SEEDS / 2
@@ -635,8 +643,13 @@ def test_start_failures_are_forgiven_while_a_worker_is_up():
     state, _ = play(state, (0.0, WorkerLost(0, "killed")), *((0.1 + w, WorkerLost(w, "no memory")) for w in (2, 3, 4)))
     state, _ = play(state, (50.0, Tick()), (50.0, WorkerLost(3, "no memory")), (99.0, Tick()))
     state, _ = play(state, (99.0, WorkerLost(4, "no memory")))
-    assert (state.failed, state.start_failures) == (None, 3)
-    state, _ = play(state, (200.0, Tick()), (200.0, WorkerUp(5)))
+    assert state.failed is None
+    # The last that is up is lost, and then it takes three again.
+    state, _ = play(state, (200.0, WorkerLost(1, "killed")), (300.0, Tick()))
+    assert sorted(state.starting) == [5, 6]
+    state, _ = play(state, (301.0, WorkerLost(5, "no memory")), (302.0, WorkerLost(6, "no memory")))
+    assert (state.failed, state.start_failures) == (None, 2)
+    state, _ = play(state, (400.0, Tick()), (400.0, WorkerUp(7)))
     assert state.start_failures == 0
 
 
@@ -647,6 +660,26 @@ def test_a_worker_that_never_comes_up_is_killed_and_replaced():
     assert commands == [StopWorker(0, "did not come up in 50 s"), StartWorker(2)]
     assert step(state, WorkerUp(0), 51.0) == (state, [])
     assert step(state, WorkerLost(0, "stopped"), 51.0) == (state, [])
+
+
+def test_a_worker_without_a_place_is_started_anew_and_nobody_hears_of_it():
+    """However often: then the last that is up is lost, and the run waits for others as long as it should."""
+    patient = initial_state(replace(POLICY, first_deadline_s=1000.0))
+    state, _ = play(patient, (0.0, Tick()), (1.0, WorkerUp(0)), (1.0, tasks("a")))
+    for number in range(1, 6):
+        state, commands = step(state, Tick(silent=(number,)), 50.0 * number)
+        assert commands == [StopWorker(number, "did not come up in 50 s"), StartWorker(number + 1)]
+    assert (state.lost_workers, state.last_loss, state.start_failures) == (0, "none was ever lost", 0)
+    state, _ = play(state, (251.0, WorkerLost(0, "killed")), (252.0, WorkerLost(6, "no memory")))
+    assert (state.failed, state.lost_workers) == (None, 2)
+
+
+def test_what_a_silent_worker_does_not_answer_in_time_is_not_to_blame():
+    state, _ = play(ready(1), (0.0, tasks("a")))
+    state, commands = step(state, Tick(silent=(0,)), 100.0)
+    assert commands == [StopWorker(0, "no answer to task a in 100 s"), StartWorker(1)]
+    assert state.lost_workers == 1
+    assert step(state, WorkerUp(1), 101.0)[1] == [Assign(1, "a", 1)]
 
 
 def test_no_worker_for_too_long_fails_the_run():
