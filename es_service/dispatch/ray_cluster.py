@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-from es_service.errors import EvaluationError
+from es_service.errors import EvaluationError, Interrupted
 
 OBJECT_STORE_BYTES = 200 * 2**20
 """Shared memory of a local Ray: a few centres and gradient blocks. Ray would take a third of the machine's."""
@@ -73,6 +73,7 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
 
     Raises:
         EvaluationError: Ray is missing, in use by this process already, does not start, or no cluster takes us in.
+        Interrupted: SIGTERM arrived meanwhile.
     """
     without = "`--engine inline` runs on this machine without Ray"
     options: dict[str, Any] = {"address": address}
@@ -97,6 +98,11 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
             if address not in (None, "auto"):
                 _knock(address)
             ray.init(**options, logging_level=logging.ERROR, log_to_driver=False)
+        except SystemExit as stop:  # Ray's handler of SIGTERM, which takes the place of ours, exits with its number
+            ray.shutdown()
+            if stop.code != signal.SIGTERM:
+                raise
+            raise Interrupted(signal.SIGTERM) from stop
         except Exception as error:  # Ray raises many kinds: ConnectionError, RuntimeError, ValueError, TimeoutError ...
             if address is None:
                 raise EvaluationError(f"Ray does not start on this machine: {error}. {without}") from error

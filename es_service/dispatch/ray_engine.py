@@ -52,7 +52,8 @@ def ray_engine(
         elastic: as many workers as there is room for, instead of `policy.workers`; in a cluster, also when it changes.
 
     Raises:
-        EvaluationError: Ray is missing, does not start, or no cluster answers at the address.
+        EvaluationError: Ray is missing, does not start, or no cluster answers at the address. Interrupted: SIGTERM
+            arrived meanwhile.
     """
     ray = connect(address, claim, policy.workers if elastic else policy.workers * claim.cpus)
     try:

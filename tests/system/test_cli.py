@@ -288,6 +288,24 @@ def test_a_signal_during_start_up_ends_quietly(config, tmp_path, delay_s):
     assert "Traceback" not in errors
 
 
+@pytest.mark.parametrize("delay_s", [0.5, 1.0, 1.5, 2.5])
+def test_sigterm_while_ray_starts_ends_as_at_any_other_time(config, tmp_path, delay_s):
+    """Ray has a handler of its own meanwhile. Seconds count from when the run folder is there, before Ray starts."""
+    folder = tmp_path / "run"
+    long = ["--engine", "ray", "--workers", "1", "--set", "budget.generations=100000"]
+    process = subprocess.Popen(
+        [*COMMAND, "run", str(config), "--out", str(folder), *long], cwd=ROOT, stderr=subprocess.PIPE, text=True
+    )
+    while not (folder / "run.db").exists():
+        time.sleep(0.01)
+    time.sleep(delay_s)
+    process.terminate()
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 143
+    assert errors.endswith(f"Go on with: es-service resume {folder}\n")
+    assert "Traceback" not in errors
+
+
 def test_a_second_driver_is_refused_and_told_who_holds_the_run(config, tmp_path):
     folder = tmp_path / "run"
     process = subprocess.Popen(
