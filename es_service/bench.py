@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from es_service.config.resolution import did_you_mean, one_of
+from es_service.cores import cores
 from es_service.errors import ConfigError, EvaluationError
 from es_service.tasks import Tasks, child_environment
 from workers.environments import TASKS
@@ -49,13 +49,13 @@ def bench_rollouts(
                 f"--task {task}: no known task; must be {one_of(known)}, or brax:NAME, or module:Class"
                 f"{did_you_mean(task, known)}"
             )
-    every = sorted({1, len(os.sched_getaffinity(0))})
+    every = sorted({1, cores()})
     for task in tasks or TASKS:
         cannot: set[str] = set()
         for policy, rollout in itertools.product(policies, rollouts):
             if rollout in cannot:
                 continue
-            for batch, cores in itertools.product(batches or BATCHES.get(task, ANT_BATCHES), every):
+            for batch, count in itertools.product(batches or BATCHES.get(task, ANT_BATCHES), every):
                 arguments = {
                     "task": task,
                     "options": {},
@@ -65,7 +65,7 @@ def bench_rollouts(
                     "seconds": seconds,
                     "rollout": rollout,
                 }
-                row = _row(arguments, cores)
+                row = _row(arguments, count)
                 if "note" in row and set(rollouts) == {"simd"}:
                     raise EvaluationError(f"{task}: {row['note']}")
                 yield row
@@ -74,12 +74,12 @@ def bench_rollouts(
                     break
 
 
-def _row(arguments: Mapping[str, Any], cores: int) -> dict[str, Any]:
+def _row(arguments: Mapping[str, Any], count: int) -> dict[str, Any]:
     command = [sys.executable, "-m", "workers.measure", json.dumps(arguments)]
     environment = child_environment()
     started = [
         subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for _ in range(cores)
+        for _ in range(count)
     ]
     found = []
     for process in started:
@@ -93,7 +93,7 @@ def _row(arguments: Mapping[str, Any], cores: int) -> dict[str, Any]:
     return named | {
         "policy": "on" if arguments["policy"] else "off",
         "batch": arguments["batch"],
-        "cores": cores,
+        "cores": count,
         "steps_per_second": sum(one["steps_per_second"] for one in found),
         "compile_seconds": max(one["compile_seconds"] for one in found),
         "peak_mib": max(one["peak_mib"] for one in found),

@@ -18,6 +18,7 @@ from rich.console import Console
 
 from es_service.api import load_config
 from es_service.config.model import worker_spec
+from es_service.cores import cores
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy
 from es_service.errors import ServiceError
@@ -75,7 +76,7 @@ def _ray() -> Iterator[Finding]:
 
 
 def _machine() -> Iterator[Finding]:
-    usable, present = len(os.sched_getaffinity(0)), os.cpu_count() or 1
+    usable, present = cores(), os.cpu_count() or 1
     yield "ok", f"{usable} of {present} cores usable: that many workers by default"
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
     yield ("ok" if memory >= MIN_MEMORY_BYTES else "note"), f"{memory / 2**30:.1f} GiB of memory free"

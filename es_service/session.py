@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from es_service import driver
 from es_service.algorithms import ALGORITHMS
 from es_service.config.model import RunConfig, policy_shape, worker_spec
+from es_service.cores import cores
 from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.inline_engine import inline_engine
@@ -136,4 +136,4 @@ def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Mome
 def worker_count(config: RunConfig) -> int:
     """Workers to start: as configured, or one per core this process may use."""
     workers = config.compute.workers
-    return len(os.sched_getaffinity(0)) if workers == "auto" else workers
+    return cores() if workers == "auto" else workers
