@@ -269,7 +269,9 @@ class ComputeConfig(_Section):
         30.0, description="Least deadline of a chunk in seconds; slow chunks raise it for those that follow."
     )
     compile_timeout_s: Positive = Field(
-        120.0, description="Deadline of a worker's first chunk of each kind, which compiles."
+        120.0,
+        description="Deadline of a worker's first chunk of each kind, which compiles; or what later ones may take, if "
+        "that is longer.",
     )
     max_attempts: Count = Field(4, description="Times a chunk is tried before the run stops with its error.")
     no_worker_timeout_s: Positive = Field(

@@ -33,7 +33,8 @@ class Policy:
     that a single broken worker is replaced before its task is blamed."""
     start_deadline_s: float = 120.0
     first_deadline_s: float = 600.0
-    """For the first task of a kind on a worker, which compiles, and for any task while no duration is known."""
+    """For the first task of a kind on a worker, which compiles, and for any task while no duration is known; or what
+    later ones may take, if that is longer."""
     min_deadline_s: float = 30.0
     deadline_factor: float = 5.0
     """Later tasks may take max(min_deadline_s, deadline_factor x size x median of recent durations of their kind)."""

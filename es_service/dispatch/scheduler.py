@@ -276,12 +276,11 @@ def _close_slot(s: SchedulerState, out: list[Command], worker: int, record: _Wor
 def _begin_first_slot(s: SchedulerState, record: _Worker, now: float) -> _Worker:
     if not record.slots:
         return record._replace(deadline_s=math.inf)
-    task = record.slots[0].task
+    task, policy = record.slots[0].task, s.policy
     usual_s = chunk_s(s, task.kind)
-    if task.kind in record.warm and usual_s is not None:
-        limit_s = max(s.policy.min_deadline_s, s.policy.deadline_factor * task.size * usual_s)
-    else:
-        limit_s = s.policy.first_deadline_s
+    limit_s = max(policy.min_deadline_s, policy.deadline_factor * task.size * (usual_s or 0.0))
+    if usual_s is None or task.kind not in record.warm:
+        limit_s = max(limit_s, policy.first_deadline_s)
     return record._replace(started_s=now, deadline_s=now + limit_s)
 
 

@@ -562,6 +562,16 @@ def test_deadlines_exempt_compiling_and_follow_the_median_of_their_kind():
     assert len(state.durations_s["train"]) == 31, "a bounded window"
 
 
+def test_what_compiles_may_take_no_less_time_than_what_does_not():
+    """Neither while no duration is known, nor on a worker that is new."""
+    state, _ = play(ready(1, in_flight=1, first_deadline_s=10.0, min_deadline_s=60.0), (0.0, tasks("abcde")))
+    assert next_deadline(state) == 60.0
+    state, _ = play(state, (50.0, Result(0, "a", 1)), (100.0, Result(0, "b", 1)))
+    assert next_deadline(state) == 100.0 + 5.0 * 50.0
+    state, _ = play(state, (110.0, WorkerLost(0, "killed")), (111.0, WorkerUp(1)))
+    assert next_deadline(state) == 111.0 + 5.0 * 50.0
+
+
 def test_deadlines_and_durations_are_in_proportion_to_the_size_of_a_task():
     sized = Submit(tuple(Task(key, "train", size) for key, size in (("a", 1), ("b", 4), ("c", 3), ("d", 1))))
     state, _ = play(ready(1, in_flight=1), (0.0, sized), (5.0, Result(0, "a", 1)), (17.0, Result(0, "b", 1)))
