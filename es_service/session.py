@@ -26,6 +26,13 @@ from workers.actor import WorkerActor
 from workers.policy import initial_parameters
 
 TASKS = Tasks()
+LIMITS = {
+    "start_deadline_s": "half of compute.no_worker_timeout_s",
+    "first_deadline_s": "compute.compile_timeout_s",
+    "min_deadline_s": "at least compute.chunk_timeout_s",
+    "no_worker_timeout_s": "compute.no_worker_timeout_s",
+}
+"""What sets how patient the engine is, as its messages say it."""
 
 OnGeneration = Callable[[Mapping[str, Any]], None]
 """Called with each history row once it is safe."""
@@ -94,6 +101,7 @@ def scheduling_policy(config: RunConfig) -> SchedulingPolicy:
         first_deadline_s=compute.compile_timeout_s,
         min_deadline_s=compute.chunk_timeout_s,
         no_worker_timeout_s=compute.no_worker_timeout_s,
+        names=LIMITS,
     )
 
 

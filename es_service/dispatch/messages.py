@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
-from dataclasses import dataclass
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,12 @@ class Policy:
     """This many workers in a row lost before they came up, and none up meanwhile: the environment is broken."""
     no_worker_timeout_s: float = 300.0
     """Longest time with tasks waiting and no worker up; longer than `start_deadline_s` to be of any use."""
+    names: Mapping[str, str] = field(default_factory=dict)
+    """What messages call a limit, so that a user knows what to change: field -> name; others are called as they are."""
+
+    def name_of(self, limit: str) -> str:
+        """What messages call a field of this class."""
+        return self.names.get(limit, limit)
 
     def __post_init__(self) -> None:
         for name in ("workers", "in_flight", "max_attempts", "max_failures_in_a_row", "max_start_failures"):

@@ -79,6 +79,8 @@ class _Worker(NamedTuple):
     """When it began the first slot."""
     deadline_s: float = math.inf
     """When it must have answered the first slot."""
+    limit: str = ""
+    """Field of the policy that this comes from."""
     warm: frozenset[str] = frozenset()
     """Kinds it has finished a task of, hence compiled."""
     failures_in_a_row: int = 0
@@ -278,10 +280,11 @@ def _begin_first_slot(s: SchedulerState, record: _Worker, now: float) -> _Worker
         return record._replace(deadline_s=math.inf)
     task, policy = record.slots[0].task, s.policy
     usual_s = chunk_s(s, task.kind)
-    limit_s = max(policy.min_deadline_s, policy.deadline_factor * task.size * (usual_s or 0.0))
-    if usual_s is None or task.kind not in record.warm:
-        limit_s = max(limit_s, policy.first_deadline_s)
-    return record._replace(started_s=now, deadline_s=now + limit_s)
+    limit, limit_s = "min_deadline_s", max(policy.min_deadline_s, policy.deadline_factor * task.size * (usual_s or 0.0))
+    compiles = usual_s is None or task.kind not in record.warm
+    if compiles and limit_s < policy.first_deadline_s:
+        limit, limit_s = "first_deadline_s", policy.first_deadline_s
+    return record._replace(started_s=now, deadline_s=now + limit_s, limit=limit)
 
 
 def _lose(
@@ -348,22 +351,23 @@ def _fail(s: SchedulerState, out: list[Command], message: str) -> SchedulerState
 
 def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int, ...]) -> SchedulerState:
     """Stop every worker whose deadline has passed; fail if no worker was up for too long."""
-    late = {w: f"did not come up in {s.policy.start_deadline_s:g} s" for w, at in s.starting.items() if now >= at}
+    policy = s.policy
+    reason = f"did not come up in {policy.start_deadline_s:g} s ({policy.name_of('start_deadline_s')})"
+    late = {worker: reason for worker, at in s.starting.items() if now >= at}
     for worker, record in (*s.up.items(), *s.draining.items()):
         if now >= record.deadline_s:
             limit_s = record.deadline_s - record.started_s
-            late[worker] = f"no answer to task {record.slots[0].task.key} in {limit_s:.3g} s"
+            key, name = record.slots[0].task.key, policy.name_of(record.limit)
+            late[worker] = f"no answer to task {key} in {limit_s:.3g} s ({name})"
     for worker, reason in late.items():
         if s.failed is None:
             out.append(StopWorker(worker, reason))
             is_silent = worker in silent
             has_no_place = is_silent and worker in s.starting
             s = _lose(s, out, worker, reason, now, fault=not has_no_place, charge=not is_silent)
-    if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + s.policy.no_worker_timeout_s:
-        for_s = s.policy.no_worker_timeout_s
-        return _fail(
-            s, out, f"{len(s.tasks)} tasks wait and no worker was up for {for_s:g} s; last loss: {s.last_loss}"
-        )
+    if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + policy.no_worker_timeout_s:
+        for_s = f"{policy.no_worker_timeout_s:g} s ({policy.name_of('no_worker_timeout_s')})"
+        return _fail(s, out, f"{len(s.tasks)} tasks wait and no worker was up for {for_s}; last loss: {s.last_loss}")
     return s
 
 

@@ -1,0 +1,47 @@
+"""What a session makes of its config before anything starts."""
+
+from __future__ import annotations
+
+import re
+
+from es_service.api import load_config
+from es_service.config.model import ComputeConfig
+from es_service.dispatch.messages import Result, StopWorker, Submit, Task, Tick, WorkerUp
+from es_service.dispatch.scheduler import initial_state, step
+from es_service.session import LIMITS, scheduling_policy
+
+CONFIG = {
+    "task": {"environment": "point_maze"},
+    "search": {"algorithm": "es"},
+    "budget": {"generations": 1},
+    "compute": {"workers": 1, "chunk_timeout_s": 5, "compile_timeout_s": 8, "no_worker_timeout_s": 20},
+}
+
+
+def messages_after(*events) -> list[str]:
+    """Why workers are stopped, and the run, over all events; (seconds, event)."""
+    state, said = initial_state(scheduling_policy(load_config(CONFIG))), []
+    for now, event in events:
+        state, commands = step(state, event, now)
+        said += [command.reason for command in commands if isinstance(command, StopWorker)]
+    return [*said, state.failed or ""]
+
+
+def test_messages_of_deadlines_name_the_keys_that_set_them():
+    work = Submit(tuple(Task(key, "train") for key in "abcd"))
+    late = messages_after((0.0, work), (10.0, Tick()), (20.0, Tick()))
+    assert late[0] == "did not come up in 10 s (half of compute.no_worker_timeout_s)"
+    assert "no worker was up for 20 s (compute.no_worker_timeout_s); last loss" in late[-1]
+    assert messages_after((0.0, work), (1.0, WorkerUp(0)), (9.0, Tick()))[0] == (
+        "no answer to task a in 8 s (compute.compile_timeout_s)"
+    )
+    answers = [(1.0, WorkerUp(0)), (2.0, Result(0, "a", 1)), (2.1, Result(0, "b", 1))]
+    assert messages_after((0.0, work), *answers, (7.1, Tick()))[0] == (
+        "no answer to task c in 5 s (at least compute.chunk_timeout_s)"
+    )
+
+
+def test_keys_that_messages_name_exist():
+    for name in LIMITS.values():
+        (key,) = re.findall(r"compute\.(\w+)", name)
+        assert key in ComputeConfig.model_fields
