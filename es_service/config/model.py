@@ -276,8 +276,8 @@ class ComputeConfig(_Section):
     max_attempts: Count = Field(4, description="Times a chunk is tried before the run stops with its error.")
     no_worker_timeout_s: Positive = Field(
         120.0,
-        description="Seconds without any live worker after which the run stops; a worker that takes half as long to "
-        "start is replaced.",
+        description="Seconds without any live worker after which the run stops, in a cluster that has no room yet as "
+        "well; a worker that takes half as long to start is replaced.",
     )
     dispatch_log: Switch = Field(
         False, description="Whether the run folder gets a dispatch.jsonl: what each worker was sent, answered, died of."

@@ -26,7 +26,8 @@ from es_service.errors import EvaluationError
 from es_service.protocol import Centre, Chunk, WorkerPlace, WorkerSpec
 
 PLACEMENT_S = 30.0
-"""Longest wait for the first actor to be given a place; Ray itself would wait for ever."""
+"""Longest wait for the first actor to be given a place in a Ray of our own; Ray itself would wait for ever. A cluster
+that was joined may have to grow first, or others there to end: there no_worker_timeout_s counts, if it is longer."""
 IN_CALL_BYTES = 64 * 2**10
 """A centre up to this size travels with every call; a larger one is stored once and fetched once per node."""
 
@@ -60,7 +61,7 @@ def ray_engine(
         if elastic:
             policy = replace(policy, workers=max(1, look(ray, claim).room))
         watch = None if address is None else Watch(ray, claim)
-        transport = Actors(ray, spec, actor, claim, watch, policy.workers if elastic else None)
+        transport = Actors(ray, spec, actor, claim, watch, policy.workers if elastic else None, policy)
         return Engine(transport, policy, should_stop, log)
     except BaseException:
         disconnect(ray)
@@ -82,13 +83,21 @@ class Actors:
     """A Transport whose workers are Ray actors."""
 
     def __init__(
-        self, ray: ModuleType, spec: WorkerSpec, actor: type, claim: Claim, watch: Watch | None, room: int | None
+        self,
+        ray: ModuleType,
+        spec: WorkerSpec,
+        actor: type,
+        claim: Claim,
+        watch: Watch | None,
+        room: int | None,
+        policy: Policy,
     ) -> None:
         """Start nobody yet.
 
         Args:
             watch: of the cluster that was joined; None in a Ray of our own, whose one node is this machine.
             room: workers to ask for as the cluster is now; from then on follow its room. None: never ask.
+            policy: how long to wait for a place.
         """
         self._ray = ray
         self._spec, self._claim = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim
@@ -108,7 +117,9 @@ class Actors:
         """Workers to be asked for their place again before they are sent anything, since another was lost."""
         self._inbox: deque[Message] = deque()
         self._centre: tuple[Centre, Any] | None = None
-        self._placed_by_s = time.monotonic() + PLACEMENT_S
+        patience_s = PLACEMENT_S if watch is None else max(PLACEMENT_S, policy.no_worker_timeout_s)
+        self._placed_by_s = time.monotonic() + patience_s
+        self._patience = f"{patience_s:g} s" + ("" if watch is None else f" ({policy.name_of('no_worker_timeout_s')})")
 
     def places(self) -> dict[int, WorkerPlace]:
         """Worker id -> where it is, of those that have a place."""
@@ -165,7 +176,7 @@ class Actors:
         """The next message.
 
         Raises:
-            EvaluationError: the cluster has had no place for any actor in PLACEMENT_S, or does not answer any more.
+            EvaluationError: the cluster has had no place for any actor for too long, or does not answer any more.
         """
         if self._watch is not None:
             self._follow(self._watch)
@@ -184,7 +195,7 @@ class Actors:
             timeout_s = 0.0  # that was where a worker is; None would say that no answer waits behind it
         if not self._places and time.monotonic() > self._placed_by_s:
             raise EvaluationError(
-                f"no worker was given a place in {PLACEMENT_S:g} s. Each needs {self._claim}; the cluster has "
+                f"no worker was given a place in {self._patience}. Each needs {self._claim}; the cluster has "
                 f"{_resources(self._ray.cluster_resources())} in all, free are "
                 f"{_resources(self._ray.available_resources())}. Add nodes, or stop what else runs there."
             )

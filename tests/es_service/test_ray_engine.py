@@ -11,9 +11,10 @@ from typing import Any
 
 import pytest
 
+from es_service.dispatch import ray_engine as module
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.messages import Policy
-from es_service.dispatch.ray_cluster import ONE_CORE
+from es_service.dispatch.ray_cluster import ONE_CORE, Membership
 from es_service.dispatch.ray_engine import Actors
 from es_service.errors import EvaluationError
 from es_service.protocol import TrainingChunk
@@ -83,6 +84,11 @@ class PretendedRay:
     def shutdown(self) -> None:
         pass
 
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": 2.0}
+
+    available_resources = cluster_resources
+
     def end(self, actor: Actor, state: str = "dead") -> None:
         """An actor dies or hangs: nothing it owes is answered any more."""
         actor.state = state
@@ -119,8 +125,18 @@ class PretendedRay:
             ref.is_ready = True
 
 
-def ray_engine(ray: PretendedRay, policy: Policy) -> Engine[Actors]:
-    actors = Actors(ray, SPEC, type(None), ONE_CORE, None, None)  # type: ignore[arg-type]
+class PretendedWatch:
+    """Of a cluster that never changes."""
+
+    def latest(self) -> Membership:
+        return Membership(0, frozenset())
+
+    def close(self) -> None:
+        pass
+
+
+def ray_engine(ray: PretendedRay, policy: Policy, watch: PretendedWatch | None = None) -> Engine[Actors]:
+    actors = Actors(ray, SPEC, type(None), ONE_CORE, watch, None, policy)  # type: ignore[arg-type]
     return Engine(actors, policy)
 
 
@@ -156,6 +172,20 @@ def test_an_actor_that_is_given_no_place_is_not_lost():
         assert len(ray.actors) > 8
         assert engine.counts.lost_workers == 1
         assert "no answer to task" in engine.last_loss
+
+
+@pytest.mark.parametrize(
+    ("watch", "message"),
+    [
+        (None, r"in 0\.1 s\. Each needs 1 CPU; .*has 2 CPU"),
+        (PretendedWatch(), r"in 0\.4 s \(no_worker_timeout_s\)\. Each needs 1 CPU; .*has 2 CPU"),
+    ],
+)
+def test_the_wait_for_a_first_place_is_the_policy_s_in_a_cluster_that_was_joined(monkeypatch, watch, message):
+    monkeypatch.setattr(module, "PLACEMENT_S", 0.1)
+    policy = Policy(1, start_deadline_s=0.2, no_worker_timeout_s=0.4)
+    with pytest.raises(EvaluationError, match=message), ray_engine(PretendedRay(0), policy, watch) as engine:
+        engine.evaluate(FIRST, [CHUNK])
 
 
 def test_a_chunk_that_kills_its_workers_is_found_out_after_as_many_as_it_has_attempts():

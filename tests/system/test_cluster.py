@@ -234,8 +234,10 @@ def test_what_cannot_be_joined_is_named(tmp_path):
         assert "RAY_AUTH_TOKEN is the cluster's" in run(RAY_AUTH_TOKEN="f" * 64)
 
         started = time.monotonic()
-        printed = run("--or-resume", "--set", "compute.worker_resources.cpu=64")
-        assert "no worker was given a place in 30 s. Each needs 64 CPU; the cluster has 1 CPU" in printed
+        shape = ("--set", "compute.worker_resources.cpu=64", "--set", "compute.no_worker_timeout_s=30")
+        printed = run("--or-resume", *shape)
+        patience = "30 s (compute.no_worker_timeout_s)"
+        assert f"no worker was given a place in {patience}. Each needs 64 CPU; the cluster has 1 CPU" in printed
         assert time.monotonic() - started < 60
 
         # A cluster of other versions is one that says it has them.
