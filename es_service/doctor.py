@@ -21,10 +21,11 @@ from es_service.config.model import worker_spec
 from es_service.cores import cores
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy
-from es_service.errors import ServiceError
+from es_service.errors import Interrupted, ServiceError
 from es_service.noise import TEST_VECTORS, normal_integers, stream_keys
 from es_service.platform_info import platform_info
 from es_service.protocol import Centre, EpisodesResult, TrainingChunk
+from es_service.signals import stop_on_signals
 from es_service.statistics import no_observations, normalisation
 from es_service.store.folder import is_network_filesystem
 from workers.environments import TASKS
@@ -53,6 +54,8 @@ def examine(console: Console) -> bool:
 def _guarded(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     try:
         yield from check()
+    except Interrupted:
+        raise
     except (OSError, ServiceError) as error:
         yield "FAIL", f"{check.__name__.strip('_')}: {error}"
 
@@ -129,7 +132,7 @@ def _rollout() -> Iterator[Finding]:
     mean_O, std_O = normalisation(no_observations(task.observation_size), enabled=False)
     centre = Centre(0, initial_parameters(spec.policy, config.policy.init, 0), config.search.sigma, mean_O, std_O)
     started = time.perf_counter()
-    with inline_engine(spec, Policy(workers=1)) as engine:
+    with stop_on_signals() as should_stop, inline_engine(spec, Policy(workers=1), should_stop) as engine:
         engine.evaluate(centre, [TrainingChunk(0, 0)])
         ready = time.perf_counter()
         results = engine.evaluate(centre, [TrainingChunk(1, chunk) for chunk in range(8)])

@@ -24,6 +24,7 @@ from typing import IO
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
+from es_service.errors import Interrupted
 from es_service.protocol import Centre, Chunk, WorkerSpec, worker_environment
 from es_service.wire import BUFFER_BYTES, Channel, framed
 
@@ -185,6 +186,8 @@ class ChildProcesses:
                         return text
                     case _:
                         return f"it said {said!r}"
+        except Interrupted:  # a signal's handler may raise it anywhere
+            raise
         except Exception:  # of its class, if what it said is not what was written
             return traceback.format_exc()
         return None if is_open else ""

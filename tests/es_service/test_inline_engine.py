@@ -19,7 +19,7 @@ from es_service.dispatch import inline_engine as inline_module
 from es_service.dispatch.engine import Answer
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy, WorkerLost, WorkerUp
-from es_service.errors import EvaluationError
+from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import TrainingChunk
 from es_service.wire import framed
 from tests.helpers import SPEC, centre, random_parameters, spec
@@ -115,6 +115,19 @@ def test_a_worker_that_says_what_nobody_can_use_is_lost(transport, said, reason)
     assert isinstance(second, WorkerLost)
     assert re.search(reason, first.reason)
     assert transport.process_ids() == {}
+
+
+def test_a_signal_while_a_worker_is_heard_is_no_fault_of_the_worker(transport, monkeypatch):
+    def interrupt(_):
+        raise Interrupted(signal.SIGINT)
+
+    transport, ends = transport
+    ends[1].sendall(framed(("up",)))
+    monkeypatch.setattr(inline_module.Channel, "receive", interrupt)
+    with pytest.raises(Interrupted):
+        transport.receive(1.0)
+    monkeypatch.undo()
+    assert transport.receive(1.0) == WorkerUp(1)
 
 
 def test_a_worker_that_has_said_its_last_is_lost_while_messages_still_wait_for_it(transport):

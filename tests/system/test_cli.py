@@ -475,3 +475,17 @@ def test_list_and_doctor(tmp_path):
     assert code == 0, printed
     assert "noise equals its" in printed
     assert "FAIL" not in printed
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_doctor_without_a_finding(tmp_path, number, code):
+    """While its worker starts."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen([*COMMAND, "doctor"], cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert any("noise equals" in line for line in process.stdout)
+    time.sleep(0.2)
+    process.send_signal(number)
+    printed, _ = process.communicate(timeout=20)
+    assert process.returncode == code
+    assert "FAIL" not in printed
