@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 from es_service.config.resolution import did_you_mean, one_of
@@ -77,16 +78,21 @@ def bench_rollouts(
 def _row(arguments: Mapping[str, Any], count: int) -> dict[str, Any]:
     command = [sys.executable, "-m", "workers.measure", json.dumps(arguments)]
     environment = child_environment()
-    started = [
-        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for _ in range(count)
-    ]
     found = []
-    for process in started:
-        printed, errors = process.communicate()
-        if process.returncode:
-            raise EvaluationError(f"{arguments['task']} cannot be measured:\n{errors.strip()}")
-        found.append(json.loads(printed.splitlines()[-1]))
+    with ExitStack() as ends:
+        started = []
+        for _ in range(count):
+            process = subprocess.Popen(
+                command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            )
+            ends.enter_context(process)  # waits for it
+            ends.callback(process.kill)  # should another fail, or a signal arrive
+            started.append(process)
+        for process in started:
+            printed, errors = process.communicate()
+            if process.returncode:
+                raise EvaluationError(f"{arguments['task']} cannot be measured:\n{errors.strip()}")
+            found.append(json.loads(printed.splitlines()[-1]))
     named = {"task": arguments["task"], "rollout": arguments["rollout"]}
     if "problem" in found[0]:
         return named | {"note": f"simd cannot compile it: {found[0]['problem']}; it runs on xla"}
