@@ -7,10 +7,12 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 REPEAT_S = 1.0
 """A second signal within this time is the same request: launchers forward what the terminal has sent already."""
+SHOW_CURSOR = b"\x1b[?25h\n"
+"""A live table hides the cursor, and at once means without putting anything back."""
 
 
 class StopRequest:
@@ -28,8 +30,11 @@ class StopRequest:
         now = time.monotonic()
         if self.number is None:
             self.number, self._since_s = number, now
-        elif now - self._since_s > REPEAT_S:
-            os._exit(128 + number)  # asked again; what is committed is safe
+        elif now - self._since_s > REPEAT_S:  # asked again; what is committed is safe
+            with suppress(OSError):
+                if os.isatty(1):
+                    os.write(1, SHOW_CURSOR)
+            os._exit(128 + number)
 
 
 @contextmanager
