@@ -70,9 +70,9 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
     faults = {4: signal.SIGKILL, 12: signal.SIGSTOP}
     send = Actors.send
 
-    def send_and_strike(self, worker, centre, key, attempt, chunk):
-        send(self, worker, centre, key, attempt, chunk)
-        number = faults.pop(chunk.generation, None) if isinstance(chunk, TrainingChunk) else None
+    def send_and_strike(self, worker, centre, key, attempt, chunks):
+        send(self, worker, centre, key, attempt, chunks)
+        number = faults.pop(key.generation, None) if key.kind == "TrainingChunk" else None
         if number is not None:
             os.kill(self.places()[worker].pid, number)
 
@@ -168,7 +168,7 @@ def test_it_works_in_a_thread_where_signals_cannot_be_set(tmp_path, reference):
 
 
 class Mirror:
-    """An actor that answers a chunk with the environment its worker would have, and Ray's name for its GPU."""
+    """An actor that answers each chunk with the environment its worker would have, and Ray's name for its GPU."""
 
     def __init__(self, spec: bytes, index: int, gpus: float) -> None:
         self.gpus = gpus
@@ -179,11 +179,12 @@ class Mirror:
     def build(self) -> None:
         pass
 
-    def run(self, centre: bytes, chunk: bytes) -> bytes:
+    def run(self, centre: bytes, chunks: bytes) -> bytes:
         import ray
 
         ids = ray.get_runtime_context().get_accelerator_ids()["GPU"]
-        return pickle.dumps((os.getpid(), ids, worker_environment(os.environ, self.gpus)))
+        answer = os.getpid(), ids, worker_environment(os.environ, self.gpus)
+        return pickle.dumps([answer for _ in pickle.loads(chunks)])
 
 
 def with_two_pretended_gpus(monkeypatch):
