@@ -35,7 +35,6 @@ CONFIG = SMALL | {
         "engine": "ray",
         "chunk_pairs": 4,
         "gradient_block_pairs": 8,
-        "chunk_timeout_s": 1.0,
         "dispatch_log": True,
     }
 }
@@ -78,7 +77,7 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
 
     monkeypatch.setattr(Actors, "send", send_and_strike)
     notices = []
-    outcome = run(tmp_path / "run", on_notice=notices.append, workers=2)
+    outcome = run(tmp_path / "run", on_notice=notices.append, workers=2, chunk_timeout_s=1.0)
     assert digest_parts(tmp_path / "run") == reference
     assert not faults
     assert outcome.run.history["lost_workers"].sum() == 2
