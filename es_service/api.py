@@ -20,7 +20,7 @@ from es_service.errors import ConfigError, StoreError
 from es_service.history import history_columns
 from es_service.maps.behaviour_map import ELITE_PREFIX
 from es_service.protocol import Moments
-from es_service.run_state import moments_from_arrays, moments_to_arrays, without_elites
+from es_service.run_state import moments_from_arrays, moments_to_arrays, without_fitness
 from es_service.run_view import Run, open_run
 from es_service.session import TASKS, OnGeneration, OnNotice, Outcome, task_of, work
 from es_service.store import reader
@@ -165,7 +165,8 @@ def fork(
 
     The history up to there comes along and generations count on, so a fork that changes nothing ends with the same
     bits as its parent would. Where a setting changes what an evaluation means, of the task or of how observations are
-    normalised, the best centre so far no longer counts as one, and the map begins empty.
+    normalised, no fitness seen so far counts any more: the best centre, nsra_es's record and the map begin anew; the
+    weight of fitness stays as it is.
 
     Raises:
         ConfigError: a change that the state does not fit (another task, network or algorithm). StoreError: the
@@ -175,7 +176,7 @@ def fork(
     at, parts = origin.parts(generation)
     changed = {name for name, _, _ in changed_constants(origin.constants, config.constants())}
     if any(name in OBSERVED or name.startswith("task.") for name in changed - {"task.episodes_per_member"}):
-        parts = without_elites(parts) | {"best": parts["best"] | {"fitness": np.asarray(-np.inf)}}
+        parts = without_fitness(parts)
     history = [row for row in origin.history_rows() if row["generation"] <= at]
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
     lineage = _lineage(origin, at)

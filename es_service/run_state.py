@@ -9,6 +9,7 @@ import numpy as np
 
 from es_service.algorithms.base import (
     NO_CELL,
+    FitnessWeight,
     SearchState,
     member_from_arrays,
     member_part,
@@ -112,12 +113,14 @@ def state_from_parts(
     )
 
 
-def without_elites(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, Arrays]:
-    """The parts of a state whose map has been emptied."""
+def without_fitness(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, Arrays]:
+    """The parts of a state in which no fitness seen so far counts: no best centre, an empty map, no record to beat."""
     kept = {name: dict(part) for name, part in parts.items() if not name.startswith((CELL_PREFIX, ELITE_PREFIX))}
     for name, part in kept.items():
         if name.startswith(member_part("")):
             part["cell"] = np.asarray(NO_CELL, np.int64)
+    kept["best"]["fitness"] = np.asarray(-np.inf)
+    kept["weight"] = weight_to_arrays(FitnessWeight(weight_from_arrays(parts["weight"]).value))
     return kept
 
 
