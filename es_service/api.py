@@ -102,7 +102,7 @@ def resume(
     def changed(store: RunStore) -> RunConfig:
         recorded = store.folder / "config.yaml"
         source = recorded if recorded.exists() else store.meta.config
-        return loading.resume_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+        return loading.changed_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
 
     return _go_on(Path(folder), changed, on_generation, on_notice, hook)
 
@@ -199,12 +199,7 @@ def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -
         )
     mapping = {name: dict(section) if isinstance(section, dict) else section for name, section in origin.config.items()}
     mapping["search"]["init_from"] = None  # it has the parent's state instead
-    if {"task.fitness", "task.episode_steps"} & set(keys):
-        mapping["map"]["qd_offset"] = "auto"  # which follows from them; unless it is set as well
-    if "search.pairs" in keys:
-        for shape in ("chunk_pairs", "rollout_block_pairs", "gradient_block_pairs"):
-            mapping["compute"][shape] = "auto"
-    config = loading.load_config(mapping, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+    config = loading.changed_config(mapping, overrides, tasks=TASKS, algorithms=ALGORITHMS)
     fixed = ("task.environment", "policy.hidden", "search.algorithm", "search.members", *MAP_GEOMETRY)
     if unfit := [change for change in changed_constants(origin.constants, config.constants()) if change[0] in fixed]:
         listed = "\n".join(f"  {name}: {old} -> {new}" for name, old, new in unfit)

@@ -419,6 +419,8 @@ def test_bad_paths(config, finished, tmp_path):
         (("status", tmp_path / "nothing"), 1, "does not exist"),
         (("digest", config), 1, "not a run folder"),
         (("resume", finished[0], "--set", "search.sigma=0.5", "--set", "seed=3"), 2, "search.sigma: 0.02 -> 0.5"),
+        (("resume", finished[0], "--set", "search.sigma=a", "--set", "budget.generatons=3"), 2, "did you mean budget."),
+        (("resume", finished[0], "--set", "compute.rollout_block_pairs=auto"), 0, "is spent"),
     ]
     for arguments, expected, message in cases:
         code, printed = es(*arguments)
