@@ -10,7 +10,8 @@ import numpy as np
 
 from es_service.algorithms import ALGORITHMS
 from es_service.config import loading
-from es_service.config.model import RunConfig, changed_constants, policy_shape
+from es_service.config.model import START_KEYS, STATE_KEYS, RunConfig, changed_constants, policy_shape, start_afresh
+from es_service.config.yaml_text import show
 from es_service.errors import ConfigError
 from es_service.maps.behaviour_map import ELITE_PREFIX
 from es_service.protocol import Moments
@@ -22,34 +23,38 @@ from es_service.store.beginning import Beginning
 
 OBSERVED = ("policy.observation_clip", "policy.observation_normalization")
 """What a policy does with its observations."""
-MAP_GEOMETRY = ("map.enabled", "map.kind", "map.bounds", "map.cells")
-"""What the state of a map depends on."""
 
 
 def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -> RunConfig:
     """The config of a fork: the parent's resolved one with overrides.
 
     Raises:
-        ConfigError: as `load_config`, or the parent's state does not fit the changes.
+        ConfigError: as `load_config`, the parent's state does not fit the changes, or a key would change nothing.
     """
     origin = open_run(parent)
     overrides = [overrides] if isinstance(overrides, str) else list(overrides)
-    keys = [override.partition("=")[0].strip() for override in overrides]
-    if "search.preset" in keys:
+    wanted = loading.parse_overrides(overrides)[0]
+    if idle := [f"  {key}" for key in START_KEYS if key in wanted]:
+        listed = "\n".join(idle)
         raise ConfigError(
-            "search.preset: a fork has every key from its parent, so a preset would fill in nothing; set the keys "
-            "themselves (`es-service list` shows what a preset stands for)"
+            f"{origin.folder}: a fork has its state and all its settings, so these would change nothing:\n{listed}\n"
+            f"instead of a preset, set the keys that it stands for (`es-service list` shows them); "
+            f"{start_afresh(str(origin.folder))}"
         )
     mapping = {name: dict(section) if isinstance(section, dict) else section for name, section in origin.config.items()}
     mapping["search"]["init_from"] = None  # it has the parent's state instead
     config = loading.changed_config(mapping, overrides, tasks=TASKS, algorithms=ALGORITHMS)
-    fixed = ("task.environment", "policy.hidden", "search.algorithm", "search.members", *MAP_GEOMETRY)
-    if unfit := [change for change in changed_constants(origin.constants, config.constants()) if change[0] in fixed]:
-        listed = "\n".join(f"  {name}: {old} -> {new}" for name, old, new in unfit)
+    changes = changed_constants(origin.constants, config.constants())
+    unfit = [f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes if name in STATE_KEYS]
+    names = task_of(config).descriptor_names
+    if not unfit and list(names) != origin.descriptor_names:  # a task of the user's that is not what it was
+        unfit = [
+            f"  the descriptor of {config.task.environment}: {show(origin.descriptor_names)} -> {show(list(names))}"
+        ]
+    if unfit:
+        listed = "\n".join(unfit)
         raise ConfigError(
-            f"{origin.folder}: its state does not fit these changes:\n{listed}\n"
-            f"to start afresh from its centre (same task and network): "
-            f"es-service run CONFIG --set search.init_from={origin.folder}"
+            f"{origin.folder}: its state does not fit these changes:\n{listed}\n{start_afresh(str(origin.folder))}"
         )
     return config
 

@@ -59,6 +59,7 @@ _FOLLOWERS = {
     "task.episode_steps": ("map.qd_offset",),
     "task.fitness": ("map.qd_offset",),
     f"{OPTIONS}descriptor": _MAP,
+    "map.kind": ("map.cells",),
     "policy.observation_normalization": ("policy.observation_clip",),
     "search.algorithm": ("search.members",),
     "search.pairs": _SHAPES,

@@ -279,11 +279,15 @@ def test_changed_constants_lists_both_values_and_absent_ones():
     assert changed_constants(old, new) == [("b", 2, 5), ("c", 3, "(absent)"), ("d", "(absent)", 4)]
 
 
-def test_describe_changes_shows_all_and_the_fork_that_makes_them():
-    message = describe_changes([("search.sigma", 0.02, 0.05), ("policy.hidden", [64, 64], [8, 8])], run="runs/a")
-    assert "  search.sigma: 0.02 -> 0.05" in message.splitlines()
-    assert "  policy.hidden: [64, 64] -> [8, 8]" in message.splitlines()
-    assert "es-service fork runs/a --set search.sigma=0.05 --set 'policy.hidden=[8, 8]'" in message
+def test_describe_changes_shows_all_and_the_commands_that_make_them():
+    changes = [("search.sigma", 0.02, 0.05), ("policy.hidden", [64, 64], [8, 8]), ("task.options.start", "a b", "c d")]
+    lines = describe_changes(changes, run="runs/a").splitlines()
+    assert {"  search.sigma: 0.02 -> 0.05", "  policy.hidden: [64, 64] -> [8, 8]"} < set(lines)
+    assert lines[-2].endswith(": es-service fork runs/a --set search.sigma=0.05 --set 'task.options.start=c d'")
+    assert lines[-1].startswith("a fork has to keep policy.hidden; to start anew from its centre")
+    assert lines[-1].endswith(": es-service run CONFIG --set search.init_from=runs/a")
+    for key in ("search.members", "search.preset", "map.cells", "task.environment", "task.options.descriptor"):
+        assert "es-service fork" not in describe_changes([(key, "a", "b")])
 
 
 def changed(*overrides: str, config: RunConfig | None = None) -> RunConfig:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from es_service import api
+from es_service import api, descent, session
+from es_service.config.model import START_KEYS
+from es_service.errors import ConfigError
 from tests.system.session import SMALL
+from workers.environments import TASKS
 
 
 def run(folder: Path, *overrides: str, config=SMALL):
@@ -33,3 +37,55 @@ def test_a_record_of_another_fitness_does_not_hold_the_weight_down(tmp_path):
     assert before["value"] < 1.0
     assert after["record"] == history["centre_fitness_mean"].iloc[7:].max() < before["record"]
     assert history["fitness_weight"].iloc[7] == before["value"] < history["fitness_weight"].iloc[8]
+
+
+@pytest.mark.parametrize(
+    ("override", "change"),
+    [
+        ("policy.hidden=[16]", "policy.hidden: [8] -> [16]"),
+        ("search.algorithm=es", "search.algorithm: nsra_es -> es"),
+        ("search.members=3", "search.members: 5 -> 3"),
+        ("task.environment=ant_trap", "task.environment: point_maze -> ant_trap"),
+        ("map.kind=cvt", "map.kind: grid -> cvt"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused(parent, override, change):
+    with pytest.raises(ConfigError) as caught:
+        descent.fork_config(parent.folder, [override, "budget.generations=9"])
+    lines = str(caught.value).splitlines()
+    assert f"  {change}" in lines
+    assert lines[-1].endswith(f": es-service run CONFIG --set search.init_from={parent.folder}")
+
+
+def test_another_descriptor_is_refused(tmp_path, monkeypatch):
+    """One of as many dimensions: a novelty archive of both would mean nothing."""
+    bounds = TASKS["point_maze"].descriptor_bounds
+    told = replace(
+        TASKS["point_maze"],
+        options={"descriptor": ("place", "speed", "height")},
+        descriptors={
+            "place": (("x", "y"), bounds), "speed": (("u", "v"), bounds), "height": (("h",), bounds[:1])
+        },
+    )  # fmt: skip
+    for module in (api, descent, session):
+        monkeypatch.setattr(module, "TASKS", {"point_maze": told})
+    monkeypatch.setattr(api, "work", lambda *arguments: None)  # as workers know of no such option
+    api.run(SMALL, tmp_path / "run")
+    assert (
+        descent.fork_config(tmp_path / "run", ["task.options.descriptor=place"]).task.options["descriptor"] == "place"
+    )
+    for other in ("speed", "height"):
+        with pytest.raises(ConfigError, match=rf"task\.options\.descriptor: place -> {other}\n[^$]*search\.init_from="):
+            descent.fork_config(tmp_path / "run", [f"task.options.descriptor={other}"])
+    for module in (api, descent, session):
+        monkeypatch.setattr(module, "TASKS", {"point_maze": replace(told, descriptors={"place": (("a", "b"), bounds)})})
+    with pytest.raises(ConfigError, match=r"the descriptor of point_maze: \[x, y\] -> \[a, b\]\n.*search\.init_from="):
+        descent.fork_config(tmp_path / "run")
+
+
+@pytest.mark.parametrize("key", START_KEYS)
+def test_what_would_change_nothing_is_refused(parent, key):
+    with pytest.raises(ConfigError) as caught:
+        descent.fork_config(parent.folder, [f"{key}=uber", "search.sigma=0.1"])
+    assert f"  {key}" in str(caught.value).splitlines()
+    assert f"es-service run CONFIG --set search.init_from={parent.folder}" in str(caught.value)
