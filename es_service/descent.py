@@ -88,7 +88,8 @@ def started(config: RunConfig, folder: str) -> tuple[dict[str, Any], Beginning]:
         )
     at, parts = origin.parts(wanted=lambda part: not part.startswith(ELITE_PREFIX))
     member, moments = origin.newest_member(at, parts), moments_from_arrays(parts["observations"])
-    if member.own_mean_O is not None and member.own_std_O is not None:
+    enabled = origin.constants["policy.observation_normalization"]
+    if enabled and member.own_mean_O is not None and member.own_std_O is not None:
         # Those that its policy runs with, as if that many observations had given them.
         mean_O, std_O = member.own_mean_O.astype(np.float64), member.own_std_O.astype(np.float64)
         moments = Moments(moments.count, mean_O, moments.count * np.square(std_O))

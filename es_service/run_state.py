@@ -10,6 +10,7 @@ import numpy as np
 from es_service.algorithms.base import (
     NO_CELL,
     FitnessWeight,
+    Member,
     SearchState,
     member_from_arrays,
     member_part,
@@ -28,6 +29,7 @@ from es_service.maps.behaviour_map import (
 )
 from es_service.novelty import archive_from_parts, archive_to_parts
 from es_service.protocol import FloatArray, Moments
+from es_service.statistics import normalisation
 
 Arrays = dict[str, np.ndarray]
 
@@ -122,6 +124,14 @@ def without_fitness(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, 
     kept["best"]["fitness"] = np.asarray(-np.inf)
     kept["weight"] = weight_to_arrays(FitnessWeight(weight_from_arrays(parts["weight"]).value))
     return kept
+
+
+def statistics_in_force(observations: Moments, member: Member | None, enabled: bool) -> tuple[FloatArray, FloatArray]:
+    """(mean, standard deviation) that a member's centres run with: its own if it has any, else the whole run's; 0 and 1
+    where observations are not normalised."""
+    if enabled and member is not None and member.own_mean_O is not None and member.own_std_O is not None:
+        return member.own_mean_O, member.own_std_O
+    return normalisation(observations, enabled)
 
 
 def moments_to_arrays(moments: Moments) -> Arrays:

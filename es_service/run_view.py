@@ -29,8 +29,7 @@ from es_service.maps.behaviour_map import (
 from es_service.maps.geometry import Grid
 from es_service.novelty import BLOCK_PREFIX, archive_from_parts
 from es_service.protocol import FloatArray, PolicyShape
-from es_service.run_state import best_from_arrays, moments_from_arrays
-from es_service.statistics import normalisation
+from es_service.run_state import best_from_arrays, moments_from_arrays, statistics_in_force
 from es_service.store import reader
 from es_service.store.schema import RunMeta
 from workers.policy import act, normalise, split_layers
@@ -237,10 +236,8 @@ class Run:
         """(generation, the centre updated in it with the statistics that it would go on with)."""
         at, parts = self.parts(wanted=lambda part: not part.startswith((ELITE_PREFIX, CELL_PREFIX)))
         member = self.newest_member(at, parts)
-        mean_O, std_O = member.own_mean_O, member.own_std_O
-        if mean_O is None or std_O is None:
-            enabled = self.constants["policy.observation_normalization"]
-            mean_O, std_O = normalisation(moments_from_arrays(parts["observations"]), enabled)
+        enabled = self.constants["policy.observation_normalization"]
+        mean_O, std_O = statistics_in_force(moments_from_arrays(parts["observations"]), member, enabled)
         return at, self.policy_of(member.centre_D, mean_O, std_O)
 
     def newest_member(self, generation: int, parts: Mapping[str, Mapping[str, np.ndarray]]) -> Member:

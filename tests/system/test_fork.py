@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from es_service import api, descent, session
@@ -89,3 +90,20 @@ def test_what_would_change_nothing_is_refused(parent, key):
         descent.fork_config(parent.folder, [f"{key}=uber", "search.sigma=0.1"])
     assert f"  {key}" in str(caught.value).splitlines()
     assert f"es-service run CONFIG --set search.init_from={parent.folder}" in str(caught.value)
+
+
+def test_without_normalisation_no_statistics_are_used_nor_a_member_s_own(parent, tmp_path):
+    """Whose block began from an elite that brought its own, and goes on in the fork; their bound goes with them."""
+    search = {"algorithm": "me_es", "pairs": 16, "evaluation_episodes": 4, "parent_statistics": "elite"}
+    wanted = ("search.block_generations=8", f"search.init_from={parent.folder}", "budget.generations=6")
+    begun = run(tmp_path / "begun", *wanted, config=SMALL | {"search": search})
+    assert "own_std_O" in begun.parts()[1]["member_0"]
+    assert (begun.policy("centre").observation_std_O != 1.0).all()
+    forked = fork(begun, tmp_path / "fork", "policy.observation_normalization=false", "budget.generations=7")
+    assert forked.constants["policy.observation_clip"] is None
+    _, elites = forked.elites()
+    centre = forked.policy("centre")
+    for policy in (centre, *elites.values()):
+        np.testing.assert_array_equal(policy.observation_mean_O, 0.0)
+        np.testing.assert_array_equal(policy.observation_std_O, 1.0)
+    assert len(elites) == 1
