@@ -26,7 +26,7 @@ OBSERVED = ("policy.observation_clip", "policy.observation_normalization")
 
 
 def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -> RunConfig:
-    """The config of a fork: the parent's resolved one with overrides.
+    """The config of a fork: the one that the parent would go on with, with overrides.
 
     Raises:
         ConfigError: as `load_config`, the parent's state does not fit the changes, or a key would change nothing.
@@ -41,8 +41,8 @@ def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -
             f"instead of a preset, set the keys that it stands for (`es-service list` shows them); "
             f"{start_afresh(str(origin.folder))}"
         )
-    mapping = {name: dict(section) if isinstance(section, dict) else section for name, section in origin.config.items()}
-    mapping["search"]["init_from"] = None  # it has the parent's state instead
+    present = origin.present_config
+    mapping = present | {"search": present["search"] | {"init_from": None}}  # it has the parent's state instead
     config = loading.changed_config(mapping, overrides, tasks=TASKS, algorithms=ALGORITHMS)
     changes = changed_constants(origin.constants, config.constants())
     unfit = [f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes if name in STATE_KEYS]

@@ -115,7 +115,7 @@ def evaluate(run: Run, chosen: Sequence[Candidate], episodes: int, workers: int 
     overrides = ["compute.engine=inline", "compute.address=null"]
     overrides += ["compute.worker_resources.cpu=1", "compute.worker_resources.gpu=0"]
     overrides += [f"compute.workers={workers or 'auto'}"]
-    config = changed_config(run.config, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+    config = changed_config(run.present_config, overrides, tasks=TASKS, algorithms=ALGORITHMS)
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     with (
         stop_on_signals() as should_stop,

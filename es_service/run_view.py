@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from es_service import digest as run_digest
 from es_service.algorithms.base import Member, member_from_arrays, member_part
+from es_service.config.model import COMPUTE_CONSTANTS
+from es_service.config.yaml_text import read_yaml_file
 from es_service.errors import NotInRunError
 from es_service.maps.behaviour_map import (
     CELL_PREFIX,
@@ -31,6 +33,7 @@ from es_service.novelty import BLOCK_PREFIX, archive_from_parts
 from es_service.protocol import FloatArray, PolicyShape
 from es_service.run_state import best_from_arrays, moments_from_arrays, statistics_in_force
 from es_service.store import reader
+from es_service.store.folder import CONFIG
 from es_service.store.schema import RunMeta
 from workers.policy import act, normalise, split_layers
 
@@ -83,6 +86,21 @@ class Run:
     def config(self) -> dict[str, Any]:
         """The resolved config the run was created with."""
         return self.meta.config
+
+    @property
+    def present_config(self) -> dict[str, Any]:
+        """`config` as the run would go on with it: budget, engine and time limits as they were last set.
+
+        Raises ConfigError if the folder's `config.yaml`, which has them, cannot be read.
+        """
+        file = self.folder / CONFIG
+        if not file.exists():
+            return self.config
+        recorded = read_yaml_file(file)[0]
+        budget, compute = (recorded.get(section, self.config[section]) for section in ("budget", "compute"))
+        if isinstance(compute, Mapping):
+            compute = {**compute, **{key: self.config["compute"][key] for key in COMPUTE_CONSTANTS}}
+        return self.config | {"budget": budget, "compute": compute}
 
     @property
     def constants(self) -> dict[str, Any]:

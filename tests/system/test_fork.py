@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from es_service import api, descent, session
+from es_service import api, descent, evaluation, session
 from es_service.config.model import START_KEYS
 from es_service.errors import ConfigError
+from es_service.session import scheduling_policy
 from tests.system.session import SMALL
 from workers.environments import TASKS
 
@@ -107,3 +109,22 @@ def test_without_normalisation_no_statistics_are_used_nor_a_member_s_own(parent,
         np.testing.assert_array_equal(policy.observation_mean_O, 0.0)
         np.testing.assert_array_equal(policy.observation_std_O, 1.0)
     assert len(elites) == 1
+
+
+def test_what_a_resume_has_changed_is_so_for_a_fork_and_an_evaluation(parent, tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    shutil.copytree(parent.folder, folder)
+    recorded = folder / "config.yaml"
+    recorded.write_text(recorded.read_text().replace("engine: inline", "engine: ray"))  # as a cluster's run has it
+    assert descent.fork_config(folder).compute.engine == "ray"
+    run = api.resume(folder, ["budget.generations=7", "compute.engine=inline", "compute.compile_timeout_s=77"]).run
+    config = descent.fork_config(folder, ["search.sigma=0.1"])
+    assert (config.budget.generations, config.compute.engine, config.compute.compile_timeout_s) == (7, "inline", 77.0)
+    seen = []
+    monkeypatch.setattr(
+        evaluation, "scheduling_policy", lambda config: seen.append(config) or scheduling_policy(config)
+    )
+    list(evaluation.evaluate(run, [], episodes=1, workers=1))
+    assert seen[0].compute.compile_timeout_s == 77.0
+    recorded.unlink()
+    assert descent.fork_config(folder).budget.generations == 6, "as it was created"
