@@ -12,6 +12,7 @@ from typing import Any
 from uuid import uuid4
 
 from es_service.algorithms import ALGORITHMS
+from es_service.commands import command
 from es_service.config import loading
 from es_service.config.model import RunConfig, changed_constants, describe_changes
 from es_service.descent import fork_config, forked, started
@@ -133,7 +134,7 @@ def _go_on(
         if store.meta.columns != history_columns(task_of(config), config.map.enabled):
             raise StoreError(
                 f"{folder} was written by a version of es-service with other history columns; continue it with that "
-                f"version, or go on from its state in a new run: es-service fork {folder}"
+                f"version, or go on from its state in a new run: {command('fork', folder)}"
             )
         try:
             write_config(folder, config.resolved_yaml())

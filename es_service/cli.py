@@ -34,6 +34,7 @@ from es_service.cli_options import (
     print_error,
     print_note,
 )
+from es_service.commands import command
 from es_service.config.resolution import config_warnings
 from es_service.errors import ConfigError, EvaluationError, Interrupted, NotInRunError, ServiceError
 from es_service.report.catalogue import print_catalogue
@@ -239,12 +240,12 @@ def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
             outcome = work(on_generation=partial(show_and_note, show), on_notice=note)
     except Interrupted:
         if began or (folder / DATABASE).exists():
-            print_note(f"interrupted; every finished generation is saved. Go on with: es-service resume {folder}")
+            print_note(f"interrupted; every finished generation is saved. Go on with: {command('resume', folder)}")
         else:
             print_note("interrupted before the run began; nothing was written")
         raise
     except EvaluationError:
-        print_note(f"every finished generation is saved. Once the cause is gone: es-service resume {folder}")
+        print_note(f"every finished generation is saved. Once the cause is gone: {command('resume', folder)}")
         raise
     print_summary(console, outcome.run, outcome.reason)
 

@@ -8,6 +8,7 @@ import typer
 
 from es_service import api, jobs
 from es_service.cli_options import ConfigArgument, SeedOption, SetOption, WorkersOption, compute, overrides, print_note
+from es_service.commands import command
 
 job_commands = typer.Typer()
 
@@ -31,7 +32,7 @@ def submit(
     loaded = api.load_config(config, wanted, new=False)  # paths are those of the cluster's head, which checks them
     job = jobs.submit(loaded, address, out)
     print(job)
-    print_note(f"submitted; watch it with: es-service logs {job} --address {address} --follow")
+    print_note(f"submitted; watch it with: {command('logs', job, '--address', address, '--follow')}")
 
 
 @job_commands.command(name="jobs")

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.algorithms import ALGORITHMS
+from es_service.commands import command
 from es_service.config.loading import changed_config
 from es_service.config.model import worker_spec
 from es_service.dispatch.inline_engine import inline_engine
@@ -83,7 +84,7 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
     generation.
     """
     if run.generation is None:
-        raise NotInRunError(f"{run.folder} has no generation yet; `es-service resume {run.folder}` continues it")
+        raise NotInRunError(f"{run.folder} has no generation yet; `{command('resume', run.folder)}` continues it")
     found = []
     if best:
         kept = best_from_arrays(run.parts(wanted=lambda part: part == "best")[1]["best"])

@@ -6,12 +6,12 @@ shapes and checks the sections against each other, so build one with it and not 
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from es_service.commands import command
 from es_service.config.yaml_text import dump_yaml, show
 from es_service.protocol import Bounds, PolicyShape, TaskSpec, WorkerSpec
 
@@ -346,14 +346,14 @@ def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tu
 def describe_changes(changes: Sequence[tuple[str, Any, Any]], run: str = "RUN") -> str:
     """What to tell someone whose resume would change constants of the run: all of them, and the way out."""
     forkable = [(name, new) for name, _, new in changes if name not in (*STATE_KEYS, *START_KEYS) and new != ABSENT]
-    settings = " ".join(f"--set {shlex.quote(f'{name}={show(new)}')}" for name, new in forkable)
+    settings = [word for name, new in forkable for word in ("--set", f"{name}={show(new)}")]
     fixed = [name for name, _, _ in changes if name in (*STATE_KEYS, *START_KEYS)]
     lines = [
         "a run keeps its task, policy, search, novelty, map, seed and chunk shapes for life; this would change:",
         *(f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes),
     ]
     if forkable:
-        lines.append(f"to go on from its state with other settings: es-service fork {run} {settings}")
+        lines.append(f"to go on from its state with other settings: {command('fork', run, *settings)}")
     if fixed:
         lines.append(f"a fork has to keep {', '.join(fixed)}; {start_afresh(run)}")
     return "\n".join(lines)
@@ -361,8 +361,8 @@ def describe_changes(changes: Sequence[tuple[str, Any, Any]], run: str = "RUN") 
 
 def start_afresh(run: str) -> str:
     """The way out where the state of a run is of no use with the settings that are wanted."""
-    command = f"es-service run CONFIG --set search.init_from={run}"
-    return f"to start anew from its centre (same task and network): {command}"
+    way = command("run", "CONFIG", "--set", f"search.init_from={run}")
+    return f"to start anew from its centre (same task and network): {way}"
 
 
 def policy_shape(config: RunConfig, task: TaskSpec) -> PolicyShape:

@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 from pathlib import Path
 
+from es_service.commands import command
 from es_service.errors import StoreError
 
 CONFIG = "config.yaml"
@@ -97,7 +98,9 @@ def require_run_folder(folder: Path) -> None:
     """Raises StoreError unless `folder` holds the database of a run or its copy."""
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
-        raise StoreError(f"{folder} is not a run folder: it {what}. `es-service run CONFIG --out {folder}` starts one.")
+        raise StoreError(
+            f"{folder} is not a run folder: it {what}. `{command('run', 'CONFIG', '--out', folder)}` starts one."
+        )
     if not (folder / DATABASE).exists() and not (folder / COPY).exists():
         raise StoreError(
             f"{folder} is not a run folder: it holds no {DATABASE}. If `es-service run` was stopped while creating "
@@ -124,7 +127,7 @@ def explained(error: sqlite3.Error | OSError, folder: Path, doing: str, then: st
 
     `then` is what to do after the cause is gone; resuming if None.
     """
-    then = then or f"`es-service resume {folder}`"
+    then = then or f"`{command('resume', folder)}`"
     if is_disk_full(error, folder):
         return StoreError(
             f"{folder}: disk full while {doing} ({error}). Everything stored before is safe; free space, then {then}."
