@@ -21,7 +21,7 @@ from es_service.history import history_columns
 from es_service.run_view import open_run
 from es_service.session import TASKS, OnGeneration, OnNotice, Outcome, task_of, work
 from es_service.store.beginning import Beginning
-from es_service.store.folder import DATABASE, explained, write_config
+from es_service.store.folder import explained, holds_run, write_config
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook
 
@@ -112,7 +112,7 @@ def run_or_resume(
     Raises:
         ConfigError: the folder's run has other constants than `config` (all are listed). Otherwise as `run`.
     """
-    begun = (Path(out) / DATABASE).exists()
+    begun = holds_run(Path(out))
     wanted = config if isinstance(config, RunConfig) else load_config(config, new=not begun)
     if not begun:
         return run(wanted, out, on_generation=on_generation, on_notice=on_notice, hook=hook)

@@ -41,7 +41,7 @@ from es_service.report.catalogue import print_catalogue
 from es_service.report.progress import Row, show_progress
 from es_service.report.status import follow_status, print_status, print_summary
 from es_service.session import task_of
-from es_service.store.folder import DATABASE
+from es_service.store.folder import holds_run
 from workers.environments import TASKS
 
 app = typer.Typer(
@@ -83,7 +83,7 @@ def run(
     wanted = overrides(set_, seed=seed, **compute(workers, engine, address))
     if or_resume and out is None:
         raise ConfigError("--or-resume needs --out: without it every run has a folder of its own")
-    begun = or_resume and out is not None and (out / DATABASE).exists()
+    begun = or_resume and out is not None and holds_run(out)
     loaded = api.load_config(config, wanted, new=not begun)
     for warning in config_warnings(loaded, task_of(loaded)):
         print_note(f"note: {warning}")
@@ -239,7 +239,7 @@ def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
         with show_progress(console, errors, str(folder)) as (show, note):
             outcome = work(on_generation=partial(show_and_note, show), on_notice=note)
     except Interrupted:
-        if began or (folder / DATABASE).exists():
+        if began or holds_run(folder):
             print_note(f"interrupted; every finished generation is saved. Go on with: {command('resume', folder)}")
         else:
             print_note("interrupted before the run began; nothing was written")

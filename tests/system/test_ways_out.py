@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+import subprocess
+import sys
 
 import pytest
 from rich.console import Console
@@ -15,13 +18,28 @@ from es_service.evaluation import candidates
 from es_service.report.status import follow_status, print_summary
 from es_service.store.lock import acquire_lock
 from es_service.store.writer import RunStore
-from tests.es_service.store_examples import finished
-from tests.system.session import SMALL
+from tests.es_service.store_examples import finished, without_root_rights
+from tests.system.session import ROOT, SMALL
+
+
+def es(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """A command in a process of its own; its end is no traceback."""
+    result = subprocess.run(
+        [sys.executable, "-m", "es_service", *map(str, arguments)],
+        cwd=ROOT,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert "Traceback" not in result.stderr, result.stderr
+    return result
 
 
 def words_after(text: str, verb: str) -> list[str]:
     """Of the first command `es-service VERB ...` in a message."""
-    found = re.search(rf"(?:es-service|\S*pytest\S*|\S*__main__.py) {verb} ([^`\n]*)", text)
+    found = re.search(rf"es-service {verb} ([^`\n]*)", text)
     assert found is not None, text
     return shlex.split(found[1])
 
@@ -59,3 +77,32 @@ def test_a_folder_with_spaces_is_one_word_of_every_command(tmp_path, capsys):
             api.open_run(finished(tmp_path / "no generation", 0)), best=True, centre=False, cells=(), every=False
         )
     assert words_after(str(empty.value), "resume") == [str(tmp_path / "no generation")]
+
+
+def test_run_or_resume_goes_on_where_only_the_copy_is_left(tmp_path):
+    """As a kill between the renames of a restoration leaves it."""
+    folder = tmp_path / "run"
+    wanted = SMALL | {"budget": {"generations": 2}}
+    api.run(wanted, folder)
+    (folder / "run.db").rename(folder / "run.db.copy")
+    notices = []
+    assert api.run_or_resume(wanted, folder, on_notice=notices.append).run.generation == 2
+    assert "Restored run.db.copy" in notices[0]
+    (folder / "run.db").rename(folder / "run.db.copy")
+    config = tmp_path / "config.yaml"
+    config.write_text(api.load_config(wanted).resolved_yaml())
+    assert es("run", config, "--or-resume", "--out", folder).returncode == 0
+
+
+@pytest.mark.parametrize("folder", ["locked/run", "a" * 300])
+def test_a_folder_that_cannot_be_looked_at(tmp_path, folder):
+    (tmp_path / "locked").mkdir()
+    (tmp_path / "locked").chmod(0)
+    with without_root_rights(), pytest.raises(StoreError, match=r"looking for a run: .*Errno") as error:
+        api.run_or_resume(SMALL, tmp_path / folder)
+    assert str(tmp_path / folder) in str(error.value)
+    config = tmp_path / "config.yaml"
+    config.write_text(api.load_config(SMALL).resolved_yaml())
+    result = es("run", config, "--or-resume", "--out", tmp_path / ("a" * 300))
+    assert result.returncode == 1
+    assert "Check that the folder" in result.stderr
