@@ -128,6 +128,10 @@ def _go_on(
 ) -> Outcome:
     """Open a run, make sure that the config for this session is its own, and work."""
     with RunStore.open(folder, hook=hook) as store:
+        # What opening has repaired stays so, whatever is refused now. Told once: `work` tells what is there later.
+        for notice in store.notices:
+            on_notice(notice)
+        store.notices.clear()
         config = make_config(store)
         if changes := changed_constants(store.meta.constants, config.constants()):
             raise ConfigError(f"{folder}: {describe_changes(changes, str(folder))}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shlex
@@ -13,12 +14,12 @@ from rich.console import Console
 
 from es_service import api
 from es_service.config.model import describe_changes
-from es_service.errors import NotInRunError, StoreError
+from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.evaluation import candidates
 from es_service.report.status import follow_status, print_summary
 from es_service.store.lock import acquire_lock
 from es_service.store.writer import RunStore
-from tests.es_service.store_examples import finished, without_root_rights
+from tests.es_service.store_examples import finished, flip_bit, without_root_rights
 from tests.system.session import ROOT, SMALL
 
 
@@ -106,3 +107,19 @@ def test_a_folder_that_cannot_be_looked_at(tmp_path, folder):
     result = es("run", config, "--or-resume", "--out", tmp_path / ("a" * 300))
     assert result.returncode == 1
     assert "Check that the folder" in result.stderr
+
+
+def test_a_repair_is_told_once_also_if_the_command_is_then_refused(tmp_path):
+    folder = tmp_path / "run"
+    run = api.run(SMALL | {"budget": {"generations": 3}}, folder).run
+    sound = (folder / "run.db").read_bytes()
+    at = sound.rindex(run.policy("centre").parameters_D.tobytes())
+    for wanted, refused in (("search.sigma=0.3", True), ("budget.generations=3", False)):
+        (folder / "run.db").write_bytes(sound)
+        flip_bit(folder / "run.db", at + 8)
+        notices: list[str] = []
+        with pytest.raises(ConfigError) if refused else contextlib.nullcontext():
+            api.resume(folder, [wanted], on_notice=notices.append)
+        (notice,) = notices
+        assert "fell back to generation 2" in notice
+        assert run.generation == (2 if refused else 3)
