@@ -180,8 +180,8 @@ def evaluate(
         cells=list(dict.fromkeys(_place(text) for text in cell or ())),
         every=every,
     )
-    with csv_file(out) as rows:
-        print_evaluations(console, found, evaluation.evaluate(found, chosen, episodes, workers), rows, every=every)
+    with csv_file(out, print_note) as write:
+        print_evaluations(console, found, evaluation.evaluate(found, chosen, episodes, workers), write, every=every)
 
 
 @app.command()
