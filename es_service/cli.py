@@ -27,7 +27,6 @@ from es_service.cli_options import (
     SeedOption,
     SetOption,
     WorkersOption,
-    compute,
     console,
     errors,
     overrides,
@@ -80,7 +79,7 @@ def run(
     ] = False,
 ) -> None:
     """Start a run from a config file."""
-    wanted = overrides(set_, seed=seed, **compute(workers, engine, address))
+    wanted = overrides(set_, seed=seed, workers=workers, engine=engine, address=address)
     if or_resume and out is None:
         raise ConfigError("--or-resume needs --out: without it every run has a folder of its own")
     begun = or_resume and out is not None and holds_run(out)
@@ -100,7 +99,7 @@ def resume(
     address: AddressOption = None,
 ) -> None:
     """Go on with a run; only budget, engine, workers and time limits may change."""
-    wanted = overrides(set_, **compute(workers, engine, address))
+    wanted = overrides(set_, workers=workers, engine=engine, address=address)
     _session(folder, partial(api.resume, folder, wanted))
 
 
@@ -117,7 +116,7 @@ def fork(
     address: AddressOption = None,
 ) -> None:
     """Start a new run from another run's state, with changed settings."""
-    wanted = overrides(set_, **compute(workers, engine, address))
+    wanted = overrides(set_, workers=workers, engine=engine, address=address)
     folder = out if out is not None else api.default_folder(api.fork_config(parent, wanted))
     _session(folder, partial(api.fork, parent, wanted, generation=generation, out=folder))
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from es_service import api, jobs
-from es_service.cli_options import ConfigArgument, SeedOption, SetOption, WorkersOption, compute, overrides, print_note
+from es_service.cli_options import ConfigArgument, SeedOption, SetOption, WorkersOption, overrides, print_note
 from es_service.commands import command
 
 job_commands = typer.Typer()
@@ -28,7 +28,7 @@ def submit(
     workers: WorkersOption = None,
 ) -> None:
     """Send a run to a Ray cluster as a job. The same command again goes on with it, after whatever happened."""
-    wanted = overrides(set_, seed=seed, **compute(workers, None, "auto"))
+    wanted = overrides(set_, seed=seed, workers=workers, address="auto")
     loaded = api.load_config(config, wanted, new=False)  # paths are those of the cluster's head, which checks them
     job = jobs.submit(loaded, address, out)
     print(job)

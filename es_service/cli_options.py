@@ -25,19 +25,25 @@ AddressOption = Annotated[
 ]
 
 
-def compute(workers: int | None, engine: str | None, address: str | None) -> dict[str, object]:
-    """The options that say where a run runs, by config key. A cluster to join is a Ray cluster."""
-    if address is not None and engine is None:
-        engine = "ray"
-    chosen: dict[str, object] = {"compute.workers": workers, "compute.engine": engine, "compute.address": address}
-    if engine == "inline" and address is None:  # what the file, or the run's record, says of a cluster is moot then
-        chosen |= {"compute.address": "null", "compute.worker_resources.cpu": 1, "compute.worker_resources.gpu": 0}
-    return chosen
+def overrides(
+    set_: list[str] | None,
+    *,
+    seed: int | None = None,
+    workers: int | None = None,
+    engine: str | None = None,
+    address: str | None = None,
+) -> list[str]:
+    """What options imply, then `--set` values, then the keys that options stand for; later ones win.
 
-
-def overrides(set_: list[str] | None, **options: object) -> list[str]:
-    """`--set` values, then options that stand for a key; the later ones win."""
-    return [*(set_ or []), *(f"{key}={value}" for key, value in options.items() if value is not None)]
+    What they imply makes moot what a file, or a run's record, says of a cluster; `--set` that contradicts it is refused.
+    """
+    implied: list[str] = []
+    if address is not None and engine is None:  # a cluster to join is a Ray cluster
+        implied = ["compute.engine=ray"]
+    elif engine == "inline" and address is None:
+        implied = ["compute.address=null", "compute.worker_resources.cpu=1", "compute.worker_resources.gpu=0"]
+    named = {"seed": seed, "compute.workers": workers, "compute.engine": engine, "compute.address": address}
+    return [*implied, *(set_ or []), *(f"{key}={value}" for key, value in named.items() if value is not None)]
 
 
 def print_note(message: str) -> None:

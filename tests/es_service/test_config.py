@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from es_service import cli_options
 from es_service.algorithms import ALGORITHMS
 from es_service.config.loading import changed_config, load_config
 from es_service.config.model import RunConfig, changed_constants, describe_changes, worker_spec
@@ -212,6 +213,33 @@ def test_shipped_configs_hide_no_preset_key(path):
     uber = preset_values("uber") | {"search.pairs": 64}
     config = load_config(path, ["search.preset=uber"], tasks=ALL_TASKS, algorithms=ALGORITHMS)
     assert config.constants().items() >= uber.items()
+
+
+# Options of the command line
+
+
+def test_options_win_over_the_file_and_over_set():
+    file = MINIMAL | {"compute": {"engine": "ray", "address": "head:6379", "worker_resources": {"gpu": 0.5}}}
+    compute = load(file, *cli_options.overrides(["compute.workers=3"], seed=4, workers=2, engine="inline")).compute
+    assert (compute.engine, compute.address, compute.worker_resources.gpu, compute.workers) == ("inline", None, 0.0, 2)
+    compute = load(MINIMAL | {"compute": {"engine": "inline"}}, *cli_options.overrides(None, address="auto")).compute
+    assert (compute.engine, compute.address) == ("ray", "auto")
+
+
+def test_what_options_imply_does_not_silence_set():
+    for wanted, problem in (
+        (
+            cli_options.overrides(["compute.address=h:1"], engine="inline"),
+            "compute.address: h:1 needs compute.engine = ray",
+        ),
+        (cli_options.overrides(["compute.worker_resources.gpu=1"], engine="inline"), "worker_resources.gpu: 1 needs"),
+        (
+            cli_options.overrides(["compute.engine=inline"], address="h:1"),
+            "compute.address: h:1 needs compute.engine = ray",
+        ),
+    ):
+        with pytest.raises(ConfigError, match=problem):
+            load(MINIMAL, *wanted)
 
 
 # Round trip and constants
