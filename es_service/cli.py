@@ -138,12 +138,12 @@ def digest_(
     folder: RunArgument,
     parts: Annotated[bool, typer.Option("--parts", help="One line per part of the state.")] = False,
 ) -> None:
-    """Print the SHA-256 over everything deterministic in a run."""
-    mixed = "  mixed" if digest.is_mixed(folder) else ""
+    """Print the SHA-256 over everything deterministic in a run, after checking all of it."""
+    found, mixed = digest.checked_parts(folder)
     if parts:
-        for name, value in digest.digest_parts(folder).items():
+        for name, value in found.items():
             print(f"{value}  {name}")
-    print(f"{digest.digest(folder)}{mixed}")
+    print(f"{digest.digest_of(found)}{'  mixed' if mixed else ''}")
 
 
 @app.command(name="list")

@@ -35,7 +35,7 @@ def overrides(
 ) -> list[str]:
     """What options imply, then `--set` values, then the keys that options stand for; later ones win.
 
-    What they imply makes moot what a file, or a run's record, says of a cluster; `--set` that contradicts it is refused.
+    So what a file, or a run's record, says of a cluster is moot, and a `--set` that contradicts the options is refused.
     """
     implied: list[str] = []
     if address is not None and engine is None:  # a cluster to join is a Ray cluster

@@ -163,14 +163,17 @@ def state_payload(connection: sqlite3.Connection, part: str, generation: int) ->
 def read_platforms(folder: Path) -> list[tuple[int, dict[str, Any]]]:
     """(first generation, platform) in order; each holds until the next."""
     with reading(folder) as (connection, _):
-        platforms: list[tuple[int, dict[str, Any]]] = []
-        for at, text, sha256 in connection.execute(
-            "SELECT generation, platform, sha256 FROM platform ORDER BY generation"
-        ):
-            if text_sha256(f"platform {at}", text) != sha256:
-                raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
-            platforms.append((at, json.loads(text)))
-        return platforms
+        return platforms(connection)
+
+
+def platforms(connection: sqlite3.Connection) -> list[tuple[int, dict[str, Any]]]:
+    """`read_platforms` of a connection inside `reading`."""
+    found: list[tuple[int, dict[str, Any]]] = []
+    for at, text, sha256 in connection.execute("SELECT generation, platform, sha256 FROM platform ORDER BY generation"):
+        if text_sha256(f"platform {at}", text) != sha256:
+            raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
+        found.append((at, json.loads(text)))
+    return found
 
 
 def verify_run(folder: Path) -> list[str]:

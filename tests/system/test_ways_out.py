@@ -114,6 +114,11 @@ def test_a_repair_is_told_once_also_if_the_command_is_then_refused(tmp_path):
     run = api.run(SMALL | {"budget": {"generations": 3}}, folder).run
     sound = (folder / "run.db").read_bytes()
     at = sound.rindex(run.policy("centre").parameters_D.tobytes())
+    flip_bit(folder / "run.db", at + 8)
+    refusal = es("digest", folder, "--parts")
+    assert (refusal.returncode, refusal.stdout) == (1, "")
+    assert re.search(r"state of 'member_\d' at generation 3 does not match its SHA-256", refusal.stderr)
+    assert words_after(refusal.stderr, "resume") == [str(folder)]
     for wanted, refused in (("search.sigma=0.3", True), ("budget.generations=3", False)):
         (folder / "run.db").write_bytes(sound)
         flip_bit(folder / "run.db", at + 8)
