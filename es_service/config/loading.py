@@ -26,6 +26,7 @@ from es_service.config.resolution import (
     folder_problems,
     member_problems,
     one_of,
+    policy_problems,
     resolve,
     rollout_problems,
     shape_problems,
@@ -151,7 +152,8 @@ def _load(
         problems.append(f"task.environment: {error}")
     values = resolve(values, left_open, task)
     if task is not None:
-        problems += task_problems(values, task) + map_problems(values, task) + rollout_problems(values, task)
+        problems += task_problems(values, task) + policy_problems(values, task)
+        problems += map_problems(values, task) + rollout_problems(values, task)
     problems += member_problems(values) + shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & _BUDGET and all(values.get(key) is None for key in _BUDGET):
