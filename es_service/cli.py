@@ -6,12 +6,14 @@ Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by S
 
 from __future__ import annotations
 
+import contextlib
+import io
 import sys
 from collections.abc import Callable
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -210,6 +212,8 @@ def doctor() -> None:
 
 def main() -> None:
     """Run the command; turn errors into one readable message and an exit code. `__main__` is the way in."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a ± is no reason to fail where there is only ASCII
     try:
         app()
     except Interrupted:
@@ -226,17 +230,23 @@ def main() -> None:
 
 
 def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
-    """Show a run while it works, and at its end what came of it."""
+    """Show a run while it works, and at its end what came of it. It goes on where nobody reads that any more."""
     began = False
 
-    def show_and_note(show: Callable[[Row], None], row: Row) -> None:
+    def tell(show: Callable[[Any], None], what: Row | str) -> None:
+        try:
+            show(what)
+        except SystemExit:  # what rich makes of a broken pipe; from then on it prints nothing
+            print_note(f"nobody reads the output any more; the run goes on: {command('status', folder, '--follow')}")
+
+    def tell_generation(show: Callable[[Row], None], row: Row) -> None:
         nonlocal began
         began = True  # whatever has become of the folder's name since
-        show(row)
+        tell(show, row)
 
     try:
         with show_progress(console, errors, str(folder)) as (show, note):
-            outcome = work(on_generation=partial(show_and_note, show), on_notice=note)
+            outcome = work(on_generation=partial(tell_generation, show), on_notice=partial(tell, note))
     except Interrupted:
         if began or holds_run(folder):
             print_note(f"interrupted; every finished generation is saved. Go on with: {command('resume', folder)}")
@@ -246,7 +256,8 @@ def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
     except EvaluationError:
         print_note(f"every finished generation is saved. Once the cause is gone: {command('resume', folder)}")
         raise
-    print_summary(console, outcome.run, outcome.reason)
+    with contextlib.suppress(SystemExit):
+        print_summary(console, outcome.run, outcome.reason)
 
 
 def _place(text: str) -> tuple[int, ...]:

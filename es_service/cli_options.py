@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Annotated
 
@@ -46,11 +47,12 @@ def overrides(
     return [*implied, *(set_ or []), *(f"{key}={value}" for key, value in named.items() if value is not None)]
 
 
-def print_note(message: str) -> None:
-    """A line for the user that is no result."""
-    errors.print(message, highlight=False, markup=False, soft_wrap=True)
+def print_note(message: str, style: str | None = None) -> None:
+    """A line for the user that is no result; nothing where nobody reads it, of which rich makes an exit."""
+    with contextlib.suppress(SystemExit):
+        errors.print(message, style=style, highlight=False, markup=False, soft_wrap=True)
 
 
 def print_error(message: str) -> None:
     """What has gone wrong, and what to do."""
-    errors.print(f"error: {message}", style="red", highlight=False, markup=False, soft_wrap=True)
+    print_note(f"error: {message}", style="red")

@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+import time
 
 import pytest
 from rich.console import Console
@@ -18,6 +19,7 @@ from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.evaluation import candidates
 from es_service.report.status import follow_status, print_summary
 from es_service.store.lock import acquire_lock
+from es_service.store.reader import read_generation
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import finished, flip_bit, without_root_rights
 from tests.system.session import ROOT, SMALL
@@ -128,3 +130,28 @@ def test_a_repair_is_told_once_also_if_the_command_is_then_refused(tmp_path):
         (notice,) = notices
         assert "fell back to generation 2" in notice
         assert run.generation == (2 if refused else 3)
+
+
+@pytest.mark.parametrize("errors", [subprocess.PIPE, subprocess.STDOUT])
+def test_a_run_goes_on_where_nobody_reads_its_output(tmp_path, errors):
+    """With STDOUT, nobody reads its notes either."""
+    folder, config = tmp_path / "run", tmp_path / "config.yaml"
+    config.write_text(api.load_config(SMALL | {"budget": {"generations": 10**6}}).resolved_yaml())
+    arguments = [sys.executable, "-m", "es_service", "run", str(config), "--out", str(folder)]
+    with subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.PIPE, stderr=errors, text=True) as run:
+        assert run.stdout is not None
+        assert run.stdout.readline().startswith("generation 0")
+        run.stdout.close()
+        time.sleep(2.5)  # it prints once a second
+        if run.stderr:
+            assert run.stderr.readline().endswith(f"the run goes on: es-service status {folder} --follow\n")
+        reached = read_generation(folder) or 0
+        time.sleep(0.5)
+        assert (read_generation(folder) or 0) > reached
+        run.terminate()
+        assert run.wait(timeout=60) == 143
+
+
+def test_output_that_has_no_sign_for_plus_or_minus(tmp_path):
+    outcome = api.run(SMALL | {"budget": {"generations": 1}}, tmp_path / "run")
+    assert " ? " in es("status", outcome.run.folder, PYTHONIOENCODING="ascii").stdout
