@@ -11,28 +11,20 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-import numpy as np
-
 from es_service.algorithms import ALGORITHMS
+from es_service.commands import command
 from es_service.config import loading
-from es_service.config.model import RunConfig, changed_constants, describe_changes, policy_shape
+from es_service.config.model import RunConfig, changed_constants, describe_changes
+from es_service.descent import fork_config, forked, started
 from es_service.errors import ConfigError, StoreError
 from es_service.history import history_columns
-from es_service.maps.behaviour_map import ELITE_PREFIX
-from es_service.protocol import Moments
-from es_service.run_state import moments_from_arrays, moments_to_arrays, without_elites
-from es_service.run_view import Run, open_run
+from es_service.run_view import open_run
 from es_service.session import TASKS, OnGeneration, OnNotice, Outcome, task_of, work
-from es_service.store import reader
 from es_service.store.beginning import Beginning
-from es_service.store.folder import DATABASE, explained, write_config
+from es_service.store.folder import explained, holds_run, write_config
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook
 
-OBSERVED = ("policy.observation_clip", "policy.observation_normalization")
-"""What a policy does with its observations."""
-MAP_GEOMETRY = ("map.enabled", "map.kind", "map.bounds", "map.cells")
-"""What the state of a map depends on."""
 RUNS_FOLDER = Path("runs")
 """Where runs go unless told otherwise, relative to the current folder."""
 
@@ -80,7 +72,7 @@ def run(
         config = load_config(config)
     parent, beginning = None, Beginning()
     if config.search.init_from is not None:
-        parent, beginning = _start_from(config, config.search.init_from)
+        parent, beginning = started(config, config.search.init_from)
     return _create_and_work(config, out, parent, beginning, on_generation, on_notice, hook)
 
 
@@ -104,7 +96,7 @@ def resume(
     def changed(store: RunStore) -> RunConfig:
         recorded = store.folder / "config.yaml"
         source = recorded if recorded.exists() else store.meta.config
-        return loading.resume_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+        return loading.changed_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
 
     return _go_on(Path(folder), changed, on_generation, on_notice, hook)
 
@@ -122,7 +114,7 @@ def run_or_resume(
     Raises:
         ConfigError: the folder's run has other constants than `config` (all are listed). Otherwise as `run`.
     """
-    begun = (Path(out) / DATABASE).exists()
+    begun = holds_run(Path(out))
     wanted = config if isinstance(config, RunConfig) else load_config(config, new=not begun)
     if not begun:
         return run(wanted, out, on_generation=on_generation, on_notice=on_notice, hook=hook)
@@ -138,13 +130,17 @@ def _go_on(
 ) -> Outcome:
     """Open a run, make sure that the config for this session is its own, and work."""
     with RunStore.open(folder, hook=hook) as store:
+        # What opening has repaired stays so, whatever is refused now. Told once: `work` tells what is there later.
+        for notice in store.notices:
+            on_notice(notice)
+        store.notices.clear()
         config = make_config(store)
         if changes := changed_constants(store.meta.constants, config.constants()):
             raise ConfigError(f"{folder}: {describe_changes(changes, str(folder))}")
         if store.meta.columns != history_columns(task_of(config), config.map.enabled):
             raise StoreError(
                 f"{folder} was written by a version of es-service with other history columns; continue it with that "
-                f"version, or go on from its state in a new run: es-service fork {folder}"
+                f"version, or go on from its state in a new run: {command('fork', folder)}"
             )
         try:
             write_config(folder, config.resolved_yaml())
@@ -167,54 +163,16 @@ def fork(
 
     The history up to there comes along and generations count on, so a fork that changes nothing ends with the same
     bits as its parent would. Where a setting changes what an evaluation means, of the task or of how observations are
-    normalised, the best centre so far no longer counts as one, and the map begins empty.
+    normalised, no fitness seen so far counts any more: the best centre, nsra_es's record and the map begin anew; the
+    weight of fitness stays as it is.
 
     Raises:
         ConfigError: a change that the state does not fit (another task, network or algorithm). StoreError: the
             generation is not kept. Otherwise as `run`.
     """
-    origin, config = open_run(parent), fork_config(parent, overrides)
-    at, parts = origin.parts(generation)
-    changed = {name for name, _, _ in changed_constants(origin.constants, config.constants())}
-    if any(name in OBSERVED or name.startswith("task.") for name in changed - {"task.episodes_per_member"}):
-        parts = without_elites(parts) | {"best": parts["best"] | {"fitness": np.asarray(-np.inf)}}
-    history = [row for row in origin.history_rows() if row["generation"] <= at]
-    platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
-    lineage = _lineage(origin, at)
-    return _create_and_work(config, out, lineage, Beginning(history, parts, platforms), on_generation, on_notice, hook)
-
-
-def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -> RunConfig:
-    """The config of a fork: the parent's resolved one with overrides.
-
-    Raises:
-        ConfigError: as `load_config`, or the parent's state does not fit the changes.
-    """
-    origin = open_run(parent)
-    overrides = [overrides] if isinstance(overrides, str) else list(overrides)
-    keys = [override.partition("=")[0].strip() for override in overrides]
-    if "search.preset" in keys:
-        raise ConfigError(
-            "search.preset: a fork has every key from its parent, so a preset would fill in nothing; set the keys "
-            "themselves (`es-service list` shows what a preset stands for)"
-        )
-    mapping = {name: dict(section) if isinstance(section, dict) else section for name, section in origin.config.items()}
-    mapping["search"]["init_from"] = None  # it has the parent's state instead
-    if {"task.fitness", "task.episode_steps"} & set(keys):
-        mapping["map"]["qd_offset"] = "auto"  # which follows from them; unless it is set as well
-    if "search.pairs" in keys:
-        for shape in ("chunk_pairs", "rollout_block_pairs", "gradient_block_pairs"):
-            mapping["compute"][shape] = "auto"
-    config = loading.load_config(mapping, overrides, tasks=TASKS, algorithms=ALGORITHMS)
-    fixed = ("task.environment", "policy.hidden", "search.algorithm", "search.members", *MAP_GEOMETRY)
-    if unfit := [change for change in changed_constants(origin.constants, config.constants()) if change[0] in fixed]:
-        listed = "\n".join(f"  {name}: {old} -> {new}" for name, old, new in unfit)
-        raise ConfigError(
-            f"{origin.folder}: its state does not fit these changes:\n{listed}\n"
-            f"to start afresh from its centre (same task and network): "
-            f"es-service run CONFIG --set search.init_from={origin.folder}"
-        )
-    return config
+    config = fork_config(parent, overrides)
+    lineage, beginning = forked(open_run(parent), config, generation)
+    return _create_and_work(config, out, lineage, beginning, on_generation, on_notice, hook)
 
 
 def default_folder(config: RunConfig) -> Path:
@@ -254,30 +212,3 @@ def _create_and_work(
     )
     with RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=hook) as store:
         return work(config, store, on_generation, on_notice)
-
-
-def _start_from(config: RunConfig, folder: str) -> tuple[dict[str, Any], Beginning]:
-    """What a run records and keeps of the one whose newest centre it starts from; all of one generation."""
-    origin, shape = open_run(folder), policy_shape(config, task_of(config))
-    if origin.policy_shape != shape:
-        raise ConfigError(
-            f"search.init_from: the policy of {origin.folder} has layers {list(origin.policy_shape.widths)}, "
-            f"this run's has {list(shape.widths)}; use the same task and policy.hidden"
-        )
-    at, parts = origin.parts(wanted=lambda part: not part.startswith(ELITE_PREFIX))
-    member, moments = origin.newest_member(at, parts), moments_from_arrays(parts["observations"])
-    if member.own_mean_O is not None and member.own_std_O is not None:
-        # Those that its policy runs with, as if that many observations had given them.
-        mean_O, std_O = member.own_mean_O.astype(np.float64), member.own_std_O.astype(np.float64)
-        moments = Moments(moments.count, mean_O, moments.count * np.square(std_O))
-    start = {"centre_D": member.centre_D, **moments_to_arrays(moments)}
-    return _lineage(origin, at), Beginning(start=start)
-
-
-def _lineage(origin: Run, generation: int) -> dict[str, Any]:
-    return {
-        "run_id": origin.run_id,
-        "folder": str(origin.folder.absolute()),
-        "generation": generation,
-        "digest": origin.digest(),
-    }

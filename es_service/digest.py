@@ -2,7 +2,7 @@
 
 Hashed are values, each with its name, type and shape: not payload bytes as stored, row order on disk, seconds, rates,
 workers, hosts or paths. It is taken from what the tables contain, without looking at the SHA-256 stored beside it
-(`store.reader.verify_run` does that): a flipped bit in a state payload or a deterministic history value gives another
+(`checked_parts` does that first): a flipped bit in a state payload or a deterministic history value gives another
 digest, or a StoreError where the value can no longer be read as one.
 """
 
@@ -11,24 +11,32 @@ from __future__ import annotations
 import hashlib
 import json
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
+from es_service.commands import command
 from es_service.errors import StoreError
 from es_service.maps.behaviour_map import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.store.codec import decode_part, row_bytes
-from es_service.store.reader import read_platforms, reading, state_payload
+from es_service.store.folder import DATABASE
+from es_service.store.reader import platforms, reading, state_payload
 from es_service.store.schema import RunMeta, history_select
+from es_service.store.verify import verify
 
 Connection = sqlite3.Connection
 
 
 def digest(folder: Path) -> str:
     """Of the run in `folder` as it is now: equal for two runs exactly if all of `digest_parts` are equal."""
-    lines = (f"{name}\0{sha256}\n" for name, sha256 in sorted(digest_parts(folder).items()))
+    return digest_of(digest_parts(folder))
+
+
+def digest_of(parts: Mapping[str, str]) -> str:
+    """The digest of a run whose `digest_parts` are these."""
+    lines = (f"{name}\0{sha256}\n" for name, sha256 in sorted(parts.items()))
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
@@ -39,19 +47,41 @@ def digest_parts(folder: Path) -> dict[str, str]:
     Raises StoreError if the run cannot be read.
     """
     with reading(folder) as (connection, meta):
-        try:
-            tables = {name: table(connection, meta) for name, table in TABLES.items()}
-            return {**_state(connection), **tables}
-        except ValueError as error:
-            raise StoreError(f"{folder} holds what cannot be read: {error}; resume it to repair what can be") from error
+        return _parts(folder, connection, meta)
+
+
+def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
+    """`digest_parts` and `is_mixed` of one moment, after everything stored was checked against its SHA-256.
+
+    Raises StoreError that names what is damaged.
+    """
+    with reading(folder) as (connection, meta):
+        if problems := verify(connection, folder / DATABASE).problems:
+            raise StoreError(
+                f"{folder} is damaged: {'; '.join(problems)}. `{command('resume', folder)}` goes on from the newest "
+                "generation that is sound."
+            )
+        return _parts(folder, connection, meta), _is_mixed(connection)
 
 
 def is_mixed(folder: Path) -> bool:
     """Whether the stored generations were computed on more than one platform (versions, CPU or GPU kind)."""
     with reading(folder) as (connection, _):
-        newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
-    in_force = [platform for at, platform in read_platforms(folder) if newest is not None and at <= newest]
+        return _is_mixed(connection)
+
+
+def _is_mixed(connection: Connection) -> bool:
+    newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
+    in_force = [platform for at, platform in platforms(connection) if newest is not None and at <= newest]
     return len({json.dumps(platform, sort_keys=True) for platform in in_force}) > 1
+
+
+def _parts(folder: Path, connection: Connection, meta: RunMeta) -> dict[str, str]:
+    try:
+        tables = {name: table(connection, meta) for name, table in TABLES.items()}
+        return {**_state(connection), **tables}
+    except ValueError as error:
+        raise StoreError(f"{folder} holds what cannot be read: {error}; resume it to repair what can be") from error
 
 
 def _state(connection: Connection) -> dict[str, str]:

@@ -35,8 +35,8 @@ from es_service.maps.behaviour_map import (
 from es_service.maps.geometry import make_geometry, reachable_cells
 from es_service.novelty import novelty
 from es_service.protocol import Centre, DispatchCounts, EpisodesResult, Evaluator, FloatArray, Moments, TaskSpec
-from es_service.run_state import Arrays, Best, RunState, state_from_parts, state_parts
-from es_service.statistics import merge_moments, normalisation
+from es_service.run_state import Arrays, Best, RunState, state_from_parts, state_parts, statistics_in_force
+from es_service.statistics import merge_moments
 
 HistoryRow = dict[str, int | float | None]
 Reachable = NDArray[np.bool_] | None
@@ -254,10 +254,9 @@ def _keep(
 def _centre(
     search: Search, generation: int, centre_D: FloatArray, observations: Moments, member: Member | None = None
 ) -> Centre:
-    """The point to send out, with the statistics in force: the member's own if it has any, else the run's."""
-    mean_O, std_O = normalisation(observations, search.config.policy.observation_normalization)
-    if member is not None and member.own_mean_O is not None and member.own_std_O is not None:
-        mean_O, std_O = member.own_mean_O, member.own_std_O
+    """The point to send out, with the statistics in force."""
+    enabled = search.config.policy.observation_normalization
+    mean_O, std_O = statistics_in_force(observations, member, enabled)
     return Centre(generation, centre_D, search.config.search.sigma, mean_O, std_O)
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.algorithms import ALGORITHMS
-from es_service.config.loading import resume_config
+from es_service.commands import command
+from es_service.config.loading import changed_config
 from es_service.config.model import worker_spec
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError
@@ -83,7 +84,7 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
     generation.
     """
     if run.generation is None:
-        raise NotInRunError(f"{run.folder} has no generation yet; `es-service resume {run.folder}` continues it")
+        raise NotInRunError(f"{run.folder} has no generation yet; `{command('resume', run.folder)}` continues it")
     found = []
     if best:
         kept = best_from_arrays(run.parts(wanted=lambda part: part == "best")[1]["best"])
@@ -115,7 +116,7 @@ def evaluate(run: Run, chosen: Sequence[Candidate], episodes: int, workers: int 
     overrides = ["compute.engine=inline", "compute.address=null"]
     overrides += ["compute.worker_resources.cpu=1", "compute.worker_resources.gpu=0"]
     overrides += [f"compute.workers={workers or 'auto'}"]
-    config = resume_config(run.config, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+    config = changed_config(run.present_config, overrides, tasks=TASKS, algorithms=ALGORITHMS)
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     with (
         stop_on_signals() as should_stop,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from es_service.commands import command
 from es_service.config.resolution import did_you_mean, one_of
 from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.maps.behaviour_map import BehaviourMap, Elite
@@ -37,7 +38,7 @@ def export(run: Run, to: str, folder: Path) -> list[Path]:
     if to not in FORMATS:
         raise ConfigError(f"--to {to}: no known format; must be {one_of(FORMATS)}{did_you_mean(to, FORMATS)}")
     if run.generation is None:
-        raise NotInRunError(f"{run.folder} has no generation yet; `es-service resume {run.folder}` continues it")
+        raise NotInRunError(f"{run.folder} has no generation yet; `{command('resume', run.folder)}` continues it")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         return FORMATS[to](run, folder)

@@ -51,8 +51,8 @@ class TaskSpec:
     wall_clearance: float = 0.0
     """How near the middle of a wall no descriptor can come."""
     least_reward: float | None = None
-    """What a QD-score counts from, per step: about the least mean reward of an episode. No bound where the task does not
-    make it one: short episodes of AntTrap can be below. None where nobody says."""
+    """What a QD-score counts from, per step: about the least mean reward of an episode. Not always a bound: short
+    episodes of AntTrap can be below. None where nobody says."""
     no_simd: str = ""
     """Why simd cannot compile its episodes; empty where it can."""
     no_vectors: str = ""

@@ -9,6 +9,8 @@ import numpy as np
 
 from es_service.algorithms.base import (
     NO_CELL,
+    FitnessWeight,
+    Member,
     SearchState,
     member_from_arrays,
     member_part,
@@ -27,6 +29,7 @@ from es_service.maps.behaviour_map import (
 )
 from es_service.novelty import archive_from_parts, archive_to_parts
 from es_service.protocol import FloatArray, Moments
+from es_service.statistics import normalisation
 
 Arrays = dict[str, np.ndarray]
 
@@ -112,13 +115,23 @@ def state_from_parts(
     )
 
 
-def without_elites(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, Arrays]:
-    """The parts of a state whose map has been emptied."""
+def without_fitness(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, Arrays]:
+    """The parts of a state in which no fitness seen so far counts: no best centre, an empty map, no record to beat."""
     kept = {name: dict(part) for name, part in parts.items() if not name.startswith((CELL_PREFIX, ELITE_PREFIX))}
     for name, part in kept.items():
         if name.startswith(member_part("")):
             part["cell"] = np.asarray(NO_CELL, np.int64)
+    kept["best"]["fitness"] = np.asarray(-np.inf)
+    kept["weight"] = weight_to_arrays(FitnessWeight(weight_from_arrays(parts["weight"]).value))
     return kept
+
+
+def statistics_in_force(observations: Moments, member: Member | None, enabled: bool) -> tuple[FloatArray, FloatArray]:
+    """(mean, standard deviation) that a member's centres run with: its own if it has any, else the whole run's; 0 and 1
+    where observations are not normalised."""
+    if enabled and member is not None and member.own_mean_O is not None and member.own_std_O is not None:
+        return member.own_mean_O, member.own_std_O
+    return normalisation(observations, enabled)
 
 
 def moments_to_arrays(moments: Moments) -> Arrays:

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from es_service import digest as run_digest
 from es_service.algorithms.base import Member, member_from_arrays, member_part
+from es_service.config.model import COMPUTE_CONSTANTS
+from es_service.config.yaml_text import read_yaml_file
 from es_service.errors import NotInRunError
 from es_service.maps.behaviour_map import (
     CELL_PREFIX,
@@ -29,9 +31,9 @@ from es_service.maps.behaviour_map import (
 from es_service.maps.geometry import Grid
 from es_service.novelty import BLOCK_PREFIX, archive_from_parts
 from es_service.protocol import FloatArray, PolicyShape
-from es_service.run_state import best_from_arrays, moments_from_arrays
-from es_service.statistics import normalisation
+from es_service.run_state import best_from_arrays, moments_from_arrays, statistics_in_force
 from es_service.store import reader
+from es_service.store.folder import CONFIG
 from es_service.store.schema import RunMeta
 from workers.policy import act, normalise, split_layers
 
@@ -84,6 +86,21 @@ class Run:
     def config(self) -> dict[str, Any]:
         """The resolved config the run was created with."""
         return self.meta.config
+
+    @property
+    def present_config(self) -> dict[str, Any]:
+        """`config` as the run would go on with it: budget, engine and time limits as they were last set.
+
+        Raises ConfigError if the folder's `config.yaml`, which has them, cannot be read.
+        """
+        file = self.folder / CONFIG
+        if not file.exists():
+            return self.config
+        recorded = read_yaml_file(file)[0]
+        budget, compute = (recorded.get(section, self.config[section]) for section in ("budget", "compute"))
+        if isinstance(compute, Mapping):
+            compute = {**compute, **{key: self.config["compute"][key] for key in COMPUTE_CONSTANTS}}
+        return self.config | {"budget": budget, "compute": compute}
 
     @property
     def constants(self) -> dict[str, Any]:
@@ -237,10 +254,8 @@ class Run:
         """(generation, the centre updated in it with the statistics that it would go on with)."""
         at, parts = self.parts(wanted=lambda part: not part.startswith((ELITE_PREFIX, CELL_PREFIX)))
         member = self.newest_member(at, parts)
-        mean_O, std_O = member.own_mean_O, member.own_std_O
-        if mean_O is None or std_O is None:
-            enabled = self.constants["policy.observation_normalization"]
-            mean_O, std_O = normalisation(moments_from_arrays(parts["observations"]), enabled)
+        enabled = self.constants["policy.observation_normalization"]
+        mean_O, std_O = statistics_in_force(moments_from_arrays(parts["observations"]), member, enabled)
         return at, self.policy_of(member.centre_D, mean_O, std_O)
 
     def newest_member(self, generation: int, parts: Mapping[str, Mapping[str, np.ndarray]]) -> Member:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from es_service.config.map_rules import OPTIONS, map_problems
-from es_service.config.model import RunConfig, WorkerResources, changed_constants, describe_changes
+from es_service.config.model import RunConfig, WorkerResources
 from es_service.config.presets import PRESETS, preset_values
 from es_service.config.resolution import (
     LEFT_OPEN,
@@ -26,6 +26,7 @@ from es_service.config.resolution import (
     folder_problems,
     member_problems,
     one_of,
+    policy_problems,
     resolve,
     rollout_problems,
     shape_problems,
@@ -52,6 +53,19 @@ _FIELDS = {name: field for name, field in RunConfig.model_fields.items() if name
 _GROUPS = (*_SECTIONS, OPTIONS.removesuffix("."), RESOURCES.removesuffix("."))
 """What holds keys and is no value itself."""
 _BUDGET = [name for name in _FIELDS if name.startswith("budget.")]
+_SHAPES = ("compute.chunk_pairs", "compute.rollout_block_pairs", "compute.gradient_block_pairs")
+_MAP = ("map.kind", "map.bounds", "map.cells")
+_FOLLOWERS = {
+    "task.environment": (OPTIONS, "task.episode_steps", *_MAP, "map.qd_offset"),
+    "task.episode_steps": ("map.qd_offset",),
+    "task.fitness": ("map.qd_offset",),
+    f"{OPTIONS}descriptor": _MAP,
+    "map.kind": ("map.cells",),
+    "policy.observation_normalization": ("policy.observation_clip",),
+    "search.algorithm": ("search.members",),
+    "search.pairs": _SHAPES,
+}
+"""Key -> how the names of those begin whose values follow from it, unless they are written as well."""
 
 
 def load_config(
@@ -74,28 +88,22 @@ def load_config(
     Raises:
         ConfigError: names the file, then lists every problem on a line of its own.
     """
-    return _load(source, overrides, tasks, algorithms, new=new)
+    return _load(source, overrides, tasks, algorithms, new=new, resolved=False)
 
 
-def resume_config(
+def changed_config(
     source: Source, overrides: Iterable[str] = (), *, tasks: Mapping[str, TaskSpec], algorithms: Mapping[str, object]
 ) -> RunConfig:
-    """The config of a run that exists, with what may change on resume changed: budget, engine, workers, time limits.
+    """The config of a run that exists, with some keys changed; what follows from those, by a preset or from the task,
+    is resolved anew. Whether the run can change so is for the caller to say.
 
-    Arguments as for `load_config`; `source` is the run's own `config.yaml`. The run it once started from need no longer
-    be there.
+    Arguments as for `load_config`; `source` is a resolved config, such as the run's own `config.yaml`. The run it once
+    started from need no longer be there.
 
     Raises:
-        ConfigError: as for `load_config`, or an override would change a constant of the run.
+        ConfigError: as for `load_config`.
     """
-    overrides = tuple(overrides)
-    old = _load(source, (), tasks, algorithms, new=False).constants()
-    wanted = _parse_overrides(overrides)[0]
-    changes = changed_constants(old, old | {name: value for name, value in wanted.items() if name in old})
-    if changes:
-        run = "RUN" if isinstance(source, Mapping) else os.path.dirname(os.fspath(source)) or "."
-        raise ConfigError(describe_changes(changes, run))
-    return _load(source, overrides, tasks, algorithms, new=False)
+    return _load(source, overrides, tasks, algorithms, new=False, resolved=True)
 
 
 def _load(
@@ -105,6 +113,7 @@ def _load(
     algorithms: Mapping[str, object],
     *,
     new: bool,
+    resolved: bool,
 ) -> RunConfig:
     if isinstance(source, Mapping):
         name, mapping, problems = "config", source, []
@@ -113,9 +122,9 @@ def _load(
         name = os.fspath(source)
     values, unusable, more = _sort_keys(mapping)
     problems += more
-    wanted, more = _parse_overrides(overrides)
+    wanted, more = parse_overrides(overrides)
     problems += more
-    values |= wanted
+    values = (_without_followers(values, wanted) if resolved else values) | wanted
 
     left_open = {key for key, ask in LEFT_OPEN.items() if _asks(values.get(key, ask), ask)}
     values = {key: value for key, value in values.items() if key not in left_open}
@@ -145,7 +154,8 @@ def _load(
     task: TaskSpec | None = found.get("task.environment")
     values = resolve(values, left_open, task)
     if task is not None:
-        problems += task_problems(values, task) + map_problems(values, task) + rollout_problems(values, task)
+        problems += task_problems(values, task) + policy_problems(values, task)
+        problems += map_problems(values, task) + rollout_problems(values, task)
     problems += member_problems(values) + shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & _BUDGET and all(values.get(key) is None for key in _BUDGET):
@@ -183,7 +193,7 @@ def _sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, A
     return values, unusable, problems
 
 
-def _parse_overrides(overrides: Iterable[str]) -> tuple[dict[str, Any], list[str]]:
+def parse_overrides(overrides: Iterable[str]) -> tuple[dict[str, Any], list[str]]:
     """Values by dotted key, and a problem for each override that has none to give."""
     values: dict[str, Any] = {}
     problems: list[str] = []
@@ -204,6 +214,13 @@ def _parse_overrides(overrides: Iterable[str]) -> tuple[dict[str, Any], list[str
         else:
             problems.append(f"{where}: {_unknown_key(name)}")
     return values, problems
+
+
+def _without_followers(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
+    """Resolved values without those that follow from one that is about to be another."""
+    changed = [key for key in _FOLLOWERS if key in wanted and wanted[key] != values.get(key)]
+    followers = tuple(name for key in changed for name in _FOLLOWERS[key])
+    return {key: value for key, value in values.items() if not key.startswith(followers)}
 
 
 def _unknown_key(name: str) -> str:

@@ -9,9 +9,9 @@ from it was invalid and has been reported already, so rules that need it keep si
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Collection, Mapping
 from difflib import get_close_matches
-from pathlib import Path
 from typing import Any
 
 from es_service.config.map_rules import OPTIONS, default_cells, default_kind, default_qd_offset, options_of
@@ -44,6 +44,8 @@ LEAST_CHUNK_PAIRS = 16
 """Smaller ones cost more to send than they help to share out a small population."""
 CHUNKS = 8
 """Wanted of a population of 128 to 512 pairs, so that several workers can share it."""
+MOST_PARAMETERS = 80_000_000
+"""The store keeps a member's centre and Adam's two moments, 12 bytes a parameter, in one value: SQLite's end at 1e9."""
 MOST_ROLLOUT_BLOCK_PAIRS = 32
 """Enough to fill vector units."""
 MOST_ROLLOUT_BLOCK_BYTES = 5 * 2**20
@@ -155,6 +157,17 @@ def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
     return problems
 
 
+def policy_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
+    """Where the network is larger than a run can keep."""
+    hidden = values.get("policy.hidden", PolicyConfig.model_fields["hidden"].default)
+    if PolicyShape((task.observation_size, *hidden, task.action_size)).parameters <= MOST_PARAMETERS:
+        return []
+    return [
+        f"policy.hidden: {show(list(hidden))} makes more than {MOST_PARAMETERS:,} parameters for {task.name}, the most "
+        "that the run store takes; must be narrower"
+    ]
+
+
 def member_problems(values: Mapping[str, Any]) -> list[str]:
     """Where the algorithm cannot have as many members."""
     algorithm, members = values.get("search.algorithm"), values.get("search.members")
@@ -234,10 +247,17 @@ def rollout_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
 def folder_problems(values: Mapping[str, Any]) -> list[str]:
     """Where the config names a run that is not there."""
     folder = values.get("search.init_from")
-    if folder is None or Path(folder).is_dir():
+    if folder is None:
         return []
-    what = "is a file" if Path(folder).exists() else "does not exist"
-    return [f"search.init_from: {folder} {what}; must be the folder of another run, or null"]
+    try:
+        found = os.stat(folder)
+    except (FileNotFoundError, NotADirectoryError):
+        what = "does not exist"
+    except (OSError, ValueError) as error:  # in a folder that may not be looked into, too long, a null character
+        what = f"cannot be looked at ({getattr(error, 'strerror', error)})"
+    else:
+        what = "" if stat.S_ISDIR(found.st_mode) else "is a file"
+    return [f"search.init_from: {folder} {what}; must be the folder of another run, or null"] if what else []
 
 
 def config_warnings(config: RunConfig, task: TaskSpec) -> list[str]:

@@ -27,6 +27,14 @@ class _Loader(yaml.SafeLoader):
         """A whole number; PyYAML's own reads a leading 0 as octal."""
         return int(str(self.construct_scalar(node)))
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> object:
+        """The value of a node. PyYAML's own errors say where; Python's come from text that is not what its tag says."""
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError):
+            tag = node.tag.replace("tag:yaml.org,2002:", "!!")
+            raise yaml.constructor.ConstructorError(None, None, f"this is no {tag}", node.start_mark) from None
+
 
 class _Dumper(yaml.SafeDumper):
     """Quotes exactly those strings that `_Loader` would read as something else."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import csv
 import math
-from collections.abc import Iterable, Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from rich.console import Console
 
@@ -15,39 +16,73 @@ from es_service.errors import ConfigError, StoreError
 from es_service.evaluation import Fresh
 from es_service.run_view import Run
 
+Write = Callable[[Mapping[str, Any]], None]
+
 
 @contextlib.contextmanager
-def csv_file(path: Path | None) -> Iterator[IO[str] | None]:
-    """The file to write rows to, opened before there are any; None for none.
+def csv_file(path: Path | None, note: Callable[[str], None]) -> Iterator[Write]:
+    """What to call with each row of a table, which is at `path` once all of them are there; None for none.
+
+    Until then they are in a file beside it, and what was at `path` stays. If something ends this early they are left
+    there, which `note` is told.
 
     Raises ConfigError for a name without .csv, so that nothing else is ever overwritten, StoreError if it cannot be
     written.
     """
     if path is None:
-        yield None
+        yield lambda row: None
         return
     if path.suffix != ".csv":
         raise ConfigError(f"--out {path}: must end in .csv")
+    new, is_empty = path.with_name(f"{path.name}.new"), True
+    with _explained(path):
+        if path.is_dir():
+            raise ConfigError(f"--out {path}: is a folder; must be a file")
+        file = new.open("w", newline="")
+
+    def write(row: Mapping[str, Any]) -> None:
+        nonlocal is_empty
+        writer = csv.DictWriter(file, list(row), lineterminator="\n")
+        with _explained(path):
+            if is_empty:
+                writer.writeheader()
+            writer.writerow(row)
+            file.flush()
+        is_empty = False
+
     try:
-        file = path.open("w", newline="")
+        yield write
+        with _explained(path):
+            file.close()
+            os.replace(new, path)
+    except BaseException:
+        with contextlib.suppress(OSError):  # on a full disk there is still something to write
+            file.close()
+        if is_empty:
+            new.unlink(missing_ok=True)
+        else:
+            note(f"what was evaluated until then is in {new}")
+        raise
+
+
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise StoreError(f"cannot write {path}: {error.strerror}; choose another --out") from error
-    with file:
-        yield file
 
 
-def print_evaluations(
-    console: Console, run: Run, results: Iterable[Fresh], file: IO[str] | None, *, every: bool
-) -> None:
-    """A line per policy as it comes, then, if `every` elite was asked, what it says of the map; rows also as CSV."""
+def print_evaluations(console: Console, run: Run, results: Iterable[Fresh], write: Write, *, every: bool) -> None:
+    """A line per policy as it comes, its row to `write`; then, if `every` elite was asked, what it says of the map."""
     names = run.descriptor_names
-    rows: list[dict[str, Any]] = []
     found: list[Fresh] = []
     _line(console, f"{'policy':<10} {'from':>7} {'stored':>10} {'fresh':>10} {'± s.e.':>8}  where (± spread)")
     for fresh in results:
         found.append(fresh)
-        rows.append(_row(fresh, names))
-        where = ", ".join(f"{name} {rows[-1][name]:.3g} ± {rows[-1][f'{name}_std']:.2g}" for name in names)
+        row = _row(fresh, names)
+        write(row)
+        where = ", ".join(f"{name} {row[name]:.3g} ± {row[f'{name}_std']:.2g}" for name in names)
         one = fresh.candidate
         _line(
             console,
@@ -56,10 +91,6 @@ def print_evaluations(
         )
     if every:
         _line(console, _about_elites(run, [fresh for fresh in found if fresh.candidate.cell is not None]))
-    if file is not None:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def _row(fresh: Fresh, names: list[str]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
+from es_service.commands import command
 from es_service.report.progress import plain_line
 from es_service.run_view import Run
 from es_service.store.lock import lock_holder
@@ -41,7 +42,7 @@ def follow_status(console: Console, run: Run) -> None:
             next_generation = rows[-1]["generation"] + 1
             console.print(plain_line(rows[-1]), highlight=False, soft_wrap=True)
         if not running:
-            _print_line(console, f"no driver is running; go on with: es-service resume {run.folder}")
+            _print_line(console, f"no driver is running; go on with: {command('resume', run.folder)}")
             return
         time.sleep(FOLLOW_INTERVAL_S)
 
@@ -49,19 +50,19 @@ def follow_status(console: Console, run: Run) -> None:
 def print_summary(console: Console, run: Run, reason: str) -> None:
     """What a session ends with: the result, the folder, the next commands."""
     rows = run.history_rows()
-    folder, twice = run.folder, f"--set budget.generations={max(1, rows[-1]['generation']) * 2}"
+    folder, twice = run.folder, ("--set", f"budget.generations={max(1, rows[-1]['generation']) * 2}")
     _print_line(console, f"\nDone: {reason}.")
     _print_fields(console, _progress(rows))
     _print_line(console, f"\nThe run is in {folder}. Next:")
     program = "es-service" if shutil.which("es-service") else sys.argv[0]  # `make run` has it in .venv/bin only
-    for command in (
-        f"status {folder}",
-        f"evaluate {folder}",
-        f"digest {folder}",
-        f"resume {folder} {twice}",
-        f"fork {folder} --set search.sigma={run.constants['search.sigma'] * 2:g} {twice}",
+    for words in (
+        ("status", folder),
+        ("evaluate", folder),
+        ("digest", folder),
+        ("resume", folder, *twice),
+        ("fork", folder, "--set", f"search.sigma={run.constants['search.sigma'] * 2:g}", *twice),
     ):
-        _print_line(console, f"  {program} {command}")
+        _print_line(console, f"  {command(*words, program=program)}")
 
 
 def _progress(rows: list[dict[str, Any]]) -> dict[str, str]:

@@ -8,6 +8,7 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+from es_service.commands import command
 from es_service.errors import StoreError
 from es_service.store.beginning import Beginning, store_beginning
 from es_service.store.folder import (
@@ -117,7 +118,7 @@ def _refuse_taken(folder: Path) -> None:
         raise StoreError(f"cannot create a run in {folder}: it is a file; choose another --out")
     names = {path.name for path in folder.iterdir()}
     if names & {DATABASE, COPY}:
-        raise StoreError(f"{folder} already holds a run; continue it with `es-service resume {folder}`")
+        raise StoreError(f"{folder} already holds a run; continue it with `{command('resume', folder)}`")
     others = sorted(names - _LEFT_BEHIND)
     if others:
         shown = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")

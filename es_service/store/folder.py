@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 from pathlib import Path
 
+from es_service.commands import command
 from es_service.errors import StoreError
 
 CONFIG = "config.yaml"
@@ -93,12 +94,25 @@ def remove_database(path: Path) -> None:
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
+def holds_run(folder: Path) -> bool:
+    """Whether there is a run in `folder`: its database, or the copy that opening puts in the place of a lost one.
+
+    Raises StoreError where that cannot be told.
+    """
+    try:
+        return (folder / DATABASE).exists() or (folder / COPY).exists()
+    except OSError as error:
+        raise explained(error, folder, "looking for a run", "give the same command again") from error
+
+
 def require_run_folder(folder: Path) -> None:
-    """Raises StoreError unless `folder` holds the database of a run or its copy."""
+    """Raises StoreError unless `folder` holds a run."""
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
-        raise StoreError(f"{folder} is not a run folder: it {what}. `es-service run CONFIG --out {folder}` starts one.")
-    if not (folder / DATABASE).exists() and not (folder / COPY).exists():
+        raise StoreError(
+            f"{folder} is not a run folder: it {what}. `{command('run', 'CONFIG', '--out', folder)}` starts one."
+        )
+    if not holds_run(folder):
         raise StoreError(
             f"{folder} is not a run folder: it holds no {DATABASE}. If `es-service run` was stopped while creating "
             f"it, nothing was lost: give the same command again."
@@ -124,7 +138,7 @@ def explained(error: sqlite3.Error | OSError, folder: Path, doing: str, then: st
 
     `then` is what to do after the cause is gone; resuming if None.
     """
-    then = then or f"`es-service resume {folder}`"
+    then = then or f"`{command('resume', folder)}`"
     if is_disk_full(error, folder):
         return StoreError(
             f"{folder}: disk full while {doing} ({error}). Everything stored before is safe; free space, then {then}."

@@ -18,6 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from es_service.commands import command
 from es_service.errors import RunLockedError, StoreError
 from es_service.store.folder import LOCK, explained
 
@@ -138,7 +139,7 @@ def _locked(folder: Path) -> RunLockedError:
     holder = lock_holder(folder) or _identity(b"")
     return RunLockedError(
         f"{folder} is being written by process {holder['pid'] or '(unknown)'} on host {holder['host'] or '(unknown)'} "
-        f"since {holder['since'] or '(unknown)'}. Watch it with `es-service status {folder} --follow`, "
+        f"since {holder['since'] or '(unknown)'}. Watch it with `{command('status', folder, '--follow')}`, "
         f"or stop that process first."
     )
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from es_service.commands import command
 from es_service.errors import StoreError
 from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict, row_sha256, text_sha256
 from es_service.store.folder import COPY, DATABASE, is_network_filesystem, require_run_folder
@@ -46,7 +47,7 @@ def reading(folder: Path) -> Iterator[tuple[sqlite3.Connection, RunMeta]]:
 def _connected(folder: Path) -> tuple[sqlite3.Connection, RunMeta]:
     require_run_folder(folder)
     if not (folder / DATABASE).exists():
-        raise StoreError(f"{folder / DATABASE} is missing; `es-service resume {folder}` restores it from {COPY}")
+        raise StoreError(f"{folder / DATABASE} is missing; `{command('resume', folder)}` restores it from {COPY}")
     if not is_network_filesystem(folder) or not (folder / COPY).exists():
         return _connected_to(folder / DATABASE)
     # There the database of a writer at work is left alone.
@@ -73,7 +74,7 @@ def _unreadable(folder: Path, error: Exception) -> StoreError:
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     is_database = code != sqlite3.SQLITE_NOTADB and "no such table: meta" not in str(error)
     what = "cannot be read" if is_database else "is not a run folder"
-    return StoreError(f"{folder} {what}: {error}. If it is a run, `es-service resume {folder}` repairs what can be.")
+    return StoreError(f"{folder} {what}: {error}. If it is a run, `{command('resume', folder)}` repairs what can be.")
 
 
 def read_meta(folder: Path) -> RunMeta:
@@ -130,7 +131,7 @@ def read_parts(
             connection.execute("SELECT generation, state_sha256 FROM history ORDER BY generation DESC LIMIT 2")
         )
         if not states:
-            raise StoreError(f"{folder} has no generation yet; `es-service resume {folder}` continues it")
+            raise StoreError(f"{folder} has no generation yet; `{command('resume', folder)}` continues it")
         asked = max(states) if generation is None else generation
         whole = sorted(
             at for at, state in states.items() if rows_in_force(kept, at) and state_in_force(kept, at) == state
@@ -162,14 +163,17 @@ def state_payload(connection: sqlite3.Connection, part: str, generation: int) ->
 def read_platforms(folder: Path) -> list[tuple[int, dict[str, Any]]]:
     """(first generation, platform) in order; each holds until the next."""
     with reading(folder) as (connection, _):
-        platforms: list[tuple[int, dict[str, Any]]] = []
-        for at, text, sha256 in connection.execute(
-            "SELECT generation, platform, sha256 FROM platform ORDER BY generation"
-        ):
-            if text_sha256(f"platform {at}", text) != sha256:
-                raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
-            platforms.append((at, json.loads(text)))
-        return platforms
+        return platforms(connection)
+
+
+def platforms(connection: sqlite3.Connection) -> list[tuple[int, dict[str, Any]]]:
+    """`read_platforms` of a connection inside `reading`."""
+    found: list[tuple[int, dict[str, Any]]] = []
+    for at, text, sha256 in connection.execute("SELECT generation, platform, sha256 FROM platform ORDER BY generation"):
+        if text_sha256(f"platform {at}", text) != sha256:
+            raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
+        found.append((at, json.loads(text)))
+    return found
 
 
 def verify_run(folder: Path) -> list[str]:

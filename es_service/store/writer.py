@@ -18,6 +18,7 @@ from typing import Any, Self
 
 from numpy.typing import NDArray
 
+from es_service.commands import command
 from es_service.errors import StoreError
 from es_service.store.beginning import Beginning, load_start
 from es_service.store.codec import (
@@ -146,7 +147,7 @@ class RunStore:
             if row is None or part_sha256(name, at, row[0]) != self._kept[name][at]:
                 raise StoreError(
                     f"{self.folder / DATABASE}: state of {name!r} at generation {at} was damaged since it was "
-                    f"opened; `es-service resume {self.folder}` falls back to what is sound"
+                    f"opened; `{command('resume', self.folder)}` falls back to what is sound"
                 )
             return decode_part(row[0])
 

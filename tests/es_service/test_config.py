@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from es_service import cli_options
 from es_service.algorithms import ALGORITHMS
-from es_service.config.loading import load_config, resume_config
+from es_service.config.loading import changed_config, load_config
 from es_service.config.model import RunConfig, changed_constants, describe_changes, worker_spec
 from es_service.config.presets import PRESETS, preset_table, preset_values
 from es_service.config.resolution import (
@@ -214,6 +215,33 @@ def test_shipped_configs_hide_no_preset_key(path):
     assert config.constants().items() >= uber.items()
 
 
+# Options of the command line
+
+
+def test_options_win_over_the_file_and_over_set():
+    file = MINIMAL | {"compute": {"engine": "ray", "address": "head:6379", "worker_resources": {"gpu": 0.5}}}
+    compute = load(file, *cli_options.overrides(["compute.workers=3"], seed=4, workers=2, engine="inline")).compute
+    assert (compute.engine, compute.address, compute.worker_resources.gpu, compute.workers) == ("inline", None, 0.0, 2)
+    compute = load(MINIMAL | {"compute": {"engine": "inline"}}, *cli_options.overrides(None, address="auto")).compute
+    assert (compute.engine, compute.address) == ("ray", "auto")
+
+
+def test_what_options_imply_does_not_silence_set():
+    for wanted, problem in (
+        (
+            cli_options.overrides(["compute.address=h:1"], engine="inline"),
+            "compute.address: h:1 needs compute.engine = ray",
+        ),
+        (cli_options.overrides(["compute.worker_resources.gpu=1"], engine="inline"), "worker_resources.gpu: 1 needs"),
+        (
+            cli_options.overrides(["compute.engine=inline"], address="h:1"),
+            "compute.address: h:1 needs compute.engine = ray",
+        ),
+    ):
+        with pytest.raises(ConfigError, match=problem):
+            load(MINIMAL, *wanted)
+
+
 # Round trip and constants
 
 
@@ -279,42 +307,69 @@ def test_changed_constants_lists_both_values_and_absent_ones():
     assert changed_constants(old, new) == [("b", 2, 5), ("c", 3, "(absent)"), ("d", "(absent)", 4)]
 
 
-def test_describe_changes_shows_all_and_the_fork_that_makes_them():
-    message = describe_changes([("search.sigma", 0.02, 0.05), ("policy.hidden", [64, 64], [8, 8])], run="runs/a")
-    assert "  search.sigma: 0.02 -> 0.05" in message.splitlines()
-    assert "  policy.hidden: [64, 64] -> [8, 8]" in message.splitlines()
-    assert "es-service fork runs/a --set search.sigma=0.05 --set 'policy.hidden=[8, 8]'" in message
+def test_describe_changes_shows_all_and_the_commands_that_make_them():
+    changes = [("search.sigma", 0.02, 0.05), ("policy.hidden", [64, 64], [8, 8]), ("task.options.start", "a b", "c d")]
+    lines = describe_changes(changes, run="runs/a").splitlines()
+    assert {"  search.sigma: 0.02 -> 0.05", "  policy.hidden: [64, 64] -> [8, 8]"} < set(lines)
+    assert lines[-2].endswith(": es-service fork runs/a --set search.sigma=0.05 --set 'task.options.start=c d'")
+    assert lines[-1].startswith("a fork has to keep policy.hidden; to start anew from its centre")
+    assert lines[-1].endswith(": es-service run CONFIG --set search.init_from=runs/a")
+    for key in ("search.members", "search.preset", "map.cells", "task.environment", "task.options.descriptor"):
+        assert "es-service fork" not in describe_changes([(key, "a", "b")])
 
 
-def resume(*overrides: str) -> RunConfig:
-    stored = parse_value(load().resolved_yaml())
+def changed(*overrides: str, config: RunConfig | None = None) -> RunConfig:
+    stored = parse_value((config or load()).resolved_yaml())
     assert isinstance(stored, dict)
-    return resume_config(stored, overrides, tasks=TASKS, algorithms={"es": None})
+    return changed_config(stored, overrides, tasks=TASKS, algorithms=ALGORITHMS)
 
 
-def test_resume_may_change_budget_workers_and_limits():
-    config = resume("budget.generations=9", "compute.workers=2", "compute.chunk_timeout_s=5", "compute.max_attempts=1")
+def changes(*overrides: str, config: RunConfig | None = None) -> list[str]:
+    """Constants that overrides of a run's config would change."""
+    old, new = (config or load()).constants(), changed(*overrides, config=config).constants()
+    return [f"{name}: {before} -> {after}" for name, before, after in changed_constants(old, new)]
+
+
+def test_budget_workers_and_limits_are_no_constants():
+    config = changed("budget.generations=9", "compute.workers=2", "compute.chunk_timeout_s=5", "compute.max_attempts=1")
     assert (config.budget.generations, config.compute.workers, config.compute.max_attempts) == (9, 2, 1)
     assert config.constants() == load().constants()
-    assert resume("search.sigma=2e-2") == resume()  # saying what is so changes nothing
 
 
-def test_resume_refuses_constants_and_points_to_fork():
+@pytest.mark.parametrize("override", ["search.sigma=2e-2", "compute.chunk_pairs=auto", "task.episode_steps=null"])
+def test_saying_what_is_so_changes_nothing(override):
+    assert changed(override) == changed()
+
+
+def test_what_follows_from_a_changed_key_is_resolved_anew():
+    assert changes("search.sigma=0.05", "seed=7") == ["search.sigma: 0.02 -> 0.05", "seed: 0 -> 7"]
+    assert changes("search.pairs=120") == [
+        "search.pairs: 512 -> 120",
+        "compute.chunk_pairs: 64 -> 8",
+        "compute.rollout_block_pairs: 32 -> 8",
+        "compute.gradient_block_pairs: 512 -> 120",
+    ]
+    clipped = ["policy.observation_normalization: True -> False", "policy.observation_clip: 5.0 -> None"]
+    assert changes("policy.observation_normalization=false") == clipped
+    assert changes("policy.observation_normalization=false", "policy.observation_clip=5") == clipped[:1]
+    assert changes("search.algorithm=ns_es") == ["search.algorithm: es -> ns_es", "search.members: 1 -> 5"]
+    shaped = load(MINIMAL, "search.pairs=16", "compute.chunk_pairs=4", "map.qd_offset=3")
+    assert changes("search.pairs=16", "task.fitness=sum", config=shaped) == []
+    assert changes("task.fitness=final", "map.qd_offset=3", config=shaped) == ["task.fitness: sum -> final"]
+
+
+def test_every_problem_of_a_change_is_told():
     with pytest.raises(ConfigError) as caught:
-        resume("search.sigma=0.05", "seed=7", "budget.generations=9", "compute.chunk_pairs=32")
-    message = str(caught.value)
-    for line in ("search.sigma: 0.02 -> 0.05", "seed: 0 -> 7", "compute.chunk_pairs: 64 -> 32"):
-        assert f"  {line}" in message.splitlines()
-    assert "fork RUN --set search.sigma=0.05 --set compute.chunk_pairs=32 --set seed=7" in message
-    with pytest.raises(ConfigError, match=r"did you mean budget\.generations"):
-        resume("budget.generation=9")
+        changed("search.sigma=abc", "budget.generatons=3")
+    assert "search.sigma: abc is not allowed" in str(caught.value)
+    assert "did you mean budget.generations?" in str(caught.value)
 
 
 def test_a_run_outlives_the_run_it_started_from(tmp_path):
     (tmp_path / "old").mkdir()
     stored = parse_value(load(MINIMAL, f"search.init_from={tmp_path / 'old'}").resolved_yaml())
     (tmp_path / "old").rmdir()
-    assert resume_config(stored, tasks=TASKS, algorithms={"es": None}).search.init_from == str(tmp_path / "old")
+    assert changed_config(stored, tasks=TASKS, algorithms=ALGORITHMS).search.init_from == str(tmp_path / "old")
     with pytest.raises(ConfigError, match="old does not exist; must be the folder of another run, or null"):
         load(stored)
 

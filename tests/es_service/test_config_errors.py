@@ -14,6 +14,7 @@ from es_service.config.loading import load_config
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
 from es_service.protocol import TaskSpec
+from tests.es_service.store_examples import without_root_rights
 from workers import environments
 
 POINT_MAZE = environments.TASKS["point_maze"]
@@ -83,6 +84,12 @@ def file(tmp_path):
         ("compute.rollout=sind", "sind ... must be auto or xla or simd; did you mean simd?"),
         ("compute.workers=0", "0 ... must be auto or a whole number, at least 1"),
         ("compute.chunk_pairs=half", "half ... must be auto or a whole number"),
+        ("policy.hidden=[10000000000, 10000000000]", "[10000000000, 10000000000] makes more than 80,000,000 para"),
+        ("policy.hidden=[8950, 8950]", "[8950, 8950] makes more than 80,000,000 parameters for point_maze, the most"),
+        ("search.init_from=/etc/passwd", "/etc/passwd is a file; must be the folder of another run, or null"),
+        ("search.init_from=/etc/passwd/run", "/etc/passwd/run does not exist; must be the folder of another run"),
+        ("search.init_from=/" + 300 * "a", f"/{300 * 'a'} cannot be looked at (File name too long); must be the"),
+        ('search.init_from="/a\\0b"', "/a\0b cannot be looked at (embedded null byte); must be the folder of another"),
         ("search.init_from=/no/such/run", "/no/such/run does not exist; must be the folder of another run"),
         ("map.kind=gird", "gird ... must be auto or grid or cvt; did you mean grid?"),
         ("map.bounds=3", "3 ... must be auto or a list of pairs [low, high], such as [[-1, 1], [-1, 1]]"),
@@ -141,6 +148,13 @@ def test_a_problem_elsewhere_is_one_line_with_a_hint(override, message):
     assert len(line) < 400
 
 
+def test_a_run_to_start_from_in_a_folder_that_may_not_be_looked_into(tmp_path):
+    (tmp_path / "locked").mkdir(mode=0)
+    with without_root_rights():
+        (line,) = problems(MINIMAL, f"search.init_from={tmp_path}/locked/run")
+    assert "cannot be looked at (Permission denied); must be the folder of another run, or null" in line
+
+
 def test_a_cluster_or_a_gpu_without_ray_is_refused():
     asked = ("compute.engine=inline", "compute.address=auto", "compute.worker_resources.gpu=0.5")
     assert problems(MINIMAL, *asked) == [
@@ -169,6 +183,11 @@ def test_a_cluster_or_a_gpu_without_ray_is_refused():
         ("task: !!python/name:os.system\n", "line 1, column 7: not YAML: could not determine a constructor"),
         ("task: 1\n---\ntask: 2\n", "expected a single document"),
         ("task: \x01\n", "line 1: not YAML: character code 1 is not allowed"),
+        ("task: !!bool maybe\n", "line 1, column 7: not YAML: this is no !!bool: task: !!bool maybe"),
+        ("a:\n  - !!timestamp foo\n", "line 2, column 5: not YAML: this is no !!timestamp"),
+        ("task: !!float ''\n", "line 1, column 7: not YAML: this is no !!float"),
+        ("task: !!int 1.5\n", "line 1, column 7: not YAML: this is no !!int"),
+        ("seed: " + "9" * 5000, "line 1, column 7: not YAML: this is no !!int"),
         ("[" * 500, "nested too deeply"),
         (b"task: \xff\n", "not a text file: byte 6 is not UTF-8"),
     ],

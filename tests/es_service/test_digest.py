@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from es_service import digest as digest_module
-from es_service.digest import arrays_sha256, digest, digest_parts, is_mixed
+from es_service.digest import arrays_sha256, checked_parts, digest, digest_of, digest_parts, is_mixed
 from es_service.errors import StoreError
 from es_service.store import schema as store_schema
 from es_service.store.codec import encode_part
@@ -161,6 +161,14 @@ def test_a_later_table_is_one_line(folder, monkeypatch):
     monkeypatch.setitem(digest_module.TABLES, "map", lambda connection, run: "0" * 64)
     assert digest_parts(folder)["map"] == "0" * 64
     assert digest(folder) != before
+
+
+def test_parts_and_total_are_of_one_moment_and_of_a_sound_run(folder):
+    parts, mixed = checked_parts(folder)
+    assert (parts, digest_of(parts), mixed) == (digest_parts(folder), digest(folder), is_mixed(folder))
+    change(folder, "UPDATE history SET seconds_rollout = 1e9 WHERE generation = 3")  # which no digest would show
+    with pytest.raises(StoreError, match=r"damaged: history row of generation 3 .*; .*\. `es-service resume "):
+        checked_parts(folder)
 
 
 def test_a_run_without_a_generation_has_a_digest(tmp_path):

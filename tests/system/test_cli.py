@@ -163,6 +163,20 @@ def test_resume_of_a_finished_run_does_nothing(finished):
     assert digest(finished[0]) == before
 
 
+@pytest.mark.parametrize("budget", ["generations=30", "env_steps=100", "wall_clock_s=1e-3", "target_fitness=-1e9"])
+def test_a_spent_budget_starts_no_engine(finished, tmp_path, monkeypatch, budget):
+    from es_service import api, session
+
+    shutil.copytree(finished[0], tmp_path / "run")
+    monkeypatch.delattr(session, "_engine")
+    monkeypatch.setattr(session, "platform_info", lambda: {"jax": "99.0"})  # on which nothing is computed
+    notices: list[str] = []
+    overrides = ["budget.generations=1000", f"budget.{budget}"]
+    outcome = api.resume(tmp_path / "run", overrides, on_notice=notices.append)
+    assert (outcome.run.generation, notices) == (30, [])
+    assert any(word in outcome.reason for word in ("is spent", "is reached"))
+
+
 def test_fork_without_changes_goes_on_as_its_parent_would(config, finished, tmp_path):
     parent, child = tmp_path / "parent", tmp_path / "child"
     assert es("run", config, "--out", parent, "--set", "budget.generations=10")[0] == 0
@@ -437,6 +451,8 @@ def test_bad_paths(config, finished, tmp_path):
         (("status", tmp_path / "nothing"), 1, "does not exist"),
         (("digest", config), 1, "not a run folder"),
         (("resume", finished[0], "--set", "search.sigma=0.5", "--set", "seed=3"), 2, "search.sigma: 0.02 -> 0.5"),
+        (("resume", finished[0], "--set", "search.sigma=a", "--set", "budget.generatons=3"), 2, "did you mean budget."),
+        (("resume", finished[0], "--set", "compute.rollout_block_pairs=auto"), 0, "is spent"),
     ]
     for arguments, expected, message in cases:
         code, printed = es(*arguments)

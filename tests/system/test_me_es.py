@@ -19,9 +19,10 @@ import pytest
 
 from es_service import api
 from es_service.digest import digest_parts
-from es_service.errors import ConfigError, NotInRunError
+from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.export import arrays, ribs_archive
 from es_service.maps.geometry import Grid
+from es_service.report.evaluations import csv_file
 from es_service.run_view import map_places
 from tests.system.test_workers import children
 
@@ -196,6 +197,35 @@ def test_evaluate_overwrites_nothing_but_csv_files(tmp_path, finished):
         assert result.returncode == code
         assert str(out) in result.stderr
     assert command("evaluate", finished.folder, "--all", "--cell", "1,1").returncode == 2
+
+
+def test_evaluate_replaces_a_file_when_it_has_all_rows(tmp_path, finished):
+    file, notes = tmp_path / "rows.csv", []
+    file.write_text("of last week\n")
+
+    def interrupted() -> None:
+        with csv_file(file, notes.append) as write:
+            write({"policy": "best", "fitness": 1.5})
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert file.read_text() == "of last week\n"
+    assert (tmp_path / "rows.csv.new").read_text() == "policy,fitness\nbest,1.5\n"
+    assert notes == [f"what was evaluated until then is in {file}.new"]
+    assert command("evaluate", finished.folder, "--cell", "99,9", "--out", file).returncode == 2
+    assert file.read_text() == "of last week\n"
+    assert command("evaluate", finished.folder, "--episodes", 2, "--out", file).returncode == 0
+    assert file.read_text().startswith("policy,generation,episodes")
+    assert [path.name for path in tmp_path.iterdir()] == ["rows.csv"]
+    (tmp_path / "full.csv.new").symlink_to("/dev/full")
+    with pytest.raises(StoreError, match="No space left"), csv_file(tmp_path / "full.csv", notes.append) as write:
+        write({"policy": "best"})
+    with (
+        pytest.raises(ConfigError, match="is a folder"),
+        csv_file(tmp_path.rename(tmp_path.with_suffix(".csv")), print),
+    ):
+        pass
 
 
 def test_elites_at_the_edges_of_cells_keep_their_cells_in_pyribs(monkeypatch, finished):

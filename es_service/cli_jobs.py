@@ -1,0 +1,63 @@
+"""The command line's `es-service submit | jobs | logs | stop`: runs as jobs of a Ray cluster."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from es_service import api, jobs
+from es_service.cli_options import ConfigArgument, SeedOption, SetOption, WorkersOption, overrides, print_note
+from es_service.commands import command
+
+job_commands = typer.Typer()
+
+JobsOption = Annotated[
+    str, typer.Option("--address", help="The cluster's dashboard, such as http://127.0.0.1:8265.", show_default=False)
+]
+JobArgument = Annotated[str, typer.Argument(help="Id of a job, as `submit` printed it.", show_default=False)]
+
+
+@job_commands.command()
+def submit(
+    config: ConfigArgument,
+    address: JobsOption,
+    out: Annotated[str, typer.Option("--out", help="Folder of the run on the cluster's head, or a disk it shares.")],
+    set_: SetOption = None,
+    seed: SeedOption = None,
+    workers: WorkersOption = None,
+) -> None:
+    """Send a run to a Ray cluster as a job. The same command again goes on with it, after whatever happened."""
+    wanted = overrides(set_, seed=seed, workers=workers, address="auto")
+    loaded = api.load_config(config, wanted, new=False)  # paths are those of the cluster's head, which checks them
+    job = jobs.submit(loaded, address, out)
+    print(job)
+    print_note(f"submitted; watch it with: {command('logs', job, '--address', address, '--follow')}")
+
+
+@job_commands.command(name="jobs")
+def jobs_(address: JobsOption) -> None:
+    """List the cluster's jobs, newest first: id, state, run folder."""
+    for job in jobs.list_jobs(address):
+        print(f"{job.id}  {job.state:<9}  {job.folder}")
+
+
+@job_commands.command()
+def logs(
+    job: JobArgument,
+    address: JobsOption,
+    follow: Annotated[bool, typer.Option("--follow", help="Keep printing until the job ends.")] = False,
+) -> None:
+    """Print what a job has printed."""
+    for text in jobs.logs(job, address, follow=follow):
+        print(text, end="", flush=True)
+    if follow:
+        state = jobs.state(job, address)
+        print_note(f"{job} {state.lower()}")
+        raise typer.Exit(0 if state == "SUCCEEDED" else 1)
+
+
+@job_commands.command()
+def stop(job: JobArgument, address: JobsOption) -> None:
+    """Stop a job; what is committed stays, and submitting it again goes on from there."""
+    print_note(f"{job} {jobs.stop(job, address).lower()}")

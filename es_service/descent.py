@@ -1,0 +1,106 @@
+"""What a new run takes from another one: everything (a fork), or a centre (`search.init_from`)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from es_service.algorithms import ALGORITHMS
+from es_service.config import loading
+from es_service.config.model import START_KEYS, STATE_KEYS, RunConfig, changed_constants, policy_shape, start_afresh
+from es_service.config.yaml_text import show
+from es_service.errors import ConfigError
+from es_service.maps.behaviour_map import ELITE_PREFIX
+from es_service.protocol import Moments
+from es_service.run_state import moments_from_arrays, moments_to_arrays, without_fitness
+from es_service.run_view import Run, open_run
+from es_service.session import TASKS, task_of
+from es_service.store import reader
+from es_service.store.beginning import Beginning
+
+OBSERVED = ("policy.observation_clip", "policy.observation_normalization")
+"""What a policy does with its observations."""
+
+
+def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -> RunConfig:
+    """The config of a fork: the one that the parent would go on with, with overrides.
+
+    Raises:
+        ConfigError: as `load_config`, the parent's state does not fit the changes, or a key would change nothing.
+    """
+    origin = open_run(parent)
+    overrides = [overrides] if isinstance(overrides, str) else list(overrides)
+    wanted = loading.parse_overrides(overrides)[0]
+    if idle := [f"  {key}" for key in START_KEYS if key in wanted]:
+        listed = "\n".join(idle)
+        raise ConfigError(
+            f"{origin.folder}: a fork has its state and all its settings, so these would change nothing:\n{listed}\n"
+            f"instead of a preset, set the keys that it stands for (`es-service list` shows them); "
+            f"{start_afresh(str(origin.folder))}"
+        )
+    present = origin.present_config
+    mapping = present | {"search": present["search"] | {"init_from": None}}  # it has the parent's state instead
+    config = loading.changed_config(mapping, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+    changes = changed_constants(origin.constants, config.constants())
+    unfit = [f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes if name in STATE_KEYS]
+    names = task_of(config).descriptor_names
+    if not unfit and list(names) != origin.descriptor_names:  # a task of the user's that is not what it was
+        unfit = [
+            f"  the descriptor of {config.task.environment}: {show(origin.descriptor_names)} -> {show(list(names))}"
+        ]
+    if unfit:
+        listed = "\n".join(unfit)
+        raise ConfigError(
+            f"{origin.folder}: its state does not fit these changes:\n{listed}\n{start_afresh(str(origin.folder))}"
+        )
+    return config
+
+
+def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict[str, Any], Beginning]:
+    """What a fork of `origin` records of it, and begins with: all of it up to a generation, None for the newest.
+
+    Raises:
+        StoreError: the state of that generation is not kept.
+    """
+    at, parts = origin.parts(generation)
+    changed = {name for name, _, _ in changed_constants(origin.constants, config.constants())}
+    if any(name in OBSERVED or name.startswith("task.") for name in changed - {"task.episodes_per_member"}):
+        parts = without_fitness(parts)
+    history = [row for row in origin.history_rows() if row["generation"] <= at]
+    platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
+    return _lineage(origin, at), Beginning(history, parts, platforms)
+
+
+def started(config: RunConfig, folder: str) -> tuple[dict[str, Any], Beginning]:
+    """What a run that starts from the newest centre of the run in `folder` records of that, and begins with.
+
+    Raises:
+        ConfigError: the centre is of another network.
+    """
+    origin, shape = open_run(folder), policy_shape(config, task_of(config))
+    if origin.policy_shape != shape:
+        raise ConfigError(
+            f"search.init_from: the policy of {origin.folder} has layers {list(origin.policy_shape.widths)}, "
+            f"this run's has {list(shape.widths)}; use the same task and policy.hidden"
+        )
+    at, parts = origin.parts(wanted=lambda part: not part.startswith(ELITE_PREFIX))
+    member, moments = origin.newest_member(at, parts), moments_from_arrays(parts["observations"])
+    enabled = origin.constants["policy.observation_normalization"]
+    if enabled and member.own_mean_O is not None and member.own_std_O is not None:
+        # Those that its policy runs with, as if that many observations had given them.
+        mean_O, std_O = member.own_mean_O.astype(np.float64), member.own_std_O.astype(np.float64)
+        moments = Moments(moments.count, mean_O, moments.count * np.square(std_O))
+    start = {"centre_D": member.centre_D, **moments_to_arrays(moments)}
+    return _lineage(origin, at), Beginning(start=start)
+
+
+def _lineage(origin: Run, generation: int) -> dict[str, Any]:
+    return {
+        "run_id": origin.run_id,
+        "folder": str(origin.folder.absolute()),
+        "generation": generation,
+        "digest": origin.digest(),
+    }

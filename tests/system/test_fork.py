@@ -1,0 +1,130 @@
+"""What a fork takes from its parent, what it leaves behind, what it refuses."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from es_service import api, descent, evaluation, session
+from es_service.config.model import START_KEYS
+from es_service.errors import ConfigError
+from es_service.session import scheduling_policy
+from tests.system.session import SMALL
+from workers.environments import TASKS
+
+
+def run(folder: Path, *overrides: str, config=SMALL):
+    return api.run(api.load_config(config, overrides), folder).run
+
+
+def fork(parent, folder: Path, *overrides: str):
+    return api.fork(parent.folder, overrides, out=folder).run
+
+
+@pytest.fixture(scope="module")
+def parent(tmp_path_factory):
+    """Six generations of nsra_es."""
+    return run(tmp_path_factory.mktemp("parent") / "run", "budget.generations=6")
+
+
+def test_a_record_of_another_fitness_does_not_hold_the_weight_down(tmp_path):
+    """Sums of rewards are far below the last reward alone: against its record nothing would ever be an improvement."""
+    parent = run(tmp_path / "parent", "task.fitness=final", "budget.generations=6")
+    before = parent.parts()[1]["weight"]
+    forked = fork(parent, tmp_path / "fork", "task.fitness=sum", "budget.generations=8")
+    after, history = forked.parts()[1]["weight"], forked.history
+    assert before["value"] < 1.0
+    assert after["record"] == history["centre_fitness_mean"].iloc[7:].max() < before["record"]
+    assert history["fitness_weight"].iloc[7] == before["value"] < history["fitness_weight"].iloc[8]
+
+
+@pytest.mark.parametrize(
+    ("override", "change"),
+    [
+        ("policy.hidden=[16]", "policy.hidden: [8] -> [16]"),
+        ("search.algorithm=es", "search.algorithm: nsra_es -> es"),
+        ("search.members=3", "search.members: 5 -> 3"),
+        ("task.environment=ant_trap", "task.environment: point_maze -> ant_trap"),
+        ("map.kind=cvt", "map.kind: grid -> cvt"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused(parent, override, change):
+    with pytest.raises(ConfigError) as caught:
+        descent.fork_config(parent.folder, [override, "budget.generations=9"])
+    lines = str(caught.value).splitlines()
+    assert f"  {change}" in lines
+    assert lines[-1].endswith(f": es-service run CONFIG --set search.init_from={parent.folder}")
+
+
+def test_another_descriptor_is_refused(tmp_path, monkeypatch):
+    """One of as many dimensions: a novelty archive of both would mean nothing."""
+    bounds = TASKS["point_maze"].descriptor_bounds
+    told = replace(
+        TASKS["point_maze"],
+        options={"descriptor": ("place", "speed", "height")},
+        descriptors={
+            "place": (("x", "y"), bounds), "speed": (("u", "v"), bounds), "height": (("h",), bounds[:1])
+        },
+    )  # fmt: skip
+    for module in (api, descent, session):
+        monkeypatch.setattr(module, "TASKS", {"point_maze": told})
+    monkeypatch.setattr(api, "work", lambda *arguments: None)  # as workers know of no such option
+    api.run(SMALL, tmp_path / "run")
+    assert (
+        descent.fork_config(tmp_path / "run", ["task.options.descriptor=place"]).task.options["descriptor"] == "place"
+    )
+    for other in ("speed", "height"):
+        with pytest.raises(ConfigError, match=rf"task\.options\.descriptor: place -> {other}\n[^$]*search\.init_from="):
+            descent.fork_config(tmp_path / "run", [f"task.options.descriptor={other}"])
+    for module in (api, descent, session):
+        monkeypatch.setattr(module, "TASKS", {"point_maze": replace(told, descriptors={"place": (("a", "b"), bounds)})})
+    with pytest.raises(ConfigError, match=r"the descriptor of point_maze: \[x, y\] -> \[a, b\]\n.*search\.init_from="):
+        descent.fork_config(tmp_path / "run")
+
+
+@pytest.mark.parametrize("key", START_KEYS)
+def test_what_would_change_nothing_is_refused(parent, key):
+    with pytest.raises(ConfigError) as caught:
+        descent.fork_config(parent.folder, [f"{key}=uber", "search.sigma=0.1"])
+    assert f"  {key}" in str(caught.value).splitlines()
+    assert f"es-service run CONFIG --set search.init_from={parent.folder}" in str(caught.value)
+
+
+def test_without_normalisation_no_statistics_are_used_nor_a_member_s_own(parent, tmp_path):
+    """Whose block began from an elite that brought its own, and goes on in the fork; their bound goes with them."""
+    search = {"algorithm": "me_es", "pairs": 16, "evaluation_episodes": 4, "parent_statistics": "elite"}
+    wanted = ("search.block_generations=8", f"search.init_from={parent.folder}", "budget.generations=6")
+    begun = run(tmp_path / "begun", *wanted, config=SMALL | {"search": search})
+    assert "own_std_O" in begun.parts()[1]["member_0"]
+    assert (begun.policy("centre").observation_std_O != 1.0).all()
+    forked = fork(begun, tmp_path / "fork", "policy.observation_normalization=false", "budget.generations=7")
+    assert forked.constants["policy.observation_clip"] is None
+    _, elites = forked.elites()
+    centre = forked.policy("centre")
+    for policy in (centre, *elites.values()):
+        np.testing.assert_array_equal(policy.observation_mean_O, 0.0)
+        np.testing.assert_array_equal(policy.observation_std_O, 1.0)
+    assert len(elites) == 1
+
+
+def test_what_a_resume_has_changed_is_so_for_a_fork_and_an_evaluation(parent, tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    shutil.copytree(parent.folder, folder)
+    recorded = folder / "config.yaml"
+    recorded.write_text(recorded.read_text().replace("engine: inline", "engine: ray"))  # as a cluster's run has it
+    assert descent.fork_config(folder).compute.engine == "ray"
+    run = api.resume(folder, ["budget.generations=7", "compute.engine=inline", "compute.compile_timeout_s=77"]).run
+    config = descent.fork_config(folder, ["search.sigma=0.1"])
+    assert (config.budget.generations, config.compute.engine, config.compute.compile_timeout_s) == (7, "inline", 77.0)
+    seen = []
+    monkeypatch.setattr(
+        evaluation, "scheduling_policy", lambda config: seen.append(config) or scheduling_policy(config)
+    )
+    list(evaluation.evaluate(run, [], episodes=1, workers=1))
+    assert seen[0].compute.compile_timeout_s == 77.0
+    recorded.unlink()
+    assert descent.fork_config(folder).budget.generations == 6, "as it was created"

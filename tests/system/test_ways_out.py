@@ -1,0 +1,157 @@
+"""Commands that messages name: they can be copied as they are, and do what is said of them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shlex
+import subprocess
+import sys
+import time
+
+import pytest
+from rich.console import Console
+
+from es_service import api
+from es_service.config.model import describe_changes
+from es_service.errors import ConfigError, NotInRunError, StoreError
+from es_service.evaluation import candidates
+from es_service.report.status import follow_status, print_summary
+from es_service.store.lock import acquire_lock
+from es_service.store.reader import read_generation
+from es_service.store.writer import RunStore
+from tests.es_service.store_examples import finished, flip_bit, without_root_rights
+from tests.system.session import ROOT, SMALL
+
+
+def es(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """A command in a process of its own; its end is no traceback."""
+    result = subprocess.run(
+        [sys.executable, "-m", "es_service", *map(str, arguments)],
+        cwd=ROOT,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert "Traceback" not in result.stderr, result.stderr
+    return result
+
+
+def words_after(text: str, verb: str) -> list[str]:
+    """Of the first command `es-service VERB ...` in a message."""
+    found = re.search(rf"es-service {verb} ([^`\n]*)", text)
+    assert found is not None, text
+    return shlex.split(found[1])
+
+
+def test_a_folder_with_spaces_is_one_word_of_every_command(tmp_path, capsys):
+    folder = tmp_path / "it's a run"
+    console = Console(width=40)
+    outcome = api.run(SMALL | {"budget": {"generations": 1}}, folder)
+    print_summary(console, outcome.run, outcome.reason)
+    follow_status(console, outcome.run)
+    printed = capsys.readouterr().out
+    commands = [line for line in printed.splitlines() if line.startswith("  ")]
+    assert [shlex.split(line)[1:3] for line in commands] == [
+        [verb, str(folder)] for verb in ("status", "evaluate", "digest", "resume", "fork")
+    ]
+    assert words_after(printed.splitlines()[-1], "resume") == [str(folder)]
+    assert words_after(describe_changes([("seed", 0, 1)], str(folder)), "fork") == [str(folder), "--set", "seed=1"]
+    lock = acquire_lock(folder)
+    with pytest.raises(StoreError) as locked:
+        RunStore.open(folder)
+    lock.release()
+    assert words_after(str(locked.value), "status") == [str(folder), "--follow"]
+    with pytest.raises(StoreError) as taken:
+        api.run(SMALL, folder)
+    assert words_after(str(taken.value), "resume") == [str(folder)]
+    (folder / "run.db").rename(folder / "run.db.copy")
+    with pytest.raises(StoreError) as missing:
+        api.open_run(folder)
+    assert words_after(str(missing.value), "resume") == [str(folder)]
+    with pytest.raises(StoreError) as none:
+        api.open_run(folder / "none")
+    assert words_after(str(none.value), "run") == ["CONFIG", "--out", str(folder / "none")]
+    with pytest.raises(NotInRunError) as empty:
+        candidates(
+            api.open_run(finished(tmp_path / "no generation", 0)), best=True, centre=False, cells=(), every=False
+        )
+    assert words_after(str(empty.value), "resume") == [str(tmp_path / "no generation")]
+
+
+def test_run_or_resume_goes_on_where_only_the_copy_is_left(tmp_path):
+    """As a kill between the renames of a restoration leaves it."""
+    folder = tmp_path / "run"
+    wanted = SMALL | {"budget": {"generations": 2}}
+    api.run(wanted, folder)
+    (folder / "run.db").rename(folder / "run.db.copy")
+    notices = []
+    assert api.run_or_resume(wanted, folder, on_notice=notices.append).run.generation == 2
+    assert "Restored run.db.copy" in notices[0]
+    (folder / "run.db").rename(folder / "run.db.copy")
+    config = tmp_path / "config.yaml"
+    config.write_text(api.load_config(wanted).resolved_yaml())
+    assert es("run", config, "--or-resume", "--out", folder).returncode == 0
+
+
+@pytest.mark.parametrize("folder", ["locked/run", "a" * 300])
+def test_a_folder_that_cannot_be_looked_at(tmp_path, folder):
+    (tmp_path / "locked").mkdir()
+    (tmp_path / "locked").chmod(0)
+    with without_root_rights(), pytest.raises(StoreError, match=r"looking for a run: .*Errno") as error:
+        api.run_or_resume(SMALL, tmp_path / folder)
+    assert str(tmp_path / folder) in str(error.value)
+    config = tmp_path / "config.yaml"
+    config.write_text(api.load_config(SMALL).resolved_yaml())
+    result = es("run", config, "--or-resume", "--out", tmp_path / ("a" * 300))
+    assert result.returncode == 1
+    assert "Check that the folder" in result.stderr
+
+
+def test_a_repair_is_told_once_also_if_the_command_is_then_refused(tmp_path):
+    folder = tmp_path / "run"
+    run = api.run(SMALL | {"budget": {"generations": 3}}, folder).run
+    sound = (folder / "run.db").read_bytes()
+    at = sound.rindex(run.policy("centre").parameters_D.tobytes())
+    flip_bit(folder / "run.db", at + 8)
+    refusal = es("digest", folder, "--parts")
+    assert (refusal.returncode, refusal.stdout) == (1, "")
+    assert re.search(r"state of 'member_\d' at generation 3 does not match its SHA-256", refusal.stderr)
+    assert words_after(refusal.stderr, "resume") == [str(folder)]
+    for wanted, refused in (("search.sigma=0.3", True), ("budget.generations=3", False)):
+        (folder / "run.db").write_bytes(sound)
+        flip_bit(folder / "run.db", at + 8)
+        notices: list[str] = []
+        with pytest.raises(ConfigError) if refused else contextlib.nullcontext():
+            api.resume(folder, [wanted], on_notice=notices.append)
+        (notice,) = notices
+        assert "fell back to generation 2" in notice
+        assert run.generation == (2 if refused else 3)
+
+
+@pytest.mark.parametrize("errors", [subprocess.PIPE, subprocess.STDOUT])
+def test_a_run_goes_on_where_nobody_reads_its_output(tmp_path, errors):
+    """With STDOUT, nobody reads its notes either."""
+    folder, config = tmp_path / "run", tmp_path / "config.yaml"
+    config.write_text(api.load_config(SMALL | {"budget": {"generations": 10**6}}).resolved_yaml())
+    arguments = [sys.executable, "-m", "es_service", "run", str(config), "--out", str(folder)]
+    with subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.PIPE, stderr=errors, text=True) as run:
+        assert run.stdout is not None
+        assert run.stdout.readline().startswith("generation 0")
+        run.stdout.close()
+        time.sleep(2.5)  # it prints once a second
+        if run.stderr:
+            assert run.stderr.readline().endswith(f"the run goes on: es-service status {folder} --follow\n")
+        reached = read_generation(folder) or 0
+        time.sleep(0.5)
+        assert (read_generation(folder) or 0) > reached
+        run.terminate()
+        assert run.wait(timeout=60) == 143
+
+
+def test_output_that_has_no_sign_for_plus_or_minus(tmp_path):
+    outcome = api.run(SMALL | {"budget": {"generations": 1}}, tmp_path / "run")
+    assert " ? " in es("status", outcome.run.folder, PYTHONIOENCODING="ascii").stdout
