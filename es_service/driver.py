@@ -86,19 +86,25 @@ def run(
     """
     budget = search.config.budget
     clock = Clock(0.0)
-    if store.generation is None:
+    if (state := stored_state(store, search.task)) is None:
         map_ = empty_map(make_geometry(search.config.map)) if search.config.map.enabled else None
         reachable = _reachable(search, map_)
         state = _keep(store, report, clock, None, *_first_generation(search, evaluator, clock, map_, reachable))
     else:
-        last = store.last_history() or {}
-        seconds, dimensions = float(last.get("wall_clock_s") or 0.0), len(search.task.descriptor_names)
-        state = state_from_parts(store.load(without=ELITE_PREFIX), store.generation, seconds, dimensions)
         reachable = _reachable(search, state.search.map)
         clock = Clock(state.wall_clock_s)
     while (reason := spent(budget, state)) is None:
         state = _keep(store, report, clock, state, *_next_generation(search, evaluator, store, clock, state, reachable))
     return state, reason
+
+
+def stored_state(store: Store, task: TaskSpec) -> RunState | None:
+    """The newest state in the store, without the elites' policies; None before the first generation."""
+    if store.generation is None:
+        return None
+    seconds = float((store.last_history() or {}).get("wall_clock_s") or 0.0)
+    parts = store.load(without=ELITE_PREFIX)
+    return state_from_parts(parts, store.generation, seconds, len(task.descriptor_names))
 
 
 def spent(budget: BudgetConfig, state: RunState) -> str | None:

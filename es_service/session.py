@@ -14,10 +14,9 @@ from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy as SchedulingPolicy
-from es_service.maps.behaviour_map import ELITE_PREFIX
 from es_service.platform_info import platform_info
 from es_service.protocol import FloatArray, Moments, TaskSpec, with_options
-from es_service.run_state import RunState, moments_from_arrays, state_from_parts
+from es_service.run_state import moments_from_arrays
 from es_service.run_view import Run, open_run
 from es_service.signals import stop_on_signals
 from es_service.statistics import no_observations
@@ -62,7 +61,8 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
         told = len(store.notices)
 
     tell_notices()
-    if (state := _stored_state(store, task)) is not None and (reason := driver.spent(config.budget, state)) is not None:
+    state = driver.stored_state(store, task)
+    if state is not None and (reason := driver.spent(config.budget, state)) is not None:
         return Outcome(open_run(store.folder), reason)  # no engine need start to find that out
     platform = platform_info()
     if config.compute.worker_resources.gpu:
@@ -131,14 +131,6 @@ def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) 
 def task_of(config: RunConfig) -> TaskSpec:
     """The task of a run, with the descriptor that its options choose."""
     return with_options(TASKS[config.task.environment], config.task.options)
-
-
-def _stored_state(store: RunStore, task: TaskSpec) -> RunState | None:
-    """The newest state in the store; None before the first generation."""
-    if store.generation is None:
-        return None
-    seconds, dimensions = float((store.last_history() or {}).get("wall_clock_s") or 0.0), len(task.descriptor_names)
-    return state_from_parts(store.load(without=ELITE_PREFIX), store.generation, seconds, dimensions)
 
 
 def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Moments]:
