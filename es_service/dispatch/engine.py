@@ -69,7 +69,7 @@ class Transport(Protocol):
         ...
 
     def close(self) -> None:
-        """Kill all workers and wait for them to end."""
+        """Kill all workers and wait for them to end; those in a cluster that was joined end soon after."""
         ...
 
 
@@ -86,7 +86,7 @@ def task_sizes(chunks: int, workers: int, chunk_s: float | None, task_s: float) 
 
 
 class Engine(Generic[AnyTransport]):
-    """An Evaluator. Use as a context manager: leaving it kills the workers, who hold nothing."""
+    """An Evaluator. Use as a context manager: leaving it closes it, and the workers hold nothing."""
 
     def __init__(
         self,
@@ -149,7 +149,7 @@ class Engine(Generic[AnyTransport]):
         return [result for key, _ in parts for result in self._results.pop(key)]
 
     def close(self) -> None:
-        """Kill all workers and wait for them."""
+        """Kill all workers and wait for them to end; those in a cluster that was joined end soon after."""
         self.transport.close()
 
     def __enter__(self) -> Self:

@@ -202,7 +202,7 @@ class Actors:
         return None
 
     def close(self) -> None:
-        """Kill all actors and leave the cluster; a Ray of our own ends."""
+        """Kill all actors and leave the cluster, where they end seconds later; a Ray of our own has then ended."""
         if self._watch is not None:
             self._watch.close()
         for worker in list(self._handles):
