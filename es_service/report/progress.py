@@ -1,4 +1,4 @@
-"""What a run shows while it runs: a live table on a terminal, one plain line a second elsewhere."""
+"""What a run shows while it runs: a live table on a terminal, one plain line a second elsewhere (TERM=dumb, too)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _PARTS = ("rollout", "gradient", "evaluation", "driver", "store")
 @contextmanager
 def show_progress(console: Console, errors: Console, title: str) -> Iterator[tuple[ShowRow, ShowNotice]]:
     """Yield two functions: one to call with every history row, one with every notice."""
-    if not console.is_terminal:
+    if not console.is_terminal or console.is_dumb_terminal:  # which cannot move its cursor up a table
         yield _plain_lines(console), partial(_print_notice, errors)
         return
     recent: deque[Row] = deque(maxlen=RATE_WINDOW)

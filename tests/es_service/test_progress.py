@@ -1,11 +1,12 @@
-"""The live table fits the screen it is shown on."""
+"""The live table fits the screen it is shown on; where there can be none, there are lines."""
 
+import io
 from collections import deque
 
 import pytest
 from rich.console import Console
 
-from es_service.report.progress import live_table
+from es_service.report.progress import live_table, show_progress
 
 ROW = {
     "generation": 123456,
@@ -34,3 +35,17 @@ def test_the_live_table_fits_the_screen(width, height):
     assert all("…" not in line for line in table)
     assert ("4.57 M" in table[0]) == (width >= 75)
     assert "workers replaced: 20" in " ".join(" ".join(lines).split())
+
+
+@pytest.mark.parametrize(("terminal", "environment"), [(False, {}), (True, {"TERM": "dumb"})])
+def test_where_no_table_can_be_shown_lines_come_at_once(terminal, environment):
+    console = Console(file=io.StringIO(), force_terminal=terminal, _environ=environment)
+    with show_progress(console, console, "runs/a") as (show, note):
+        show(ROW)
+        note("a worker was lost")
+        shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert shown.splitlines() == [
+        "generation 123456  centre -1234.56  best -1234.56  env steps 123,456,789,012  steps/s 4,567,890  "
+        "workers replaced 1",
+        "note: a worker was lost",
+    ]
