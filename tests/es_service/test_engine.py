@@ -273,7 +273,7 @@ def test_the_next_deadline_bounds_the_wait(monkeypatch):
     now = [0.0]
     transport = scripted_with_clock(monkeypatch, now)
     transport.on_send = lambda sent: transport.inbox.append(sent.answer()) if sent.worker else None
-    with Engine(transport, Policy(workers=1, first_deadline_s=0.25)) as engine:
+    with Engine(transport, Policy(workers=1, first_deadline_s=0.25, min_deadline_s=0.25)) as engine:
         engine.evaluate(FIRST, CHUNKS)
     assert transport.killed == [0]
     assert now[0] == pytest.approx(0.25)
