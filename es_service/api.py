@@ -14,7 +14,8 @@ from uuid import uuid4
 from es_service.algorithms import ALGORITHMS
 from es_service.commands import command
 from es_service.config import loading
-from es_service.config.model import RunConfig, changed_constants, describe_changes
+from es_service.config.changes import changed_constants, describe_changes
+from es_service.config.model import RunConfig
 from es_service.descent import fork_config, forked, started
 from es_service.errors import ConfigError, StoreError
 from es_service.history import history_columns

@@ -10,7 +10,8 @@ import numpy as np
 
 from es_service.algorithms import ALGORITHMS
 from es_service.config import loading
-from es_service.config.model import START_KEYS, STATE_KEYS, RunConfig, changed_constants, policy_shape, start_afresh
+from es_service.config.changes import START_KEYS, STATE_KEYS, changed_constants, start_afresh
+from es_service.config.model import RunConfig, policy_shape
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError
 from es_service.maps.behaviour_map import ELITE_PREFIX

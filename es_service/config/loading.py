@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+from es_service.config.changes import without_followers
 from es_service.config.map_rules import OPTIONS, map_problems
 from es_service.config.model import RunConfig, WorkerResources
 from es_service.config.presets import PRESETS, preset_values
@@ -53,19 +54,6 @@ _FIELDS = {name: field for name, field in RunConfig.model_fields.items() if name
 _GROUPS = (*_SECTIONS, OPTIONS.removesuffix("."), RESOURCES.removesuffix("."))
 """What holds keys and is no value itself."""
 _BUDGET = [name for name in _FIELDS if name.startswith("budget.")]
-_SHAPES = ("compute.chunk_pairs", "compute.rollout_block_pairs", "compute.gradient_block_pairs")
-_MAP = ("map.kind", "map.bounds", "map.cells")
-_FOLLOWERS = {
-    "task.environment": (OPTIONS, "task.episode_steps", *_MAP, "map.qd_offset"),
-    "task.episode_steps": ("map.qd_offset",),
-    "task.fitness": ("map.qd_offset",),
-    f"{OPTIONS}descriptor": _MAP,
-    "map.kind": ("map.cells",),
-    "policy.observation_normalization": ("policy.observation_clip",),
-    "search.algorithm": ("search.members",),
-    "search.pairs": _SHAPES,
-}
-"""Key -> how the names of those begin whose values follow from it, unless they are written as well."""
 
 
 def load_config(
@@ -124,7 +112,7 @@ def _load(
     problems += more
     wanted, more = parse_overrides(overrides)
     problems += more
-    values = (_without_followers(values, wanted) if resolved else values) | wanted
+    values = (without_followers(values, wanted) if resolved else values) | wanted
 
     left_open = {key for key, ask in LEFT_OPEN.items() if _asks(values.get(key, ask), ask)}
     values = {key: value for key, value in values.items() if key not in left_open}
@@ -214,13 +202,6 @@ def parse_overrides(overrides: Iterable[str]) -> tuple[dict[str, Any], list[str]
         else:
             problems.append(f"{where}: {_unknown_key(name)}")
     return values, problems
-
-
-def _without_followers(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
-    """Resolved values without those that follow from one that is about to be another."""
-    changed = [key for key in _FOLLOWERS if key in wanted and wanted[key] != values.get(key)]
-    followers = tuple(name for key in changed for name in _FOLLOWERS[key])
-    return {key: value for key, value in values.items() if not key.startswith(followers)}
 
 
 def _unknown_key(name: str) -> str:

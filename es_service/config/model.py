@@ -6,13 +6,12 @@ shapes and checks the sections against each other, so build one with it and not 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from es_service.commands import command
-from es_service.config.yaml_text import dump_yaml, show
+from es_service.config.yaml_text import dump_yaml
 from es_service.protocol import Bounds, PolicyShape, TaskSpec, WorkerSpec
 
 # A string beside a type is what error messages say is allowed.
@@ -284,20 +283,6 @@ class ComputeConfig(_Section):
     )
 
 
-STATE_KEYS = (
-    "task.environment",
-    "task.options.descriptor",
-    "policy.hidden",
-    "search.algorithm",
-    "search.members",
-    "map.enabled",
-    "map.kind",
-    "map.bounds",
-    "map.cells",
-)
-"""What the form and meaning of a run's state depend on: with another value no state of an earlier run can be used."""
-START_KEYS = ("search.preset", "search.init_from", "policy.init", "search.fitness_weight_start")
-"""What is used where a run starts and never again."""
 COMPUTE_CONSTANTS = ("rollout", "chunk_pairs", "rollout_block_pairs", "gradient_block_pairs")
 """Keys of `compute` that fix floating-point results, and therefore the run."""
 
@@ -332,41 +317,6 @@ def flat(sections: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in sections.items():
         values |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
     return values
-
-
-ABSENT = "(absent)"
-"""Stands for a constant that only one of two runs has."""
-
-
-def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Where two results of `constants()` differ: (dotted key, old value, new value), ABSENT where a side lacks it."""
-    return [
-        (name, old.get(name, ABSENT), new.get(name, ABSENT))
-        for name in {**old, **new}
-        if old.get(name, ABSENT) != new.get(name, ABSENT)
-    ]
-
-
-def describe_changes(changes: Sequence[tuple[str, Any, Any]], run: str = "RUN") -> str:
-    """What to tell someone whose resume would change constants of the run: all of them, and the way out."""
-    forkable = [(name, new) for name, _, new in changes if name not in (*STATE_KEYS, *START_KEYS) and new != ABSENT]
-    settings = [word for name, new in forkable for word in ("--set", f"{name}={show(new)}")]
-    fixed = [name for name, _, _ in changes if name in (*STATE_KEYS, *START_KEYS)]
-    lines = [
-        "a run keeps its task, policy, search, novelty, map, seed and chunk shapes for life; this would change:",
-        *(f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes),
-    ]
-    if forkable:
-        lines.append(f"to go on from its state with other settings: {command('fork', run, *settings)}")
-    if fixed:
-        lines.append(f"a fork has to keep {', '.join(fixed)}; {start_afresh(run)}")
-    return "\n".join(lines)
-
-
-def start_afresh(run: str) -> str:
-    """The way out where the state of a run is of no use with the settings that are wanted."""
-    way = command("run", "CONFIG", "--set", f"search.init_from={run}")
-    return f"to start anew from its centre (same task and network): {way}"
 
 
 def policy_shape(config: RunConfig, task: TaskSpec) -> PolicyShape:

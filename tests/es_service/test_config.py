@@ -15,8 +15,9 @@ from pydantic import ValidationError
 
 from es_service import cli_options
 from es_service.algorithms import ALGORITHMS
+from es_service.config.changes import changed_constants, describe_changes
 from es_service.config.loading import changed_config, load_config
-from es_service.config.model import RunConfig, changed_constants, describe_changes, worker_spec
+from es_service.config.model import RunConfig, worker_spec
 from es_service.config.presets import PRESETS, preset_table, preset_values
 from es_service.config.resolution import (
     config_warnings,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from es_service import api, descent, evaluation, session
-from es_service.config.model import START_KEYS
+from es_service.config.changes import START_KEYS
 from es_service.errors import ConfigError
 from es_service.session import scheduling_policy
 from tests.system.session import SMALL

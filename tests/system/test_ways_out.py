@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from es_service import api
-from es_service.config.model import describe_changes
+from es_service.config.changes import describe_changes
 from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.evaluation import candidates
 from es_service.report.status import follow_status, print_summary

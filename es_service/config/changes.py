@@ -1,0 +1,78 @@
+"""What changes with a key of a run: the keys that follow from it, the constants of the run; and what cannot change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from es_service.commands import command
+from es_service.config.map_rules import OPTIONS
+from es_service.config.yaml_text import show
+
+STATE_KEYS = (
+    "task.environment",
+    "task.options.descriptor",
+    "policy.hidden",
+    "search.algorithm",
+    "search.members",
+    "map.enabled",
+    "map.kind",
+    "map.bounds",
+    "map.cells",
+)
+"""What the form and meaning of a run's state depend on: with another value no state of an earlier run can be used."""
+START_KEYS = ("search.preset", "search.init_from", "policy.init", "search.fitness_weight_start")
+"""What is used where a run starts and never again."""
+_SHAPES = ("compute.chunk_pairs", "compute.rollout_block_pairs", "compute.gradient_block_pairs")
+_MAP = ("map.kind", "map.bounds", "map.cells")
+_FOLLOWERS = {
+    "task.environment": (OPTIONS, "task.episode_steps", *_MAP, "map.qd_offset"),
+    "task.episode_steps": ("map.qd_offset",),
+    "task.fitness": ("map.qd_offset",),
+    f"{OPTIONS}descriptor": _MAP,
+    "map.kind": ("map.cells",),
+    "policy.observation_normalization": ("policy.observation_clip",),
+    "search.algorithm": ("search.members",),
+    "search.pairs": _SHAPES,
+}
+"""Key -> how the names of those begin whose values follow from it, unless they are written as well."""
+ABSENT = "(absent)"
+"""Stands for a constant that only one of two runs has."""
+
+
+def without_followers(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
+    """Resolved values without those that follow from one that is about to be another."""
+    changed = [key for key in _FOLLOWERS if key in wanted and wanted[key] != values.get(key)]
+    followers = tuple(name for key in changed for name in _FOLLOWERS[key])
+    return {key: value for key, value in values.items() if not key.startswith(followers)}
+
+
+def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """Where two results of `constants()` differ: (dotted key, old value, new value), ABSENT where a side lacks it."""
+    return [
+        (name, old.get(name, ABSENT), new.get(name, ABSENT))
+        for name in {**old, **new}
+        if old.get(name, ABSENT) != new.get(name, ABSENT)
+    ]
+
+
+def describe_changes(changes: Sequence[tuple[str, Any, Any]], run: str = "RUN") -> str:
+    """What to tell someone whose resume would change constants of the run: all of them, and the way out."""
+    forkable = [(name, new) for name, _, new in changes if name not in (*STATE_KEYS, *START_KEYS) and new != ABSENT]
+    settings = [word for name, new in forkable for word in ("--set", f"{name}={show(new)}")]
+    fixed = [name for name, _, _ in changes if name in (*STATE_KEYS, *START_KEYS)]
+    lines = [
+        "a run keeps its task, policy, search, novelty, map, seed and chunk shapes for life; this would change:",
+        *(f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes),
+    ]
+    if forkable:
+        lines.append(f"to go on from its state with other settings: {command('fork', run, *settings)}")
+    if fixed:
+        lines.append(f"a fork has to keep {', '.join(fixed)}; {start_afresh(run)}")
+    return "\n".join(lines)
+
+
+def start_afresh(run: str) -> str:
+    """The way out where the state of a run is of no use with the settings that are wanted."""
+    way = command("run", "CONFIG", "--set", f"search.init_from={run}")
+    return f"to start anew from its centre (same task and network): {way}"
