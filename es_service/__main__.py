@@ -9,22 +9,19 @@ import signal
 import sys
 
 from es_service.errors import Interrupted
+from es_service.signals import interrupt
 
 
 def main() -> None:
     """Run the command line; SIGINT and SIGTERM at any moment end it with exit code 128 + n."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _interrupt)
+        signal.signal(number, interrupt)
     try:
         from es_service.cli import main as run_command
 
         run_command()
     except Interrupted as stop:
         sys.exit(128 + stop.signal_number)
-
-
-def _interrupt(number: int, frame: object) -> None:
-    raise Interrupted(number)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
+from es_service.errors import Interrupted
+
 REPEAT_S = 1.0
 """A second signal within this time is the same request: launchers forward what the terminal has sent already."""
 SHOW_CURSOR = b"\x1b[?25h\n"
@@ -37,10 +39,22 @@ class StopRequest:
             os._exit(128 + number)
 
 
+EARLY = StopRequest()
+"""A signal that came when there was nothing to finish yet."""
+
+
+def interrupt(number: int, frame: object) -> None:
+    """Signal handler while there is nothing to finish: raises Interrupted. An import may catch and forget that, so the
+    next `stop_on_signals` knows of it too."""
+    EARLY.number = number
+    raise Interrupted(number)
+
+
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
     """Catch SIGINT and SIGTERM inside the block; outside the main thread, where Python cannot, catch nothing."""
     request = StopRequest()
+    request.number = EARLY.number
     if threading.current_thread() is not threading.main_thread():
         yield request
         return

@@ -1,4 +1,4 @@
-"""A second signal ends a process at once."""
+"""A signal is heeded whenever it comes, and a second one ends a process at once."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ import signal
 import subprocess
 import sys
 
+import pytest
+
+from es_service import signals
+from es_service.errors import Interrupted
 from tests.system.session import ROOT
 
 PROGRAM = """
@@ -22,6 +26,16 @@ with signals.stop_on_signals() as should_stop, Live("busy"):
     os.kill(os.getpid(), signal.SIGINT)
     time.sleep(60)
 """
+
+
+def test_a_signal_that_was_caught_and_forgotten_stops_whatever_begins_next(monkeypatch):
+    monkeypatch.setattr(signals, "EARLY", signals.StopRequest())
+    with signals.stop_on_signals() as should_stop:
+        assert should_stop() is None
+    with pytest.raises(Interrupted):
+        signals.interrupt(signal.SIGTERM, None)
+    with signals.stop_on_signals() as should_stop:
+        assert should_stop() == signal.SIGTERM
 
 
 def test_a_second_signal_leaves_the_terminal_with_its_cursor():
