@@ -16,9 +16,9 @@ from es_service.commands import command
 from es_service.config import loading
 from es_service.config.changes import changed_constants, describe_changes
 from es_service.config.model import RunConfig
-from es_service.descent import fork_config, forked, started
 from es_service.errors import ConfigError, StoreError
 from es_service.history import history_columns
+from es_service.lineage import fork_config, forked, started
 from es_service.run_view import open_run
 from es_service.session import TASKS, OnGeneration, OnNotice, Outcome, task_of, work
 from es_service.store.beginning import Beginning

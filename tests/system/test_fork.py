@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from es_service import api, descent, evaluation, session
+from es_service import api, evaluation, lineage, session
 from es_service.config.changes import START_KEYS
 from es_service.errors import ConfigError
 from es_service.session import scheduling_policy
@@ -54,7 +54,7 @@ def test_a_record_of_another_fitness_does_not_hold_the_weight_down(tmp_path):
 )
 def test_a_state_that_does_not_fit_is_refused(parent, override, change):
     with pytest.raises(ConfigError) as caught:
-        descent.fork_config(parent.folder, [override, "budget.generations=9"])
+        lineage.fork_config(parent.folder, [override, "budget.generations=9"])
     lines = str(caught.value).splitlines()
     assert f"  {change}" in lines
     assert lines[-1].endswith(f": es-service run CONFIG --set search.init_from={parent.folder}")
@@ -70,26 +70,26 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
             "place": (("x", "y"), bounds), "speed": (("u", "v"), bounds), "height": (("h",), bounds[:1])
         },
     )  # fmt: skip
-    for module in (api, descent, session):
+    for module in (api, lineage, session):
         monkeypatch.setattr(module, "TASKS", {"point_maze": told})
     monkeypatch.setattr(api, "work", lambda *arguments: None)  # as workers know of no such option
     api.run(SMALL, tmp_path / "run")
     assert (
-        descent.fork_config(tmp_path / "run", ["task.options.descriptor=place"]).task.options["descriptor"] == "place"
+        lineage.fork_config(tmp_path / "run", ["task.options.descriptor=place"]).task.options["descriptor"] == "place"
     )
     for other in ("speed", "height"):
         with pytest.raises(ConfigError, match=rf"task\.options\.descriptor: place -> {other}\n[^$]*search\.init_from="):
-            descent.fork_config(tmp_path / "run", [f"task.options.descriptor={other}"])
-    for module in (api, descent, session):
+            lineage.fork_config(tmp_path / "run", [f"task.options.descriptor={other}"])
+    for module in (api, lineage, session):
         monkeypatch.setattr(module, "TASKS", {"point_maze": replace(told, descriptors={"place": (("a", "b"), bounds)})})
     with pytest.raises(ConfigError, match=r"the descriptor of point_maze: \[x, y\] -> \[a, b\]\n.*search\.init_from="):
-        descent.fork_config(tmp_path / "run")
+        lineage.fork_config(tmp_path / "run")
 
 
 @pytest.mark.parametrize("key", START_KEYS)
 def test_what_would_change_nothing_is_refused(parent, key):
     with pytest.raises(ConfigError) as caught:
-        descent.fork_config(parent.folder, [f"{key}=uber", "search.sigma=0.1"])
+        lineage.fork_config(parent.folder, [f"{key}=uber", "search.sigma=0.1"])
     assert f"  {key}" in str(caught.value).splitlines()
     assert f"es-service run CONFIG --set search.init_from={parent.folder}" in str(caught.value)
 
@@ -116,9 +116,9 @@ def test_what_a_resume_has_changed_is_so_for_a_fork_and_an_evaluation(parent, tm
     shutil.copytree(parent.folder, folder)
     recorded = folder / "config.yaml"
     recorded.write_text(recorded.read_text().replace("engine: inline", "engine: ray"))  # as a cluster's run has it
-    assert descent.fork_config(folder).compute.engine == "ray"
+    assert lineage.fork_config(folder).compute.engine == "ray"
     run = api.resume(folder, ["budget.generations=7", "compute.engine=inline", "compute.compile_timeout_s=77"]).run
-    config = descent.fork_config(folder, ["search.sigma=0.1"])
+    config = lineage.fork_config(folder, ["search.sigma=0.1"])
     assert (config.budget.generations, config.compute.engine, config.compute.compile_timeout_s) == (7, "inline", 77.0)
     seen = []
     monkeypatch.setattr(
@@ -127,4 +127,4 @@ def test_what_a_resume_has_changed_is_so_for_a_fork_and_an_evaluation(parent, tm
     list(evaluation.evaluate(run, [], episodes=1, workers=1))
     assert seen[0].compute.compile_timeout_s == 77.0
     recorded.unlink()
-    assert descent.fork_config(folder).budget.generations == 6, "as it was created"
+    assert lineage.fork_config(folder).budget.generations == 6, "as it was created"
