@@ -284,7 +284,7 @@ def test_the_next_deadline_bounds_the_wait(monkeypatch):
 
 def test_an_error_says_in_which_of_the_chunks_that_travelled_together_it_was():
     broken = [*CHUNKS[:3], TrainingChunk(3, "four")]  # type: ignore[arg-type]
-    with inline_engine(SPEC, Policy(workers=1, restart_backoff_s=0.0)) as engine:
+    with inline_engine(SPEC, Policy(workers=1, task_s=60.0, restart_backoff_s=0.0)) as engine:
         engine.evaluate(FIRST, CHUNKS)
         with pytest.raises(EvaluationError, match=r"(?s)task TrainingChunk 0 and 3 more of.*in TrainingChunk four of"):
             engine.evaluate(FIRST, broken)
@@ -370,9 +370,10 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
     blamed for the first."""
     before = footprint()
     long = spec(rollout="simd", episode_steps=200_000)
-    policy = Policy(workers=6, first_deadline_s=5.0, min_deadline_s=1.0, restart_backoff_s=0.01)
+    policy = Policy(workers=6, min_deadline_s=3.0, restart_backoff_s=0.01)
     with inline_engine(long, policy, threads=True) as engine:
         expected = engine.evaluate(FIRST, CHUNKS[:1])
+        engine.evaluate(FIRST, CHUNKS[:1])  # so that it is known how long it takes
         (victim,) = set(engine.transport.process_ids().values())
         timer = threading.Timer(0.02, os.kill, (victim, number))
         timer.start()
