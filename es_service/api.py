@@ -168,8 +168,8 @@ def fork(
     weight of fitness stays as it is.
 
     Raises:
-        ConfigError: a change that the state does not fit (another task, network or algorithm). StoreError: the
-            generation is not kept. Otherwise as `run`.
+        ConfigError: a change that the state does not fit (another task, descriptor, network, algorithm or map), or that
+            a fork has no use for. StoreError: the generation is not kept. Otherwise as `run`.
     """
     config = fork_config(parent, overrides)
     lineage, beginning = forked(open_run(parent), config, generation)
