@@ -48,11 +48,18 @@ def no_log(entry: Event | Command | Session | Committed) -> None:
 
 @contextmanager
 def dispatch_log(folder: Path, after_generation: int | None, *, enabled: bool) -> Iterator[Log]:
-    """A log that appends to the run folder's file, beginning with a `Session`; or one that keeps nothing."""
+    """A log that appends to the run folder's file, beginning with a `Session`; or one that keeps nothing.
+
+    Raises StoreError, here or when it is told something, if that cannot be written.
+    """
     if not enabled:
         yield no_log
         return
-    with (folder / FILE).open("ab", buffering=0) as file:
+    try:
+        file = (folder / FILE).open("ab", buffering=0)
+    except OSError as error:
+        raise explained(error, folder, f"opening {FILE}") from error
+    with file:
 
         def write(entry: Event | Command | Session | Committed) -> None:
             line = {"time": round(time.time(), 4), "is": type(entry).__name__, **vars(entry)}

@@ -1,6 +1,9 @@
 """The dispatch log survives what cuts its lines short."""
 
+import pytest
+
 from es_service.dispatch.dispatch_log import FILE, Committed, dispatch_log, read_dispatch_log
+from es_service.errors import StoreError
 
 
 def test_sessions_append_and_torn_lines_are_left_out(tmp_path):
@@ -20,3 +23,12 @@ def test_without_it_nothing_is_written(tmp_path):
     with dispatch_log(tmp_path, None, enabled=False) as log:
         log(Committed(0))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_cannot_be_opened_is_an_error_of_the_folder(tmp_path):
+    (tmp_path / FILE).mkdir()
+    with (
+        pytest.raises(StoreError, match=r"opening dispatch\.jsonl"),
+        dispatch_log(tmp_path, None, enabled=True),
+    ):
+        raise AssertionError("nothing can be logged")
