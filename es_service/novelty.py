@@ -184,9 +184,12 @@ def _mean_nearest(
     # Sure unless an entry that the tree left out could, after rounding, be among the nearest.
     sure_Q = np.sqrt(squared_Q_K[:, -1]) <= reach_Q_K[:, -1] * (1.0 - TREE_ROUNDING)
     mean_Q = _mean_smallest(squared_Q_K, neighbours, distance)
-    for index in np.flatnonzero(~sure_Q):
+    for index in np.flatnonzero(~sure_Q):  # where many ends are the same, as at a border, the last candidates are equal
         one = slice(index, index + 1)
-        mean_Q[one] = _mean_smallest(_squared(archive, query_Q_B[one], excluded_Q[one]), neighbours, distance)
+        within = np.array(tree.query_ball_point(query_Q_B[index], reach_Q_K[index, -1] * (1.0 + TREE_ROUNDING)))
+        near_1_K = _squared_to(query_Q_B[one], archive.descriptor_N_B[None, within])
+        near_1_K[:, within == excluded_Q[index]] = np.inf
+        mean_Q[one] = _mean_smallest(np.concatenate([near_1_K, tail_Q_N[one]], axis=1), neighbours, distance)
     return mean_Q
 
 

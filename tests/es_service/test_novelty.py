@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from es_service import novelty as module
 from es_service.novelty import (
     BLOCK_ENTRIES,
     TREE_STEP,
@@ -131,16 +130,27 @@ def test_the_tree_changes_no_bit(dimensions, scatter, monkeypatch):
     assert [with_tree[i] for i in (0, 41, 59)] == some
 
 
-def test_a_tree_that_rounds_otherwise_changes_no_bit(monkeypatch):
-    """Were the tree's distances off in their last bits, queries it cannot decide are compared with every entry."""
+@pytest.mark.parametrize("off", [-1e-12, 0.0, 1e-12])
+def test_a_tree_that_rounds_otherwise_changes_no_bit(monkeypatch, off):
+    """Though its last bits be off: queries that it cannot decide are compared with all that is as near."""
     archive = many(np.random.default_rng(1).integers(0, 6, (2 * TREE_STEP, 2)) / 7.0)
     queries = archive.descriptor_N_B[:50] + 1 / 3
     expected = of(NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.member_N), queries, 3)
-    compared = []
-    squared = module._squared
-    monkeypatch.setattr(module, "_squared", lambda a, q, e, first=0: compared.append(first) or squared(a, q, e, first))
+    tree, undecided = type(archive.tree), []
+    query, ball = tree.query, tree.query_ball_point
+
+    def rounded(self, points, count):
+        reach, candidates = query(self, points, count)
+        return reach * (1.0 + off), candidates
+
+    def counted(self, point, radius):
+        undecided.append(point)
+        return ball(self, point, radius)
+
+    monkeypatch.setattr(tree, "query", rounded)
+    monkeypatch.setattr(tree, "query_ball_point", counted)
     assert of(archive, queries, 3) == expected
-    assert compared.count(0) > 10  # a grid is full of ties
+    assert len(undecided) > 10  # a grid is full of ties
 
 
 @settings(max_examples=20)
