@@ -20,7 +20,7 @@ from es_service.store.codec import column_bytes, decode_part, part_sha256, row_d
 from es_service.store.folder import COPY, DATABASE, is_network_filesystem, require_run_folder
 from es_service.store.lock import lock_holder
 from es_service.store.schema import Damaged, RunMeta, history_select, load_meta
-from es_service.store.verify import KeptRows, rows_in_force, state_in_force, verify
+from es_service.store.verify import KeptRows, rows_in_force, state_in_force
 
 _BUSY_S = 5.0
 
@@ -174,12 +174,3 @@ def platforms(connection: sqlite3.Connection) -> list[tuple[int, dict[str, Any]]
             raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
         found.append((at, json.loads(text)))
     return found
-
-
-def verify_run(folder: Path) -> list[str]:
-    """Check everything stored, as opening for writing does, and return what is wrong; costs one read of the file."""
-    with reading(folder) as (connection, _):
-        try:
-            return list(verify(connection, Path(folder) / DATABASE).problems)
-        except Damaged as damage:
-            return [str(damage)]

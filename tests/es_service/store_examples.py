@@ -9,7 +9,10 @@ import numpy as np
 
 from es_service.history import Column
 from es_service.store import upkeep as store_upkeep
-from es_service.store.reader import read_history, read_parts
+from es_service.store.folder import DATABASE
+from es_service.store.reader import read_history, read_parts, reading
+from es_service.store.schema import Damaged
+from es_service.store.verify import verify
 from es_service.store.writer import RunMeta, RunStore, no_hook
 
 CONFIG_YAML = "seed: 0\n"
@@ -162,3 +165,12 @@ def without_root_rights():
         yield
     finally:
         os.seteuid(0)
+
+
+def verify_run(folder: Path) -> list[str]:
+    """What is wrong with anything stored."""
+    with reading(folder) as (connection, _):
+        try:
+            return list(verify(connection, folder / DATABASE).problems)
+        except Damaged as damage:
+            return [str(damage)]

@@ -11,7 +11,6 @@ from es_service.digest import arrays_sha256, checked_parts, digest, digest_of, d
 from es_service.errors import StoreError
 from es_service.store import schema as store_schema
 from es_service.store.codec import encode_part
-from es_service.store.reader import verify_run
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     COLUMNS,
@@ -24,6 +23,7 @@ from tests.es_service.store_examples import (
     parts_of,
     position_of,
     state_at,
+    verify_run,
 )
 
 GENERATIONS = 6

@@ -12,7 +12,7 @@ import pytest
 from es_service.digest import digest, digest_parts
 from es_service.errors import StoreError
 from es_service.store.codec import encode_part
-from es_service.store.reader import read_generation, read_history, read_parts, read_platforms, verify_run
+from es_service.store.reader import read_generation, read_history, read_parts, read_platforms
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     advance,
@@ -27,6 +27,7 @@ from tests.es_service.store_examples import (
     parts_of,
     position_of,
     state_at,
+    verify_run,
 )
 
 

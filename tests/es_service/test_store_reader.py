@@ -6,7 +6,6 @@ import sqlite3
 import pytest
 
 from es_service.errors import StoreError
-from es_service.store import reader as store_reader
 from es_service.store import schema as store_schema
 from es_service.store.reader import read_generation, read_history, read_meta, read_parts, read_platforms
 from es_service.store.writer import RunStore
@@ -17,6 +16,7 @@ from tests.es_service.store_examples import (
     create,
     finished,
     state_at,
+    verify_run,
 )
 
 
@@ -44,7 +44,7 @@ def test_a_generation_that_is_not_kept_is_refused_with_those_that_are(tmp_path):
 def test_readers_change_nothing(tmp_path):
     folder = finished(tmp_path / "run", 3)
     before = {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
-    read_meta(folder), read_history(folder), read_parts(folder), read_platforms(folder), store_reader.verify_run(folder)
+    read_meta(folder), read_history(folder), read_parts(folder), read_platforms(folder), verify_run(folder)
     assert {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()} == before
 
 
