@@ -19,9 +19,22 @@ from es_service.algorithms.me_es import restarted
 from es_service.algorithms.steps import first_state
 from es_service.clock import Clock
 from es_service.config.model import BudgetConfig, RunConfig
-from es_service.errors import EvaluationError
-from es_service.generation import estimate_gradient, evaluate_centre, evaluate_population, invalidate, judge
-from es_service.history import evaluation_columns, population_columns
+from es_service.generation import (
+    estimate_gradient,
+    evaluate_centre,
+    evaluate_population,
+    invalidate,
+    judge,
+    require_finite,
+)
+from es_service.history import (
+    HistoryRow,
+    evaluation_columns,
+    fault_columns,
+    population_columns,
+    search_columns,
+    step_columns,
+)
 from es_service.maps.behaviour_map import (
     ELITE_PREFIX,
     BehaviourMap,
@@ -38,7 +51,6 @@ from es_service.protocol import Centre, DispatchCounts, EpisodesResult, Evaluato
 from es_service.run_state import Arrays, Best, RunState, state_from_parts, state_parts, statistics_in_force
 from es_service.statistics import merge_moments
 
-HistoryRow = dict[str, int | float | None]
 Reachable = NDArray[np.bool_] | None
 """Which cells of the map can be reached, [cells]; None where the task does not know."""
 
@@ -150,14 +162,12 @@ def _first_generation(
         elites=elites,
     )
     row: HistoryRow = {
-        **_search_columns(fittest, search.algorithm.fitness_weight, None, moved),
+        **search_columns(fittest, search.algorithm.fitness_weight, None, moved.archive.size),
         **_map_columns(search, reachable, moved, fittest, None),
-        "update_norm": None,
-        "parameter_norm": _norm(centres[fittest]),
-        "invalid_members": 0,
-        **population_columns(None),
+        **step_columns(None, centres[fittest]),
+        **population_columns(None, 0),
         **evaluation_columns(evaluations[fittest], search.task),
-        **_faults(evaluator, DispatchCounts()),
+        **fault_columns(evaluator.counts, since=DispatchCounts()),
     }
     return state, row
 
@@ -187,12 +197,7 @@ def _next_generation(
     clock.lap("seconds_gradient")
     moved = algorithm.step(begun, plan, gradient_D)
     new_centre_D = moved.members[plan.member].centre_D
-    if not np.isfinite(new_centre_D).all():
-        raise EvaluationError(
-            f"generation {generation}: the centre is not finite after its update, so it is not kept. Everything up to "
-            f"generation {generation - 1} is saved; go on from there with a smaller search.learning_rate "
-            f"({settings.learning_rate:g} now): es-service fork RUN --set search.learning_rate=..."
-        )
+    require_finite(new_centre_D, settings.learning_rate, generation)
     clock.lap("seconds_driver")
     new_centre = replace(centre, parameters_D=new_centre_D)  # evaluated with the statistics of the generation's start
     evaluation = evaluate_centre(evaluator, new_centre, settings.evaluation_episodes)
@@ -205,14 +210,12 @@ def _next_generation(
     )
 
     row: HistoryRow = {
-        **_search_columns(plan.member, plan.fitness_weight, float(centre_novelty), learned),
+        **search_columns(plan.member, plan.fitness_weight, float(centre_novelty), learned.archive.size),
         **_map_columns(search, reachable, learned, plan.member, start_cell),
-        "update_norm": _norm(new_centre_D - plan.centre_D),
-        "parameter_norm": _norm(new_centre_D),
-        "invalid_members": invalid,
-        **population_columns(population),
+        **step_columns(plan.centre_D, new_centre_D),
+        **population_columns(population, invalid),
         **evaluation_columns(evaluation, search.task),
-        **_faults(evaluator, counts),
+        **fault_columns(evaluator.counts, since=counts),
     }
     state = RunState(
         generation=generation,
@@ -292,15 +295,6 @@ def _map_columns(
     }
 
 
-def _search_columns(member: int, fitness_weight: float, centre_novelty: float | None, after: SearchState) -> HistoryRow:
-    return {
-        "member": member,
-        "fitness_weight": fitness_weight,
-        "centre_novelty": centre_novelty,
-        "archive_size": after.archive.size,
-    }
-
-
 def _better(best: Best, centre: Centre, judgement: Judgement) -> Best:
     """The better of the best so far and a centre just evaluated; an invalid centre (not finite) is no improvement."""
     if not judgement.valid or judgement.fitness <= best.fitness:
@@ -311,16 +305,3 @@ def _better(best: Best, centre: Centre, judgement: Judgement) -> Best:
 
 def _steps(result: EpisodesResult) -> int:
     return int(result.steps.sum(dtype=np.int64))
-
-
-def _norm(x_D: FloatArray) -> float:
-    return float(np.sqrt(np.sum(np.square(x_D, dtype=np.float64))))
-
-
-def _faults(evaluator: Evaluator, before: DispatchCounts) -> HistoryRow:
-    now = evaluator.counts
-    return {
-        "retries": now.retries - before.retries,
-        "lost_workers": now.lost_workers - before.lost_workers,
-        "workers": now.workers,
-    }

@@ -98,6 +98,16 @@ def invalidate(population: EpisodesResult, max_invalid_fraction: float, generati
     return replace(population, fitness=fitness_P_S), invalid
 
 
+def require_finite(centre_D: FloatArray, learning_rate: float, generation: int) -> None:
+    """Raise an EvaluationError for a centre that an update has made infinite."""
+    if not np.isfinite(centre_D).all():
+        raise EvaluationError(
+            f"generation {generation}: the centre is not finite after its update, so it is not kept. Everything up to "
+            f"generation {generation - 1} is saved; go on from there with a smaller search.learning_rate "
+            f"({learning_rate:g} now): es-service fork RUN --set search.learning_rate=..."
+        )
+
+
 def judge(
     generation: int, member: int, evaluation: EpisodesResult, population: EpisodesResult | None = None
 ) -> Judgement:

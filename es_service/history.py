@@ -7,7 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from es_service.protocol import EpisodesResult, TaskSpec
+from es_service.protocol import DispatchCounts, EpisodesResult, FloatArray, TaskSpec
+
+HistoryRow = dict[str, int | float | None]
+"""Values by name of the column."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +90,24 @@ def history_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
     return (*_FITNESS, *descriptor, *(_GOAL if task.has_goal else ()), *(_MAP if has_map else ()), *_SEARCH_AND_TIMES)
 
 
-def population_columns(population: EpisodesResult | None) -> dict[str, float | None]:
+def search_columns(member: int, fitness_weight: float, centre_novelty: float | None, archive_size: int) -> HistoryRow:
+    """What the search did; no novelty in generation 0."""
+    return {
+        "member": member,
+        "fitness_weight": fitness_weight,
+        "centre_novelty": centre_novelty,
+        "archive_size": archive_size,
+    }
+
+
+def step_columns(old_D: FloatArray | None, new_D: FloatArray) -> HistoryRow:
+    """How far the centre went, and where to; None for generation 0, whose centres came from nowhere."""
+    return {"update_norm": None if old_D is None else _norm(new_D - old_D), "parameter_norm": _norm(new_D)}
+
+
+def population_columns(population: EpisodesResult | None, invalid_members: int) -> HistoryRow:
     """Quartiles of the valid members' fitness and return; None for generation 0, which has no population."""
-    columns: dict[str, float | None] = {}
+    columns: HistoryRow = {"invalid_members": invalid_members}
     for quantity in ("fitness", "return"):
         names = [f"population_{quantity}_{name}" for name in ("min", "q25", "median", "q75", "max")]
         if population is None:
@@ -102,11 +120,11 @@ def population_columns(population: EpisodesResult | None) -> dict[str, float | N
     return columns
 
 
-def evaluation_columns(evaluation: EpisodesResult, task: TaskSpec) -> dict[str, float]:
+def evaluation_columns(evaluation: EpisodesResult, task: TaskSpec) -> HistoryRow:
     """What the new centre's evaluation episodes say: fitness, return, where they end, how near the goal."""
     mean_B = evaluation.descriptor.mean(axis=0, dtype=np.float64).tolist()
     std_B = evaluation.descriptor.std(axis=0, dtype=np.float64).tolist()
-    columns = {
+    columns: HistoryRow = {
         "centre_fitness_mean": float(evaluation.fitness.mean(dtype=np.float64)),
         "centre_fitness_std": float(evaluation.fitness.std(dtype=np.float64)),
         "centre_return_mean": float(evaluation.returns.mean(dtype=np.float64)),
@@ -118,3 +136,16 @@ def evaluation_columns(evaluation: EpisodesResult, task: TaskSpec) -> dict[str, 
         columns["goal_distance"] = float(evaluation.goal_distance[:, 0].mean(dtype=np.float64))
         columns["goal_distance_min"] = float(evaluation.goal_distance[:, 1].min())
     return columns
+
+
+def fault_columns(now: DispatchCounts, *, since: DispatchCounts) -> HistoryRow:
+    """Faults survived since, and the workers at present."""
+    return {
+        "retries": now.retries - since.retries,
+        "lost_workers": now.lost_workers - since.lost_workers,
+        "workers": now.workers,
+    }
+
+
+def _norm(x_D: FloatArray) -> float:
+    return float(np.sqrt(np.sum(np.square(x_D, dtype=np.float64))))

@@ -11,6 +11,7 @@ import numpy as np
 from es_service.algorithms import ALGORITHMS
 from es_service.config import loading
 from es_service.config.changes import START_KEYS, STATE_KEYS, changed_constants, start_afresh
+from es_service.config.keys import parse_overrides
 from es_service.config.model import RunConfig, policy_shape
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError
@@ -34,7 +35,7 @@ def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -
     """
     origin = open_run(parent)
     overrides = [overrides] if isinstance(overrides, str) else list(overrides)
-    wanted = loading.parse_overrides(overrides)[0]
+    wanted = parse_overrides(overrides)[0]
     if idle := [f"  {key}" for key in START_KEYS if key in wanted]:
         listed = "\n".join(idle)
         raise ConfigError(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from es_service import digest as run_digest
 from es_service.algorithms.base import Member, member_from_arrays, member_part
-from es_service.config.model import COMPUTE_CONSTANTS
+from es_service.config.compute import COMPUTE_CONSTANTS
 from es_service.config.yaml_text import read_yaml_file
 from es_service.errors import NotInRunError
 from es_service.maps.behaviour_map import (

@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from difflib import get_close_matches
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from es_service.config.changes import without_followers
-from es_service.config.map_rules import OPTIONS, map_problems
-from es_service.config.model import RunConfig, WorkerResources
+from es_service.config.keys import BUDGET, FIELDS, SECTIONS, parse_overrides, sort_keys
+from es_service.config.map_rules import map_problems
+from es_service.config.model import RunConfig
 from es_service.config.presets import PRESETS, preset_values
 from es_service.config.resolution import (
     LEFT_OPEN,
-    RESOURCES,
     did_you_mean,
     engine_problems,
     folder_problems,
@@ -39,21 +38,6 @@ from es_service.protocol import TaskSpec
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
 """Where a config comes from: the path of a YAML file, or what such a file would contain."""
-
-_SECTIONS = {
-    name: field.annotation
-    for name, field in RunConfig.model_fields.items()
-    if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
-}
-_FIELDS = {name: field for name, field in RunConfig.model_fields.items() if name not in _SECTIONS} | {
-    f"{section}.{name}": field
-    for section, model in {**_SECTIONS, RESOURCES.removesuffix("."): WorkerResources}.items()
-    for name, field in model.model_fields.items()
-    if f"{section}.{name}." not in (OPTIONS, RESOURCES)
-}
-_GROUPS = (*_SECTIONS, OPTIONS.removesuffix("."), RESOURCES.removesuffix("."))
-"""What holds keys and is no value itself."""
-_BUDGET = [name for name in _FIELDS if name.startswith("budget.")]
 
 
 def load_config(
@@ -108,7 +92,7 @@ def _load(
     else:
         mapping, problems = read_yaml_file(os.fspath(source))
         name = os.fspath(source)
-    values, unusable, more = _sort_keys(mapping)
+    values, unusable, more = sort_keys(mapping)
     problems += more
     wanted, more = parse_overrides(overrides)
     problems += more
@@ -146,79 +130,11 @@ def _load(
         problems += map_problems(values, task) + rollout_problems(values, task)
     problems += member_problems(values) + shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
-    if "budget" not in unusable and not bad.keys() & _BUDGET and all(values.get(key) is None for key in _BUDGET):
-        problems.append(f"budget: nothing ends this run; set at least one of {one_of(_BUDGET)}")
+    if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):
+        problems.append(f"budget: nothing ends this run; set at least one of {one_of(BUDGET)}")
     if problems:
         raise config_error(name, problems)
     return RunConfig.model_validate(_nested(values))
-
-
-def _sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, Any], set[str], list[str]]:
-    """Flat values of the known keys, the groups that are no mapping, and the problems of both other kinds of key."""
-    values: dict[str, Any] = {}
-    unusable: set[str] = set()
-    problems: list[str] = []
-    for key, value in mapping.items():
-        name = f"{group}{key}"
-        if "." in str(key):
-            section, leaf = name.rsplit(".", 1)
-            problems.append(f"{name}: no dots in a file (they are for --set); write {leaf} inside {section}:")
-        elif name in _GROUPS and isinstance(value, Mapping):
-            below = _sort_keys(value, f"{name}.")
-            values |= below[0]
-            unusable |= below[1]
-            problems += below[2]
-        elif name in _GROUPS:
-            unusable.add(name)
-            problems.append(
-                f"{name}: {show(value)} where keys belong; indent them below `{_leaf(name)}:`, "
-                "or delete the line for the defaults"
-            )
-        elif name in _FIELDS or group == OPTIONS:
-            values[name] = value
-        else:
-            problems.append(_unknown_key(name))
-    return values, unusable, problems
-
-
-def parse_overrides(overrides: Iterable[str]) -> tuple[dict[str, Any], list[str]]:
-    """Values by dotted key, and a problem for each override that has none to give."""
-    values: dict[str, Any] = {}
-    problems: list[str] = []
-    for override in [overrides] if isinstance(overrides, str) else overrides:
-        name, equals, text = (part.strip() for part in override.partition("="))
-        where = f"override {override}"
-        if not equals or not name or not text:
-            hint = "write null for no value" if name and equals else "write a.b=c, such as search.sigma=0.05"
-            problems.append(f"{where}: {hint}")
-        elif name in _GROUPS:
-            keys = [key for key in _FIELDS if key.startswith(f"{name}.")] or [f"{OPTIONS}start"]
-            problems.append(f"{where}: {name} is a section; set its keys one by one, such as {keys[0]}=...")
-        elif name in _FIELDS or (name.startswith(OPTIONS) and name != OPTIONS):
-            try:
-                values[name] = parse_value(text)
-            except ValueError as error:
-                problems.append(f"{where}: {error}")
-        else:
-            problems.append(f"{where}: {_unknown_key(name)}")
-    return values, problems
-
-
-def _unknown_key(name: str) -> str:
-    """The message for a key that is none: the same key elsewhere, else the nearest one, else what there is."""
-    section, _, leaf = name.rpartition(".")
-    everywhere = {_leaf(key): key for key in (*_GROUPS, *_FIELDS)}
-    siblings = {leaf: key for leaf, key in everywhere.items() if key.rpartition(".")[0] == section}
-    for keys in ({leaf: everywhere[leaf]} if leaf in everywhere else {}, siblings, everywhere):
-        if near := get_close_matches(leaf, keys, n=1):
-            return f"{name}: unknown key; did you mean {keys[near[0]]}?"
-    if siblings:
-        return f"{name}: unknown key; {section or 'the top level'} has {', '.join(siblings)}"
-    return f"{name}: unknown key; the sections are {', '.join(_SECTIONS)}"
-
-
-def _leaf(name: str) -> str:
-    return name.rpartition(".")[2]
 
 
 def _asks(value: object, ask: str | None) -> bool:
@@ -228,7 +144,7 @@ def _asks(value: object, ask: str | None) -> bool:
 
 def _preset_values(values: Mapping[str, Any]) -> dict[str, Any]:
     """What the config's preset says; nothing where it names none of ours, which is reported as a bad value."""
-    preset = values.get("search.preset", _FIELDS["search.preset"].default)
+    preset = values.get("search.preset", FIELDS["search.preset"].default)
     if not isinstance(preset, str) or preset not in PRESETS:
         return {}
     filled = preset_values(preset)
@@ -239,7 +155,7 @@ def _preset_values(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
     """The inverse of flattening; every section is there, if empty."""
-    nested: dict[str, Any] = {section: {} for section in _SECTIONS}
+    nested: dict[str, Any] = {section: {} for section in SECTIONS}
     for name, value in values.items():
         *path, leaf = name.split(".")
         target = nested
@@ -264,9 +180,9 @@ def _value_problems(values: Mapping[str, Any]) -> dict[str, str]:
 
 def _bad_value(name: str, value: object) -> str:
     """Name, value, what is allowed, and how to write what was probably meant."""
-    if name not in _FIELDS:
+    if name not in FIELDS:
         return f"{name}: {show(value)} is not allowed; must be text"
-    field = _FIELDS[name]
+    field = FIELDS[name]
     allowed = _allowed(field.annotation, field.metadata)
     if name in LEFT_OPEN:
         allowed = f"{show(LEFT_OPEN[name])} or {allowed}"

@@ -7,55 +7,30 @@ shapes and checks the sections against each other, so build one with it and not 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import Field
 
+from es_service.config.compute import COMPUTE_CONSTANTS, ComputeConfig
+from es_service.config.fields import (
+    BoundPairs,
+    CellCounts,
+    Count,
+    Fraction,
+    NotNegative,
+    Number,
+    Positive,
+    Section,
+    Seed,
+    Switch,
+    Text,
+    Widths,
+)
 from es_service.config.yaml_text import dump_yaml
-from es_service.protocol import Bounds, PolicyShape, TaskSpec, WorkerSpec
-
-# A string beside a type is what error messages say is allowed.
-Count = Annotated[int, Field(ge=1), "a whole number, at least 1"]
-Positive = Annotated[float, Field(gt=0), "a number above 0"]
-NotNegative = Annotated[float, Field(ge=0), "a number, at least 0"]
-Number = Annotated[float, "a number"]
-Fraction = Annotated[float, Field(ge=0, le=1), "a number from 0 to 1"]
-Seed = Annotated[int, Field(ge=0, lt=2**63), "a whole number, at least 0 and below 2**63"]
-Switch = Annotated[bool, "true or false"]
-Text = Annotated[str, Field(min_length=1), "text"]
-Widths = Annotated[
-    tuple[Count, ...],
-    BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value),
-    "a list of whole numbers, each at least 1, such as [64, 64]",
-]
+from es_service.protocol import PolicyShape, TaskSpec, WorkerSpec
 
 
-def _tuples(value: Any) -> Any:
-    """Lists as tuples, and whole numbers among them as they are in a file: [[-1, 1], [0, 2.5]]."""
-    if not isinstance(value, list | tuple):
-        return value
-    return tuple(
-        tuple(float(x) if type(x) is int and abs(x) < 2**1000 else x for x in pair)
-        if isinstance(pair, list | tuple)
-        else pair
-        for pair in value
-    )
-
-
-BoundPairs = Annotated[Bounds, BeforeValidator(_tuples), "a list of pairs [low, high], such as [[-1, 1], [-1, 1]]"]
-CellCounts = Annotated[
-    tuple[Count, ...],
-    Field(min_length=1),
-    BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value),
-    "a list of whole numbers, each at least 1, such as [20, 20]",
-]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
-
-
-class TaskConfig(_Section):
+class TaskConfig(Section):
     """What is to be learned. Constants of the run."""
 
     environment: Text = Field(description="Name of the task; `es-service list` shows them.")
@@ -74,7 +49,7 @@ class TaskConfig(_Section):
     )
 
 
-class PolicyConfig(_Section):
+class PolicyConfig(Section):
     """The controller: a tanh multilayer perceptron with outputs in [-1, 1]. Constants of the run."""
 
     hidden: Widths = Field((64, 64), description="Widths of the hidden layers; [] is a linear policy under a tanh.")
@@ -95,7 +70,7 @@ class PolicyConfig(_Section):
     )
 
 
-class SearchConfig(_Section):
+class SearchConfig(Section):
     """The evolution strategy. Constants of the run."""
 
     algorithm: Text = Field(
@@ -172,7 +147,7 @@ class SearchConfig(_Section):
     )
 
 
-class NoveltyConfig(_Section):
+class NoveltyConfig(Section):
     """What is novel. Constants of the run."""
 
     neighbours: Count = Field(
@@ -183,7 +158,7 @@ class NoveltyConfig(_Section):
     )
 
 
-class MapConfig(_Section):
+class MapConfig(Section):
     """The behaviour map, whose cells keep the fittest evaluated centre each. Constants of the run."""
 
     enabled: Switch = Field(True, description="Whether the run fills a map; me_es needs one.")
@@ -205,7 +180,7 @@ class MapConfig(_Section):
     )
 
 
-class BudgetConfig(_Section):
+class BudgetConfig(Section):
     """When to stop: whichever comes first. At least one is set. May change on resume."""
 
     generations: Count | None = Field(None, description="Generations in all, sessions before a resume included.")
@@ -214,80 +189,7 @@ class BudgetConfig(_Section):
     target_fitness: Number | None = Field(None, description="Mean evaluation fitness of a centre that is good enough.")
 
 
-class WorkerResources(_Section):
-    """What one worker takes of a node, with engine ray."""
-
-    cpu: Count = Field(1, description="CPU cores that Ray sets aside for a worker; it uses one.")
-    gpu: NotNegative = Field(
-        0.0, description="GPUs of a worker, 1 or a fraction that it shares; 0 runs episodes on the CPU."
-    )
-
-
-class ComputeConfig(_Section):
-    """How the work is cut and where it runs. Only `rollout` and the three `*_pairs` are constants of the run."""
-
-    engine: Literal["ray", "inline"] = Field(
-        "ray",
-        description="What runs the workers. ray: actors, here or in a cluster. inline: this program's child processes.",
-    )
-    inline_workers: Literal["processes", "threads"] = Field(
-        "processes",
-        description="With engine inline, what workers are: processes; or threads of one, for rollout simd, which takes "
-        "less memory, and loses all of them with one.",
-    )
-    address: Text | None = Field(
-        None,
-        description="With engine ray: a cluster to join, HOST:PORT, or auto for the one on this machine; null starts a "
-        "Ray of its own.",
-    )
-    workers: Literal["auto"] | Count = Field(
-        "auto",
-        description="Worker processes. auto: one per core of the machine or cluster at hand. Never changes results.",
-    )
-    worker_resources: WorkerResources = Field(
-        default_factory=lambda: WorkerResources(cpu=1, gpu=0.0),
-        description="What one worker takes of a node, with engine ray.",
-    )
-    rollout: Literal["xla", "simd"] = Field(
-        description="What computes episodes. simd: code compiled for this kind of processor, some twenty times faster; "
-        "xla: JAX, for GPUs and for tasks that simd cannot compile. auto: simd where that can be."
-    )
-    chunk_pairs: Count = Field(
-        description="Pairs in one unit of work; divides search.pairs. auto: the largest divisor of it not above "
-        "an eighth of it, within 16 to 64, a multiple of 8 if there is one."
-    )
-    rollout_block_pairs: Count = Field(
-        description="Pairs that step together, so that their weights stay in cache; divides chunk_pairs. auto: the "
-        "largest divisor of it not above 32 whose weights take at most 5 MiB."
-    )
-    gradient_block_pairs: Count = Field(
-        description="Pairs summed into one partial gradient; not above search.pairs. auto: as few whole chunks as "
-        "make at most 32 blocks, and blocks that are worth a message."
-    )
-    chunk_timeout_s: Positive = Field(
-        30.0, description="Least deadline of a chunk in seconds; slow chunks raise it for those that follow."
-    )
-    compile_timeout_s: Positive = Field(
-        120.0,
-        description="Deadline of a worker's first chunk of each kind, which compiles; or what later ones may take, if "
-        "that is longer.",
-    )
-    max_attempts: Count = Field(4, description="Times a chunk is tried before the run stops with its error.")
-    no_worker_timeout_s: Positive = Field(
-        120.0,
-        description="Seconds without any live worker after which the run stops, in a cluster that has no room yet as "
-        "well; a worker that takes half as long to start is replaced.",
-    )
-    dispatch_log: Switch = Field(
-        False, description="Whether the run folder gets a dispatch.jsonl: what each worker was sent, answered, died of."
-    )
-
-
-COMPUTE_CONSTANTS = ("rollout", "chunk_pairs", "rollout_block_pairs", "gradient_block_pairs")
-"""Keys of `compute` that fix floating-point results, and therefore the run."""
-
-
-class RunConfig(_Section):
+class RunConfig(Section):
     """A whole run. Equal configs give equal results, wherever and however often they run."""
 
     task: TaskConfig

@@ -12,8 +12,10 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, Self, TypeVar
 
-from es_service.dispatch import messages, scheduler
+from es_service.dispatch import messages
 from es_service.dispatch.dispatch_log import Log, no_log
+from es_service.dispatch.scheduler import step
+from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, usual_chunk_s
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts, TaskKey
 
@@ -105,7 +107,7 @@ class Engine(Generic[AnyTransport]):
         self.transport = transport
         self._should_stop = should_stop
         self._log = log
-        self._state = scheduler.initial_state(policy)
+        self._state = initial_state(policy)
         self._centre: Centre | None = None
         self._phase = 0
         self._chunks: dict[Hashable, Sequence[Chunk]] = {}
@@ -138,10 +140,10 @@ class Engine(Generic[AnyTransport]):
         parts = self._parts(chunks)
         self._centre, self._chunks, self._results = centre, dict(parts), {}
         self._step(messages.Submit(tuple(messages.Task(key, key.kind, key.chunks) for key, _ in parts)))
-        while scheduler.pending(self._state):
+        while pending(self._state):
             if (number := self._should_stop()) is not None:
                 raise Interrupted(number)
-            wait_s = min(POLL_S, max(0.0, scheduler.next_deadline(self._state) - time.monotonic()))
+            wait_s = min(POLL_S, max(0.0, next_deadline(self._state) - time.monotonic()))
             if (message := self.transport.receive(wait_s)) is not None:
                 self._handle(message)
             else:  # only now: a late look at the clock must not kill workers whose answers were waiting
@@ -163,7 +165,7 @@ class Engine(Generic[AnyTransport]):
         if not chunks:
             return []
         kind, policy = type(chunks[0]).__name__, self._state.policy
-        sizes = task_sizes(len(chunks), self._state.wanted, scheduler.chunk_s(self._state, kind), policy.task_s)
+        sizes = task_sizes(len(chunks), self._state.wanted, usual_chunk_s(self._state, kind), policy.task_s)
         ends = list(itertools.accumulate(sizes))
         parts = [chunks[end - size : end] for end, size in zip(ends, sizes, strict=True)]
         return [(TaskKey(self._phase, kind, part[0].generation, part[0].chunk_id, len(part)), part) for part in parts]
@@ -176,7 +178,7 @@ class Engine(Generic[AnyTransport]):
 
     def _step(self, event: messages.Event) -> bool:
         """Feed the scheduler and do as it says; whether it accepted a result."""
-        self._state, commands = scheduler.step(self._state, event, time.monotonic())
+        self._state, commands = step(self._state, event, time.monotonic())
         if commands or not isinstance(event, messages.Tick):
             self._log(event)
         for command in commands:

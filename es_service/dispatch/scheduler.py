@@ -4,9 +4,9 @@ Dispatch station, between the driver's tasks and the engines that own the worker
 next state and the commands the engine must carry out, in order. No I/O, no clock, no randomness, no threads: the same
 arguments give the same answer, and a published state never changes, so a simulation can try every interleaving.
 
-An engine starts with `initial_state(policy)` and a `Tick`, feeds every message of its workers as an event, and sends a
-`Tick` whenever `next_deadline(state)` has come. It must feed the messages that already wait *before* a late `Tick`:
-otherwise a driver that was busy elsewhere would kill workers whose answers it had not read.
+An engine starts with `initial_state(policy)` of scheduler_state.py and a `Tick`, feeds every message of its workers as
+an event, and sends a `Tick` whenever `next_deadline(state)` has come. It must feed the messages that already wait
+*before* a late `Tick`: otherwise a driver that was busy elsewhere would kill workers whose answers it had not read.
 
 Choices. A result is a pure function of its key, so any result of a known worker for a key that still waits is accepted,
 even of a superseded attempt; a stopped worker is forgotten at once, so what it still says is dropped and counted. Only
@@ -18,16 +18,13 @@ attempts of good tasks. A worker lost while draining is nobody's fault. One that
 anew, since one that hangs before it can say where it is looks the same, but counts as no loss.
 
 Cost: each step makes shallow copies of the containers (C speed, a few microseconds for a thousand entries) and changes
-only the records touched; the records are frozen and shared between states.
+only the records touched.
 """
 
 from __future__ import annotations
 
-import math
-import statistics
 from collections import deque
 from collections.abc import Hashable
-from typing import NamedTuple
 
 from es_service.dispatch.messages import (
     Assign,
@@ -37,7 +34,6 @@ from es_service.dispatch.messages import (
     Event,
     Fail,
     Failure,
-    Policy,
     Result,
     SetWorkers,
     StartWorker,
@@ -48,103 +44,20 @@ from es_service.dispatch.messages import (
     WorkerLost,
     WorkerUp,
 )
+from es_service.dispatch.scheduler_state import (
+    SchedulerState,
+    Slot,
+    Waiting,
+    Worker,
+    begin_first_slot,
+    find_slot,
+    holds,
+    next_deadline,
+    next_for,
+)
 
 RECENT_DURATIONS = 31
 """Durations per kind of task that the running median is taken over."""
-
-# State.
-
-
-class _Waiting(NamedTuple):
-    """A task that has not been delivered."""
-
-    task: Task
-    faults: int = 0
-    holder: int | None = None
-    """The worker it is assigned to; None while it is in the queue."""
-    last_holder: int | None = None
-    """The worker it came back from; None before that."""
-
-
-class _Slot(NamedTuple):
-    task: Task
-    attempt: int
-
-
-class _Worker(NamedTuple):
-    """A worker that came up. `slots` is what it has not answered yet, in the order sent; it runs the first."""
-
-    slots: tuple[_Slot, ...] = ()
-    started_s: float = 0.0
-    """When it began the first slot."""
-    deadline_s: float = math.inf
-    """When it must have answered the first slot."""
-    limit: str = ""
-    """Field of the policy that this comes from."""
-    warm: frozenset[str] = frozenset()
-    """Kinds it has finished a task of, hence compiled."""
-    failures_in_a_row: int = 0
-
-
-class SchedulerState(NamedTuple):
-    """Everything the scheduler remembers. Treat the containers as read-only; times are in the seconds of `now`."""
-
-    policy: Policy
-    wanted: int
-    starting: dict[int, float]
-    """Deadline of each worker that has not come up yet."""
-    up: dict[int, _Worker]
-    draining: dict[int, _Worker]
-    tasks: dict[Hashable, _Waiting]
-    queue: deque[Hashable]
-    """Keys to assign, next first."""
-    durations_s: dict[str, tuple[float, ...]]
-    """Recent durations of a chunk per kind, without those that include compiling."""
-    next_worker: int = 0
-    start_at_s: float = -math.inf
-    """No worker is started before this."""
-    losses_in_a_row: int = 0
-    start_failures: int = 0
-    down_since_s: float | None = None
-    """Since when tasks wait and no worker is up."""
-    last_loss: str = "none was ever lost"
-    failed: str | None = None
-    """The message of `Fail`; the state is then terminal."""
-    retries: int = 0
-    """Assignments beyond a task's first."""
-    lost_workers: int = 0
-    """Workers lost, or stopped for a fault."""
-    duplicates: int = 0
-    """Results and failures that were dropped: stale, repeated, or of an unknown worker."""
-
-
-def initial_state(policy: Policy) -> SchedulerState:
-    """No task and no worker yet; the first step, whatever its event, starts the workers."""
-    return SchedulerState(policy, policy.workers, {}, {}, {}, {}, deque(), {})
-
-
-def pending(state: SchedulerState) -> int:
-    """Number of tasks submitted and not delivered."""
-    return len(state.tasks)
-
-
-def chunk_s(state: SchedulerState, kind: str) -> float | None:
-    """How long a chunk of this kind takes in the median; None while that is not known."""
-    durations_s = state.durations_s.get(kind)
-    return statistics.median(durations_s) if durations_s else None
-
-
-def next_deadline(state: SchedulerState) -> float:
-    """When the next `Tick` will do something, in the seconds of `now`; infinity if only a message can."""
-    if state.failed is not None:
-        return math.inf
-    times = [worker.deadline_s for group in (state.up, state.draining) for worker in group.values()]
-    times.extend(state.starting.values())
-    if len(state.starting) + len(state.up) < state.wanted:
-        times.append(state.start_at_s)
-    if state.down_since_s is not None:
-        times.append(state.down_since_s + state.policy.no_worker_timeout_s)
-    return min(times, default=math.inf)
 
 
 def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerState, list[Command]]:
@@ -172,7 +85,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
             _submit(s, tasks)
         case WorkerUp(worker):
             if s.starting.pop(worker, None) is not None:
-                s.up[worker] = _Worker()
+                s.up[worker] = Worker()
                 s = s._replace(start_failures=0)
         case WorkerLost(worker, reason, bystander):
             s = _lose(s, out, worker, reason, now, fault=worker not in s.draining, charge=not bystander)
@@ -203,7 +116,7 @@ def _submit(s: SchedulerState, tasks: tuple[Task, ...]) -> None:
     for task in tasks:
         if task.key in s.tasks:
             raise ValueError(f"task {task.key} was submitted twice")
-        s.tasks[task.key] = _Waiting(task)
+        s.tasks[task.key] = Waiting(task)
         s.queue.append(task.key)
 
 
@@ -220,7 +133,7 @@ def _result(
         s = s._replace(losses_in_a_row=0)
     else:
         s = s._replace(duplicates=s.duplicates + 1)
-    index = _find_slot(record, key, attempt)
+    index = find_slot(record, key, attempt)
     if index is not None:
         task = record.slots[index].task
         kind = task.kind
@@ -237,7 +150,7 @@ def _result(
 def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) -> SchedulerState:
     worker, key = event.worker, event.key
     record = s.up.get(worker) or s.draining.get(worker)
-    index = _find_slot(record, key, event.attempt) if record is not None else None
+    index = find_slot(record, key, event.attempt) if record is not None else None
     if record is None or index is None:
         return s._replace(duplicates=s.duplicates + 1)
     record = record._replace(failures_in_a_row=record.failures_in_a_row + 1)
@@ -254,18 +167,11 @@ def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) 
     return _charge(s, out, key, f"it raised on worker {worker}: {event.message}")
 
 
-def _find_slot(record: _Worker, key: Hashable, attempt: int) -> int | None:
-    for index, slot in enumerate(record.slots):
-        if slot.attempt == attempt and slot.task.key == key:
-            return index
-    return None
-
-
-def _close_slot(s: SchedulerState, out: list[Command], worker: int, record: _Worker, index: int, now: float) -> None:
+def _close_slot(s: SchedulerState, out: list[Command], worker: int, record: Worker, index: int, now: float) -> None:
     """Store the worker without that slot, start the clock of the next one; a drained worker is stopped."""
     record = record._replace(slots=record.slots[:index] + record.slots[index + 1 :])
     if index == 0:
-        record = _begin_first_slot(s, record, now)
+        record = begin_first_slot(s, record, now)
     if worker in s.up:
         s.up[worker] = record
     elif record.slots:
@@ -273,18 +179,6 @@ def _close_slot(s: SchedulerState, out: list[Command], worker: int, record: _Wor
     else:
         del s.draining[worker]
         out.append(StopWorker(worker, "drained"))
-
-
-def _begin_first_slot(s: SchedulerState, record: _Worker, now: float) -> _Worker:
-    if not record.slots:
-        return record._replace(deadline_s=math.inf)
-    task, policy = record.slots[0].task, s.policy
-    usual_s = chunk_s(s, task.kind)
-    limit, limit_s = "min_deadline_s", max(policy.min_deadline_s, policy.deadline_factor * task.size * (usual_s or 0.0))
-    compiles = usual_s is None or task.kind not in record.warm
-    if compiles and limit_s < policy.first_deadline_s:
-        limit, limit_s = "first_deadline_s", policy.first_deadline_s
-    return record._replace(started_s=now, deadline_s=now + limit_s, limit=limit)
 
 
 def _lose(
@@ -303,9 +197,9 @@ def _lose(
     if not starting and record is None:
         return s
     slots = record.slots if record is not None else ()
-    running = slots[0].task.key if slots and _holds(s, worker, slots[0].task.key) else None
+    running = slots[0].task.key if slots and holds(s, worker, slots[0].task.key) else None
     for slot in reversed(slots):
-        if _holds(s, worker, slot.task.key):
+        if holds(s, worker, slot.task.key):
             _requeue(s, worker, slot.task.key)
     if not fault:
         return s
@@ -323,11 +217,6 @@ def _lose(
     if running is not None and charge:
         return _charge(s, out, running, f"it took worker {worker} with it: {reason}")
     return s
-
-
-def _holds(s: SchedulerState, worker: int, key: Hashable) -> bool:
-    waiting = s.tasks.get(key)
-    return waiting is not None and waiting.holder == worker
 
 
 def _requeue(s: SchedulerState, worker: int, key: Hashable) -> None:
@@ -396,7 +285,7 @@ def _assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState
         if not s.queue:
             break
         for worker in [worker for worker, record in s.up.items() if len(record.slots) == load]:
-            index = _next_for(s, worker)
+            index = next_for(s, worker)
             if index is None:
                 continue
             key = s.queue[index]
@@ -404,16 +293,8 @@ def _assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState
             waiting, record = s.tasks[key], s.up[worker]
             s.tasks[key] = waiting._replace(holder=worker)
             retries += waiting.last_holder is not None
-            slot = _Slot(waiting.task, waiting.faults + 1)
+            slot = Slot(waiting.task, waiting.faults + 1)
             record = record._replace(slots=(*record.slots, slot))
-            s.up[worker] = _begin_first_slot(s, record, now) if load == 0 else record
+            s.up[worker] = begin_first_slot(s, record, now) if load == 0 else record
             out.append(Assign(worker, key, slot.attempt))
     return s if retries == s.retries else s._replace(retries=retries)
-
-
-def _next_for(s: SchedulerState, worker: int) -> int | None:
-    """Index of the first queued task that this worker may have."""
-    for index, key in enumerate(s.queue):
-        if s.tasks[key].last_holder != worker or len(s.up) == 1:
-            return index
-    return None

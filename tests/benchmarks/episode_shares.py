@@ -32,7 +32,8 @@ from workers.policy import initial_parameters
 from workers.simd.code import Code, module
 from workers.simd.emit import graph_function
 from workers.simd.kernel import compile_kernel
-from workers.simd.network import plan, policy_function
+from workers.simd.layout import plan
+from workers.simd.network import policy_function
 from workers.simd.noise import fill_function
 from workers.simd.rollout import always_zero
 from workers.simd.target import compile_object, host_target, load_object

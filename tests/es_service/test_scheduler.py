@@ -32,14 +32,8 @@ from es_service.dispatch.messages import (
     WorkerLost,
     WorkerUp,
 )
-from es_service.dispatch.scheduler import (
-    SchedulerState,
-    chunk_s,
-    initial_state,
-    next_deadline,
-    pending,
-    step,
-)
+from es_service.dispatch.scheduler import step
+from es_service.dispatch.scheduler_state import SchedulerState, initial_state, next_deadline, pending, usual_chunk_s
 
 START_FATES = ("start_dies", "start_hangs", "no_place")
 TASK_FATES = ("task_dies", "task_hangs", "task_slow", "task_raises", "contradicts")
@@ -575,12 +569,12 @@ def test_what_compiles_may_take_no_less_time_than_what_does_not():
 def test_deadlines_and_durations_are_in_proportion_to_the_size_of_a_task():
     sized = Submit(tuple(Task(key, "train", size) for key, size in (("a", 1), ("b", 4), ("c", 3), ("d", 1))))
     state, _ = play(ready(1, in_flight=1), (0.0, sized), (5.0, Result(0, "a", 1)), (17.0, Result(0, "b", 1)))
-    assert chunk_s(state, "train") == 3.0
+    assert usual_chunk_s(state, "train") == 3.0
     assert next_deadline(state) == 17.0 + 5.0 * 3 * 3.0
     state, _ = step(state, Result(0, "c", 1), 20.0)
     assert state.durations_s == {"train": (3.0, 1.0)}
     assert next_deadline(state) == 20.0 + 5.0 * 1 * 2.0
-    assert chunk_s(state, "evaluate") is None
+    assert usual_chunk_s(state, "evaluate") is None
 
 
 def test_the_clock_of_a_prefetched_task_starts_when_the_one_ahead_is_done():

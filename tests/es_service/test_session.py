@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 
 from es_service.api import load_config
-from es_service.config.model import ComputeConfig
+from es_service.config.compute import ComputeConfig
 from es_service.dispatch.messages import Result, StopWorker, Submit, Task, Tick, WorkerUp
-from es_service.dispatch.scheduler import initial_state, step
+from es_service.dispatch.scheduler import step
+from es_service.dispatch.scheduler_state import initial_state
 from es_service.session import LIMITS, scheduling_policy
 
 CONFIG = {

@@ -7,6 +7,7 @@
     kernel.py     all of it, with cache.py before; words.py
 
     noise.py      the generator, and weighted sums of it
+    layout.py     where a policy's weights are
     network.py    the policy, whose members' weights are made where they are used
     episodes.py   whole episodes: these, and what the task does between, in one kernel
     rollout.py    what workers call

@@ -24,7 +24,8 @@ from workers.episode import Carry, Episodes, EpisodeSteps, episode_steps
 from workers.simd.code import Code, Values, module
 from workers.simd.emit import graph_function
 from workers.simd.kernel import Kernel, compile_kernel, jaxpr_digest, load_compiled
-from workers.simd.network import Network, plan, policy_function
+from workers.simd.layout import Network, plan
+from workers.simd.network import policy_function
 from workers.simd.noise import definition, fill_function
 from workers.simd.primitives import UnsupportedError
 from workers.simd.target import Target, host_target

@@ -24,7 +24,7 @@ from workers.simd import noise, rollout
 from workers.simd.code import Code, module
 from workers.simd.episodes import compile_episodes
 from workers.simd.kernel import load_compiled
-from workers.simd.network import plan
+from workers.simd.layout import plan
 from workers.simd.noise import UNROLLED, fill_function
 from workers.simd.primitives import UnsupportedError
 from workers.simd.target import NoVectorsError, host_target

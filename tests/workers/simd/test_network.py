@@ -15,7 +15,8 @@ from tests.helpers import random_parameters
 from tests.workers.simd.test_episodes import WIDTHS, targets
 from workers.simd.code import Code, module
 from workers.simd.kernel import load_compiled
-from workers.simd.network import Network, plan, policy_function
+from workers.simd.layout import Network, plan
+from workers.simd.network import policy_function
 from workers.simd.noise import fill_function
 from workers.simd.target import Target
 from workers.simd.words import aligned

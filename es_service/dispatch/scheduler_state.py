@@ -1,0 +1,141 @@
+"""What the scheduler remembers, and what follows from it without an event.
+
+Dispatch station, the data of `scheduler.step`. The records are frozen and shared between states.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import deque
+from collections.abc import Hashable
+from typing import NamedTuple
+
+from es_service.dispatch.messages import Policy, Task
+
+
+class Waiting(NamedTuple):
+    """A task that has not been delivered."""
+
+    task: Task
+    faults: int = 0
+    holder: int | None = None
+    """The worker it is assigned to; None while it is in the queue."""
+    last_holder: int | None = None
+    """The worker it came back from; None before that."""
+
+
+class Slot(NamedTuple):
+    task: Task
+    attempt: int
+
+
+class Worker(NamedTuple):
+    """A worker that came up. `slots` is what it has not answered yet, in the order sent; it runs the first."""
+
+    slots: tuple[Slot, ...] = ()
+    started_s: float = 0.0
+    """When it began the first slot."""
+    deadline_s: float = math.inf
+    """When it must have answered the first slot."""
+    limit: str = ""
+    """Field of the policy that this comes from."""
+    warm: frozenset[str] = frozenset()
+    """Kinds it has finished a task of, hence compiled."""
+    failures_in_a_row: int = 0
+
+
+class SchedulerState(NamedTuple):
+    """Everything the scheduler remembers. Treat the containers as read-only; times are in the seconds of `now`."""
+
+    policy: Policy
+    wanted: int
+    starting: dict[int, float]
+    """Deadline of each worker that has not come up yet."""
+    up: dict[int, Worker]
+    draining: dict[int, Worker]
+    tasks: dict[Hashable, Waiting]
+    queue: deque[Hashable]
+    """Keys to assign, next first."""
+    durations_s: dict[str, tuple[float, ...]]
+    """Recent durations of a chunk per kind, without those that include compiling."""
+    next_worker: int = 0
+    start_at_s: float = -math.inf
+    """No worker is started before this."""
+    losses_in_a_row: int = 0
+    start_failures: int = 0
+    down_since_s: float | None = None
+    """Since when tasks wait and no worker is up."""
+    last_loss: str = "none was ever lost"
+    failed: str | None = None
+    """The message of `Fail`; the state is then terminal."""
+    retries: int = 0
+    """Assignments beyond a task's first."""
+    lost_workers: int = 0
+    """Workers lost, or stopped for a fault."""
+    duplicates: int = 0
+    """Results and failures that were dropped: stale, repeated, or of an unknown worker."""
+
+
+def initial_state(policy: Policy) -> SchedulerState:
+    """No task and no worker yet; the first step, whatever its event, starts the workers."""
+    return SchedulerState(policy, policy.workers, {}, {}, {}, {}, deque(), {})
+
+
+def pending(state: SchedulerState) -> int:
+    """Number of tasks submitted and not delivered."""
+    return len(state.tasks)
+
+
+def usual_chunk_s(state: SchedulerState, kind: str) -> float | None:
+    """How long a chunk of this kind takes in the median; None while that is not known."""
+    durations_s = state.durations_s.get(kind)
+    return statistics.median(durations_s) if durations_s else None
+
+
+def next_deadline(state: SchedulerState) -> float:
+    """When the next `Tick` will do something, in the seconds of `now`; infinity if only a message can."""
+    if state.failed is not None:
+        return math.inf
+    times = [worker.deadline_s for group in (state.up, state.draining) for worker in group.values()]
+    times.extend(state.starting.values())
+    if len(state.starting) + len(state.up) < state.wanted:
+        times.append(state.start_at_s)
+    if state.down_since_s is not None:
+        times.append(state.down_since_s + state.policy.no_worker_timeout_s)
+    return min(times, default=math.inf)
+
+
+def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worker:
+    """The worker with the clock of its first slot started, and how long that may take."""
+    if not worker.slots:
+        return worker._replace(deadline_s=math.inf)
+    task, policy = worker.slots[0].task, state.policy
+    usual_s = usual_chunk_s(state, task.kind)
+    limit, limit_s = "min_deadline_s", max(policy.min_deadline_s, policy.deadline_factor * task.size * (usual_s or 0.0))
+    compiles = usual_s is None or task.kind not in worker.warm
+    if compiles and limit_s < policy.first_deadline_s:
+        limit, limit_s = "first_deadline_s", policy.first_deadline_s
+    return worker._replace(started_s=now, deadline_s=now + limit_s, limit=limit)
+
+
+def find_slot(worker: Worker, key: Hashable, attempt: int) -> int | None:
+    """Index of what a worker has not answered yet; None if it was sent no such thing, or has answered it."""
+    for index, slot in enumerate(worker.slots):
+        if slot.attempt == attempt and slot.task.key == key:
+            return index
+    return None
+
+
+def holds(state: SchedulerState, worker: int, key: Hashable) -> bool:
+    """Whether a task waits for the answer of this worker."""
+    waiting = state.tasks.get(key)
+    return waiting is not None and waiting.holder == worker
+
+
+def next_for(state: SchedulerState, worker: int) -> int | None:
+    """Index of the first queued task that a worker may have."""
+    for index, key in enumerate(state.queue):
+        if state.tasks[key].last_holder != worker or len(state.up) == 1:
+            return index
+    return None
