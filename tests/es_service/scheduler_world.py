@@ -1,0 +1,391 @@
+"""A world that breaks in every way we know, for the scheduler to live in."""
+
+from __future__ import annotations
+
+import copy
+import heapq
+import itertools
+import math
+from collections import Counter, deque
+from random import Random
+
+from es_service.dispatch.messages import (
+    Assign,
+    Deliver,
+    Drain,
+    Event,
+    Fail,
+    Failure,
+    Policy,
+    Result,
+    SetWorkers,
+    StartWorker,
+    StopWorker,
+    Submit,
+    Task,
+    Tick,
+    WorkerLost,
+    WorkerUp,
+)
+from es_service.dispatch.scheduler import step
+from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending
+
+START_FATES = ("start_dies", "start_hangs", "no_place")
+TASK_FATES = ("task_dies", "task_hangs", "task_slow", "task_raises", "contradicts")
+FAULTS = (
+    *START_FATES,
+    *TASK_FATES,
+    "dies_idle",
+    "duplicates",
+    "reports_stopped",
+    "speaks_after_stop",
+    "drain",
+    "resize",
+)
+
+
+class World:
+    """Workers as an engine would see them, faults drawn from one seed, and its own books to check the scheduler by."""
+
+    def __init__(self, seed: int) -> None:
+        r = self.random = Random(seed)
+        self.policy = Policy(
+            workers=r.randint(1, 4),
+            in_flight=r.randint(1, 2),
+            max_attempts=r.randint(2, 5),
+            start_deadline_s=3.0,
+            first_deadline_s=8.0,
+            min_deadline_s=2.0,
+            deadline_factor=4.0,
+            max_failures_in_a_row=r.randint(1, 3),
+            restart_backoff_s=0.5,
+            max_backoff_s=r.choice((4.0, 20.0)),
+            max_start_failures=r.randint(2, 5),
+            no_worker_timeout_s=r.choice((4.0, 12.0)),
+        )
+        harshness = r.choice((0.0, 0.05, 0.2, 0.5))
+        self.faultless = harshness == 0.0
+        self.rate = {fault: harshness * r.random() ** 2 for fault in FAULTS}
+        if harshness and r.random() < 0.1:
+            self.rate[r.choice(("start_dies", "start_hangs", "task_raises", "task_dies"))] = 1.0
+        self.poison_rate = harshness * r.choice((0.0, 0.0, 0.1))
+        self.check_purity = seed % 31 == 0
+        self.state, self.now = initial_state(self.policy), 0.0
+        self.heap: list[tuple[float, int, object, tuple]] = []
+        self.serial = itertools.count()
+        self.seen: Counter[str] = Counter()
+        # What the processes do.
+        self.alive: set[int] = set()
+        self.inbox: dict[int, deque[tuple[tuple, int]]] = {}
+        self.busy: set[int] = set()
+        self.unplaced: set[int] = set()
+        self.last_word: dict[int, float] = {}
+        self.poison: dict[tuple, str] = {}
+        # What a correct scheduler must know.
+        self.wanted = self.policy.workers
+        self.known: set[int] = set()
+        self.up: set[int] = set()
+        self.draining: set[int] = set()
+        self.open: dict[int, list[tuple[tuple, int]]] = {}
+        self.fresh: deque[tuple] = deque()
+        self.waiting: set[tuple] = set()
+        self.delivered: set[tuple] = set()
+        self.faults: Counter[tuple] = Counter()
+        self.last_holder: dict[tuple, int] = {}
+        self.assigned = self.lost = self.dropped = self.start_failures = self.newest = 0
+        self.down_since: float | None = None
+        self.failed: str | None = None
+
+    # The processes.
+
+    def at(self, delay: float, function: object, *args: object) -> None:
+        heapq.heappush(self.heap, (self.now + delay, next(self.serial), function, args))
+
+    def happens(self, fault: str) -> bool:
+        return self.random.random() < self.rate[fault]
+
+    def say(self, worker: int, event: Event) -> None:
+        """A message that arrives late, in order per worker only."""
+        arrival = max(self.now, self.last_word.get(worker, 0.0)) + self.random.expovariate(20.0)
+        self.last_word[worker] = arrival
+        self.at(arrival - self.now, self.feed, event)
+
+    def start_process(self, worker: int) -> None:
+        self.alive.add(worker)
+        self.inbox[worker], self.open[worker] = deque(), []
+        if self.happens("start_dies"):
+            self.at(self.random.random(), self.die, worker)
+        elif self.happens("no_place"):
+            self.unplaced.add(worker)
+        elif not self.happens("start_hangs"):
+            self.at(self.random.random(), self.come_up, worker)
+
+    def come_up(self, worker: int) -> None:
+        if worker in self.alive or self.happens("speaks_after_stop"):
+            self.say(worker, WorkerUp(worker))
+            if self.happens("dies_idle"):
+                self.at(self.random.expovariate(0.5), self.die, worker)
+
+    def die(self, worker: int) -> None:
+        if worker in self.alive:
+            self.alive.discard(worker)
+            self.say(worker, WorkerLost(worker, "killed"))
+
+    def begin(self, worker: int) -> None:
+        if worker not in self.alive or worker in self.busy or not self.inbox[worker]:
+            return
+        self.busy.add(worker)
+        key, attempt = self.inbox[worker].popleft()
+        fate = self.poison.get(key) or next((fate for fate in TASK_FATES if self.happens(fate)), "ok")
+        if fate != "task_hangs":
+            self.at(self.random.random() + 10.0 * (fate == "task_slow"), self.end, worker, key, attempt, fate)
+
+    def end(self, worker: int, key: tuple, attempt: int, fate: str) -> None:
+        if worker not in self.alive and not self.happens("speaks_after_stop"):
+            return
+        if fate == "task_dies":
+            self.die(worker)
+            return
+        if fate in ("task_raises", "contradicts"):
+            self.say(worker, Failure(worker, key, attempt, "ValueError: no"))
+        if fate != "task_raises":
+            self.say(worker, Result(worker, key, attempt))
+        if self.happens("duplicates"):
+            self.say(worker, Result(worker, key, attempt) if fate == "ok" else Failure(worker, key, attempt, "again"))
+        self.busy.discard(worker)
+        self.begin(worker)
+
+    # The books.
+
+    def forget(self, worker: int, *, fault: bool, charge: bool) -> None:
+        """The scheduler has stopped the worker or learned that it is gone."""
+        self.known.discard(worker)
+        if fault:
+            self.lost += 1
+            if worker not in self.up:
+                self.start_failures = 0 if self.up else self.start_failures + 1
+            running = self.open[worker][0][0] if self.open[worker] else None
+            if charge and running in self.waiting:
+                self.faults[running] += 1
+        self.up.discard(worker)
+        self.draining.discard(worker)
+        self.open[worker] = []
+
+    def note(self, event: Event) -> None:
+        """What the event means, before the scheduler is asked."""
+        match event:
+            case Submit(tasks):
+                self.fresh.extend(task.key for task in tasks)
+                self.waiting.update(task.key for task in tasks)
+            case WorkerUp(worker) if worker in self.known and worker not in self.up:
+                self.up.add(worker)
+                self.start_failures = 0
+            case WorkerLost(worker) if worker in self.known:
+                expected = worker in self.draining
+                self.seen["lost while draining"] += expected
+                self.forget(worker, fault=not expected, charge=not expected)
+            case Result(worker, key, attempt):
+                if worker in self.known and (key, attempt) in self.open[worker]:
+                    self.open[worker].remove((key, attempt))
+                elif worker in self.known and key in self.waiting:
+                    self.seen["superseded result"] += 1
+            case Failure(worker, key, attempt):
+                valid = worker in self.known and (key, attempt) in self.open[worker]
+                if valid:
+                    self.open[worker].remove((key, attempt))
+                if valid and key in self.waiting:
+                    self.faults[key] += 1
+                else:
+                    self.dropped += 1
+            case Drain(worker) if worker in self.known:
+                self.draining.add(worker)
+            case SetWorkers(wanted):
+                self.wanted = wanted
+                self.draining.update(sorted(self.known - self.draining)[wanted:])
+
+    def feed(self, event: Event) -> None:
+        before = self.state
+        speaker_known = isinstance(event, Result) and event.worker in self.known
+        if self.failed is None:
+            self.note(event)
+        copied = copy.deepcopy(before) if self.check_purity else None
+        self.state, commands = step(before, event, self.now)
+        if copied is not None:
+            assert step(before, event, self.now) == (self.state, commands)
+            assert before == copied
+        if self.failed is not None:
+            assert self.state is before
+            assert commands == []
+            return
+        accepted = 0
+        for command in commands:
+            assert self.failed is None or isinstance(command, StopWorker)
+            match command:
+                case StartWorker(worker):
+                    assert worker >= self.newest
+                    self.newest = worker + 1
+                    self.known.add(worker)
+                    self.start_process(worker)
+                case StopWorker(worker, reason):
+                    self.stop(worker, reason, event)
+                case Assign(worker, key, attempt):
+                    self.check_assign(worker, key, attempt)
+                case Deliver(key):
+                    assert isinstance(event, Result)
+                    assert event.key == key
+                    assert speaker_known
+                    assert key in self.waiting
+                    self.waiting.remove(key)
+                    self.delivered.add(key)
+                    accepted += 1
+                case Fail(message):
+                    self.failed = message
+                    self.check_fail(message)
+        if isinstance(event, Result) and not accepted:
+            assert not (speaker_known and event.key in self.waiting)
+            self.dropped += 1
+        self.check_books()
+        if isinstance(event, Tick):
+            assert next_deadline(self.state) > self.now
+
+    def stop(self, worker: int, reason: str, event: Event) -> None:
+        assert worker in self.known, "stopped twice, or never started"
+        if self.failed is None and reason == "drained":
+            assert worker in self.draining
+            assert not self.open[worker]
+            self.forget(worker, fault=False, charge=False)
+        elif self.failed is None:
+            assert isinstance(event, Tick | Failure)
+            has_no_place = isinstance(event, Tick) and worker in event.silent
+            self.seen["no place" if has_no_place else "quarantine" if isinstance(event, Failure) else "deadline"] += 1
+            self.forget(worker, fault=not has_no_place, charge=isinstance(event, Tick))
+        self.known.discard(worker)
+        self.up.discard(worker)
+        self.alive.discard(worker)
+        if self.happens("reports_stopped"):
+            self.say(worker, WorkerLost(worker, "stopped"))
+
+    def check_assign(self, worker: int, key: tuple, attempt: int) -> None:
+        assert worker in self.up - self.draining
+        assert key in self.waiting
+        assert all(key != held for slots in self.open.values() for held, _ in slots)
+        assert attempt == self.faults[key] + 1 <= self.policy.max_attempts
+        if key not in self.last_holder:
+            assert key == self.fresh.popleft(), "out of submission order"
+        assert self.last_holder.get(key) != worker or len(self.up - self.draining) == 1
+        self.last_holder[key] = worker
+        self.assigned += 1
+        self.open[worker].append((key, attempt))
+        assert len(self.open[worker]) <= self.policy.in_flight
+        self.inbox[worker].append((key, attempt))
+        self.at(0.0, self.begin, worker)
+
+    def check_fail(self, message: str) -> None:
+        worn_out = [key for key in self.waiting if self.faults[key] >= self.policy.max_attempts]
+        if message.startswith("task"):
+            self.seen["poison"] += 1
+            assert any(str(key) in message for key in worn_out)
+        elif "workers in a row" in message:
+            self.seen["start failures"] += 1
+            assert self.start_failures >= self.policy.max_start_failures
+            assert not self.up
+        else:
+            self.seen["no worker"] += 1
+            assert self.waiting
+            assert not self.up
+            assert self.down_since is not None
+            assert self.now - self.down_since >= self.policy.no_worker_timeout_s - 1e-9
+
+    def check_books(self) -> None:
+        state = self.state
+        assert (state.lost_workers, state.duplicates) == (self.lost, self.dropped)
+        assert state.retries == self.assigned - len(self.last_holder)
+        assert pending(state) == len(self.waiting)
+        if self.failed is not None:
+            assert state.failed == self.failed
+            assert not self.known, "a worker was left running"
+            return
+        assert all(self.faults[key] < self.policy.max_attempts for key in self.waiting), "poison went unnoticed"
+        if not self.waiting or self.up:
+            self.down_since = None
+        elif self.down_since is None:
+            self.down_since = self.now
+        usable = self.up - self.draining
+        queued = self.waiting - {key for slots in self.open.values() for key, _ in slots}
+        for worker in usable if queued else ():
+            if len(self.open[worker]) < self.policy.in_flight:
+                assert len(usable) > 1
+                assert {self.last_holder.get(key) for key in queued} == {worker}, "work waits beside a free worker"
+
+    # The run.
+
+    def tick(self) -> None:
+        self.feed(Tick(tuple(sorted(self.unplaced))))
+
+    def submit(self, generation: int) -> None:
+        tasks = tuple(
+            Task((kind, generation, index), kind)
+            for kind in ("TrainingChunk", "EvaluationChunk")
+            for index in range(self.random.randint(0, 7))
+        )
+        for task in tasks:
+            if self.random.random() < self.poison_rate:
+                self.poison[task.key] = self.random.choice(("task_raises", "task_dies", "task_hangs"))
+        self.feed(Submit(tasks))
+
+    def operate(self) -> None:
+        """An operator, or a cloud, at work."""
+        if self.happens("drain") and self.newest:
+            worker = self.random.randrange(self.newest)
+            self.feed(Drain(worker))
+            if self.random.random() < 0.5:
+                self.at(self.random.random(), self.die, worker)
+        if self.happens("resize"):
+            self.feed(SetWorkers(self.random.randint(1, 5)))
+        if self.random.random() < 0.3:
+            self.tick()
+
+    def run_until_quiet(self) -> None:
+        for _ in range(20_000):
+            due = next_deadline(self.state)
+            if self.heap and self.heap[0][0] <= due:
+                self.now, _, function, args = heapq.heappop(self.heap)
+                function(*args)  # type: ignore[operator]
+            elif due < math.inf:
+                self.now = max(self.now, due)
+                before = self.state
+                self.tick()
+                assert self.state is not before, "next_deadline announced nothing"
+            else:
+                return
+        raise AssertionError("does not come to rest")
+
+
+def simulate(seed: int) -> World:
+    world = World(seed)
+    world.tick()
+    for generation in range(3):
+        world.submit(generation)
+        for _ in range(8):
+            world.at(world.random.random() * 4.0, world.operate)
+        if world.random.random() < 0.2:
+            continue  # the next generation is submitted on top
+        world.run_until_quiet()
+        assert world.failed is not None or not world.waiting, "deadlock"
+    # The storm is over: one more generation must go through without a scratch, on as many workers as are wanted.
+    world.rate, world.poison_rate = dict.fromkeys(FAULTS, 0.0), 0.0
+    world.run_until_quiet()
+    if world.failed is not None:
+        return world
+    scratches = world.lost, world.dropped, world.state.retries
+    world.submit(3)
+    world.run_until_quiet()
+    assert world.failed is None
+    assert not world.waiting
+    assert (world.lost, world.dropped, world.state.retries) == scratches
+    assert world.alive == world.known == world.up == set(world.state.up)
+    assert len(world.alive) == world.wanted
+    assert not world.draining
+    if world.faultless:
+        assert scratches == (0, 0, 0)
+    return world
