@@ -14,10 +14,11 @@ from es_service.config.yaml_text import show
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
+MEASUREMENTS = (ROOT / "tests" / "benchmarks" / "README.md").read_text()
 
 
 def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+    return re.findall(rf"^```{language}\n(.*?)^```", README + MEASUREMENTS, re.MULTILINE | re.DOTALL)
 
 
 def between(name: str) -> str:
@@ -69,5 +70,6 @@ def test_preset_table_is_the_code_s():
 
 
 def test_files_it_names_exist():
-    for path in re.findall(r"\]\(([^)#]+)\)", README):
-        assert (ROOT / path).exists(), path
+    for text, place in ((README, ROOT), (MEASUREMENTS, ROOT / "tests" / "benchmarks")):
+        for path in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
+            assert (place / path).exists(), path
