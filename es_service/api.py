@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -63,7 +64,7 @@ def run(
     """Start a run and work until its budget is spent.
 
     Args:
-        out: folder of the run, new or empty; default runs/<environment>_<algorithm>_seed<seed>_<time>.
+        out: folder of the run, new or empty; default runs/<environment>_<algorithm>_seed<seed>_<time>-<process>.
         hook: called at the store's named points; for tests that kill the process there.
 
     Raises:
@@ -138,7 +139,14 @@ def _go_on(
         config = make_config(store)
         if changes := changed_constants(store.meta.constants, config.constants()):
             raise ConfigError(f"{folder}: {describe_changes(changes, str(folder))}")
-        if store.meta.columns != history_columns(task_of(config), config.map.enabled):
+        task, sizes = task_of(config), ("observation_size", "action_size")
+        if changed := [name for name in sizes if store.meta.task[name] != getattr(task, name)]:
+            told = ", ".join(f"{name}: {store.meta.task[name]} -> {getattr(task, name)}" for name in changed)
+            raise ConfigError(
+                f"{folder}: the task {config.task.environment} is not what it was ({told}), so the run's policies "
+                "do not fit it; undo that, or start a new run"
+            )
+        if store.meta.columns != history_columns(task, config.map.enabled):
             raise StoreError(
                 f"{folder} was written by a version of es-service with other history columns; continue it with that "
                 f"version, or go on from its state in a new run: {command('fork', folder)}"
@@ -177,11 +185,12 @@ def fork(
 
 
 def default_folder(config: RunConfig) -> Path:
-    """A new folder name under `runs/` that says what the run is and when it began."""
+    """A new folder name under `runs/` that says what the run is and when it began; runs begun together have their
+    process's number besides, so that none is refused the other's folder."""
     when = datetime.now().strftime("%Y%m%d-%H%M%S")
-    name = f"{config.task.environment}_{config.search.algorithm}_seed{config.seed}_{when}"
-    taken = len(list(RUNS_FOLDER.glob(f"{name}*")))
-    return RUNS_FOLDER / (f"{name}-{taken + 1}" if taken else name)
+    name = f"{config.task.environment}_{config.search.algorithm}_seed{config.seed}_{when}-{os.getpid()}"
+    names = (name if number == 1 else f"{name}-{number}" for number in count(1))
+    return next(RUNS_FOLDER / name for name in names if not (RUNS_FOLDER / name).exists())
 
 
 def _create_and_work(

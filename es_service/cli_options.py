@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from es_service.config.compute import ENGINE_IMPLIES
+
 console = Console()
 errors = Console(stderr=True)
 
@@ -38,11 +40,10 @@ def overrides(
 
     So what a file, or a run's record, says of a cluster is moot, and a `--set` that contradicts the options is refused.
     """
-    implied: list[str] = []
-    if address is not None and engine is None:  # a cluster to join is a Ray cluster
-        implied = ["compute.engine=ray"]
-    elif engine == "inline" and address is None:
-        implied = ["compute.address=null", "compute.worker_resources.cpu=1", "compute.worker_resources.gpu=0"]
+    if address is not None:  # a cluster to join is a Ray cluster
+        implied = [*ENGINE_IMPLIES["ray"], *([] if engine else ["compute.engine=ray"])]
+    else:
+        implied = list(ENGINE_IMPLIES.get(engine or "", ()))
     named = {"seed": seed, "compute.workers": workers, "compute.engine": engine, "compute.address": address}
     return [*implied, *(set_ or []), *(f"{key}={value}" for key, value in named.items() if value is not None)]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sqlite3
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,14 @@ from es_service.errors import StoreError
 from es_service.maps.behaviour_map import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.store.codec import decode_part, row_bytes
 from es_service.store.folder import DATABASE
-from es_service.store.reader import platforms, reading, state_payload
+from es_service.store.reader import kept_states, platforms, reading, state_payload
 from es_service.store.schema import RunMeta, history_select
 from es_service.store.verify import verify
 
 Connection = sqlite3.Connection
+
+NEWEST = 2**62
+"""Stands for the newest generation."""
 
 
 def digest(folder: Path) -> str:
@@ -41,13 +44,19 @@ def digest_of(parts: Mapping[str, str]) -> str:
 
 
 def digest_parts(folder: Path) -> dict[str, str]:
-    """SHA-256 by name: `state/<part>` of each part's newest value, `map` of all its cells and elites together, then one
-    for each of `TABLES`.
+    """SHA-256 by name: `state/<part>` of each part's newest value, `map` of all its cells and elites, `history`.
 
     Raises StoreError if the run cannot be read.
     """
     with reading(folder) as (connection, meta):
         return _parts(folder, connection, meta)
+
+
+def digest_at(folder: Path, generation: int) -> str | None:
+    """The digest that the run had after one of its last two generations; None if that state is no longer kept."""
+    with reading(folder) as (connection, meta):
+        kept = kept_states(connection)
+        return digest_of(_parts(folder, connection, meta, generation)) if generation in kept else None
 
 
 def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
@@ -76,16 +85,16 @@ def _is_mixed(connection: Connection) -> bool:
     return len({json.dumps(platform, sort_keys=True) for platform in in_force}) > 1
 
 
-def _parts(folder: Path, connection: Connection, meta: RunMeta) -> dict[str, str]:
+def _parts(folder: Path, connection: Connection, meta: RunMeta, until: int = NEWEST) -> dict[str, str]:
     try:
-        tables = {name: table(connection, meta) for name, table in TABLES.items()}
-        return {**_state(connection), **tables}
+        return {**_state(connection, until), "history": _history(connection, meta, until)}
     except ValueError as error:
         raise StoreError(f"{folder} holds what cannot be read: {error}; resume it to repair what can be") from error
 
 
-def _state(connection: Connection) -> dict[str, str]:
-    newest = connection.execute("SELECT part, max(generation) FROM state GROUP BY part ORDER BY part").fetchall()
+def _state(connection: Connection, until: int) -> dict[str, str]:
+    query = "SELECT part, max(generation) FROM state WHERE generation <= ? GROUP BY part ORDER BY part"
+    newest = connection.execute(query, (until,)).fetchall()
     parts = {part: arrays_sha256(decode_part(state_payload(connection, part, at))) for part, at in newest}
     of_map = [part for part in parts if part.startswith((GEOMETRY_PART, CELL_PREFIX, ELITE_PREFIX))]
     together = {"map": hashlib.sha256("".join(f"{part}\0{parts.pop(part)}\n" for part in of_map).encode()).hexdigest()}
@@ -102,15 +111,10 @@ def arrays_sha256(arrays: dict[str, NDArray[Any]]) -> str:
     return total.hexdigest()
 
 
-def _history(connection: Connection, meta: RunMeta) -> str:
+def _history(connection: Connection, meta: RunMeta, until: int) -> str:
     columns = sorted((column for column in meta.columns if column.deterministic), key=lambda column: column.name)
     total = hashlib.sha256(json.dumps([[column.name, column.type] for column in columns]).encode() + b"\n")
-    for values in connection.execute(history_select(columns) + " ORDER BY history.generation"):
+    query = history_select(columns) + " WHERE history.generation <= ? ORDER BY history.generation"
+    for values in connection.execute(query, (until,)):
         total.update(row_bytes(values[:-2]))
     return total.hexdigest()
-
-
-TABLES: dict[str, Callable[[Connection, RunMeta], str]] = {
-    "history": _history,
-}
-"""What is hashed beside the state, by name. A later table is one more line."""

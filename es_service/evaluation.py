@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from es_service.algorithms import ALGORITHMS
 from es_service.commands import command
+from es_service.config.compute import ENGINE_IMPLIES
 from es_service.config.loading import changed_config
 from es_service.config.model import worker_spec
 from es_service.dispatch.inline_engine import inline_engine
@@ -113,9 +114,7 @@ def evaluate(run: Run, chosen: Sequence[Candidate], episodes: int, workers: int 
 
     Raises EvaluationError where rollouts cannot go on; Interrupted when asked to stop.
     """
-    overrides = ["compute.engine=inline", "compute.address=null"]
-    overrides += ["compute.worker_resources.cpu=1", "compute.worker_resources.gpu=0"]
-    overrides += [f"compute.workers={workers or 'auto'}"]
+    overrides = ["compute.engine=inline", *ENGINE_IMPLIES["inline"], f"compute.workers={workers or 'auto'}"]
     config = changed_config(run.present_config, overrides, tasks=TASKS, algorithms=ALGORITHMS)
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     with (

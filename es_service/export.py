@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from es_service.commands import command
-from es_service.config.resolution import did_you_mean, one_of
+from es_service.config.yaml_text import did_you_mean, one_of
 from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.maps.behaviour_map import BehaviourMap, Elite
 from es_service.maps.geometry import Grid

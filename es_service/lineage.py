@@ -14,10 +14,11 @@ from es_service.config.changes import START_KEYS, STATE_KEYS, changed_constants,
 from es_service.config.keys import parse_overrides
 from es_service.config.model import RunConfig, policy_shape
 from es_service.config.yaml_text import show
+from es_service.digest import digest_at
 from es_service.errors import ConfigError
 from es_service.maps.behaviour_map import ELITE_PREFIX
 from es_service.protocol import Moments
-from es_service.run_state import moments_from_arrays, moments_to_arrays, without_fitness
+from es_service.run_state import moments_from_arrays, moments_to_arrays, without_fitness, without_scores
 from es_service.run_view import Run, open_run
 from es_service.session import TASKS, task_of
 from es_service.store import reader
@@ -53,6 +54,8 @@ def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -
         unfit = [
             f"  the descriptor of {config.task.environment}: {show(origin.descriptor_names)} -> {show(list(names))}"
         ]
+    if not unfit and origin.policy_shape != (shape := policy_shape(config, task_of(config))):
+        unfit = [f"  the network's layers: {show(list(origin.policy_shape.widths))} -> {show(list(shape.widths))}"]
     if unfit:
         listed = "\n".join(unfit)
         raise ConfigError(
@@ -71,6 +74,8 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
     changed = {name for name, _, _ in changed_constants(origin.constants, config.constants())}
     if any(name in OBSERVED or name.startswith("task.") for name in changed - {"task.episodes_per_member"}):
         parts = without_fitness(parts)
+    elif "task.episodes_per_member" in changed:
+        parts = without_scores(parts)
     history = [row for row in origin.history_rows() if row["generation"] <= at]
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
     return _lineage(origin, at), Beginning(history, parts, platforms)
@@ -100,9 +105,10 @@ def started(config: RunConfig, folder: str) -> tuple[dict[str, Any], Beginning]:
 
 
 def _lineage(origin: Run, generation: int) -> dict[str, Any]:
+    """Which run, and which state of it; no digest of a state that a driver at work has meanwhile replaced."""
     return {
         "run_id": origin.run_id,
         "folder": str(origin.folder.absolute()),
         "generation": generation,
-        "digest": origin.digest(),
+        "digest": digest_at(origin.folder, generation),
     }

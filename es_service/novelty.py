@@ -79,6 +79,20 @@ def extended(archive: NoveltyArchive, descriptor_B: ArrayLike, generation: int, 
     return _with_tree(room, archive.tree)
 
 
+def extends(archive: NoveltyArchive, earlier: NoveltyArchive) -> bool:
+    """Whether an archive begins with all entries of an earlier one."""
+    if archive.room is not None and archive.room is earlier.room and _address(archive) == _address(earlier):
+        return archive.size >= earlier.size
+    return all(
+        np.array_equal(of_archive[: earlier.size], of_earlier)
+        for of_archive, of_earlier in (
+            (archive.descriptor_N_B, earlier.descriptor_N_B),
+            (archive.generation_N, earlier.generation_N),
+            (archive.member_N, earlier.member_N),
+        )
+    )
+
+
 def novelty(
     archive: NoveltyArchive,
     descriptor_Q_B: ArrayLike,
@@ -138,6 +152,10 @@ def archive_from_parts(parts: Mapping[str, Mapping[str, np.ndarray]], dimensions
         np.concatenate([block[name] for block in blocks]) for name in ("descriptor_N_B", "generation_N", "member_N")
     )
     return _with_tree(_Room(descriptor_N_B, generation_N, member_N, generation_N.size), None)
+
+
+def _address(archive: NoveltyArchive) -> int:
+    return archive.descriptor_N_B.__array_interface__["data"][0]
 
 
 def _copied(archive: NoveltyArchive) -> _Room:

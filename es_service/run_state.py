@@ -18,6 +18,7 @@ from es_service.algorithms.base import (
     weight_from_arrays,
     weight_to_arrays,
 )
+from es_service.errors import StoreError
 from es_service.maps.behaviour_map import (
     CELL_PREFIX,
     ELITE_PREFIX,
@@ -27,7 +28,7 @@ from es_service.maps.behaviour_map import (
     map_from_parts,
     map_to_parts,
 )
-from es_service.novelty import archive_from_parts, archive_to_parts
+from es_service.novelty import archive_from_parts, archive_to_parts, extends
 from es_service.protocol import FloatArray, Moments
 from es_service.statistics import normalisation
 
@@ -63,7 +64,16 @@ class RunState:
 
 
 def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
-    """The parts of `state` that differ from `before` (all of them for None), as the store keeps them."""
+    """The parts of `state` that differ from `before` (all of them for None), as the store keeps them.
+
+    Raises:
+        StoreError: the search's state is none that can follow `before`; see `SearchState`.
+    """
+    if before is not None and (wrong := _not_followed(before.search, state.search)):
+        raise StoreError(
+            f"generation {state.generation} cannot be kept: {wrong}; es_service/algorithms/base.py says of SearchState "
+            f"what a search may change. Everything up to generation {before.generation} is saved."
+        )
     parts = {
         "observations": moments_to_arrays(state.observations),
         "counters": {
@@ -85,6 +95,21 @@ def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
     if before is None or state.best is not before.best:
         parts["best"] = _best_to_arrays(state.best)
     return parts
+
+
+def _not_followed(before: SearchState, after: SearchState) -> str:
+    """What is wrong with a state after another; empty if nothing is. Searches of ours are right by construction."""
+    if len(after.members) != len(before.members):
+        return f"the search has {len(after.members)} members, and had {len(before.members)}"
+    if not extends(after.archive, before.archive):
+        return "the novelty archive has lost or changed entries"
+    if (after.map is None) != (before.map is None):
+        return "the map came or went"
+    if after.map is None or before.map is None or after.map is before.map:
+        return ""
+    if not np.array_equal(after.map.cell_N[: before.map.size], before.map.cell_N):
+        return "the map has lost cells, or has them in another order"
+    return ""
 
 
 def state_from_parts(
@@ -124,6 +149,13 @@ def without_fitness(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, 
     kept["best"]["fitness"] = np.asarray(-np.inf)
     kept["weight"] = weight_to_arrays(FitnessWeight(weight_from_arrays(parts["weight"]).value))
     return kept
+
+
+def without_scores(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, Arrays]:
+    """The parts of a state in which no elite has a score: the luckiest of a population whose fitness meant another
+    number of episodes is none to compare with."""
+    nothing = {"score": np.asarray(np.nan)}
+    return {name: {**part, **nothing} if name.startswith(CELL_PREFIX) else dict(part) for name, part in parts.items()}
 
 
 def statistics_in_force(observations: Moments, member: Member | None, enabled: bool) -> tuple[FloatArray, FloatArray]:

@@ -47,7 +47,13 @@ class FitnessWeight:
 
 @dataclass(frozen=True)
 class SearchState:
-    """All that a search remembers between generations."""
+    """All that a search remembers between generations.
+
+    The store writes what a generation has changed, so a search of one's own may replace members (never add or drop
+    one), extend the archive (`novelty.extended`; never take entries out: compare with the newest, if those alone are to
+    count) and insert into the map (`behaviour_map.insert`; never empty a cell). Anything else ends the run with a
+    StoreError.
+    """
 
     members: tuple[Member, ...]
     archive: NoveltyArchive

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from es_service.commands import command
-from es_service.config.map_rules import OPTIONS
+from es_service.config.fields import OPTIONS
 from es_service.config.yaml_text import show
 
 STATE_KEYS = (
@@ -34,6 +34,7 @@ _FOLLOWERS = {
     "policy.observation_normalization": ("policy.observation_clip",),
     "search.algorithm": ("search.members",),
     "search.pairs": _SHAPES,
+    "compute.chunk_pairs": _SHAPES[1:],
 }
 """Key -> how the names of those begin whose values follow from it, unless they are written as well."""
 ABSENT = "(absent)"

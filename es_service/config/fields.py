@@ -8,6 +8,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from es_service.protocol import Bounds
 
+OPTIONS = "task.options."
+RESOURCES = "compute.worker_resources."
+"""How the keys of the two groups inside a section begin."""
+
 
 def _tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value

@@ -9,9 +9,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from es_service.config.compute import WorkerResources
-from es_service.config.map_rules import OPTIONS
+from es_service.config.fields import OPTIONS, RESOURCES
 from es_service.config.model import RunConfig
-from es_service.config.resolution import RESOURCES
 from es_service.config.yaml_text import parse_value, show
 
 SECTIONS = {
@@ -74,14 +73,23 @@ def parse_overrides(overrides: Iterable[str]) -> tuple[dict[str, Any], list[str]
         elif name in GROUPS:
             keys = [key for key in FIELDS if key.startswith(f"{name}.")] or [f"{OPTIONS}start"]
             problems.append(f"{where}: {name} is a section; set its keys one by one, such as {keys[0]}=...")
-        elif name in FIELDS or (name.startswith(OPTIONS) and name != OPTIONS):
+        elif name in FIELDS or _is_option(name):
             try:
-                values[name] = parse_value(text)
+                value = parse_value(text)
             except ValueError as error:
                 problems.append(f"{where}: {error}")
+                continue
+            is_word = _is_option(name) and isinstance(value, bool | int | float)  # such as off, or 10
+            values[name] = text if is_word else value
         else:
             problems.append(f"{where}: {_unknown_key(name)}")
     return values, problems
+
+
+def _is_option(name: str) -> bool:
+    """Whether a key is that of a task's option, whatever the task."""
+    option = name.removeprefix(OPTIONS)
+    return option not in ("", name) and "." not in option
 
 
 def _unknown_key(name: str) -> str:

@@ -21,18 +21,16 @@ from es_service.config.model import RunConfig
 from es_service.config.presets import PRESETS, preset_values
 from es_service.config.resolution import (
     LEFT_OPEN,
-    did_you_mean,
     engine_problems,
     folder_problems,
     member_problems,
-    one_of,
     policy_problems,
     resolve,
     rollout_problems,
     shape_problems,
     task_problems,
 )
-from es_service.config.yaml_text import config_error, parse_value, read_yaml_file, show
+from es_service.config.yaml_text import config_error, did_you_mean, one_of, parse_value, read_yaml_file, show
 from es_service.errors import ConfigError
 from es_service.protocol import TaskSpec
 
@@ -181,7 +179,7 @@ def _value_problems(values: Mapping[str, Any]) -> dict[str, str]:
 def _bad_value(name: str, value: object) -> str:
     """Name, value, what is allowed, and how to write what was probably meant."""
     if name not in FIELDS:
-        return f"{name}: {show(value)} is not allowed; must be text"
+        return f"{name}: {show(value)} is not allowed; must be text, so write it in quotes"
     field = FIELDS[name]
     allowed = _allowed(field.annotation, field.metadata)
     if name in LEFT_OPEN:

@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from es_service.config.fields import OPTIONS
 from es_service.config.yaml_text import show
 from es_service.protocol import TaskSpec, with_options
 
-OPTIONS = "task.options."
 MOST_AUTO_CELLS = 10_000
 MOST_CELLS = 10_000_000
 CVT_CELLS = 1024

@@ -11,12 +11,12 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Collection, Mapping
-from difflib import get_close_matches
 from typing import Any
 
-from es_service.config.map_rules import OPTIONS, default_cells, default_kind, default_qd_offset, options_of
+from es_service.config.fields import OPTIONS, RESOURCES
+from es_service.config.map_rules import default_cells, default_kind, default_qd_offset, options_of
 from es_service.config.model import PolicyConfig, RunConfig
-from es_service.config.yaml_text import show
+from es_service.config.yaml_text import did_you_mean, one_of, show
 from es_service.protocol import PolicyShape, TaskSpec, with_options
 
 LEFT_OPEN: dict[str, str | None] = {
@@ -32,7 +32,6 @@ LEFT_OPEN: dict[str, str | None] = {
     "compute.gradient_block_pairs": "auto",
 }
 """Keys that this module resolves -> the value that asks for it, in a file the same as leaving the key out."""
-RESOURCES = "compute.worker_resources."
 SINGLE_MEMBER = ("es", "me_es")
 """Algorithms without a meta-population."""
 MEMBERS = 5
@@ -283,15 +282,3 @@ def config_warnings(config: RunConfig, task: TaskSpec) -> list[str]:
             "consider budget.generations as well"
         )
     return warnings
-
-
-def did_you_mean(name: object, candidates: Collection[str]) -> str:
-    """A hint to append to a message: "; did you mean X?", or nothing where no candidate is near."""
-    near = get_close_matches(str(name), candidates, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
-
-
-def one_of(names: Collection[str]) -> str:
-    """Names in a sentence: "a", "a or b", "a, b or c"."""
-    *first, last = map(str, names)
-    return f"{', '.join(first)} or {last}" if first else last

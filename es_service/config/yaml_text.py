@@ -8,7 +8,8 @@ types of the config then reject) and a repeated key is a problem that names both
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from difflib import get_close_matches
 from pathlib import Path
 
 import yaml
@@ -112,6 +113,18 @@ def show(value: object) -> str:
         text = repr(value)
     text = " ".join(text.removesuffix("...\n").split())
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def did_you_mean(name: object, candidates: Collection[str]) -> str:
+    """A hint to append to a message: "; did you mean X?", or nothing where no candidate is near."""
+    near = get_close_matches(str(name), candidates, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def one_of(names: Collection[str]) -> str:
+    """Names in a sentence: "a", "a or b", "a, b or c"."""
+    *first, last = map(str, names)
+    return f"{', '.join(first)} or {last}" if first else last
 
 
 def config_error(name: object, problems: list[str]) -> ConfigError:

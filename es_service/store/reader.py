@@ -124,18 +124,10 @@ def read_parts(
     Raises StoreError if its state is not kept, naming those that are, or does not match its SHA-256.
     """
     with reading(folder) as (connection, _):
-        kept: KeptRows = {}
-        for part, at, sha256 in connection.execute("SELECT part, generation, sha256 FROM state"):
-            kept.setdefault(part, {})[at] = sha256
-        states = dict(
-            connection.execute("SELECT generation, state_sha256 FROM history ORDER BY generation DESC LIMIT 2")
-        )
+        kept, states, whole = _kept(connection)
         if not states:
             raise StoreError(f"{folder} has no generation yet; `{command('resume', folder)}` continues it")
         asked = max(states) if generation is None else generation
-        whole = sorted(
-            at for at, state in states.items() if rows_in_force(kept, at) and state_in_force(kept, at) == state
-        )
         if asked not in whole:
             if asked in states and asked == max(states):
                 raise Damaged(f"the state of generation {asked} is damaged")
@@ -152,6 +144,21 @@ def read_parts(
                 raise Damaged(f"the state of {part!r} at generation {at} does not match its SHA-256")
             parts[part] = decode_part(payload)
         return asked, parts
+
+
+def kept_states(connection: sqlite3.Connection) -> list[int]:
+    """Generations, at most two, whose whole state is there."""
+    return _kept(connection)[2]
+
+
+def _kept(connection: sqlite3.Connection) -> tuple[KeptRows, dict[int, str], list[int]]:
+    """State rows at hand; SHA-256 of the states of the last two generations; those that are whole."""
+    kept: KeptRows = {}
+    for part, at, sha256 in connection.execute("SELECT part, generation, sha256 FROM state"):
+        kept.setdefault(part, {})[at] = sha256
+    states = dict(connection.execute("SELECT generation, state_sha256 FROM history ORDER BY generation DESC LIMIT 2"))
+    whole = [at for at, state in states.items() if rows_in_force(kept, at) and state_in_force(kept, at) == state]
+    return kept, states, sorted(whole)
 
 
 def state_payload(connection: sqlite3.Connection, part: str, generation: int) -> bytes:

@@ -87,6 +87,7 @@ def main() -> None:
     asked = ((arguments.config, tuple(arguments.set)),) if arguments.config else TRIALS
     table = pd.read_csv(TABLE, keep_default_na=False) if TABLE.exists() else pd.DataFrame()
     known = set(zip(table.config, table.settings, table.seed, strict=True)) if len(table) else set()
+    RUNS.mkdir(parents=True, exist_ok=True)
     cleaned = worker_environment(os.environ)
     os.environ.clear()
     os.environ.update(cleaned)  # the processes below import JAX with it

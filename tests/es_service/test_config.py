@@ -225,6 +225,10 @@ def test_options_win_over_the_file_and_over_set():
     assert (compute.engine, compute.address, compute.worker_resources.gpu, compute.workers) == ("inline", None, 0.0, 2)
     compute = load(MINIMAL | {"compute": {"engine": "inline"}}, *cli_options.overrides(None, address="auto")).compute
     assert (compute.engine, compute.address) == ("ray", "auto")
+    threads = MINIMAL | {"compute": {"engine": "inline", "inline_workers": "threads"}}
+    for options in ({"engine": "ray"}, {"address": "auto"}, {"engine": "ray", "address": "auto"}):
+        compute = load(threads, *cli_options.overrides(None, **options)).compute
+        assert (compute.engine, compute.inline_workers) == ("ray", "processes")
 
 
 def test_what_options_imply_does_not_silence_set():
@@ -350,6 +354,7 @@ def test_what_follows_from_a_changed_key_is_resolved_anew():
         "compute.rollout_block_pairs: 32 -> 8",
         "compute.gradient_block_pairs: 512 -> 120",
     ]
+    assert changes("compute.chunk_pairs=8") == ["compute.chunk_pairs: 64 -> 8", "compute.rollout_block_pairs: 32 -> 8"]
     clipped = ["policy.observation_normalization: True -> False", "policy.observation_clip: 5.0 -> None"]
     assert changes("policy.observation_normalization=false") == clipped
     assert changes("policy.observation_normalization=false", "policy.observation_clip=5") == clipped[:1]

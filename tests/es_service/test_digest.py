@@ -6,11 +6,11 @@ import sqlite3
 import numpy as np
 import pytest
 
-from es_service import digest as digest_module
-from es_service.digest import arrays_sha256, checked_parts, digest, digest_of, digest_parts, is_mixed
+from es_service.digest import arrays_sha256, checked_parts, digest, digest_at, digest_of, digest_parts, is_mixed
 from es_service.errors import StoreError
 from es_service.store import schema as store_schema
 from es_service.store.codec import encode_part
+from es_service.store.reader import read_generation
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     COLUMNS,
@@ -156,11 +156,12 @@ def test_names_types_and_shapes_of_arrays_count():
     assert arrays_sha256({"a": np.asfortranarray(array.reshape(2, 2))}) == arrays_sha256({"a": array.reshape(2, 2)})
 
 
-def test_a_later_table_is_one_line(folder, monkeypatch):
-    before = digest(folder)
-    monkeypatch.setitem(digest_module.TABLES, "map", lambda connection, run: "0" * 64)
-    assert digest_parts(folder)["map"] == "0" * 64
-    assert digest(folder) != before
+def test_the_digest_after_the_generation_before_is_that_of_a_run_that_ended_there(folder, tmp_path):
+    newest = read_generation(folder)
+    assert newest is not None
+    assert digest_at(folder, newest) == digest(folder)
+    assert digest_at(folder, newest - 1) == digest(finished(tmp_path / "less", GENERATIONS - 1))
+    assert digest_at(folder, newest - 2) is None
 
 
 def test_parts_and_total_are_of_one_moment_and_of_a_sound_run(folder):

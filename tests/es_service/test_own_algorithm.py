@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,8 @@ from es_service import api
 from es_service.algorithms import ALGORITHMS
 from es_service.algorithms.base import Judgement, Plan
 from es_service.algorithms.steps import archived, first_state
-from es_service.errors import ConfigError
+from es_service.errors import ConfigError, StoreError
+from es_service.novelty import NoveltyArchive
 from es_service.protocol import EpisodesResult
 from es_service.statistics import no_observations
 
@@ -75,3 +78,47 @@ def raises(config):
 
 def something_else(config):
     return 3
+
+
+def forgetful(config):
+    """Keeps the three newest entries."""
+    return _absorbing(config, lambda state: replace(state, archive=_newest(state.archive, 3)))
+
+
+def growing(config):
+    """One member more after each generation."""
+    return _absorbing(config, lambda state: replace(state, members=(*state.members, state.members[0])))
+
+
+def emptying(config):
+    """A map of the newest elite alone."""
+    return _absorbing(config, lambda state: replace(state, map=_rows(state.map, slice(-1, None))))
+
+
+def _absorbing(config, change):
+    ours = ALGORITHMS["es"](config)
+    return replace(ours, absorb=lambda state, judgement: change(ours.absorb(state, judgement)))
+
+
+def _newest(archive, count):
+    rows = slice(-count, None)
+    return NoveltyArchive(archive.descriptor_N_B[rows], archive.generation_N[rows], archive.member_N[rows])
+
+
+def _rows(map_, rows):
+    names = [name for name in map_.__dataclass_fields__ if name.endswith(("_N", "_N_B"))]
+    return replace(map_, **{name: getattr(map_, name)[rows] for name in names})
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("forgetful", r"generation 3 cannot be kept: the novelty archive has lost or changed entries; .* 2 is saved"),
+        ("growing", r"generation 1 cannot be kept: the search has 3 members, and had 2"),
+        ("emptying", r"the map has lost cells, or has them in another order"),
+    ],
+)
+def test_a_state_that_the_store_could_not_give_back_ends_the_run(tmp_path, name, reason):
+    settings = [f"search.algorithm={__name__}:{name}", "map.cells=[200, 200]", "search.learning_rate=1"]
+    with pytest.raises(StoreError, match=reason):
+        api.run(api.load_config(CONFIG, settings), tmp_path / "run")

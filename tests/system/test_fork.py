@@ -12,6 +12,7 @@ import pytest
 from es_service import api, evaluation, lineage, session
 from es_service.config.changes import START_KEYS
 from es_service.errors import ConfigError
+from es_service.maps.behaviour_map import CELL_PREFIX
 from es_service.session import scheduling_policy
 from tests.system.session import SMALL
 from workers.environments import TASKS
@@ -86,6 +87,17 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
         lineage.fork_config(tmp_path / "run")
 
 
+def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkeypatch):
+    """A user's own, edited: the same parameters would mean another network."""
+    other = replace(TASKS["point_maze"], action_size=3)
+    for module in (api, lineage, session):
+        monkeypatch.setattr(module, "TASKS", {"point_maze": other})
+    with pytest.raises(ConfigError, match=r"point_maze is not what it was \(action_size: 2 -> 3\)"):
+        api.resume(parent.folder, ["budget.generations=7"])
+    with pytest.raises(ConfigError, match=r"the network's layers: \[2, 8, 2\] -> \[2, 8, 3\]\n.*search\.init_from="):
+        lineage.fork_config(parent.folder)
+
+
 @pytest.mark.parametrize("key", START_KEYS)
 def test_what_would_change_nothing_is_refused(parent, key):
     with pytest.raises(ConfigError) as caught:
@@ -128,3 +140,15 @@ def test_what_a_resume_has_changed_is_so_for_a_fork_and_an_evaluation(parent, tm
     assert seen[0].compute.compile_timeout_s == 77.0
     recorded.unlink()
     assert lineage.fork_config(folder).budget.generations == 6, "as it was created"
+
+
+def test_scores_of_another_number_of_episodes_are_forgotten(tmp_path):
+    """They are the highest fitness of a population, and a mean of more episodes is less lucky."""
+    search = {"algorithm": "me_es", "pairs": 16, "evaluation_episodes": 4, "cell_sampling": "score"}
+    parent = run(tmp_path / "parent", "budget.generations=4", config=SMALL | {"search": search})
+    assert np.isfinite(parent.behaviour_map.score_N).any()
+    config = lineage.fork_config(parent.folder, ["task.episodes_per_member=3"])
+    parts = lineage.forked(parent, config, None)[1].parts
+    scores = [part["score"] for name, part in parts.items() if name.startswith(CELL_PREFIX)]
+    assert len(scores) == parent.behaviour_map.size
+    assert np.isnan(scores).all()
