@@ -33,7 +33,15 @@ class Answer:
     results: list[ChunkResult]
 
 
-Message = messages.WorkerUp | messages.WorkerLost | messages.Failure | messages.Drain | messages.SetWorkers | Answer
+Message = (
+    messages.Placed
+    | messages.WorkerUp
+    | messages.WorkerLost
+    | messages.Failure
+    | messages.Drain
+    | messages.SetWorkers
+    | Answer
+)
 """What a transport reports: the scheduler's own events, and answers."""
 
 
@@ -44,7 +52,8 @@ class Transport(Protocol):
     """
 
     def start(self, worker: int) -> None:
-        """Begin to start a worker; `WorkerUp` or `WorkerLost` follows."""
+        """Begin to start a worker; `WorkerUp` or `WorkerLost` follows, and before that, if it has to wait for a place,
+        `Placed`."""
         ...
 
     def kill(self, worker: int) -> None:

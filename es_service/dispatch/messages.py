@@ -32,6 +32,7 @@ class Policy:
     """A task that raised, or lost the worker running it, this often is poison. Keep above `max_failures_in_a_row`, so
     that a single broken worker is replaced before its task is blamed."""
     start_deadline_s: float = 120.0
+    """For a worker to come up, counted anew once it has a place."""
     first_deadline_s: float = 600.0
     """For the first task of a kind on a worker, which compiles, and for any task while no duration is known; or what
     later ones may take, if that is longer."""
@@ -45,7 +46,8 @@ class Policy:
     """Wait before replacing the second, third ... loss without a success between: restart_backoff_s, doubling up to
     max_backoff_s. The first replacement is immediate; losses during a wait share it (a node that died, say)."""
     max_start_failures: int = 3
-    """This many workers in a row lost before they came up, and none up meanwhile: the environment is broken."""
+    """This many tries in a row to start workers that failed, and none up meanwhile: the environment is broken. All that
+    were started before the first of them was lost are one try, however many are lost and when."""
     no_worker_timeout_s: float = 300.0
     """Longest time with tasks waiting and no worker up; longer than `start_deadline_s` to be of any use."""
     names: Mapping[str, str] = field(default_factory=dict)
@@ -69,6 +71,13 @@ class Submit:
     """New tasks, to be assigned in this order. Raises ValueError for a key that still waits."""
 
     tasks: tuple[Task, ...]
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The worker, which had to wait for a place, has one and can begin to come up."""
+
+    worker: int
 
 
 @dataclass(frozen=True)
@@ -130,7 +139,7 @@ class SetWorkers:
     workers: int
 
 
-Event = Submit | WorkerUp | WorkerLost | Result | Failure | Tick | Drain | SetWorkers
+Event = Submit | Placed | WorkerUp | WorkerLost | Result | Failure | Tick | Drain | SetWorkers
 
 
 # Commands: what an engine must do, in the order given.

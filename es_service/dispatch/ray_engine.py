@@ -20,7 +20,7 @@ from typing import Any
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.messages import Drain, Failure, Policy, SetWorkers, WorkerLost, WorkerUp
+from es_service.dispatch.messages import Drain, Failure, Placed, Policy, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import ONE_CORE, Claim, Watch, connect, disconnect, look
 from es_service.errors import EvaluationError
 from es_service.protocol import Centre, Chunk, WorkerPlace, WorkerSpec
@@ -192,7 +192,7 @@ class Actors:
                 break
             if (message := self._message(ready[0])) is not None:
                 return message
-            timeout_s = 0.0  # that was where a worker is; None would say that no answer waits behind it
+            timeout_s = 0.0  # that was where a worker still is; None would say that no answer waits behind it
         if not self._places and time.monotonic() > self._placed_by_s:
             raise EvaluationError(
                 f"no worker was given a place in {self._patience}. Each needs {self._claim}; the cluster has "
@@ -228,9 +228,10 @@ class Actors:
             return Answer(call.worker, call.key, call.attempt, pickle.loads(value))
         if call.what == "build":
             return WorkerUp(call.worker)
+        is_known = call.worker in self._places  # it was asked again, whether it is still there
         self._places[call.worker] = WorkerPlace(*value)
         self._placed_by_s = float("inf")
-        return None
+        return None if is_known else Placed(call.worker)
 
     def _follow(self, watch: Watch) -> None:
         """Report what has changed in the cluster: drains first, so that a smaller number sends nobody else away."""

@@ -15,7 +15,8 @@ does one sent to a worker that was gone already, if the transport says so: a mac
 fault, however many of them are tried before all are known to be gone. A task that raised waits for another worker
 rather than go back to the same one, as long as another is up: a broken worker that raises at once must not use up the
 attempts of good tasks. A worker lost while draining is nobody's fault. One that was given no place in time is started
-anew, since one that hangs before it can say where it is looks the same, but counts as no loss.
+anew, since one that hangs before it can say where it is looks the same, but counts as no loss. Workers that are lost
+before they come up show a broken environment only if others, started after the first of them was lost, are lost, too.
 
 Cost: each step makes shallow copies of the containers (C speed, a few microseconds for a thousand entries) and changes
 only the records touched.
@@ -34,6 +35,7 @@ from es_service.dispatch.messages import (
     Event,
     Fail,
     Failure,
+    Placed,
     Result,
     SetWorkers,
     StartWorker,
@@ -83,6 +85,9 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
     match event:
         case Submit(tasks):
             _submit(s, tasks)
+        case Placed(worker):
+            if worker in s.starting:
+                s.starting[worker] = now + s.policy.start_deadline_s
         case WorkerUp(worker):
             if s.starting.pop(worker, None) is not None:
                 s.up[worker] = Worker()
@@ -203,17 +208,17 @@ def _lose(
             _requeue(s, worker, slot.task.key)
     if not fault:
         return s
-    s = s._replace(
-        lost_workers=s.lost_workers + 1,
-        start_failures=0 if s.up or s.draining else s.start_failures + starting,
-        last_loss=f"worker {worker}: {reason}",
-    )
+    s = s._replace(lost_workers=s.lost_workers + 1, last_loss=f"worker {worker}: {reason}")
+    if s.up or s.draining:
+        s = s._replace(start_failures=0)
+    elif starting and worker >= s.tried:
+        s = s._replace(start_failures=s.start_failures + 1, tried=s.next_worker)
     if now >= s.start_at_s:  # else a replacement already waits, and this one with it
         doublings = min(s.losses_in_a_row - 1, 30)
         wait_s = min(s.policy.max_backoff_s, s.policy.restart_backoff_s * 2**doublings) if doublings >= 0 else 0.0
         s = s._replace(losses_in_a_row=s.losses_in_a_row + 1, start_at_s=now + wait_s)
     if starting and s.start_failures >= s.policy.max_start_failures and not s.up and not s.draining:
-        return _fail(s, out, f"{s.start_failures} workers in a row did not come up; the last, {s.last_loss}")
+        return _fail(s, out, f"{s.start_failures} tries in a row brought no worker up; last loss: {s.last_loss}")
     if running is not None and charge:
         return _charge(s, out, running, f"it took worker {worker} with it: {reason}")
     return s

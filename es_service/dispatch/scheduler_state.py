@@ -64,6 +64,9 @@ class SchedulerState(NamedTuple):
     """No worker is started before this."""
     losses_in_a_row: int = 0
     start_failures: int = 0
+    """Tries in a row to start workers that failed."""
+    tried: int = 0
+    """Workers below this had been started when the last such failure was counted: they are part of it."""
     down_since_s: float | None = None
     """Since when tasks wait and no worker is up."""
     last_loss: str = "none was ever lost"

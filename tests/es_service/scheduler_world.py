@@ -16,6 +16,7 @@ from es_service.dispatch.messages import (
     Event,
     Fail,
     Failure,
+    Placed,
     Policy,
     Result,
     SetWorkers,
@@ -92,7 +93,8 @@ class World:
         self.delivered: set[tuple] = set()
         self.faults: Counter[tuple] = Counter()
         self.last_holder: dict[tuple, int] = {}
-        self.assigned = self.lost = self.dropped = self.start_failures = self.newest = 0
+        self.assigned = self.lost = self.dropped = self.start_failures = self.tried = self.newest = 0
+        self.start_due: dict[int, float] = {}
         self.down_since: float | None = None
         self.failed: str | None = None
 
@@ -113,10 +115,22 @@ class World:
     def start_process(self, worker: int) -> None:
         self.alive.add(worker)
         self.inbox[worker], self.open[worker] = deque(), []
+        self.start_due[worker] = self.now + self.policy.start_deadline_s
+        if self.happens("no_place"):
+            self.unplaced.add(worker)
+            if self.random.random() < 0.5:
+                self.at(1.2 * self.policy.start_deadline_s * self.random.random(), self.give_place, worker)
+        else:
+            self.build(worker)
+
+    def give_place(self, worker: int) -> None:
+        if worker in self.alive or self.happens("speaks_after_stop"):
+            self.say(worker, Placed(worker))
+            self.build(worker)
+
+    def build(self, worker: int) -> None:
         if self.happens("start_dies"):
             self.at(self.random.random(), self.die, worker)
-        elif self.happens("no_place"):
-            self.unplaced.add(worker)
         elif not self.happens("start_hangs"):
             self.at(self.random.random(), self.come_up, worker)
 
@@ -163,7 +177,11 @@ class World:
         if fault:
             self.lost += 1
             if worker not in self.up:
-                self.start_failures = 0 if self.up else self.start_failures + 1
+                if self.up:
+                    self.start_failures = 0
+                elif worker >= self.tried:  # else it had been started before another's loss that was counted
+                    self.start_failures += 1
+                    self.tried = self.newest
             running = self.open[worker][0][0] if self.open[worker] else None
             if charge and running in self.waiting:
                 self.faults[running] += 1
@@ -177,6 +195,11 @@ class World:
             case Submit(tasks):
                 self.fresh.extend(task.key for task in tasks)
                 self.waiting.update(task.key for task in tasks)
+            case Placed(worker):
+                self.unplaced.discard(worker)
+                if worker in self.known:
+                    self.seen["placed late"] += 1
+                    self.start_due[worker] = self.now + self.policy.start_deadline_s
             case WorkerUp(worker) if worker in self.known and worker not in self.up:
                 self.up.add(worker)
                 self.start_failures = 0
@@ -258,6 +281,7 @@ class World:
             assert isinstance(event, Tick | Failure)
             has_no_place = isinstance(event, Tick) and worker in event.silent
             self.seen["no place" if has_no_place else "quarantine" if isinstance(event, Failure) else "deadline"] += 1
+            assert worker in self.up or self.now >= self.start_due[worker], "it could still have come up in time"
             self.forget(worker, fault=not has_no_place, charge=isinstance(event, Tick))
         self.known.discard(worker)
         self.up.discard(worker)
@@ -285,9 +309,9 @@ class World:
         if message.startswith("task"):
             self.seen["poison"] += 1
             assert any(str(key) in message for key in worn_out)
-        elif "workers in a row" in message:
+        elif "tries in a row" in message:
             self.seen["start failures"] += 1
-            assert self.start_failures >= self.policy.max_start_failures
+            assert self.start_failures == self.policy.max_start_failures
             assert not self.up
         else:
             self.seen["no worker"] += 1
@@ -306,6 +330,7 @@ class World:
             assert not self.known, "a worker was left running"
             return
         assert all(self.faults[key] < self.policy.max_attempts for key in self.waiting), "poison went unnoticed"
+        assert self.start_failures < self.policy.max_start_failures, "a broken environment went unnoticed"
         if not self.waiting or self.up:
             self.down_since = None
         elif self.down_since is None:

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from es_service.dispatch import ray_engine as module
-from es_service.dispatch.engine import Engine
-from es_service.dispatch.messages import Policy
+from es_service.dispatch.engine import Answer, Engine
+from es_service.dispatch.messages import Placed, Policy, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import ONE_CORE, Membership
 from es_service.dispatch.ray_engine import Actors
 from es_service.errors import EvaluationError
@@ -90,7 +90,7 @@ class PretendedRay:
     available_resources = cluster_resources
 
     def end(self, actor: Actor, state: str = "dead") -> None:
-        """An actor dies or hangs: nothing it owes is answered any more."""
+        """An actor dies or hangs: nothing it owes is answered any more; or it gets a place and answers."""
         actor.state = state
         for ref in actor.owed:
             self._settle(actor, ref)
@@ -135,9 +135,14 @@ class PretendedWatch:
         pass
 
 
+def transport(
+    ray: PretendedRay, policy: Policy, watch: PretendedWatch | None = None, room: int | None = None
+) -> Actors:
+    return Actors(ray, SPEC, type(None), ONE_CORE, watch, room, policy)  # type: ignore[arg-type]
+
+
 def ray_engine(ray: PretendedRay, policy: Policy, watch: PretendedWatch | None = None) -> Engine[Actors]:
-    actors = Actors(ray, SPEC, type(None), ONE_CORE, watch, None, policy)  # type: ignore[arg-type]
-    return Engine(actors, policy)
+    return Engine(transport(ray, policy, watch), policy)
 
 
 @pytest.mark.parametrize("state", ["dead", "hung"])
@@ -156,6 +161,29 @@ def test_a_node_that_dies_is_one_fault_of_what_it_ran_however_many_workers_it_he
         ray.on_run = node_dies
         assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
         assert engine.counts.lost_workers == 5
+
+
+def test_an_actor_that_waited_for_its_place_says_once_that_it_has_one():
+    """And not again, when it is asked later whether it is still there."""
+    ray = PretendedRay(room=0)
+    actors = transport(ray, Policy(2))
+    actors.start(0)
+    assert (actors.receive(0.0), actors.silent()) == (None, (0,))
+    (actor,) = ray.actors
+    actor.owed[0].is_ready = True
+    assert [actors.receive(0.0) for _ in range(2)] == [Placed(0), None]
+    assert actors.silent() == ()
+    ray.end(actor, "alive")
+    assert [actors.receive(0.0) for _ in range(2)] == [WorkerUp(0), None]
+    ray.room = 2
+    actors.start(1)
+    assert [actors.receive(0.0) for _ in range(3)] == [Placed(1), WorkerUp(1), None]
+    ray.end(ray.actors[1])
+    for worker in (1, 0):
+        actors.send(worker, FIRST, "key", 1, [CHUNK])
+    assert isinstance(actors.receive(0.0), WorkerLost)
+    actors.send(0, FIRST, "other key", 1, [CHUNK])
+    assert [type(actors.receive(0.0)) for _ in range(3)] == [Answer, Answer, type(None)]
 
 
 def test_an_actor_that_is_given_no_place_is_not_lost():

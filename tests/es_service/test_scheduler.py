@@ -16,6 +16,7 @@ from es_service.dispatch.messages import (
     Event,
     Fail,
     Failure,
+    Placed,
     Policy,
     Result,
     SetWorkers,
@@ -237,13 +238,47 @@ def test_losses_during_a_wait_share_it():
     assert step(state, Tick(), 1.0)[1] == [StartWorker(worker) for worker in range(10, 17)]
 
 
-def test_a_broken_environment_is_reported_at_once():
+def test_a_broken_environment_is_reported_soon():
+    """Of two workers whose every start raises at once: after one wait of restart_backoff_s."""
     state, _ = play(initial_state(POLICY), (0.0, Tick()), (0.1, WorkerLost(0, "no module")))
-    state, _ = play(state, (0.2, WorkerLost(1, "no module")))
-    state, commands = step(state, WorkerLost(2, "ImportError: brax"), 0.3)
-    message = "3 workers in a row did not come up; the last, worker 2: ImportError: brax"
-    assert commands == [Fail(message)]
-    assert (state.failed, state.lost_workers) == (message, 3)
+    state, _ = play(state, (0.2, WorkerLost(1, "no module")), (0.3, WorkerLost(2, "no module")))
+    assert (state.failed, next_deadline(state)) == (None, 1.2)
+    state, _ = step(state, Tick(), 1.2)
+    state, commands = step(state, WorkerLost(3, "ImportError: brax"), 1.3)
+    message = "3 tries in a row brought no worker up; last loss: worker 3: ImportError: brax"
+    assert commands == [Fail(message), StopWorker(4, "the run failed")]
+    assert (state.failed, state.lost_workers) == (message, 4)
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+@pytest.mark.parametrize("workers", range(1, 10))
+def test_workers_that_are_lost_together_before_they_come_up_are_one_try_however_many(workers, at_once):
+    """At once, as those that are too slow are; or one after the other, as when their node or process dies."""
+    state, _ = step(initial_state(replace(POLICY, workers=workers)), Tick(), 0.0)
+    now = 0.0
+    for tries in range(POLICY.max_start_failures):
+        assert (state.failed, state.start_failures, len(state.starting)) == (None, tries, workers)
+        now += 50.0
+        if at_once:
+            state, _ = step(state, Tick(), now)
+        else:
+            losses = [(now + 0.01 * number, WorkerLost(worker, "")) for number, worker in enumerate(state.starting)]
+            state, _ = play(state, *losses)
+        now += POLICY.max_backoff_s  # less than start_deadline_s
+        state, _ = step(state, Tick(), now)
+    assert state.failed is not None
+    assert state.failed.startswith("3 tries in a row")
+
+
+def test_a_place_gives_a_worker_all_its_time_to_come_up():
+    """A cluster has room for three just before they would be started anew."""
+    state, _ = step(initial_state(replace(POLICY, workers=3)), Tick(), 0.0)
+    state, _ = play(state, *((49.0, Placed(worker)) for worker in range(3)))
+    assert next_deadline(state) == 99.0
+    state, commands = play(state, (98.0, WorkerUp(0)), (99.0, Tick()))
+    assert commands[0] == StopWorker(1, "did not come up in 50 s (start_deadline_s)")
+    for stranger in (0, 1, 7):
+        assert step(state, Placed(stranger), 99.5) == (state, [])
 
 
 def test_start_failures_are_forgiven_while_a_worker_is_up():
@@ -255,9 +290,9 @@ def test_start_failures_are_forgiven_while_a_worker_is_up():
     # The last that is up is lost, and then it takes three again.
     state, _ = play(state, (200.0, WorkerLost(1, "killed")), (300.0, Tick()))
     assert sorted(state.starting) == [5, 6]
-    state, _ = play(state, (301.0, WorkerLost(5, "no memory")), (302.0, WorkerLost(6, "no memory")))
+    state, _ = play(state, (301.0, WorkerLost(5, "no memory")), (310.0, Tick()), (311.0, WorkerLost(7, "no memory")))
     assert (state.failed, state.start_failures) == (None, 2)
-    state, _ = play(state, (400.0, Tick()), (400.0, WorkerUp(7)))
+    state, _ = play(state, (312.0, WorkerUp(6)))
     assert state.start_failures == 0
 
 

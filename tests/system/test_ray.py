@@ -118,7 +118,7 @@ def test_a_run_that_began_inline_goes_on_with_ray_where_home_cannot_be_written(t
 
 def test_workers_that_raise_while_starting_stop_the_run_with_their_error():
     with (
-        pytest.raises(EvaluationError, match=r"3 workers in a row did not come up(.|\n)*no_such_task"),
+        pytest.raises(EvaluationError, match=r"3 tries in a row brought no worker up(.|\n)*no_such_task"),
         ray_engine(spec(environment="no_such_task"), Policy(1, restart_backoff_s=0.0), actor=WorkerActor) as engine,
     ):
         engine.evaluate(centre(random_parameters()), [TrainingChunk(1, 0)])
