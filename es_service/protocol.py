@@ -6,6 +6,8 @@ of one chunk, S sign [+, -], E episodes of one evaluation chunk, O observation, 
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple, Protocol
@@ -146,6 +148,15 @@ def worker_environment(environment: Mapping[str, str], gpus: float = 0.0) -> dic
     if not gpus:
         return kept | threads | {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": ""}
     return kept | threads | GPU_SETTINGS | {"XLA_CLIENT_MEM_FRACTION": f"{GPU_MEMORY_FRACTION * min(gpus, 1.0):g}"}
+
+
+def child_environment() -> dict[str, str]:
+    """Environment variables for a process like a worker's, without a GPU, that imports what this one can import.
+
+    And nothing else: a current folder with a `workers.py` of its own must not take the place of ours.
+    """
+    path = os.pathsep.join(path or os.getcwd() for path in sys.path)
+    return worker_environment(os.environ) | {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
 
 
 @dataclass(frozen=True)

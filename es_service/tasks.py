@@ -6,7 +6,6 @@ Asking starts a process, since it imports JAX and Brax; each name is asked for o
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -14,7 +13,7 @@ from dataclasses import replace
 from functools import cache
 
 from es_service.errors import ConfigError
-from es_service.protocol import TaskSpec, worker_environment
+from es_service.protocol import TaskSpec, child_environment
 from workers.environments import TASKS
 from workers.simd.target import NoVectorsError, host_target
 
@@ -34,12 +33,6 @@ class Tasks(Mapping[str, TaskSpec]):
 
     def __len__(self) -> int:
         return len(TASKS)
-
-
-def child_environment() -> dict[str, str]:
-    """Environment variables for a process like a worker's that imports what this one can import."""
-    path = os.pathsep.join(path or os.getcwd() for path in sys.path)
-    return worker_environment(os.environ) | {"PYTHONPATH": path}
 
 
 @cache

@@ -25,7 +25,7 @@ from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
 from es_service.errors import Interrupted
-from es_service.protocol import Centre, Chunk, WorkerSpec, worker_environment
+from es_service.protocol import Centre, Chunk, WorkerSpec, child_environment
 from es_service.wire import BUFFER_BYTES, Channel, framed
 
 PIECE_S = 0.1
@@ -229,16 +229,13 @@ def _end(child: _Child, numbers: list[int]) -> str:
 
 def _start_child(spec: bytes, undo: ExitStack) -> _Child:
     """A process that knows its constants; `undo` ends it again, should anything else fail."""
-    environment = worker_environment(os.environ)
-    environment["PYTHONSAFEPATH"] = "1"
-    environment["PYTHONPATH"] = os.pathsep.join(path or os.getcwd() for path in sys.path)
     undo.enter_context(log := tempfile.TemporaryFile())  # noqa: SIM115
     ours, theirs = _socket_pair()
     undo.enter_context(ours)
     with theirs:
         process = subprocess.Popen(
             [sys.executable, "-m", "workers.process", str(theirs.fileno()), str(os.getpid())],
-            env=environment,
+            env=child_environment(),
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
             stdout=log,
