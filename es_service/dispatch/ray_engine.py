@@ -26,8 +26,8 @@ from es_service.errors import EvaluationError
 from es_service.protocol import Centre, Chunk, WorkerPlace, WorkerSpec
 
 PLACEMENT_S = 30.0
-"""Longest wait for the first actor to be given a place in a Ray of our own; Ray itself would wait for ever. A cluster
-that was joined may have to grow first, or others there to end: there no_worker_timeout_s counts, if it is longer."""
+"""Longest wait for the first actor to say where it is, unless no_worker_timeout_s is longer; Ray itself would wait for
+ever. A cluster that was joined may have to grow first, or others there to end."""
 IN_CALL_BYTES = 64 * 2**10
 """A centre up to this size travels with every call; a larger one is stored once and fetched once per node."""
 
@@ -53,13 +53,16 @@ def ray_engine(
         elastic: as many workers as there is room for, instead of `policy.workers`; in a cluster, also when it changes.
 
     Raises:
-        EvaluationError: Ray is missing, does not start, or no cluster answers at the address. Interrupted: SIGTERM
-            arrived meanwhile.
+        EvaluationError: Ray is missing, does not start, has no room for a worker on this machine, or no cluster answers
+            at the address. Interrupted: SIGTERM arrived meanwhile.
     """
     ray = connect(address, claim, policy.workers if elastic else policy.workers * claim.cpus)
     try:
+        room = look(ray, claim).room
+        if address is None and not room:  # nor will there ever be
+            raise EvaluationError(f"this machine has no place for a worker. {_demand(ray, claim)}")
         if elastic:
-            policy = replace(policy, workers=max(1, look(ray, claim).room))
+            policy = replace(policy, workers=max(1, room))
         watch = None if address is None else Watch(ray, claim)
         transport = Actors(ray, spec, actor, claim, watch, policy.workers if elastic else None, policy)
         return Engine(transport, policy, should_stop, log)
@@ -97,10 +100,10 @@ class Actors:
         Args:
             watch: of the cluster that was joined; None in a Ray of our own, whose one node is this machine.
             room: workers to ask for as the cluster is now; from then on follow its room. None: never ask.
-            policy: how long to wait for a place.
+            policy: how long to wait for the first place.
         """
         self._ray = ray
-        self._spec, self._claim = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim
+        self._spec, self._claim, self._policy = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim, policy
         self._class = ray.remote(
             num_cpus=claim.cpus,
             num_gpus=claim.gpus,
@@ -117,9 +120,8 @@ class Actors:
         """Workers to be asked for their place again before they are sent anything, since another was lost."""
         self._inbox: deque[Message] = deque()
         self._centre: tuple[Centre, Any] | None = None
-        patience_s = PLACEMENT_S if watch is None else max(PLACEMENT_S, policy.no_worker_timeout_s)
-        self._placed_by_s = time.monotonic() + patience_s
-        self._patience = f"{patience_s:g} s" + ("" if watch is None else f" ({policy.name_of('no_worker_timeout_s')})")
+        self._patience_s = max(PLACEMENT_S, policy.no_worker_timeout_s)
+        self._placed_by_s = time.monotonic() + self._patience_s
 
     def places(self) -> dict[int, WorkerPlace]:
         """Worker id -> where it is, of those that have a place."""
@@ -176,7 +178,7 @@ class Actors:
         """The next message.
 
         Raises:
-            EvaluationError: the cluster has had no place for any actor for too long, or does not answer any more.
+            EvaluationError: no actor has said for too long where it is, or the cluster does not answer any more.
         """
         if self._watch is not None:
             self._follow(self._watch)
@@ -194,10 +196,12 @@ class Actors:
                 return message
             timeout_s = 0.0  # that was where a worker still is; None would say that no answer waits behind it
         if not self._places and time.monotonic() > self._placed_by_s:
+            time_s = f"{self._patience_s:g} s ({self._policy.name_of('no_worker_timeout_s')})"
+            if self._watch is None:  # which has a place for each: their processes do not start, or very slowly
+                raise EvaluationError(f"no worker's process answered in {time_s}. {_demand(self._ray, self._claim)}")
             raise EvaluationError(
-                f"no worker was given a place in {self._patience}. Each needs {self._claim}; the cluster has "
-                f"{_resources(self._ray.cluster_resources())} in all, free are "
-                f"{_resources(self._ray.available_resources())}. Add nodes, or stop what else runs there."
+                f"no worker was given a place in {time_s}. {_demand(self._ray, self._claim)}. Add nodes, or stop what "
+                "else runs there."
             )
         return None
 
@@ -270,6 +274,14 @@ def _reason(error: Exception) -> str:
     }
     kind = type(error).__name__
     return f"{known.get(kind, kind)}: {first}"
+
+
+def _demand(ray: ModuleType, claim: Claim) -> str:
+    """What workers need, and what there is."""
+    return (
+        f"Each needs {claim}; the cluster has {_resources(ray.cluster_resources())} in all, free are "
+        f"{_resources(ray.available_resources())}"
+    )
 
 
 def _resources(amounts: dict[str, float]) -> str:
