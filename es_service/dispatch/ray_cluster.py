@@ -66,6 +66,8 @@ class Membership:
     """Workers that the nodes which are alive, and stay, could hold together."""
     leaving: frozenset[str]
     """Ids of the nodes that are about to go and want no more work."""
+    alive: frozenset[str]
+    """Ids of the nodes that are there, those about to go among them."""
 
 
 def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
@@ -125,10 +127,9 @@ def disconnect(ray: ModuleType) -> None:
 def look(ray: ModuleType, claim: Claim) -> Membership:
     """Who belongs to the cluster now. Blocks for as long as its head does not answer."""
     leaving = frozenset(_draining(ray))
-    room = sum(
-        _room(node["Resources"], claim) for node in ray.nodes() if node["Alive"] and node["NodeID"] not in leaving
-    )
-    return Membership(room, leaving)
+    alive = {node["NodeID"]: node["Resources"] for node in ray.nodes() if node["Alive"]}
+    room = sum(_room(resources, claim) for node, resources in alive.items() if node not in leaving)
+    return Membership(room, leaving, frozenset(alive))
 
 
 class Watch:

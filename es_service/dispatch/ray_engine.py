@@ -116,6 +116,8 @@ class Actors:
         self._calls: dict[Any, _Call] = {}
         self._places: dict[int, WorkerPlace] = {}
         self._drained: set[int] = set()
+        self._nodes: frozenset[str] = frozenset()
+        """All that were alive at some time."""
         self._to_ask: set[int] = set()
         """Workers to be asked for their place again before they are sent anything, since another was lost."""
         self._inbox: deque[Message] = deque()
@@ -238,12 +240,18 @@ class Actors:
         return None if is_known else Placed(call.worker)
 
     def _follow(self, watch: Watch) -> None:
-        """Report what has changed in the cluster: drains first, so that a smaller number sends nobody else away."""
+        """Report what has changed in the cluster: drains and losses first, so that a smaller number sends nobody else
+        away. Ray itself tells of an idle actor's end only when it is called."""
         now = watch.latest()
         for worker, place in self._places.items():
             if place.node in now.leaving and worker not in self._drained:
                 self._drained.add(worker)
                 self._inbox.append(Drain(worker))
+        if now.alive:  # else the look has shown nothing, for somebody answered it
+            gone = self._nodes - now.alive
+            self._nodes |= now.alive
+            for worker in [worker for worker, place in self._places.items() if place.node in gone]:
+                self._lose(worker, f"{self._places[worker]}: its node died")
         if self._room is not None and now.room and now.room != self._room:
             self._room = now.room
             self._inbox.append(SetWorkers(now.room))

@@ -13,8 +13,8 @@ import pytest
 
 from es_service.dispatch import ray_engine as module
 from es_service.dispatch.engine import Answer, Engine
-from es_service.dispatch.messages import Placed, Policy, WorkerLost, WorkerUp
-from es_service.dispatch.ray_cluster import ONE_CORE, Membership
+from es_service.dispatch.messages import Drain, Placed, Policy, SetWorkers, WorkerLost, WorkerUp
+from es_service.dispatch.ray_cluster import ONE_CORE, Membership, look
 from es_service.dispatch.ray_engine import Actors
 from es_service.errors import EvaluationError
 from es_service.protocol import TrainingChunk
@@ -63,6 +63,7 @@ class PretendedRay:
         self.room = room
         self.actors: list[Actor] = []
         self.on_run: Callable[[Actor], Any] = lambda actor: None
+        self.node_of: Callable[[int], str] = lambda number: "node"
 
     def remote(self, **_: Any) -> Callable[[type], Any]:
         return lambda cls: SimpleNamespace(remote=self._start)
@@ -100,7 +101,7 @@ class PretendedRay:
         actor = Actor(index, "alive" if placed < self.room else "pending")
         self.actors.append(actor)
         methods = {
-            "place": lambda: ("host", actor.number, "node"),
+            "place": lambda: ("host", actor.number, self.node_of(actor.number)),
             "build": lambda: None,
             "run": lambda centre, chunks: pickle.dumps([f"of {chunk}" for chunk in pickle.loads(chunks)]),
         }
@@ -126,10 +127,13 @@ class PretendedRay:
 
 
 class PretendedWatch:
-    """Of a cluster that never changes."""
+    """Of a cluster that never changes, unless `now` does."""
+
+    def __init__(self) -> None:
+        self.now = Membership(0, frozenset(), frozenset())
 
     def latest(self) -> Membership:
-        return Membership(0, frozenset())
+        return self.now
 
     def close(self) -> None:
         pass
@@ -216,6 +220,56 @@ def test_the_wait_for_a_first_place_is_the_policy_s(monkeypatch, watch, message)
     with pytest.raises(EvaluationError, match=message) as caught, ray_engine(PretendedRay(0), policy, watch) as engine:
         engine.evaluate(FIRST, [CHUNK])
     assert ("Add nodes" in str(caught.value)) == (watch is not None)
+
+
+def test_a_node_that_dies_under_idle_workers_takes_none_of_the_others_along():
+    """The newest are on the node that stays. The smaller room is known before any call fails; nor is a node dead that
+    was not seen yet, or when no node at all is seen."""
+    ray, watch = PretendedRay(), PretendedWatch()
+    ray.node_of = lambda number: "old" if number < 2 else "new"
+    actors = transport(ray, Policy(4), watch, room=4)
+    with Engine(actors, Policy(4)) as engine:
+        for alive in ({"old"}, {"old", "new"}, set(), {"old", "new"}):
+            watch.now = Membership(4, frozenset(), frozenset(alive))
+            engine.evaluate(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)])
+            assert engine.counts.lost_workers == 0
+        for number in range(2):
+            ray.end(ray.actors[number])
+        watch.now = Membership(2, frozenset(), frozenset({"new"}))
+        assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
+        assert (engine.counts.lost_workers, engine.counts.workers, engine.counts.retries) == (2, 2, 0)
+        assert "its node died" in engine.last_loss
+        assert [actor.state for actor in ray.actors[:4]] == ["dead", "dead", "alive", "alive"]
+
+
+def test_nodes_that_are_about_to_go_are_alive_and_give_no_room():
+    nodes = [
+        {"NodeID": name, "Alive": name != "dead", "Resources": {"CPU": float(cpus)}}
+        for name, cpus in (("stays", 4), ("leaves", 2), ("dead", 1))
+    ]
+    state = SimpleNamespace(get_draining_nodes=lambda: {"leaves": 0})
+    ray = SimpleNamespace(nodes=lambda: nodes, _private=SimpleNamespace(state=SimpleNamespace(state=state)))
+    seen = look(ray, ONE_CORE)  # type: ignore[arg-type]
+    assert seen == Membership(4, frozenset({"leaves"}), frozenset({"stays", "leaves"}))
+
+
+def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
+    """Those that leave with their node's consent, then those lost with theirs, then how many there should be."""
+    ray, watch = PretendedRay(), PretendedWatch()
+    ray.node_of = str
+    actors = transport(ray, Policy(3), watch, room=3)
+    watch.now = Membership(3, frozenset(), frozenset("012"))
+    for worker in range(3):
+        actors.start(worker)
+    while actors.receive(0.0):
+        pass
+    actors.send(0, FIRST, "key", 1, [CHUNK])
+    watch.now = Membership(1, frozenset("1"), frozenset("12"))
+    told = [actors.receive(0.0) for _ in range(4)]
+    assert told[0] == Drain(1)
+    assert isinstance(told[1], WorkerLost)
+    assert (told[1].worker, told[1].bystander) == (0, False)
+    assert told[2:] == [SetWorkers(1), None]
 
 
 def test_a_chunk_that_kills_its_workers_is_found_out_after_as_many_as_it_has_attempts():
