@@ -21,7 +21,10 @@ lint: .venv/installed-dev
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "Python 3.11 or newer is needed; try: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
-	$(PYTHON) -m venv .venv
+# Without the system's package for it, Debian's Python leaves half a .venv, which the next `make` would take for whole.
+	@$(PYTHON) -m venv .venv || { rm -rf .venv; \
+	  echo "$(PYTHON) could not make .venv, for the reason above; on Debian and Ubuntu install python3-venv" \
+	  "(of another Python than the system's: python3.12-venv, say), then again: make $(MAKECMDGOALS)"; exit 1; }
 
 .venv/installed: .venv/bin/python pyproject.toml constraints.txt
 	@echo "installing pinned packages into .venv; this takes a minute the first time"
