@@ -64,6 +64,9 @@ def test_what_each_environment_can_tell_of_an_episode():
     assert tuple(brax_task.describe("halfcheetah").descriptors) == ("final_x", "feet_contact", "final_joints")
     assert tuple(brax_task.describe("reacher").descriptors) == ("final_joints",)
     assert brax_task.describe("swimmer").options["backend"] == ("generalized",)
+    for name in ("ant", "halfcheetah", "reacher"):
+        for names, _ in brax_task.describe(name).descriptors.values():
+            assert not user_task.clashes(names)
     ant = with_options(brax_task.describe("ant"), {"descriptor": "feet_contact"})
     assert ant.descriptor_names == ("foot_1", "foot_2", "foot_3", "foot_4")
     assert ant.descriptor_bounds == ((0.0, 1.0),) * 4
@@ -124,7 +127,11 @@ def test_a_class_with_contradictions_is_refused(monkeypatch):
         ("walls", 5, r"is no tuple of segments"),
         ("walls", (((0.0, 1.0), (0.0, 1.0)),), r"is no tuple of segments"),
         ("least_reward", "low", r"least_reward = 'low' is no finite number"),
+        ("least_reward", "", r"least_reward = '' is no finite number"),
         ("wall_clearance", float("nan"), r"wall_clearance = nan is no finite number"),
+        ("wall_clearance", None, r"wall_clearance = None is no finite number"),
+        ("goal_distance", lambda self, state: jnp.zeros(2), r"goal_distance has the shape \(2,\), not \(\)"),
+        ("goal_distance", None, r"cannot be traced: "),
         ("options", {"walls": "both"}, r"option walls = 'both' is no tuple of text"),
         (
             "step",

@@ -44,6 +44,20 @@ ATTRIBUTES = {
     "descriptor_bounds": tuple,
 }
 
+TABLES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "the history": (
+        ("centre_{}", "centre_{}_std"),
+        ("centre_fitness_mean", "centre_fitness_std", "centre_return_mean", "centre_return_std", "centre_novelty"),
+    ),
+    "the map": (("{}", "cell_{}"), ("cell", "fitness", "generation", "member")),
+    "the novelty archive": (("{}",), ("generation", "member")),
+    "evaluate --out": (
+        ("{}", "{}_std"),
+        ("policy", "generation", "episodes", "stored_fitness", "fresh_fitness", "fresh_standard_error"),
+    ),
+}
+"""Tables of a run that have columns named after the descriptor: (those, other columns that they could be taken for)."""
+
 
 def describe(path: str) -> TaskSpec:
     """What the driver must know of a user's class. Raises TaskError if it cannot be had or misses something."""
@@ -65,11 +79,15 @@ def describe(path: str) -> TaskSpec:
         if names != bounds or not names:
             wrong.append(f"{names} descriptor_names but {bounds} descriptor_bounds")
         wrong += _wrong_pairs(task.descriptor_bounds)
+        wrong += clashes(tuple(map(str, task.descriptor_names)))
         if not _are_walls(getattr(task, "walls", None)):
             wrong.append(f"walls = {task.walls!r} is no tuple of segments ((x, y), (x, y))")
-        for name in ("wall_clearance", "least_reward"):
-            if not _are_finite((getattr(task, name, 0.0) or 0.0,)):
-                wrong.append(f"{name} = {getattr(task, name)!r} is no finite number")
+        least = getattr(task, "least_reward", None)
+        numbers = {
+            "wall_clearance": getattr(task, "wall_clearance", 0.0),
+            "least_reward": 0.0 if least is None else least,
+        }
+        wrong += [f"{name} = {x!r} is no finite number" for name, x in numbers.items() if not _are_finite((x,))]
         sizes = {name: getattr(task, name) for name, kind in ATTRIBUTES.items() if kind is int}
         wrong += [f"{name} = {size} is not positive" for name, size in sizes.items() if size < 1]
     if wrong:
@@ -100,6 +118,23 @@ def _wrong_pairs(bounds: tuple) -> list[str]:
     ]
 
 
+def clashes(names: tuple[str, ...]) -> list[str]:
+    """What is wrong with names of a descriptor's dimensions: columns that a table of a run has already."""
+    wrong: dict[str, str] = {}
+    for table, (ours, others) in TABLES.items():
+        taken = {column.casefold() for column in others}  # to SQL, and to many a reader, case makes no difference
+        for name in names:
+            for column in (form.format(name) for form in ours):
+                if column.casefold() in taken:
+                    wrong.setdefault(
+                        name,
+                        f"descriptor_names: {name!r} would be the column {column} of {table}, which has one of that "
+                        "name; choose another name",
+                    )
+                taken.add(column.casefold())
+    return list(wrong.values())
+
+
 def _are_walls(walls: Any) -> bool:
     """None, or segments between two different places."""
     return walls is None or (
@@ -126,6 +161,7 @@ def _check_shapes(path: str) -> None:
             "descriptor": (jax.eval_shape(environment.descriptor, state).shape, (len(task.descriptor_names),)),
             "the reward of step": (reward.shape, ()),
             "done of step": (done.shape, ()),
+            "goal_distance": (jax.eval_shape(environment.goal_distance, state).shape, ()),
         }
     except Exception as error:  # the user's code can raise anything
         raise TaskError(f"{path} cannot be traced: {type(error).__name__}: {error}") from error
