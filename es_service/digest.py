@@ -17,6 +17,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from es_service import platform_info
 from es_service.commands import command
 from es_service.errors import StoreError
 from es_service.maps.behaviour_map import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
@@ -74,15 +75,15 @@ def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
 
 
 def is_mixed(folder: Path) -> bool:
-    """Whether the stored generations were computed on more than one platform (versions, CPU or GPU kind)."""
+    """Whether the stored generations were computed on more than one platform (versions, CPU or GPU kind), by the driver
+    or by workers."""
     with reading(folder) as (connection, _):
         return _is_mixed(connection)
 
 
 def _is_mixed(connection: Connection) -> bool:
     newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
-    in_force = [platform for at, platform in platforms(connection) if newest is not None and at <= newest]
-    return len({json.dumps(platform, sort_keys=True) for platform in in_force}) > 1
+    return platform_info.is_mixed(at for first, at in platforms(connection) if newest is not None and first <= newest)
 
 
 def _parts(folder: Path, connection: Connection, meta: RunMeta, until: int = NEWEST) -> dict[str, str]:

@@ -58,8 +58,10 @@ Reachable = NDArray[np.bool_] | None
 class Store(Protocol):
     """What the loop needs of a run store."""
 
-    generation: int | None
-    """Newest committed generation; None before the first."""
+    @property
+    def generation(self) -> int | None:
+        """Newest committed generation; None before the first."""
+        ...
 
     def load(self, without: str | None = None) -> Mapping[str, Arrays]: ...
     def part(self, name: str) -> Arrays: ...

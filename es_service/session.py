@@ -14,9 +14,9 @@ from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy as SchedulingPolicy
-from es_service.platform_info import platform_info
+from es_service.platform_info import computed_on, is_mixed, platform_info
 from es_service.protocol import FloatArray, Moments, TaskSpec, with_options
-from es_service.run_state import moments_from_arrays
+from es_service.run_state import Arrays, moments_from_arrays
 from es_service.run_view import Run, open_run
 from es_service.signals import stop_on_signals
 from es_service.statistics import no_observations
@@ -64,12 +64,6 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
     state = driver.stored_state(store, task)
     if state is not None and (reason := driver.spent(config.budget, state)) is not None:
         return Outcome(open_run(store.folder), reason)  # no engine need start to find that out
-    platform = platform_info()
-    if config.compute.worker_resources.gpu:
-        platform |= {"device": "gpu"}  # whose bits are others
-    first = 0 if store.generation is None else store.generation + 1
-    if store.record_platform(first, platform) and first:
-        on_notice(f"from generation {first} on this run has another platform: {platform}. Its digest now says `mixed`.")
     search = driver.Search(
         config=config,
         algorithm=ALGORITHMS[config.search.algorithm](config),
@@ -90,8 +84,34 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
                 on_notice(f"generation {row['generation']}: lost {who}; {engine.last_loss}")
             on_generation(row)
 
-        _, reason = driver.run(search, engine, store, after_generation)
+        _, reason = driver.run(search, engine, _OnPlatforms(store, engine, on_notice), after_generation)
     return Outcome(open_run(store.folder), reason)
+
+
+class _OnPlatforms:
+    """The run's store for the loop: what a generation was computed on is recorded before the generation is."""
+
+    def __init__(self, store: RunStore, engine: Engine[Any], on_notice: OnNotice) -> None:
+        self._store, self._engine, self._on_notice = store, engine, on_notice
+        self._driver = platform_info()
+        self._recorded: dict[str, Any] = {}
+        self.load, self.part, self.last_history = store.load, store.part, store.last_history
+
+    @property
+    def generation(self) -> int | None:
+        return self._store.generation
+
+    def commit(self, generation: int, parts: Mapping[str, Arrays], history: driver.HistoryRow) -> None:
+        platform = computed_on(self._driver, self._engine.platforms)
+        if platform != self._recorded:
+            is_other = self._store.record_platform(generation, platform)
+            if is_other and (generation or is_mixed([platform])):
+                self._on_notice(
+                    f"from generation {generation} on this run has another platform, or workers of several: "
+                    f"{platform}. Its digest now says `mixed`."
+                )
+            self._recorded = platform
+        self._store.commit(generation, parts, history)
 
 
 def scheduling_policy(config: RunConfig) -> SchedulingPolicy:

@@ -11,6 +11,7 @@ import socket
 from collections.abc import Callable, Sequence
 from functools import partial
 
+from es_service.platform_info import platform_info, platform_text
 from es_service.protocol import Centre, Chunk, ChunkResult, WorkerPlace, worker_environment
 
 
@@ -37,8 +38,8 @@ class WorkerActor:
 
         return WorkerPlace(socket.gethostname(), os.getpid(), ray.get_runtime_context().get_node_id())
 
-    def build(self) -> None:
-        """Import JAX with the settings every worker has, and build the run's functions."""
+    def build(self) -> str:
+        """Import JAX with the settings every worker has, and build the run's functions; the platform's text."""
         environment = worker_environment(os.environ, self._gpus)
         for name in set(os.environ) - set(environment):
             del os.environ[name]
@@ -46,6 +47,11 @@ class WorkerActor:
         from workers.worker import make_worker, run_chunks
 
         self._run_chunks = partial(run_chunks, make_worker(pickle.loads(self._spec)))
+        if not self._gpus:
+            return platform_text(platform_info())
+        import jax
+
+        return platform_text(platform_info() | {"device": jax.devices()[0].device_kind})
 
     def run(self, centre: bytes, chunks: bytes) -> bytes:
         """The pickled results of chunks around a centre."""

@@ -68,6 +68,10 @@ class Transport(Protocol):
         """Have a worker that is up run the chunks around the centre, behind those it was sent before."""
         ...
 
+    def platforms(self) -> frozenset[str]:
+        """`platform_info.platform_text` of each kind of worker that has come up; of none that is this process's own."""
+        ...
+
     def silent(self) -> tuple[int, ...]:
         """Workers without a place yet, and those that may have been gone when they were sent what they should run."""
         ...
@@ -127,6 +131,11 @@ class Engine(Generic[AnyTransport]):
     def last_loss(self) -> str:
         """Which worker was lost last, and why."""
         return self._state.last_loss
+
+    @property
+    def platforms(self) -> frozenset[str]:
+        """Kinds of workers so far; see `Transport.platforms`."""
+        return self.transport.platforms()
 
     @property
     def counts(self) -> DispatchCounts:

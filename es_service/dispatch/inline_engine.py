@@ -120,6 +120,10 @@ class ChildProcesses:
         to.channel.send(*frames)
         self._watch(to.channel)
 
+    def platforms(self) -> frozenset[str]:
+        """None: children have this process's machine and packages."""
+        return frozenset()
+
     def silent(self) -> tuple[int, ...]:
         """None: sockets tell at once that a child is gone."""
         return ()

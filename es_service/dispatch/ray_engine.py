@@ -115,6 +115,7 @@ class Actors:
         self._handles: dict[int, Any] = {}
         self._calls: dict[Any, _Call] = {}
         self._places: dict[int, WorkerPlace] = {}
+        self._platforms: set[str] = set()
         self._drained: set[int] = set()
         self._nodes: frozenset[str] = frozenset()
         """All that were alive at some time."""
@@ -171,6 +172,10 @@ class Actors:
             self._lose(worker, _reason(error))
             return
         self._calls[ref] = _Call(worker, "run", key, attempt)
+
+    def platforms(self) -> frozenset[str]:
+        """What each kind of actor that has come up said of its packages and processor."""
+        return frozenset(self._platforms)
 
     def silent(self) -> tuple[int, ...]:
         """Workers that have not answered where they are."""
@@ -233,6 +238,7 @@ class Actors:
         if call.what == "run":
             return Answer(call.worker, call.key, call.attempt, pickle.loads(value))
         if call.what == "build":
+            self._platforms.add(value)
             return WorkerUp(call.worker)
         is_known = call.worker in self._places  # it was asked again, whether it is still there
         self._places[call.worker] = WorkerPlace(*value)

@@ -98,6 +98,7 @@ class InThisProcess:
     """An Evaluator whose one worker is the caller. A fault of it would be the end of the run."""
 
     counts = DispatchCounts(workers=1)
+    platforms: frozenset[str] = frozenset()
 
     def __init__(self, config: RunConfig, should_stop: Callable[[], int | None]) -> None:
         from workers.worker import make_worker

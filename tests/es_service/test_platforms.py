@@ -1,0 +1,76 @@
+"""What a run was computed on: its record, and when the digest says that it is mixed."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+
+import pytest
+
+from es_service import api, session
+from es_service.digest import is_mixed
+from es_service.platform_info import computed_on, platform_info, platform_text
+from es_service.platform_info import is_mixed as are_mixed
+from es_service.store.reader import read_platforms
+from tests.benchmarks.science import InThisProcess
+
+DRIVER = {"cpu": "a", "jax": "1"}
+LIKE_THE_DRIVER, OTHER, NEWER = platform_text(DRIVER), platform_text({"cpu": "b"}), platform_text({"cpu": "a"})
+CONFIG = {
+    "task": {"environment": "point_maze", "episode_steps": 10},
+    "policy": {"hidden": [4]},
+    "search": {"algorithm": "es", "pairs": 16},
+    "budget": {"generations": 4},
+    "compute": {"engine": "inline", "workers": 1},
+}
+
+
+@pytest.mark.parametrize(
+    ("workers", "recorded", "mixed"),
+    [
+        ((), None, False),
+        ((LIKE_THE_DRIVER,), None, False),
+        ((OTHER,), [{"cpu": "b"}], False),
+        ((OTHER, LIKE_THE_DRIVER), [DRIVER, {"cpu": "b"}], True),
+        ((OTHER, NEWER), [{"cpu": "a"}, {"cpu": "b"}], True),
+    ],
+)
+def test_workers_are_recorded_where_they_are_not_like_the_driver(workers, recorded, mixed):
+    platform = computed_on(DRIVER, workers)
+    assert platform.get("workers") == recorded
+    assert {**platform, "workers": None} == {**DRIVER, "workers": None}
+    assert are_mixed([platform]) is mixed
+    assert are_mixed([platform, DRIVER]) is (recorded is not None)
+
+
+@pytest.mark.parametrize(
+    ("joins", "mixed", "recorded"),
+    [
+        ({}, False, [0]),  # workers like the driver
+        ({0: OTHER}, False, [0]),  # all workers on another kind of machine than the driver
+        ({0: OTHER, 2: NEWER}, True, [0, 2]),
+        ({4: OTHER}, True, [0, 4]),  # in the very last generation
+    ],
+)
+def test_workers_of_several_kinds_make_a_run_mixed_from_the_generation_they_join(
+    tmp_path, monkeypatch, joins, mixed, recorded
+):
+    class Cluster(InThisProcess):
+        """Whose workers come up in the generations of `joins`."""
+
+        def evaluate(self, centre, chunks):
+            kind = joins.get(centre.generation, "" if joins and 0 in joins else platform_text(platform_info()))
+            self.platforms |= {kind} - {""}
+            return super().evaluate(centre, chunks)
+
+    @contextmanager
+    def engine(config, should_stop, log):
+        yield Cluster(config, should_stop)
+
+    monkeypatch.setattr(session, "_engine", engine)
+    told: list[str] = []
+    run = api.run(api.load_config(CONFIG), tmp_path / "run", on_notice=told.append).run
+    assert is_mixed(run.folder) is mixed
+    assert [first for first, _ in read_platforms(run.folder)] == recorded
+    assert [f"from generation {first} on" in notice for first, notice in zip(recorded[1:], told, strict=True)] == [
+        True
+    ] * len(told)
