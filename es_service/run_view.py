@@ -164,7 +164,7 @@ class Run:
         filled.
         """
         map_ = self.behaviour_map
-        place = (index(place),) if isinstance(place, int | np.integer) else tuple(index(i) for i in place)
+        place = (index(place),) if isinstance(place, int | np.integer) else tuple(map(_whole, place))
         shown = ",".join(map(str, place))
         dimensions = len(map_.geometry.shape)
         if len(place) != dimensions:
@@ -278,6 +278,11 @@ def nearest_filled(map_: BehaviourMap, place: Sequence[int]) -> tuple[int, ...] 
         (map_.geometry.index_of(int(cell)) for cell in map_.cell_N),
         key=lambda other: sum((a - b) ** 2 for a, b in zip(other, place, strict=True)),
     )
+
+
+def _whole(number: float) -> int:
+    """A whole number; pandas makes floats of them where it takes a row out of a table."""
+    return int(number) if isinstance(number, float) and number.is_integer() else index(number)
 
 
 def _light(part: str) -> bool:

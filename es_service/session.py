@@ -99,9 +99,11 @@ class _OnPlatforms:
 
     @property
     def generation(self) -> int | None:
+        """The store's."""
         return self._store.generation
 
     def commit(self, generation: int, parts: Mapping[str, Arrays], history: driver.HistoryRow) -> None:
+        """Record the platform if it is not the one in force, and say so if it is not the first; then commit."""
         platform = computed_on(self._driver, self._engine.platforms)
         if platform != self._recorded:
             is_other = self._store.record_platform(generation, platform)

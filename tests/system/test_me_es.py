@@ -141,6 +141,7 @@ def test_policies_of_cells_and_their_traces(finished):
     map_ = finished.map
     place = tuple(map_[["cell_x", "cell_y"]].iloc[-1])
     elite = finished.elite(place)
+    assert finished.cell([float(number) for number in place]) == finished.cell(place)  # as a row of the table has it
     assert elite.trace_T_B.shape == (61, 2)  # of 60 steps, the start and every one
     np.testing.assert_allclose(elite.trace_T_B[0], (0.9, -0.9), atol=1e-6)
     np.testing.assert_allclose(elite.trace_T_B[-1], map_[["x", "y"]].iloc[-1], atol=1e-5)
