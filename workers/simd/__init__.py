@@ -1,6 +1,6 @@
 """A compiler from JAX functions of one environment to vector code for many: rollouts at the speed of the core.
 
-    trace.py      jaxpr -> scalar graph    (primitives/, elementary.py; graph.py, folding.py, loops.py)
+    trace.py      jaxpr -> scalar graph    (primitives/, elementary.py, division.py; graph.py, folding.py, loops.py)
     schedule.py   which order, which loop, which products are fused with their sums
     emit.py       graph -> LLVM IR         (operations.py; code.py)
     target.py     LLVM IR -> machine code, in process

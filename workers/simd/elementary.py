@@ -51,7 +51,7 @@ def _clipped(g: Graph, x: int, most: float) -> int:
     return g.op("select", g.op("lt", x, g.f(-most)), g.f(-most), x)
 
 
-def _with_sign_of(g: Graph, size: int, sign: int) -> int:
+def with_sign_of(g: Graph, size: int, sign: int) -> int:
     """|size| with the sign bit of another."""
     magnitude = g.op("iand", g.op("bits", size), g.i(0x7FFFFFFF))
     return g.op("unbits", g.op("ior", magnitude, g.op("iand", g.op("bits", sign), g.i(0x80000000))))
@@ -112,7 +112,7 @@ def atan2(g: Graph, y: int, x: int) -> int:
     angle = g.op("select", steep, g.op("sub", g.f(math.pi / 2), angle), angle)
     leftward = g.op("slt", g.op("bits", x), g.i(0))
     angle = g.op("select", leftward, g.op("sub", g.f(math.pi), angle), angle)
-    angle = _with_sign_of(g, angle, y)
+    angle = with_sign_of(g, angle, y)
     return _nan_where_nan(g, x, _nan_where_nan(g, y, angle))
 
 
@@ -135,7 +135,7 @@ def asin(g: Graph, x: int) -> int:
     """Within 3 ulp; NaN beyond [-1, 1]."""
     great, small, _ = _asin_parts(g, x)
     angle = g.op("select", great, g.op("fma", g.f(-2.0), small, g.f(math.pi / 2)), small)
-    return _nan_where_nan(g, angle, _with_sign_of(g, angle, x))
+    return _nan_where_nan(g, angle, with_sign_of(g, angle, x))
 
 
 def acos(g: Graph, x: int) -> int:
@@ -269,6 +269,14 @@ def pow(g: Graph, x: int, y: int) -> int:
     signed = g.op("select", is_odd, g.op("neg", size), size)
     of_negative = g.op("select", is_whole, signed, g.f(math.nan))
     return g.op("select", g.op("lt", x, g.f(0.0)), of_negative, size)
+
+
+def round_half_away(g: Graph, x: int) -> int:
+    """The nearest whole number, halves away from zero. Exact."""
+    size = g.op("abs", x)
+    below = g.op("floor", size)
+    goes_up = g.op("le", g.f(0.5), g.op("sub", size, below))
+    return with_sign_of(g, g.op("select", goes_up, g.op("add", below, g.f(1.0)), below), x)
 
 
 def int_of_float(g: Graph, x: int) -> int:

@@ -2,7 +2,8 @@
 
 Three kinds of values: "f" float32, "i" 32 bits (signed or not is the operation's affair), "b" truth. Every operation is
 one instruction of a vector unit, or nearly; all of them give the same bits on every machine and at every width. There
-is no approximate division or root here, no tangent and no exponential: `elementary.py` makes those of these.
+is no approximate division or root here, no tangent and no exponential: `elementary.py` makes those of these. Vector
+units do not divide integers, so LLVM does it lane by lane, but for constant divisors.
 """
 
 from __future__ import annotations
@@ -49,6 +50,10 @@ def _bits(x: Any) -> Any:
     return np.asarray(x, np.float32).view(np.int32)
 
 
+def _truncated_quotient(a: Any, b: Any) -> Any:
+    return (a - np.fmod(a, b)) // b
+
+
 def _float(x: Any) -> Any:
     return np.asarray(x, np.int32).view(np.float32)
 
@@ -77,6 +82,11 @@ OPERATIONS: dict[str, Operation] = {
     "iand": Operation("ii", "i", np.bitwise_and, "and {I} {0}, {1}", commutes=True),
     "ior": Operation("ii", "i", np.bitwise_or, "or {I} {0}, {1}", commutes=True),
     "ixor": Operation("ii", "i", np.bitwise_xor, "xor {I} {0}, {1}", commutes=True),
+    # Never by 0, nor the least integer by -1; division.py sees to that.
+    "sdiv": Operation("ii", "i", _truncated_quotient, "sdiv {I} {0}, {1}"),
+    "srem": Operation("ii", "i", np.fmod, "srem {I} {0}, {1}"),
+    "udiv": Operation("ii", "i", lambda a, b: (_unsigned(a) // _unsigned(b)).view(np.int32), "udiv {I} {0}, {1}"),
+    "urem": Operation("ii", "i", lambda a, b: (_unsigned(a) % _unsigned(b)).view(np.int32), "urem {I} {0}, {1}"),
     # Shifts are by 0 to 31; primitives see to that.
     "shl": Operation("ii", "i", np.left_shift, "shl {I} {0}, {1}"),
     "lshr": Operation("ii", "i", lambda a, b: (_unsigned(a) >> _unsigned(b)).view(np.int32), "lshr {I} {0}, {1}"),

@@ -150,6 +150,23 @@ def choices(draw: Draw) -> Case:
     return jnp.where, [booleans(draw, of), make(draw, of), make(draw, of)]
 
 
+def arg_extremes(draw: Draw) -> Case:
+    of, dtype = shape(draw, least=1), draw(st.sampled_from(["bool", "int32", "uint32"]))
+    axis = draw(st.integers(0, len(of) - 1))
+    x = booleans(draw, of) if dtype == "bool" else integers(draw, of, dtype) % 5
+    return lambda x: (jnp.argmin(x, axis), jnp.argmax(x, axis)), [x]
+
+
+def selections(draw: Draw) -> Case:
+    of, count = shape(draw), draw(st.integers(1, 4))
+    make = draw(st.sampled_from([floats, integers]))
+    conditions = [booleans(draw, of) for _ in range(count)]
+    return lambda conditions, x: jnp.select(list(conditions), [x * (k + 1) for k in range(count)], 3), [
+        np.stack(conditions, 1),
+        make(draw, of),
+    ]
+
+
 def branches(draw: Draw) -> Case:
     functions = [lambda x: x + 1.0, lambda x: x * 2.0, lambda x: -x]
     if draw(st.booleans()):
@@ -255,7 +272,7 @@ CASES: dict[str, Callable[[Draw], Case]] = {
     "special values": binary(lambda a, b: (a + b, a - b, a * b, a / b, jnp.isfinite(a), jnp.sign(a)), special),
     "neg, abs, sign, square": unary(lambda x: (-x, jnp.abs(x), jnp.sign(x), lax.square(x))),
     "sqrt, rsqrt": unary(lambda x: (jnp.sqrt(x), lax.rsqrt(x)), 0.01, 9.0),
-    "floor, ceil, round": unary(lambda x: (jnp.floor(x), jnp.ceil(x), jnp.round(x))),
+    "floor, ceil, round": unary(lambda x: (jnp.floor(x), jnp.ceil(x), jnp.round(x), lax.round(x))),
     "powers": unary(lambda x: (x**3, lax.integer_pow(x, -2), lax.integer_pow(x, 0), x**1.5), 0.5, 2.0),
     "trigonometry": unary(lambda x: (jnp.sin(x), jnp.cos(x), jnp.tan(x * 0.4), jnp.arctan(x))),
     "arcs": unary(lambda x: (jnp.arcsin(x), jnp.arccos(x)), -1.0, 1.0),
@@ -289,6 +306,14 @@ CASES: dict[str, Callable[[Draw], Case]] = {
     "integer sums": reduction(lambda x, axes: x.sum(axes), integers),
     "extremes of axes": reduction(lambda x, axes: (x.max(axes), x.min(axes)), special),
     "all and any": reduction(lambda x, axes: (x.all(axes), x.any(axes)), booleans),
+    "remainders": binary(lambda a, b: (lax.rem(a, b), jnp.mod(a, b), a // 1.5)),
+    "division of integers": binary(lambda a, b: (a // b, a % b, lax.div(a, b), lax.rem(a, b)), integers),
+    "division without signs": binary(
+        lambda a, b: (a // b, a % b, lax.div(a, b), lax.rem(a, b)), lambda draw, of: integers(draw, of, "uint32")
+    ),
+    "signs of integers": binary(lambda a, b: jnp.sign(a - b), integers),
+    "arg extremes of others": arg_extremes,
+    "select": selections,
     "arg extremes": lambda draw: (lambda x: (jnp.argmin(x, 0), jnp.argmax(x, 0)), [special(draw, (4, 2))]),
     "dots": dots,
     "gather": gather,
@@ -367,7 +392,6 @@ def test_every_primitive_has_a_case() -> None:
         (lambda x: jnp.take(x, jnp.argmax(x)), "gather with indices that depend on the state"),
         (lambda x: lax.while_loop(lambda y: y.sum() < 9.0, lambda y: y + 1.0, x), "a while loop whose end depends"),
         (lambda x: x.astype(jnp.float16).astype(jnp.float32), "values of type float16"),
-        (lambda x: jnp.fmod(x, 1.5), "rem of float32"),
         (lambda x: (x.astype(jnp.int32).astype(jnp.uint8) + 1).astype(jnp.float32), "add of uint8"),
         (
             lambda x: lax.while_loop(lambda c: c[0] < 10**6, lambda c: (c[0] + 1, c[1]), (0, x))[1],

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jax import lax
 
-from workers.simd import elementary
+from workers.simd import division, elementary
 from workers.simd.primitives.registry import PRIMITIVES, Nodes, Rule, UnsupportedError, dtype_in, kind_of, primitive
 
 if TYPE_CHECKING:
@@ -40,30 +40,13 @@ PRIMITIVES["xor"] = _by_kind(None, "ixor", "xor")
 PRIMITIVES["population_count"] = _by_kind(None, "popcount")
 
 
-@primitive("div")
-def _div(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
-    if kind_of(dtype_in(equation)) == "f":
-        return t.ops("div", a, b)
-    return _constant_integers(t, equation, a, b)
-
-
-@primitive("rem")
-def _rem(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
-    return _constant_integers(t, equation, a, b)
-
-
-def _constant_integers(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
-    """Vector units do not divide integers; indices, which are constants, are divided here."""
-    value_a, value_b = t.values(a), t.values(b)
-    if kind_of(dtype_in(equation)) == "f" or value_a is None or value_b is None:
-        raise UnsupportedError(f"{equation.primitive.name} of {dtype_in(equation)} that are no constants")
-    if not value_b.all():
-        raise UnsupportedError(f"{equation.primitive.name} by 0")
-    dtype = np.dtype(dtype_in(equation))
-    exact_a, exact_b = (value.astype(np.int32).view(dtype).astype(np.int64) for value in (value_a, value_b))
-    quotient = np.sign(exact_a) * np.sign(exact_b) * (np.abs(exact_a) // np.abs(exact_b))
-    found = quotient if equation.primitive.name == "div" else exact_a - quotient * exact_b
-    return t.constants(np.asarray(found.astype(dtype)))
+@primitive("div", "rem")
+def _divide(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
+    is_quotient, dtype = equation.primitive.name == "div", dtype_in(equation)
+    if kind_of(dtype) == "f":
+        return t.ops("div", a, b) if is_quotient else t.map(lambda x, y: division.remainder(t.graph, x, y), a, b)
+    divide = division.whole_quotient if is_quotient else division.whole_remainder
+    return t.map(lambda x, y: divide(t.graph, x, y, dtype), a, b)
 
 
 @primitive("neg")
@@ -83,6 +66,10 @@ def _abs(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 @primitive("sign")
 def _sign(t: Tracer, equation: Any, x: Nodes) -> Nodes:
     g = t.graph
+    if dtype_in(equation) == "int32":
+        zero = t.constants(np.int32(0))
+        above, below = t.ops("slt", zero, x), t.ops("slt", x, zero)
+        return t.ops("isub", t.ops("int_of_bool", above), t.ops("int_of_bool", below))
     if kind_of(dtype_in(equation)) != "f":
         raise UnsupportedError(f"sign of {dtype_in(equation)}")
 
@@ -107,9 +94,9 @@ def _integer_pow(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 
 @primitive("round")
 def _round(t: Tracer, equation: Any, x: Nodes) -> Nodes:
-    if equation.params["rounding_method"] != lax.RoundingMethod.TO_NEAREST_EVEN:
-        raise UnsupportedError("rounding half away from zero")
-    return t.ops("round", x)
+    if equation.params["rounding_method"] == lax.RoundingMethod.TO_NEAREST_EVEN:
+        return t.ops("round", x)
+    return t.map(lambda n: elementary.round_half_away(t.graph, n), x)
 
 
 def _elementary(function: Callable[..., int]) -> Rule:

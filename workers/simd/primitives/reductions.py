@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from workers.simd.primitives.choices import extreme_of, to_float
+from workers.simd.graph import Graph
+from workers.simd.primitives.choices import choose, extreme_of, to_float
 from workers.simd.primitives.registry import PRIMITIVES, Nodes, Rule, UnsupportedError, dtype_in, kind_of, primitive
 
 if TYPE_CHECKING:
@@ -77,20 +78,36 @@ def _arg_extreme(t: Tracer, equation: Any, x: Nodes) -> Nodes:
     """The first extreme; the first NaN, if there is one."""
     g = t.graph
     (axis,) = equation.params["axes"]
-    dtype = dtype_in(equation)
-    if kind_of(dtype) != "f" or str(equation.params["index_dtype"]) != "int32":
-        raise UnsupportedError(f"{equation.primitive.name} of {dtype}")
+    if str(equation.params["index_dtype"]) != "int32":
+        raise UnsupportedError(f"{equation.primitive.name} as {equation.params['index_dtype']}")
+    goes_ahead = _beats(g, equation.primitive.name, dtype_in(equation))
     rows = np.moveaxis(x, axis, -1)
     found = []
     for row in rows.reshape(-1, x.shape[axis]).tolist():
         best, at = row[0], g.i(0)
         for number, node in enumerate(row[1:], 1):
-            ahead = g.op("lt", node, best) if equation.primitive.name == "argmin" else g.op("lt", best, node)
-            ahead = g.op("or", ahead, g.op("and", g.op("ne", node, node), g.op("eq", best, best)))
-            best = g.op("select", ahead, node, best)
+            ahead = goes_ahead(node, best)
+            best = choose(g, ahead, node, best)
             at = g.op("iselect", ahead, g.i(number), at)
         found.append(at)
     return np.array(found, np.int64).reshape(rows.shape[:-1])
+
+
+def _beats(g: Graph, name: str, dtype: str) -> Callable[[int, int], int]:
+    """Whether a node is more extreme than the best before it."""
+    kind = kind_of(dtype)
+    less = {"f": "lt", "i": "slt" if dtype == "int32" else "ult"}.get(kind)
+
+    def beats(node: int, best: int) -> int:
+        low, high = (node, best) if name == "argmin" else (best, node)
+        if less is None:
+            return g.op("and", g.op("xor", g.const("b", True), low), high)
+        ahead = g.op(less, low, high)
+        if kind == "f":
+            ahead = g.op("or", ahead, g.op("and", g.op("ne", node, node), g.op("eq", best, best)))
+        return ahead
+
+    return beats
 
 
 def _cumulate(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Rule:
