@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from es_service.commands import command
+from es_service.commands import command, install_command
 from es_service.config.yaml_text import did_you_mean, one_of
 from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.maps.behaviour_map import BehaviourMap, Elite
@@ -90,7 +90,7 @@ def ribs_archive(run: Run) -> Any:
     try:
         from ribs.archives import GridArchive
     except ImportError as error:
-        raise ConfigError("--to ribs needs pyribs: pip install 'es-service[ribs]', or pip install ribs") from error
+        raise ConfigError(f"--to ribs needs pyribs; {install_command('ribs')}") from error
     map_, elites = run.elites()
     if not isinstance(map_.geometry, Grid):
         raise NotInRunError(f"the map of {run.folder} is a cvt and no grid, as a GridArchive is; --to npz has it all")
@@ -161,7 +161,7 @@ def _parquet(run: Run, folder: Path) -> list[Path]:
         try:
             table.to_parquet(written[-1], index=False)
         except ImportError as error:
-            raise ConfigError("--to parquet needs pyarrow: pip install 'es-service[parquet]'") from error
+            raise ConfigError(f"--to parquet needs pyarrow; {install_command('parquet')}") from error
     return written
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from es_service.commands import install_command
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError, EvaluationError, ServiceError
 
@@ -127,7 +128,7 @@ def _client(address: str) -> Any:
         from ray.job_submission import JobSubmissionClient
     except ImportError as error:
         raise EvaluationError(
-            f"jobs need the extra `cluster` ({error}): pip install 'es-service[cluster]'; "
+            f"jobs need the extra `cluster` ({error}); {install_command('cluster')}. "
             "`es-service run CONFIG --address HOST:PORT` does without"
         ) from error
     for name in ("ray.dashboard.modules.dashboard_sdk", "ray._private.runtime_env.packaging"):

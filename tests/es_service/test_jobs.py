@@ -17,7 +17,9 @@ CONFIG = load_config(
 
 def test_without_the_extra_the_error_names_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "aiohttp", None)
-    with pytest.raises(EvaluationError, match=r"extra `cluster`.*pip install 'es-service\[cluster\]'"):
+    with pytest.raises(
+        EvaluationError, match=r"extra `cluster`.*in a clone .*pip install .*'\.\[cluster\]'\. `es-service"
+    ):
         jobs.submit(CONFIG, "http://127.0.0.1:8265", "/runs/x")
 
 

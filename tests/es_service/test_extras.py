@@ -1,0 +1,45 @@
+"""What is missing without an extra of the package is named with a command that gets it: from a clone, by its pins."""
+
+import re
+import sys
+import tomllib
+from pathlib import Path
+from types import SimpleNamespace
+
+import pandas as pd
+import pytest
+
+from es_service import export
+from es_service.commands import install_command
+from es_service.errors import ConfigError
+
+ROOT = Path(__file__).parents[2]
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+
+
+@pytest.mark.parametrize(("to", "package"), [("ribs", "ribs.archives"), ("parquet", "pyarrow")])
+def test_an_export_without_its_package_says_how_to_get_it(tmp_path, monkeypatch, to, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.setattr(export, "tables", lambda run: {"history": pd.DataFrame({"generation": [0]})})
+    run = SimpleNamespace(generation=0)
+    said = f"needs py{package.removeprefix('py').partition('.')[0]}; {install_command(to)}"
+    with pytest.raises(ConfigError, match=f"^--to {to} {re.escape(said)}$"):
+        export.export(run, to, tmp_path)  # pyright: ignore[reportArgumentType]
+    assert to in EXTRAS
+
+
+@pytest.mark.parametrize("folder", ["es_service", "workers", "docker"])
+def test_nobody_is_sent_to_a_package_index_for_es_service(folder):
+    texts = {path: path.read_text() for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".yaml", ".md")}
+    assert texts
+    for path, text in texts.items():
+        assert not re.search(r"pip install[^\n]*es[-_]service\[", text), path
+        for extra in re.findall(r"pip install[^\n]*'\.\[(\w+)\]'", text):
+            assert extra in EXTRAS, path
+
+
+def test_the_packages_of_extras_are_pinned():
+    pinned = {line.partition("==")[0].lower() for line in (ROOT / "constraints.txt").read_text().splitlines()}
+    for packages in EXTRAS.values():
+        names = {re.split(r"[\[><=]", package)[0].lower() for package in packages} - {"es-service"}
+        assert names <= pinned
