@@ -22,10 +22,10 @@ import pandas as pd
 
 from es_service import api, session
 from es_service.protocol import worker_environment
-from tests.benchmarks.ants import RESULTS, summary
+from tests.benchmarks.ants import summary
 from tests.benchmarks.science import CONFIGS, in_this_process
 
-TABLE = RESULTS / "ant_maze_trials.csv"
+TABLE = Path(__file__).parent / "results" / "ant_maze_trials.csv"
 RUNS = Path(__file__).parents[2] / "runs" / "ant_trials"
 ENV_STEPS = 150_000_000
 SEED = 100

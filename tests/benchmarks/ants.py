@@ -1,15 +1,18 @@
 """What did long runs find on AntMaze and AntTrap? Summaries of run folders, as curves, tables and a picture.
 
-    es-service run configs/ant_maze_me_es.yaml --out RUN --set budget.env_steps=1_000_000_000
-    python -m tests.benchmarks.ants RUN [RUN ...]
+    es-service run configs/ant_maze_me_es.yaml --out RUN --set budget.env_steps=1_000_000_000 \\
+        --set budget.generations=null       # the config would stop at 2000
+    python -m tests.benchmarks.ants RUN [RUN ...] --to FOLDER
 
-Writes results/ants.csv, a row per run, results/ants_curves.csv, up to 60 rows per run, and results/ants.png: where all
-evaluated centres ended, early ones light, and the way of the best one's first episode.
+Writes into the folder ants.csv, a row per run, ants_curves.csv, up to 60 rows per run, and ants.png: where all
+evaluated centres ended, early ones light, and the way of the best one's first episode. Those of our own runs are in
+tests/benchmarks/results.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +28,6 @@ from es_service.platform_info import cpu_kind
 from es_service.run_view import Run
 from workers.environments import TASKS
 
-RESULTS = Path(__file__).parent / "results"
 POINTS = 60
 """Of a curve."""
 NEAR_GOAL_M = 5.0
@@ -131,14 +133,17 @@ def draw(runs: dict[str, Run], path: Path) -> None:
     plt.close(figure)
 
 
-def main() -> None:
+def main(words: Sequence[str] | None = None) -> None:
+    """The command line, or other words in its place."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path)
-    parser.add_argument("--to", type=Path, default=RESULTS)
-    arguments = parser.parse_args()
+    # Without a default: runs of a reader are not to take the place of ours.
+    parser.add_argument("--to", type=Path, required=True, metavar="FOLDER")
+    arguments = parser.parse_args(words)
     runs = {path.name: open_run(path) for path in arguments.runs}
     table = pd.DataFrame([summary(name, run) for name, run in runs.items()])
     print(table.T.to_string())
+    arguments.to.mkdir(parents=True, exist_ok=True)
     table.to_csv(arguments.to / "ants.csv", index=False)
     pd.concat([curve(name, run) for name, run in runs.items()]).to_csv(arguments.to / "ants_curves.csv", index=False)
     draw(runs, arguments.to / "ants.png")

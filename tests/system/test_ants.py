@@ -11,6 +11,7 @@ import pytest
 
 from es_service import api
 from es_service.digest import digest_parts
+from tests.benchmarks import ants
 from tests.system.test_workers import children
 
 pytestmark = pytest.mark.slow
@@ -49,3 +50,11 @@ def test_one_worker_and_two_of_which_one_is_killed(tmp_path, environment):
     assert history["centre_return_mean"].notna().all()
     assert ("goal_distance" in history) == (environment == "ant_maze")
     assert digest_parts(tmp_path / "two") == digest_parts(tmp_path / "one")
+    ants.main([str(tmp_path / "one"), str(tmp_path / "two"), "--to", str(tmp_path / "tables")])
+    assert {file.name for file in (tmp_path / "tables").iterdir()} == {"ants.csv", "ants_curves.csv", "ants.png"}
+
+
+def test_runs_of_a_reader_do_not_take_the_place_of_the_measured_ones(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        ants.main(["RUN"])
+    assert "the following arguments are required: --to" in capsys.readouterr().err
