@@ -20,8 +20,8 @@ def remainder(g: Graph, x: int, y: int) -> int:
     """
     rest = size = g.op("abs", x)
     step = g.op("abs", y)
-    # A rounded quotient's remainder is a float, so each trip is exact. The first leaves at most 2^-24 of x, or 3/4 y,
-    # the second at most 3/4 y of that, above or below zero.
+    # What a rounded quotient leaves of a number is a float, so each trip is exact. The first leaves at most 2^-24 of x
+    # or 3/4 of y, whichever is more, and so the second at most 3/4 of y, above zero or below.
     for _ in range(2):
         times = g.op("round", g.op("div", rest, step))
         rest = g.op("fma", g.op("neg", times), step, rest)
