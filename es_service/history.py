@@ -64,7 +64,7 @@ _SEARCH_AND_TIMES = (
     Column("update_norm", "REAL", True, "Euclidean norm of the step from the old centre to the new one"),
     Column("parameter_norm", "REAL", True, "Euclidean norm of the new centre"),
     Column("invalid_members", "INTEGER", True, "members with a non-finite fitness or descriptor"),
-    Column("retries", "INTEGER", False, "chunks run again in this generation"),
+    Column("retries", "INTEGER", False, "chunks handed out again in this generation"),
     Column("lost_workers", "INTEGER", False, "workers that died, hung or were replaced in this generation"),
     Column("workers", "INTEGER", False, "workers the evaluator was asked to keep"),
     Column("wall_clock_s", "REAL", False, "seconds spent in this run so far, all sessions together"),

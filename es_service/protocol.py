@@ -262,6 +262,7 @@ class DispatchCounts:
     """Faults survived so far by an evaluator, over all generations of this process."""
 
     retries: int = 0
+    """Chunks handed out again, also those that a lost worker had not begun."""
     lost_workers: int = 0
     workers: int = 0
     """Workers the evaluator was asked to keep."""

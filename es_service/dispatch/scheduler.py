@@ -246,13 +246,13 @@ def _fail(s: SchedulerState, out: list[Command], message: str) -> SchedulerState
 def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int, ...]) -> SchedulerState:
     """Stop every worker whose deadline has passed; fail if no worker was up for too long."""
     policy = s.policy
-    reason = f"did not come up in {policy.start_deadline_s:g} s ({policy.name_of('start_deadline_s')})"
+    reason = f"did not come up in {_plain(policy.start_deadline_s)} s ({policy.name_of('start_deadline_s')})"
     late = {worker: reason for worker, at in s.starting.items() if now >= at}
     for worker, record in (*s.up.items(), *s.draining.items()):
         if now >= record.deadline_s:
             limit_s = record.deadline_s - record.started_s
             key, name = record.slots[0].task.key, policy.name_of(record.limit)
-            late[worker] = f"no answer to task {key} in {limit_s:.3g} s ({name})"
+            late[worker] = f"no answer to task {key} in {_plain(limit_s)} s ({name})"
     for worker, reason in late.items():
         if s.failed is None:
             out.append(StopWorker(worker, reason))
@@ -260,9 +260,14 @@ def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int
             has_no_place = is_silent and worker in s.starting
             s = _lose(s, out, worker, reason, now, fault=not has_no_place, charge=not is_silent)
     if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + policy.no_worker_timeout_s:
-        for_s = f"{policy.no_worker_timeout_s:g} s ({policy.name_of('no_worker_timeout_s')})"
+        for_s = f"{_plain(policy.no_worker_timeout_s)} s ({policy.name_of('no_worker_timeout_s')})"
         return _fail(s, out, f"{len(s.tasks)} tasks wait and no worker was up for {for_s}; last loss: {s.last_loss}")
     return s
+
+
+def _plain(seconds: float) -> str:
+    """Three digits at most matter to a reader; no exponent does."""
+    return f"{seconds:.0f}" if seconds >= 100.0 else f"{seconds:.3g}"
 
 
 def _drain(s: SchedulerState, out: list[Command], worker: int) -> None:
@@ -297,7 +302,7 @@ def _assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState
             del s.queue[index]
             waiting, record = s.tasks[key], s.up[worker]
             s.tasks[key] = waiting._replace(holder=worker)
-            retries += waiting.last_holder is not None
+            retries += waiting.task.size if waiting.last_holder is not None else 0
             slot = Slot(waiting.task, waiting.faults + 1)
             record = record._replace(slots=(*record.slots, slot))
             s.up[worker] = begin_first_slot(s, record, now) if load == 0 else record

@@ -73,7 +73,7 @@ class SchedulerState(NamedTuple):
     failed: str | None = None
     """The message of `Fail`; the state is then terminal."""
     retries: int = 0
-    """Assignments beyond a task's first."""
+    """Chunks assigned again: of each assignment of a task beyond its first."""
     lost_workers: int = 0
     """Workers lost, or stopped for a fault."""
     duplicates: int = 0

@@ -75,7 +75,9 @@ def _progress(rows: list[dict[str, Any]]) -> dict[str, str]:
         filled["map"] = f"{last['map_cells']:,} cells, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
     lost, retries = (sum(row[name] for row in rows) for name in ("lost_workers", "retries"))
-    faults = {"faults survived": f"{lost} workers replaced, {retries} chunks run again"} if lost or retries else {}
+    faults = {}
+    if lost or retries:
+        faults["faults survived"] = f"{lost} workers replaced, {retries} chunks handed out again"
     return {
         "generation": str(last["generation"]),
         "best fitness": f"{last['best_fitness']:.2f}",

@@ -88,12 +88,13 @@ class World:
         self.up: set[int] = set()
         self.draining: set[int] = set()
         self.open: dict[int, list[tuple[tuple, int]]] = {}
+        self.size: dict[tuple, int] = {}
         self.fresh: deque[tuple] = deque()
         self.waiting: set[tuple] = set()
         self.delivered: set[tuple] = set()
         self.faults: Counter[tuple] = Counter()
         self.last_holder: dict[tuple, int] = {}
-        self.assigned = self.lost = self.dropped = self.start_failures = self.tried = self.newest = 0
+        self.again = self.lost = self.dropped = self.start_failures = self.tried = self.newest = 0
         self.start_due: dict[int, float] = {}
         self.down_since: float | None = None
         self.failed: str | None = None
@@ -195,6 +196,7 @@ class World:
             case Submit(tasks):
                 self.fresh.extend(task.key for task in tasks)
                 self.waiting.update(task.key for task in tasks)
+                self.size.update((task.key, task.size) for task in tasks)
             case Placed(worker):
                 self.unplaced.discard(worker)
                 if worker in self.known:
@@ -294,11 +296,12 @@ class World:
         assert key in self.waiting
         assert all(key != held for slots in self.open.values() for held, _ in slots)
         assert attempt == self.faults[key] + 1 <= self.policy.max_attempts
-        if key not in self.last_holder:
+        if key in self.last_holder:
+            self.again += self.size[key]
+        else:
             assert key == self.fresh.popleft(), "out of submission order"
         assert self.last_holder.get(key) != worker or len(self.up - self.draining) == 1
         self.last_holder[key] = worker
-        self.assigned += 1
         self.open[worker].append((key, attempt))
         assert len(self.open[worker]) <= self.policy.in_flight
         self.inbox[worker].append((key, attempt))
@@ -323,7 +326,7 @@ class World:
     def check_books(self) -> None:
         state = self.state
         assert (state.lost_workers, state.duplicates) == (self.lost, self.dropped)
-        assert state.retries == self.assigned - len(self.last_holder)
+        assert state.retries == self.again
         assert pending(state) == len(self.waiting)
         if self.failed is not None:
             assert state.failed == self.failed
@@ -349,7 +352,7 @@ class World:
 
     def submit(self, generation: int) -> None:
         tasks = tuple(
-            Task((kind, generation, index), kind)
+            Task((kind, generation, index), kind, self.random.randint(1, 3))
             for kind in ("TrainingChunk", "EvaluationChunk")
             for index in range(self.random.randint(0, 7))
         )

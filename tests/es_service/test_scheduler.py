@@ -182,6 +182,21 @@ def test_deadlines_and_durations_are_in_proportion_to_the_size_of_a_task():
     assert usual_chunk_s(state, "evaluate") is None
 
 
+@pytest.mark.parametrize(
+    ("limit_s", "said"), [(0.25, "0.25"), (12.5, "12.5"), (99.96, "100"), (3600.0, "3600"), (1_234_567.8, "1234568")]
+)
+def test_seconds_are_said_without_an_exponent(limit_s, said):
+    state, _ = play(ready(1, first_deadline_s=limit_s, min_deadline_s=0.1), (0.0, tasks("a")))
+    reason = f"no answer to task a in {said} s (first_deadline_s)"
+    assert step(state, Tick(), limit_s)[1][0] == StopWorker(0, reason)
+
+
+def test_chunks_handed_out_again_are_counted_not_tasks():
+    sized = Submit((Task("a", "train", 5), Task("b", "train", 3)))
+    state, _ = play(ready(1), (0.0, sized), (1.0, WorkerLost(0, "killed")), (2.0, WorkerUp(1)))
+    assert state.retries == 8
+
+
 def test_the_clock_of_a_prefetched_task_starts_when_the_one_ahead_is_done():
     state, _ = play(ready(1), (0.0, tasks("abcd")), (10.0, Result(0, "a", 1)), (12.0, Result(0, "b", 1)))
     assert state.durations_s == {"train": (2.0,)}
