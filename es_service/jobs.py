@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 from uuid import uuid4
 
 from es_service.commands import install_command
@@ -121,7 +122,7 @@ def _client(address: str) -> Any:
     """Ray's client for jobs."""
     if not address.startswith(("http://", "https://")):
         raise ConfigError(
-            f"--address {address}: must be the URL of the cluster's dashboard, such as http://{address.split(':')[0]}:8265"
+            f"--address {address}: must be the URL of the cluster's dashboard, such as http://{_host(address)}:8265"
         )
     try:
         import aiohttp  # noqa: F401  what Ray's client lacks without the extra
@@ -135,6 +136,17 @@ def _client(address: str) -> Any:
         logging.getLogger(name).setLevel(logging.WARNING)  # they would tell of each upload
     with _explained(address):
         return JobSubmissionClient(address)
+
+
+def _host(address: str) -> str:
+    """The host that a wrong address means, as it stands in a URL; this machine if it names none."""
+    try:
+        host = urlsplit(address if "://" in address else f"//{address}").hostname
+    except ValueError:  # a bracket that is not closed
+        host = None
+    if host is None or host == "auto":
+        return "127.0.0.1"
+    return f"[{host}]" if ":" in host else host
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import pytest
@@ -23,9 +24,23 @@ def test_without_the_extra_the_error_names_it(monkeypatch):
         jobs.submit(CONFIG, "http://127.0.0.1:8265", "/runs/x")
 
 
-def test_the_address_is_that_of_the_dashboard():
-    with pytest.raises(ConfigError, match=r"--address node:6379: must be the URL .* such as http://node:8265"):
-        jobs.list_jobs("node:6379")
+@pytest.mark.parametrize(
+    ("address", "host"),
+    [
+        ("node:6379", "node"),
+        ("10.0.0.1", "10.0.0.1"),
+        ("ray://10.0.0.1:10001", "10.0.0.1"),
+        ("[::1]:8265", "[::1]"),
+        ("ray://[::1]:10001", "[::1]"),
+        ("[::1", "127.0.0.1"),
+        ("auto", "127.0.0.1"),
+        ("", "127.0.0.1"),
+    ],
+)
+def test_the_address_is_that_of_the_dashboard(address, host):
+    suggestion = f"--address {address}: must be the URL of the cluster's dashboard, such as http://{host}:8265"
+    with pytest.raises(ConfigError, match=f"^{re.escape(suggestion)}$"):
+        jobs.list_jobs(address)
 
 
 def test_a_relative_folder_is_refused():
