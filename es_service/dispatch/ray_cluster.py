@@ -132,6 +132,14 @@ def look(ray: ModuleType, claim: Claim) -> Membership:
     return Membership(room, leaving, frozenset(alive))
 
 
+def demand(ray: ModuleType, claim: Claim) -> str:
+    """What workers need, and what there is."""
+    return (
+        f"Each needs {claim}; the cluster has {_resources(ray.cluster_resources())} in all, free are "
+        f"{_resources(ray.available_resources())}"
+    )
+
+
 class Watch:
     """Looks at the cluster again and again in a thread of its own, since a look may block."""
 
@@ -175,6 +183,11 @@ def _room(resources: dict[str, float], claim: Claim) -> int:
     if claim.gpus >= 1:
         by_gpu = int(resources.get("GPU", 0.0) / claim.gpus)
     return min(by_cpu, by_gpu)
+
+
+def _resources(amounts: dict[str, float]) -> str:
+    """The resources that matter here, as a user would name them."""
+    return ", ".join(f"{amounts.get(name, 0.0):g} {name}" for name in ("CPU", "GPU"))
 
 
 def _draining(ray: ModuleType) -> dict[str, int]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import pickle
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
@@ -21,7 +22,7 @@ from typing import Any
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.messages import Drain, Failure, Placed, Policy, SetWorkers, WorkerLost, WorkerUp
-from es_service.dispatch.ray_cluster import ONE_CORE, Claim, Watch, connect, disconnect, look
+from es_service.dispatch.ray_cluster import ONE_CORE, Claim, Watch, connect, demand, disconnect, look
 from es_service.errors import EvaluationError
 from es_service.protocol import Centre, Chunk, WorkerPlace, WorkerSpec
 
@@ -60,7 +61,7 @@ def ray_engine(
     try:
         room = look(ray, claim).room
         if address is None and not room:  # nor will there ever be
-            raise EvaluationError(f"this machine has no place for a worker. {_demand(ray, claim)}")
+            raise EvaluationError(f"this machine has no place for a worker. {demand(ray, claim)}")
         if elastic:
             policy = replace(policy, workers=max(1, room))
         watch = None if address is None else Watch(ray, claim)
@@ -205,9 +206,9 @@ class Actors:
         if not self._places and time.monotonic() > self._placed_by_s:
             time_s = f"{self._patience_s:g} s ({self._policy.name_of('no_worker_timeout_s')})"
             if self._watch is None:  # which has a place for each: their processes do not start, or very slowly
-                raise EvaluationError(f"no worker's process answered in {time_s}. {_demand(self._ray, self._claim)}")
+                raise EvaluationError(f"no worker's process answered in {time_s}. {demand(self._ray, self._claim)}")
             raise EvaluationError(
-                f"no worker was given a place in {time_s}. {_demand(self._ray, self._claim)}. Add nodes, or stop what "
+                f"no worker was given a place in {time_s}. {demand(self._ray, self._claim)}. Add nodes, or stop what "
                 "else runs there."
             )
         return None
@@ -228,9 +229,9 @@ class Actors:
             value = self._ray.get(ref)
         except errors.RayTaskError as error:  # it raised, and lives
             if call.what != "run":
-                return self._lost(call.worker, str(error))
+                return self._lost(call.worker, _text(error))
             del self._calls[ref]
-            return Failure(call.worker, call.key, call.attempt, str(error))
+            return Failure(call.worker, call.key, call.attempt, _text(error))
         except errors.RayError as error:
             where = self._places.get(call.worker)
             return self._lost(call.worker, f"{where or 'before it had a place'}: {_reason(error)}")
@@ -280,7 +281,7 @@ class Actors:
 
 def _reason(error: Exception) -> str:
     """What a fault of an actor means, on one line."""
-    first = str(error).strip().partition("\n")[0]
+    first = _text(error).strip().partition("\n")[0]
     known = {
         "OutOfMemoryError": "its node ran out of memory and Ray killed it",
         "ActorUnavailableError": "its node does not answer",
@@ -290,14 +291,6 @@ def _reason(error: Exception) -> str:
     return f"{known.get(kind, kind)}: {first}"
 
 
-def _demand(ray: ModuleType, claim: Claim) -> str:
-    """What workers need, and what there is."""
-    return (
-        f"Each needs {claim}; the cluster has {_resources(ray.cluster_resources())} in all, free are "
-        f"{_resources(ray.available_resources())}"
-    )
-
-
-def _resources(amounts: dict[str, float]) -> str:
-    """The resources that matter here, as a user would name them."""
-    return ", ".join(f"{amounts.get(name, 0.0):g} {name}" for name in ("CPU", "GPU"))
+def _text(error: Exception) -> str:
+    """What an error says, without the colours that Ray gives it whoever may read it."""
+    return re.sub(r"\x1b\[[0-9;]*m", "", str(error))

@@ -13,7 +13,7 @@ import pytest
 
 from es_service.dispatch import ray_engine as module
 from es_service.dispatch.engine import Answer, Engine
-from es_service.dispatch.messages import Drain, Placed, Policy, SetWorkers, WorkerLost, WorkerUp
+from es_service.dispatch.messages import Drain, Failure, Placed, Policy, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import ONE_CORE, Membership, look
 from es_service.dispatch.ray_engine import Actors
 from es_service.errors import EvaluationError
@@ -270,6 +270,22 @@ def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
     assert isinstance(told[1], WorkerLost)
     assert (told[1].worker, told[1].bystander) == (0, False)
     assert told[2:] == [SetWorkers(1), None]
+
+
+@pytest.mark.parametrize("error", [RayTaskError, ActorDiedError])
+@pytest.mark.parametrize("call", range(3))
+def test_what_is_said_of_an_error_has_no_colours(error, call):
+    """Neither of one in a place, a build or a run; it is for logs, too."""
+    ray = PretendedRay()
+    actors = transport(ray, Policy(1))
+    actors.start(0)
+    actors.send(0, FIRST, "key", 1, [CHUNK])
+    ray.actors[0].owed[call].error = error("\x1b[36mray::worker-0\x1b[39m: \x1b[1;31mno\x1b[0m")
+    told = [actors.receive(0.0) for _ in range(3)]
+    said = [message.reason for message in told if isinstance(message, WorkerLost)]
+    said += [message.message for message in told if isinstance(message, Failure)]
+    assert len(said) == 1
+    assert said[0].endswith("ray::worker-0: no")
 
 
 def test_a_chunk_that_kills_its_workers_is_found_out_after_as_many_as_it_has_attempts():
