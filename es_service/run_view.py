@@ -280,7 +280,7 @@ def nearest_filled(map_: BehaviourMap, place: Sequence[int]) -> tuple[int, ...] 
     )
 
 
-def _whole(number: float) -> int:
+def _whole(number: Any) -> int:
     """A whole number; pandas makes floats of them where it takes a row out of a table."""
     return int(number) if isinstance(number, float) and number.is_integer() else index(number)
 
