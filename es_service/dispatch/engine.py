@@ -15,7 +15,7 @@ from typing import Generic, Protocol, Self, TypeVar
 from es_service.dispatch import messages
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.scheduler import step
-from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, usual_chunk_s
+from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, told_last_words, usual_chunk_s
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts, TaskKey
 
@@ -56,8 +56,9 @@ class Transport(Protocol):
         `Placed`."""
         ...
 
-    def kill(self, worker: int) -> None:
-        """Kill a worker for good and free what it held; nothing happens if it is gone.
+    def kill(self, worker: int) -> str:
+        """Kill a worker for good and free what it held; nothing happens if it is gone. What its process wrote last,
+        where that is at hand; else an empty text.
 
         Messages of a killed worker may still be received (that it is lost, too): the scheduler has forgotten it and
         drops them, so a transport need not look for them.
@@ -205,7 +206,7 @@ class Engine(Generic[AnyTransport]):
                 case messages.StartWorker(worker):
                     self.transport.start(worker)
                 case messages.StopWorker(worker, _):
-                    self.transport.kill(worker)
+                    self._state = told_last_words(self._state, worker, self.transport.kill(worker))
                 case messages.Assign(worker, key, attempt):
                     assert self._centre is not None
                     self.transport.send(worker, self._centre, key, attempt, self._chunks[key])

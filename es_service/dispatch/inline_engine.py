@@ -23,7 +23,7 @@ from typing import IO
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
+from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
 from es_service.protocol import Centre, Chunk, WorkerSpec, child_environment
 from es_service.wire import BUFFER_BYTES, Channel, framed
@@ -99,11 +99,12 @@ class ChildProcesses:
         theirs.close()
         self._add(worker, child, ours)
 
-    def kill(self, worker: int) -> None:
-        """Kill a worker's child, wait for it and free its descriptors; its other workers are lost."""
-        if worker in self._workers:
-            child = self._forget(worker)
-            self._lose(child, f"worker {worker}, a thread of the same process, had to be killed", bystanders=True)
+    def kill(self, worker: int) -> str:
+        """Kill a worker's child, wait for it and free its descriptors; its other workers are lost. Its last words."""
+        if worker not in self._workers:
+            return ""
+        child = self._forget(worker)
+        return self._lose(child, f"worker {worker}, a thread of the same process, had to be killed", bystanders=True)
 
     def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
         """Send the chunks, behind the centre if the worker does not know it."""
@@ -203,8 +204,9 @@ class ChildProcesses:
         worker.channel.close()
         return worker.child
 
-    def _lose(self, child: _Child, reason: str = "", *, bystanders: bool = False) -> None:
-        """Kill a child for good, and report those of its workers lost that are not forgotten, after what they said.
+    def _lose(self, child: _Child, reason: str = "", *, bystanders: bool = False) -> str:
+        """Kill a child for good, and report those of its workers lost that are not forgotten, after what they said. Its
+        last words.
 
         One that had nothing in hand is a bystander: the scheduler may send it what another of the child had, before it
         comes to its loss.
@@ -213,22 +215,26 @@ class ChildProcesses:
         for number in lost:
             self._hear(number)
             self._forget(number)
-        how = _end(child, list(lost))
+        how, last_words = _end(child)
+        if not reason:
+            reason = f"worker {', '.join(map(str, lost))} (pid {child.process.pid}) ended with {how}"
+            reason += f":\n{last_words}" if last_words else ""
+        elif bystanders:
+            reason = with_last_words(reason, last_words)
         for number, worker in lost.items():
-            self._ready.append(WorkerLost(number, reason or how, bystander=bystanders or not worker.unanswered))
+            self._ready.append(WorkerLost(number, reason, bystander=bystanders or not worker.unanswered))
+        return last_words
 
 
-def _end(child: _Child, numbers: list[int]) -> str:
-    """Kill a child; how it ended and what it said last, as a reason."""
+def _end(child: _Child) -> tuple[str, str]:
+    """Kill a child; how it ended, and what it wrote last."""
     child.process.kill()
     code = child.process.wait()
     child.control.close()
     child.log.seek(0)
     last_words = child.log.read()[-2000:].decode(errors="replace").strip()
     child.log.close()
-    how = f"signal {-code}" if code < 0 else f"exit code {code}"
-    whose = f"worker {', '.join(map(str, numbers))}"
-    return f"{whose} (pid {child.process.pid}) ended with {how}" + (f":\n{last_words}" if last_words else "")
+    return f"signal {-code}" if code < 0 else f"exit code {code}", last_words
 
 
 def _start_child(spec: bytes, undo: ExitStack) -> _Child:

@@ -184,3 +184,8 @@ class Fail:
 
 
 Command = StartWorker | StopWorker | Assign | Deliver | Fail
+
+
+def with_last_words(reason: str, last_words: str) -> str:
+    """The reason of a loss, with what the process wrote before it was killed, if anything."""
+    return f"{reason}; its process had written:\n{last_words}" if last_words else reason

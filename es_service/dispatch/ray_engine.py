@@ -141,8 +141,8 @@ class Actors:
         except self._ray.exceptions.RayError as error:
             self._lose(worker, f"cannot be started: {error}")
 
-    def kill(self, worker: int) -> None:
-        """Kill an actor's process and drop whatever it still owes."""
+    def kill(self, worker: int) -> str:
+        """Kill an actor's process and drop whatever it still owes. What it wrote is on its node, in Ray's logs."""
         for ref in [ref for ref, call in self._calls.items() if call.worker == worker]:
             del self._calls[ref]
         self._places.pop(worker, None)
@@ -151,6 +151,7 @@ class Actors:
         if handle is not None:
             with contextlib.suppress(self._ray.exceptions.RayError, ValueError):
                 self._ray.kill(handle, no_restart=True)
+        return ""
 
     def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
         """Call the actor. A centre is stored once, however many calls share it, and dropped with the next one.

@@ -208,7 +208,7 @@ def _lose(
             _requeue(s, worker, slot.task.key)
     if not fault:
         return s
-    s = s._replace(lost_workers=s.lost_workers + 1, last_loss=f"worker {worker}: {reason}")
+    s = s._replace(lost_workers=s.lost_workers + 1, last_lost=worker, last_loss=f"worker {worker}: {reason}")
     if s.up or s.draining:
         s = s._replace(start_failures=0)
     elif starting and worker >= s.tried:

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Hashable
 from typing import NamedTuple
 
-from es_service.dispatch.messages import Policy, Task
+from es_service.dispatch.messages import Policy, Task, with_last_words
 
 
 class Waiting(NamedTuple):
@@ -69,6 +69,8 @@ class SchedulerState(NamedTuple):
     """Workers below this had been started when the last such failure was counted: they are part of it."""
     down_since_s: float | None = None
     """Since when tasks wait and no worker is up."""
+    last_lost: int | None = None
+    """The worker that was lost last, and why:"""
     last_loss: str = "none was ever lost"
     failed: str | None = None
     """The message of `Fail`; the state is then terminal."""
@@ -120,6 +122,15 @@ def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worke
     if compiles and limit_s < policy.first_deadline_s:
         limit, limit_s = "first_deadline_s", policy.first_deadline_s
     return worker._replace(started_s=now, deadline_s=now + limit_s, limit=limit)
+
+
+def told_last_words(state: SchedulerState, worker: int, last_words: str) -> SchedulerState:
+    """The state when it is known what the process of a worker just stopped had written. That is told of the last loss,
+    and of the failure of the run if it came of this loss."""
+    if worker != state.last_lost:
+        return state
+    failed = None if state.failed is None else with_last_words(state.failed, last_words)
+    return state._replace(last_loss=with_last_words(state.last_loss, last_words), failed=failed)
 
 
 def find_slot(worker: Worker, key: Hashable, attempt: int) -> int | None:

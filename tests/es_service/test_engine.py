@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import signal
 import subprocess
 import threading
@@ -61,6 +62,7 @@ class Scripted:
         self.inbox: deque = deque()
         self.sent: list[Sent] = []
         self.killed: list[int] = []
+        self.last_words: dict[int, str] = {}
         self.waits: list[float] = []
         self.closed = False
         self.on_send: Callable[[Sent], Any] = lambda sent: self.inbox.append(sent.answer())
@@ -71,6 +73,7 @@ class Scripted:
 
     def kill(self, worker):
         self.killed.append(worker)
+        return self.last_words.get(worker, "")
 
     def send(self, worker, centre, key, attempt, chunks):
         self.sent.append(Sent(worker, centre, key, attempt, chunks))
@@ -277,6 +280,22 @@ def test_the_next_deadline_bounds_the_wait(monkeypatch):
         engine.evaluate(FIRST, CHUNKS)
     assert transport.killed == [0]
     assert now[0] == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("is_last", [False, True])
+def test_what_a_hung_worker_had_written_is_told_with_its_loss(monkeypatch, is_last):
+    """Also by the error, if it is the loss that ends the run; what a healthy one wrote is nobody's business."""
+    transport = scripted_with_clock(monkeypatch, [0.0])
+    transport.last_words = {0: "no licence; retrying", 1: "all is well"}
+    transport.on_send = lambda sent: transport.inbox.append(sent.answer()) if sent.worker else None
+    policy = Policy(workers=2, first_deadline_s=1.0, min_deadline_s=1.0, max_attempts=1 if is_last else 2)
+    with Engine(transport, policy) as engine:
+        if is_last:
+            with pytest.raises(EvaluationError, match=r"failed in 1 attempts.*had written:\nno licence; retrying$"):
+                engine.evaluate(FIRST, CHUNKS)
+        else:
+            engine.evaluate(FIRST, CHUNKS)
+        assert re.search(r"^worker 0: no answer .* its process had written:\nno licence; retrying$", engine.last_loss)
 
 
 # Child processes.

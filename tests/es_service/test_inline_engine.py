@@ -117,6 +117,18 @@ def test_a_worker_that_says_what_nobody_can_use_is_lost(transport, said, reason)
     assert transport.process_ids() == {}
 
 
+def test_what_a_process_wrote_before_it_was_killed_is_told_of_all_its_workers(transport):
+    transport, _ = transport
+    transport._workers[0].child.log.write(b"waiting for a licence\n")
+    assert transport.kill(0) == "waiting for a licence"
+    lost = transport.receive(0.0)
+    assert isinstance(lost, WorkerLost)
+    assert lost.reason == (
+        "worker 0, a thread of the same process, had to be killed; its process had written:\nwaiting for a licence"
+    )
+    assert transport.kill(0) == ""
+
+
 def test_a_signal_while_a_worker_is_heard_is_no_fault_of_the_worker(transport, monkeypatch):
     def interrupt(_):
         raise Interrupted(signal.SIGINT)
