@@ -61,15 +61,18 @@ def dispatch_log(folder: Path, after_generation: int | None, *, enabled: bool) -
         raise explained(error, folder, f"opening {FILE}") from error
     with file:
 
-        def write(entry: Event | Command | Session | Committed) -> None:
-            line = {"time": round(time.time(), 4), "is": type(entry).__name__, **vars(entry)}
+        def append(line: bytes) -> None:
             try:
-                file.write(json.dumps(line, default=_plain).encode() + b"\n")
+                file.write(line + b"\n")
             except OSError as error:
                 raise explained(error, folder, f"writing {FILE}") from error
 
+        def write(entry: Event | Command | Session | Committed) -> None:
+            line = {"time": round(time.time(), 4), "is": type(entry).__name__, **vars(entry)}
+            append(json.dumps(line, default=_plain).encode())
+
         if file.tell():
-            file.write(b"\n")  # ends a line that a full disk or a kill cut short
+            append(b"")  # ends a line that a full disk or a kill cut short
         write(Session(after_generation, socket.gethostname(), os.getpid()))
         yield write
 

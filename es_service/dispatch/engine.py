@@ -111,7 +111,7 @@ class Engine(Generic[AnyTransport]):
         should_stop: Callable[[], int | None] = lambda: None,
         log: Log = no_log,
     ) -> None:
-        """Start `policy.workers` workers.
+        """Start `policy.workers` workers; if that raises, as the log may, the transport is closed.
 
         Args:
             transport: belongs to the engine from now on, which closes it.
@@ -126,7 +126,11 @@ class Engine(Generic[AnyTransport]):
         self._phase = 0
         self._chunks: dict[Hashable, Sequence[Chunk]] = {}
         self._results: dict[Hashable, list[ChunkResult]] = {}
-        self._step(messages.Tick())
+        try:
+            self._step(messages.Tick())
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def last_loss(self) -> str:

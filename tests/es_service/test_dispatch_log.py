@@ -1,5 +1,8 @@
 """The dispatch log survives what cuts its lines short."""
 
+import os
+from contextlib import suppress
+
 import pytest
 
 from es_service.dispatch.dispatch_log import FILE, Committed, dispatch_log, read_dispatch_log
@@ -30,5 +33,20 @@ def test_a_file_that_cannot_be_opened_is_an_error_of_the_folder(tmp_path):
     with (
         pytest.raises(StoreError, match=r"opening dispatch\.jsonl"),
         dispatch_log(tmp_path, None, enabled=True),
+    ):
+        raise AssertionError("nothing can be logged")
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_full_disk_is_an_error_of_the_folder_from_the_first_byte_on(small_disk, begun):
+    """Whether the file is new, or there is a line to be ended first."""
+    if begun:
+        (small_disk / FILE).write_bytes(bytes(os.statvfs(small_disk).f_bsize))  # the next byte needs another block
+    with suppress(OSError), (small_disk / "filling").open("wb", buffering=0) as filling:
+        while filling.write(bytes(4096)):
+            pass
+    with (
+        pytest.raises(StoreError, match=r"disk full while writing dispatch\.jsonl"),
+        dispatch_log(small_disk, None, enabled=True),
     ):
         raise AssertionError("nothing can be logged")

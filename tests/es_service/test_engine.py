@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from es_service.dispatch import engine as engine_module
 from es_service.dispatch.engine import POLL_S, Answer, Engine, task_sizes
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
+from es_service.dispatch.messages import Failure, Policy, StartWorker, WorkerLost, WorkerUp
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import EvaluationChunk, PolicyShape, TrainingChunk
 from tests.helpers import SPEC, centre, random_parameters, spec
@@ -380,6 +380,17 @@ def test_children_that_cannot_be_started_are_lost_workers_and_leave_nothing_behi
         pytest.raises(EvaluationError, match=r"(?s)3 tries in a row.*cannot be started.*Too many open files"),
     ):
         engine.evaluate(FIRST, CHUNKS)
+    assert footprint() == before
+
+
+def test_an_engine_whose_log_cannot_be_written_leaves_no_child_behind():
+    def full(entry):
+        if isinstance(entry, StartWorker) and entry.worker == 1:
+            raise OSError(28, "No space left on device")
+
+    before = footprint()
+    with pytest.raises(OSError, match="No space left"):
+        inline_engine(SPEC, Policy(workers=2), log=full)
     assert footprint() == before
 
 
