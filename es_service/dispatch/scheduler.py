@@ -12,11 +12,10 @@ Choices. A result is a pure function of its key, so any result of a known worker
 even of a superseded attempt; a stopped worker is forgotten at once, so what it still says is dropped and counted. Only
 the task a worker was running is charged with its loss; one prefetched behind it goes back with its attempt unused. So
 does one sent to a worker that was gone already, if the transport says so: a machine that dies under many workers is one
-fault, however many of them are tried before all are known to be gone. A task that raised waits for another worker
-rather than go back to the same one, as long as another is up: a broken worker that raises at once must not use up the
-attempts of good tasks. A worker lost while draining is nobody's fault. One that was given no place in time is started
-anew, since one that hangs before it can say where it is looks the same, but counts as no loss. Workers that are lost
-before they come up show a broken environment only if others, started after the first of them was lost, are lost, too.
+fault, however many of them are tried before all are known to be gone. A worker lost while draining is nobody's fault.
+One that was given no place in time is started anew, since one that hangs before it can say where it is looks the same,
+but counts as no loss. Workers that are lost before they come up show a broken environment only if others, started after
+the first of them was lost, are lost, too. Which worker gets which task, and by when it must answer: assignment.py.
 
 Cost: each step makes shallow copies of the containers (C speed, a few microseconds for a thousand entries) and changes
 only the records touched.
@@ -27,8 +26,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Hashable
 
+from es_service.dispatch.assignment import assign, begin_first_slot
 from es_service.dispatch.messages import (
-    Assign,
     Command,
     Deliver,
     Drain,
@@ -48,14 +47,11 @@ from es_service.dispatch.messages import (
 )
 from es_service.dispatch.scheduler_state import (
     SchedulerState,
-    Slot,
     Waiting,
     Worker,
-    begin_first_slot,
     find_slot,
     holds,
     next_deadline,
-    next_for,
 )
 
 RECENT_DURATIONS = 31
@@ -110,7 +106,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
                 _drain(s, out, worker)
     if s.failed is None:
         s = _start_workers(s, out, now)
-        s = _assign(s, out, now)
+        s = assign(s, out, now)
         down = bool(s.tasks) and not s.up and not s.draining
         if down != (s.down_since_s is not None):
             s = s._replace(down_since_s=now if down else None)
@@ -286,25 +282,3 @@ def _start_workers(s: SchedulerState, out: list[Command], now: float) -> Schedul
         s.starting[worker] = now + s.policy.start_deadline_s
         out.append(StartWorker(worker))
     return s._replace(next_worker=s.next_worker + missing)
-
-
-def _assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
-    """Give queued tasks to workers with room, idle ones first."""
-    retries = s.retries
-    for load in range(s.policy.in_flight):
-        if not s.queue:
-            break
-        for worker in [worker for worker, record in s.up.items() if len(record.slots) == load]:
-            index = next_for(s, worker)
-            if index is None:
-                continue
-            key = s.queue[index]
-            del s.queue[index]
-            waiting, record = s.tasks[key], s.up[worker]
-            s.tasks[key] = waiting._replace(holder=worker)
-            retries += waiting.task.size if waiting.last_holder is not None else 0
-            slot = Slot(waiting.task, waiting.faults + 1)
-            record = record._replace(slots=(*record.slots, slot))
-            s.up[worker] = begin_first_slot(s, record, now) if load == 0 else record
-            out.append(Assign(worker, key, slot.attempt))
-    return s if retries == s.retries else s._replace(retries=retries)

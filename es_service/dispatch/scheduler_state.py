@@ -111,19 +111,6 @@ def next_deadline(state: SchedulerState) -> float:
     return min(times, default=math.inf)
 
 
-def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worker:
-    """The worker with the clock of its first slot started, and how long that may take."""
-    if not worker.slots:
-        return worker._replace(deadline_s=math.inf)
-    task, policy = worker.slots[0].task, state.policy
-    usual_s = usual_chunk_s(state, task.kind)
-    limit, limit_s = "min_deadline_s", max(policy.min_deadline_s, policy.deadline_factor * task.size * (usual_s or 0.0))
-    compiles = usual_s is None or task.kind not in worker.warm
-    if compiles and limit_s < policy.first_deadline_s:
-        limit, limit_s = "first_deadline_s", policy.first_deadline_s
-    return worker._replace(started_s=now, deadline_s=now + limit_s, limit=limit)
-
-
 def told_last_words(state: SchedulerState, worker: int, last_words: str) -> SchedulerState:
     """The state when it is known what the process of a worker just stopped had written. That is told of the last loss,
     and of the failure of the run if it came of this loss."""
@@ -145,11 +132,3 @@ def holds(state: SchedulerState, worker: int, key: Hashable) -> bool:
     """Whether a task waits for the answer of this worker."""
     waiting = state.tasks.get(key)
     return waiting is not None and waiting.holder == worker
-
-
-def next_for(state: SchedulerState, worker: int) -> int | None:
-    """Index of the first queued task that a worker may have."""
-    for index, key in enumerate(state.queue):
-        if state.tasks[key].last_holder != worker or len(state.up) == 1:
-            return index
-    return None
