@@ -383,6 +383,14 @@ def test_children_that_cannot_be_started_are_lost_workers_and_leave_nothing_behi
     assert footprint() == before
 
 
+def test_threads_that_are_lost_together_before_they_are_up_do_not_end_the_run():
+    with inline_engine(SPEC, Policy(workers=6, restart_backoff_s=0.01), threads=True) as engine:
+        (victim,) = set(engine.transport.process_ids().values())
+        os.kill(victim, signal.SIGKILL)
+        assert len(engine.evaluate(FIRST, CHUNKS)) == len(CHUNKS)
+        assert (engine.counts.lost_workers, engine.counts.retries) == (6, 0)
+
+
 def test_an_engine_whose_log_cannot_be_written_leaves_no_child_behind():
     def full(entry):
         if isinstance(entry, StartWorker) and entry.worker == 1:
