@@ -282,7 +282,9 @@ def nearest_filled(map_: BehaviourMap, place: Sequence[int]) -> tuple[int, ...] 
 
 def _whole(number: Any) -> int:
     """A whole number; pandas makes floats of them where it takes a row out of a table."""
-    return int(number) if isinstance(number, float) and number.is_integer() else index(number)
+    if int(number) != number:
+        raise TypeError(f"{number!r} is no whole number")
+    return int(number)
 
 
 def _light(part: str) -> bool:
