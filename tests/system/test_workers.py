@@ -18,7 +18,7 @@ from es_service.digest import digest_parts
 from es_service.dispatch import inline_engine
 from es_service.dispatch.engine import Engine
 from es_service.errors import EvaluationError
-from es_service.protocol import TrainingChunk
+from es_service.protocol import TrainingChunk, child_environment
 from tests.system.session import ROOT
 
 CONFIG = {
@@ -166,8 +166,8 @@ def test_a_chunk_that_fails_everywhere_ends_the_run_with_its_error(tmp_path, mon
 
 
 def test_workers_that_cannot_start_end_the_run_with_their_last_words(tmp_path, monkeypatch):
-    broken = {**os.environ, "JAX_PLATFORMS": "no_such_platform"}
-    monkeypatch.setattr(inline_engine, "worker_environment", lambda environment: broken.copy())
+    broken = child_environment() | {"JAX_PLATFORMS": "no_such_platform"}
+    monkeypatch.setattr(inline_engine, "child_environment", lambda: broken)
     with pytest.raises(EvaluationError, match="no_such_platform"):
         run(tmp_path / "run", rollout="xla")  # simd needs none
     assert children() == []
