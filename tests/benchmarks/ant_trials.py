@@ -29,24 +29,19 @@ TABLE = Path(__file__).parent / "results" / "ant_maze_trials.csv"
 RUNS = Path(__file__).parents[2] / "runs" / "ant_trials"
 ENV_STEPS = 150_000_000
 SEED = 100
-STEPS = {
-    "usual": (),
-    "0.02, 0.03": ("search.sigma=0.02", "search.learning_rate=0.03"),
-    "0.05, 0.03": ("search.sigma=0.05", "search.learning_rate=0.03"),
-    "0.1, 0.1": ("search.sigma=0.1", "search.learning_rate=0.1"),
-}
 TRIALS: tuple[tuple[str, tuple[str, ...]], ...] = (
-    ("ant_maze_me_es", STEPS["usual"]),
-    ("ant_maze_me_es", STEPS["0.05, 0.03"]),
-    ("ant_maze_me_es", STEPS["0.02, 0.03"]),
-    ("ant_maze_me_es", STEPS["0.1, 0.1"]),
-    ("ant_maze_me_es", (*STEPS["0.05, 0.03"], "task.fitness=final")),
-    ("ant_maze_me_es", (*STEPS["0.05, 0.03"], "search.pairs=32")),
-    ("ant_maze_nsra_es", STEPS["0.05, 0.03"]),
-    ("ant_maze_me_es", (*STEPS["0.05, 0.03"], "policy.observation_normalization=false")),
-    ("ant_maze_me_es", (*STEPS["0.05, 0.03"], "search.common_random_numbers=false")),
-    ("ant_maze_me_es", (*STEPS["0.05, 0.03"], "search.cell_sampling=score")),
-    ("ant_maze_me_es", (*STEPS["0.05, 0.03"], "search.block_generations=20")),
+    ("ant_maze_me_es", ()),  # sigma 0.02, learning rate 0.01, as shipped
+    ("ant_maze_me_es", ("search.sigma=0.05", "search.learning_rate=0.03")),
+    ("ant_maze_me_es", ("search.sigma=0.02", "search.learning_rate=0.03")),
+    # Larger steps were worse, so what follows has the usual ones, or smaller ones.
+    ("ant_maze_me_es", ("search.learning_rate=0.005",)),
+    ("ant_maze_me_es", ("search.pairs=32",)),
+    ("ant_maze_me_es", ("task.fitness=final",)),
+    ("ant_maze_me_es", ("search.cell_sampling=score",)),
+    ("ant_maze_nsra_es", ()),
+    ("ant_maze_me_es", ("search.block_generations=20",)),
+    ("ant_maze_me_es", ("search.common_random_numbers=false",)),
+    ("ant_maze_me_es", ("policy.observation_normalization=false",)),
 )
 """(config, settings), in the order in which they were thought of."""
 KEPT = (
