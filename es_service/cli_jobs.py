@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -9,6 +10,9 @@ import typer
 from es_service import api, jobs
 from es_service.cli_options import ConfigArgument, SeedOption, SetOption, WorkersOption, overrides, print_note
 from es_service.commands import command
+from es_service.config.keys import parse_overrides
+from es_service.config.yaml_text import read_yaml_file
+from es_service.errors import ConfigError
 
 job_commands = typer.Typer()
 
@@ -29,10 +33,20 @@ def submit(
 ) -> None:
     """Send a run to a Ray cluster as a job. The same command again goes on with it, after whatever happened."""
     wanted = overrides(set_, seed=seed, workers=workers, address="auto")
+    _require_absolute_start(config, wanted)
     loaded = api.load_config(config, wanted, new=False)  # paths are those of the cluster's head, which checks them
     job = jobs.submit(loaded, address, out)
     print(job)
     print_note(f"submitted; watch it with: {command('logs', job, '--address', address, '--follow')}")
+
+
+def _require_absolute_start(config: Path, wanted: list[str]) -> None:
+    """Raise a ConfigError for a `search.init_from` that would mean another folder here than on the cluster's head."""
+    in_file = read_yaml_file(config)[0].get("search")
+    named = {"search.init_from": in_file.get("init_from")} if isinstance(in_file, dict) else {}
+    start = (named | parse_overrides(wanted)[0]).get("search.init_from")
+    if isinstance(start, str) and not start.startswith("/"):
+        raise ConfigError(f"search.init_from: {start} must be absolute, a path as the cluster's head sees it")
 
 
 @job_commands.command(name="jobs")

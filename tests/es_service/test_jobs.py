@@ -7,8 +7,9 @@ import sys
 
 import pytest
 
-from es_service import jobs
+from es_service import cli_jobs, jobs
 from es_service.api import load_config
+from es_service.config.yaml_text import dump_yaml
 from es_service.errors import ConfigError, EvaluationError
 
 CONFIG = load_config(
@@ -51,3 +52,16 @@ def test_a_relative_folder_is_refused():
 def test_where_nothing_answers_the_error_says_what_to_check():
     with pytest.raises(EvaluationError, match=r"the cluster at http://127\.0\.0\.1:1 did not do it: .*RAY_AUTH_TOKEN"):
         jobs.list_jobs("http://127.0.0.1:1")
+
+
+@pytest.mark.parametrize("start", ["runs/a", "~/runs/a"])
+@pytest.mark.parametrize("in_file", [True, False])
+def test_a_start_that_is_another_folder_on_the_head_is_refused(tmp_path, start, in_file):
+    file = tmp_path / "config.yaml"
+    search = {"algorithm": "es"} | ({"init_from": start} if in_file else {})
+    file.write_text(dump_yaml({"task": {"environment": "point_maze"}, "search": search, "budget": {"generations": 1}}))
+    set_ = [] if in_file else [f"search.init_from={start}"]
+    with pytest.raises(ConfigError, match=rf"search\.init_from: {start} must be absolute"):
+        cli_jobs.submit(file, "http://127.0.0.1:1", "/runs/x", set_=set_)
+    with pytest.raises(EvaluationError, match="did not do it"):  # past this check: nothing answers there
+        cli_jobs.submit(file, "http://127.0.0.1:1", "/runs/x", set_=["search.init_from=/runs/a"])
