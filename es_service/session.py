@@ -94,7 +94,7 @@ class _OnPlatforms:
     def __init__(self, store: RunStore, engine: Engine[Any], on_notice: OnNotice) -> None:
         self._store, self._engine, self._on_notice = store, engine, on_notice
         self._driver = platform_info()
-        self._recorded: dict[str, Any] = {}
+        self._workers: frozenset[str] | None = None
         self.load, self.part, self.last_history = store.load, store.part, store.last_history
 
     @property
@@ -104,15 +104,16 @@ class _OnPlatforms:
 
     def commit(self, generation: int, parts: Mapping[str, Arrays], history: driver.HistoryRow) -> None:
         """Record the platform if it is not the one in force, and say so if it is not the first; then commit."""
-        platform = computed_on(self._driver, self._engine.platforms)
-        if platform != self._recorded:
+        workers = self._engine.platforms
+        if workers != self._workers:
+            platform = computed_on(self._driver, workers)
             is_other = self._store.record_platform(generation, platform)
             if is_other and (generation or is_mixed([platform])):
                 self._on_notice(
                     f"from generation {generation} on this run has another platform, or workers of several: "
                     f"{platform}. Its digest now says `mixed`."
                 )
-            self._recorded = platform
+            self._workers = workers
         self._store.commit(generation, parts, history)
 
 
