@@ -15,8 +15,8 @@ from pydantic import ValidationError
 
 from es_service import cli_options
 from es_service.algorithms import ALGORITHMS
-from es_service.config.changes import changed_constants, describe_changes
-from es_service.config.loading import changed_config, load_config
+from es_service.config.changes import changed_constants
+from es_service.config.loading import load_config
 from es_service.config.model import RunConfig, worker_spec
 from es_service.config.presets import PRESETS, preset_table, preset_values
 from es_service.config.resolution import (
@@ -28,18 +28,10 @@ from es_service.config.resolution import (
 from es_service.config.yaml_text import dump_yaml, parse_value
 from es_service.errors import ConfigError
 from es_service.tasks import Tasks
-from workers import environments
+from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, load
 
-POINT_MAZE = environments.TASKS["point_maze"]
-TASKS = {"point_maze": POINT_MAZE}
 ALL_TASKS = Tasks()
 CONFIGS = Path(__file__).parents[2] / "configs"
-MINIMAL = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 3}}
-MINIMAL_TEXT = "task: {environment: point_maze}\nsearch: {algorithm: es}\nbudget: {generations: 3}\n"
-
-
-def load(source=MINIMAL, *overrides: str) -> RunConfig:
-    return load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
 
 
 @pytest.fixture
@@ -290,94 +282,6 @@ def test_dumped_values_read_back(value):
 
 def test_resolved_yaml_is_plain_yaml_for_other_readers():
     assert yaml.safe_load(load().resolved_yaml())["search"]["sigma"] == 0.02
-
-
-def test_constants_name_what_fixes_the_results():
-    constants = load().constants()
-    assert constants["search.sigma"] == 0.02
-    assert constants["task.options.start"] == "default"
-    assert constants["policy.hidden"] == [64, 64]
-    assert constants["seed"] == 0
-    assert {name for name in constants if name.startswith("compute.")} == {
-        "compute.rollout",
-        "compute.chunk_pairs",
-        "compute.rollout_block_pairs",
-        "compute.gradient_block_pairs",
-    }
-    assert not [name for name in constants if name.startswith("budget.")]
-
-
-def test_changed_constants_lists_both_values_and_absent_ones():
-    old, new = {"a": 1, "b": 2, "c": 3}, {"a": 1, "b": 5, "d": 4}
-    assert changed_constants(old, new) == [("b", 2, 5), ("c", 3, "(absent)"), ("d", "(absent)", 4)]
-
-
-def test_describe_changes_shows_all_and_the_commands_that_make_them():
-    changes = [("search.sigma", 0.02, 0.05), ("policy.hidden", [64, 64], [8, 8]), ("task.options.start", "a b", "c d")]
-    lines = describe_changes(changes, run="runs/a").splitlines()
-    assert {"  search.sigma: 0.02 -> 0.05", "  policy.hidden: [64, 64] -> [8, 8]"} < set(lines)
-    assert lines[-2].endswith(": es-service fork runs/a --set search.sigma=0.05 --set 'task.options.start=c d'")
-    assert lines[-1].startswith("a fork has to keep policy.hidden; to start anew from its centre")
-    assert lines[-1].endswith(": es-service run CONFIG --set search.init_from=runs/a")
-    for key in ("search.members", "search.preset", "map.cells", "task.environment", "task.options.descriptor"):
-        assert "es-service fork" not in describe_changes([(key, "a", "b")])
-
-
-def changed(*overrides: str, config: RunConfig | None = None) -> RunConfig:
-    stored = parse_value((config or load()).resolved_yaml())
-    assert isinstance(stored, dict)
-    return changed_config(stored, overrides, tasks=TASKS, algorithms=ALGORITHMS)
-
-
-def changes(*overrides: str, config: RunConfig | None = None) -> list[str]:
-    """Constants that overrides of a run's config would change."""
-    old, new = (config or load()).constants(), changed(*overrides, config=config).constants()
-    return [f"{name}: {before} -> {after}" for name, before, after in changed_constants(old, new)]
-
-
-def test_budget_workers_and_limits_are_no_constants():
-    config = changed("budget.generations=9", "compute.workers=2", "compute.chunk_timeout_s=5", "compute.max_attempts=1")
-    assert (config.budget.generations, config.compute.workers, config.compute.max_attempts) == (9, 2, 1)
-    assert config.constants() == load().constants()
-
-
-@pytest.mark.parametrize("override", ["search.sigma=2e-2", "compute.chunk_pairs=auto", "task.episode_steps=null"])
-def test_saying_what_is_so_changes_nothing(override):
-    assert changed(override) == changed()
-
-
-def test_what_follows_from_a_changed_key_is_resolved_anew():
-    assert changes("search.sigma=0.05", "seed=7") == ["search.sigma: 0.02 -> 0.05", "seed: 0 -> 7"]
-    assert changes("search.pairs=120") == [
-        "search.pairs: 512 -> 120",
-        "compute.chunk_pairs: 64 -> 8",
-        "compute.rollout_block_pairs: 32 -> 8",
-        "compute.gradient_block_pairs: 512 -> 120",
-    ]
-    assert changes("compute.chunk_pairs=8") == ["compute.chunk_pairs: 64 -> 8", "compute.rollout_block_pairs: 32 -> 8"]
-    clipped = ["policy.observation_normalization: True -> False", "policy.observation_clip: 5.0 -> None"]
-    assert changes("policy.observation_normalization=false") == clipped
-    assert changes("policy.observation_normalization=false", "policy.observation_clip=5") == clipped[:1]
-    assert changes("search.algorithm=ns_es") == ["search.algorithm: es -> ns_es", "search.members: 1 -> 5"]
-    shaped = load(MINIMAL, "search.pairs=16", "compute.chunk_pairs=4", "map.qd_offset=3")
-    assert changes("search.pairs=16", "task.fitness=sum", config=shaped) == []
-    assert changes("task.fitness=final", "map.qd_offset=3", config=shaped) == ["task.fitness: sum -> final"]
-
-
-def test_every_problem_of_a_change_is_told():
-    with pytest.raises(ConfigError) as caught:
-        changed("search.sigma=abc", "budget.generatons=3")
-    assert "search.sigma: abc is not allowed" in str(caught.value)
-    assert "did you mean budget.generations?" in str(caught.value)
-
-
-def test_a_run_outlives_the_run_it_started_from(tmp_path):
-    (tmp_path / "old").mkdir()
-    stored = parse_value(load(MINIMAL, f"search.init_from={tmp_path / 'old'}").resolved_yaml())
-    (tmp_path / "old").rmdir()
-    assert changed_config(stored, tasks=TASKS, algorithms=ALGORITHMS).search.init_from == str(tmp_path / "old")
-    with pytest.raises(ConfigError, match="old does not exist; must be the folder of another run, or null"):
-        load(stored)
 
 
 def test_worker_spec_says_what_the_config_says():

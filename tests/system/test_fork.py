@@ -1,20 +1,28 @@
-"""What a fork takes from its parent, what it leaves behind, what it refuses."""
+"""What a fork, or a run that starts from another, takes from it, what it leaves behind, what it refuses."""
 
 from __future__ import annotations
 
+import re
 import shutil
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
-from es_service import api, evaluation, lineage, session
+from es_service import api, evaluation, lineage, open_run, session
 from es_service.config.changes import START_KEYS
+from es_service.digest import digest_at
 from es_service.errors import ConfigError
 from es_service.maps.behaviour_map import CELL_PREFIX
 from es_service.session import scheduling_policy
-from tests.system.session import SMALL
+from es_service.store.reader import read_generation
+from tests.system.command_line import digest, es
+from tests.system.session import ROOT, SMALL, finish
 from workers.environments import TASKS
 
 
@@ -152,3 +160,91 @@ def test_scores_of_another_number_of_episodes_are_forgotten(tmp_path):
     scores = [part["score"] for name, part in parts.items() if name.startswith(CELL_PREFIX)]
     assert len(scores) == parent.behaviour_map.size
     assert np.isnan(scores).all()
+
+
+def test_fork_without_changes_goes_on_as_its_parent_would(config, finished, tmp_path):
+    parent, child = tmp_path / "parent", tmp_path / "child"
+    assert es("run", config, "--out", parent, "--set", "budget.generations=10")[0] == 0
+    for generation in ([], ["--generation", 9]):
+        code, printed = es("fork", parent, *generation, "--out", child, "--set", "budget.generations=30")
+        assert code == 0
+        assert "note:" not in printed  # the same machine: no other platform to tell of
+        assert digest(child) == digest(finished[0])
+        origin = open_run(child).meta.parent
+        assert origin is not None
+        at = generation[1] if generation else 10
+        assert (origin["generation"], origin["digest"]) == (at, digest_at(parent, at))
+        assert re.search(rf"started from\s+{parent}, generation", es("status", child)[1].replace("\n", ""))
+        child = tmp_path / "child9"
+
+
+def test_fork_with_changes_and_what_does_not_fit(finished, tmp_path):
+    more = ("--set", "budget.generations=32")
+    code, _ = es("fork", finished[0], "--out", tmp_path / "a", "--set", "search.pairs=24", *more)
+    assert code == 0
+    assert open_run(tmp_path / "a").config["search"]["pairs"] == 24
+    assert len(open_run(tmp_path / "a").history) == 33
+    code, printed = es("fork", finished[0], "--out", tmp_path / "b", "--set", "policy.hidden=[16]", *more)
+    assert code == 2
+    assert "policy.hidden: [8] -> [16]" in printed
+    code, printed = es("fork", finished[0], "--generation", 3, "--out", tmp_path / "c", *more)
+    assert code == 1
+    assert "it keeps that of [29, 30]" in printed
+    assert not (tmp_path / "b").exists()
+    assert not (tmp_path / "c").exists()
+
+
+def test_init_from_starts_at_the_other_run_s_centre(config, finished, tmp_path):
+    code, printed = es("run", config, "--out", tmp_path / "r", "--set", f"search.init_from={finished[0]}",
+                       "--set", "budget.target_fitness=-1e9", "--set", "search.sigma=0.01")  # fmt: skip
+    assert code == 0, printed
+    child, parent = open_run(tmp_path / "r"), open_run(finished[0])
+    assert child.generation == 0
+    _, parts = child.parts()
+    assert (parts["observations"]["m2_O"] == parent.parts()[1]["observations"]["m2_O"]).all()
+    for member in range(5):
+        assert (parts[f"member_{member}"]["centre_D"] == parent.policy("centre").parameters_D).all()
+    assert child.meta.parent is not None
+    assert child.meta.parent["digest"] == digest(finished[0])
+    code, printed = es("run", config, "--out", tmp_path / "s", "--set", f"search.init_from={finished[0]}",
+                       "--set", "policy.hidden=[16]")  # fmt: skip
+    assert code == 2
+    assert "has layers [2, 8, 2], this run's has [2, 16, 2]" in printed
+    assert not (tmp_path / "s").exists()
+
+
+def test_init_from_keeps_what_it_started_from(config, finished, tmp_path):
+    """The other run goes on, or away; a run that began from it and died at once is resumed to the same digest."""
+    origin, whole, killed = tmp_path / "origin", tmp_path / "whole", tmp_path / "killed"
+    shutil.copytree(finished[0], origin)
+    mapping = yaml.safe_load(config.read_text())
+    mapping["search"]["init_from"] = str(origin)
+    mapping["budget"]["generations"] = 5
+    assert finish(whole, config=mapping) == 0
+    assert finish(killed, config=mapping, kill={"at": "opened"}) == -signal.SIGKILL
+    assert read_generation(killed) is None
+    shutil.rmtree(origin)
+    assert es("resume", killed)[0] == 0
+    assert digest(killed) == digest(whole)
+
+
+def test_a_fork_killed_at_once_is_its_parent_s_state_already(config, finished, tmp_path):
+    parent, child = tmp_path / "parent", tmp_path / "child"
+    assert es("run", config, "--out", parent, "--set", "budget.generations=10")[0] == 0
+    process = subprocess.run(
+        [sys.executable, "-c", "import os, signal; from es_service import api\n"
+         f"api.fork({str(parent)!r}, ['budget.generations=30'], out={str(child)!r}, "
+         "hook=lambda name: os.kill(os.getpid(), signal.SIGKILL))"],
+        cwd=ROOT, timeout=60, check=False,
+    )  # fmt: skip
+    assert process.returncode == -signal.SIGKILL
+    assert read_generation(child) == 10
+    assert es("resume", child)[0] == 0
+    assert digest(child) == digest(finished[0])
+
+
+def test_a_fork_with_another_fitness_forgets_the_best_of_before(finished, tmp_path):
+    more = ("--set", "budget.generations=32")
+    assert es("fork", finished[0], "--out", tmp_path / "a", "--set", "task.fitness=final", *more)[0] == 0
+    history = open_run(tmp_path / "a").history
+    assert history["best_fitness"].iloc[-1] == history["centre_fitness_mean"].iloc[31:].max()

@@ -19,13 +19,11 @@ from es_service.protocol import (
     TrainingChunk,
 )
 from es_service.run_view import Policy
-from es_service.statistics import merge_moments, no_observations
 from tests import helpers
 from tests.helpers import PARAMETERS, centre, random_parameters
 from tests.twins import noise as noise_twin
 from tests.twins import point_maze as maze_twin
 from workers.environments import Environment, make_environment
-from workers.policy import initial_parameters
 from workers.rollout import make_training_rollout
 from workers.worker import episode_keys, make_worker
 
@@ -314,30 +312,3 @@ def test_numpy_policy_equals_the_rollout_s(spec, monkeypatch):
     policy = Policy(SHAPE, parameters_D, MEAN, STD, 5.0)
     np.testing.assert_allclose(result.returns, policy(result.descriptor)[:, 0], atol=1e-6)
     assert np.isnan(result.goal_distance).all()
-
-
-def test_initial_columns_have_their_norms_and_layers_differ():
-    shape = PolicyShape((8, 8, 8, 8))  # equal shapes on purpose: one key for all layers would make them equal
-    for init, norms in (("unit_columns", (1.0, 1.0, 0.01)), ("small_columns", (0.01, 0.01, 0.01))):
-        flat = initial_parameters(shape, init, seed=0)
-        layers = [flat[start : start + 64].reshape(8, 8) for start in (0, 72, 144)]
-        biases = [flat[start : start + 8] for start in (64, 136, 208)]
-        for weights, norm in zip(layers, norms, strict=True):
-            np.testing.assert_allclose(np.linalg.norm(weights, axis=0), norm, rtol=1e-5)
-        assert not np.any(biases)
-        assert not np.allclose(layers[0] / norms[0], layers[1] / norms[1])
-    other = initial_parameters(shape, "unit_columns", seed=0, member=1)
-    assert not np.allclose(other, initial_parameters(shape, "unit_columns", seed=0))
-
-
-def test_merged_moments_equal_those_of_all_observations_at_once():
-    rng = np.random.default_rng(0)
-    parts = [rng.normal(3.0, 2.0, (n, 2)) for n in (5, 1, 100)]
-    from es_service.protocol import Moments
-
-    moments = [Moments(len(x), x.mean(0), x.var(0) * len(x)) for x in parts]
-    total = merge_moments(no_observations(2), [*moments, no_observations(2)])
-    everything = np.concatenate(parts)
-    assert total.count == 106
-    np.testing.assert_allclose(total.mean_O, everything.mean(0))
-    np.testing.assert_allclose(total.m2_O, everything.var(0) * 106)

@@ -1,0 +1,17 @@
+"""The smallest config, and tasks to load one for."""
+
+from __future__ import annotations
+
+from es_service.algorithms import ALGORITHMS
+from es_service.config.loading import load_config
+from es_service.config.model import RunConfig
+from workers import environments
+
+POINT_MAZE = environments.TASKS["point_maze"]
+TASKS = {"point_maze": POINT_MAZE}
+MINIMAL = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 3}}
+MINIMAL_TEXT = "task: {environment: point_maze}\nsearch: {algorithm: es}\nbudget: {generations: 3}\n"
+
+
+def load(source=MINIMAL, *overrides: str) -> RunConfig:
+    return load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)

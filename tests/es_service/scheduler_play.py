@@ -1,0 +1,53 @@
+"""The scheduler by hand: a policy, tasks named by letters, workers that are ready."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from es_service.dispatch.messages import (
+    Command,
+    Event,
+    Policy,
+    StartWorker,
+    Submit,
+    Task,
+    Tick,
+    WorkerUp,
+)
+from es_service.dispatch.scheduler import step
+from es_service.dispatch.scheduler_state import SchedulerState, initial_state
+
+POLICY = Policy(
+    workers=2,
+    in_flight=2,
+    max_attempts=3,
+    start_deadline_s=50.0,
+    first_deadline_s=100.0,
+    min_deadline_s=10.0,
+    deadline_factor=5.0,
+    max_failures_in_a_row=2,
+    restart_backoff_s=1.0,
+    max_backoff_s=3.0,
+    max_start_failures=3,
+    no_worker_timeout_s=30.0,
+)
+
+
+def play(state: SchedulerState, *events: tuple[float, Event]) -> tuple[SchedulerState, list[Command]]:
+    """The state after all events, and the commands of the last."""
+    commands: list[Command] = []
+    for now, event in events:
+        state, commands = step(state, event, now)
+    return state, commands
+
+
+def tasks(keys: str) -> Submit:
+    """One task per letter; capitals are of another kind."""
+    return Submit(tuple(Task(key, "train" if key.islower() else "evaluate") for key in keys))
+
+
+def ready(workers: int = 2, **changes: object) -> SchedulerState:
+    """All workers up at time 0."""
+    state, commands = step(initial_state(replace(POLICY, workers=workers, **changes)), Tick(), 0.0)  # type: ignore[arg-type]
+    assert commands == [StartWorker(worker) for worker in range(workers)]
+    return play(state, *((0.0, WorkerUp(worker)) for worker in range(workers)))[0]

@@ -1,0 +1,149 @@
+"""Cells of a map: grids and centroids, edges, what is outside."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from es_service.maps.geometry import (
+    Cvt,
+    Grid,
+    geometry_from_arrays,
+    geometry_to_arrays,
+    make_geometry,
+)
+from tests.es_service.map_examples import OBLONG, PLANE, SQUARE, map_config
+from tests.twins import behaviour_map as twin
+
+
+@pytest.mark.parametrize(
+    ("descriptor", "index"),
+    [
+        ((0.0, 0.0), (0, 0)),
+        ((1.99, 0.49), (0, 0)),
+        ((2.0, 0.5), (1, 1)),  # an edge belongs to the upper cell
+        ((4.0, 1.5), (2, 3)),
+        ((6.0, 2.0), (2, 3)),  # but for the last one
+        ((-0.1, 9.0), (0, 3)),  # outside: the border cell
+        ((1e300, -1e300), (2, 0)),
+        ((3.0, 1.0), (1, 2)),
+    ],
+)
+def test_cells_of_a_grid_by_hand(descriptor, index):
+    assert PLANE.index_of(int(PLANE.cells_of([descriptor])[0])) == index
+    assert twin.grid_index(PLANE.bounds, PLANE.shape, descriptor) == index
+
+
+def test_edges_by_hand():
+    assert [edges.tolist() for edges in PLANE.edges] == [[0.0, 2.0, 4.0, 6.0], [0.0, 0.5, 1.0, 1.5, 2.0]]
+    assert Grid(((-0.3, 0.1),), (7,)).edges[0][-1] == 0.1
+
+
+bounds_and_cells = st.lists(
+    st.tuples(st.floats(-100.0, 100.0), st.floats(1e-3, 200.0), st.integers(1, 12)).map(
+        lambda x: ((x[0], x[0] + x[1]), x[2])
+    ),
+    min_size=1,
+    max_size=3,
+)
+
+
+@given(bounds_and_cells, st.data())
+def test_grids_equal_the_twin_on_any_descriptor_and_on_every_edge(sides, data):
+    bounds, shape = zip(*sides, strict=True)
+    grid = Grid(bounds, shape)
+    descriptors = [
+        [data.draw(st.sampled_from(edges.tolist()) | st.floats(-400.0, 400.0)) for edges in grid.edges]
+        for _ in range(5)
+    ]
+    expected = [twin.cell_number(shape, twin.grid_index(bounds, shape, descriptor)) for descriptor in descriptors]
+    assert grid.cells_of(descriptors).tolist() == expected
+
+
+def test_five_thousand_descriptors_equal_the_twin():
+    grid = Grid(((-35.0, 40.0), (-1.0, 0.1)), (20, 7))
+    descriptors = np.random.default_rng(0).uniform([-40, -1.2], [45, 0.3], (5000, 2))
+    expected = [twin.cell_number(grid.shape, twin.grid_index(grid.bounds, grid.shape, d)) for d in descriptors]
+    assert grid.cells_of(descriptors).tolist() == expected
+    assert len(set(expected)) == grid.size
+
+
+def test_cells_are_numbered_with_the_last_dimension_fastest():
+    assert [PLANE.index_of(cell) for cell in (0, 1, 3, 4, 11)] == [(0, 0), (0, 1), (0, 3), (1, 0), (2, 3)]
+    assert all(PLANE.cell_at(PLANE.index_of(cell)) == cell for cell in range(PLANE.size))
+    assert all(twin.cell_number(PLANE.shape, PLANE.index_of(cell)) == cell for cell in range(PLANE.size))
+
+
+@pytest.mark.parametrize("index", [(3, 0), (0, 4), (-1, 0), (0,), (0, 0, 0), ()])
+def test_there_is_no_cell_outside_the_grid(index):
+    assert PLANE.cell_at(index) is None
+
+
+# Centroids
+
+
+@pytest.mark.parametrize("bounds", [SQUARE, OBLONG])
+def test_centroids_are_the_same_for_every_call_and_their_cells_are_alike(bounds):
+    config = map_config(kind="cvt", cells=[256], bounds=[list(pair) for pair in bounds])
+    cvt, again = make_geometry(config), make_geometry(config)
+    assert isinstance(cvt, Cvt)
+    assert isinstance(again, Cvt)
+    assert cvt.centroid_C_B.tobytes() == again.centroid_C_B.tobytes()
+    low, high = np.array(bounds).T
+    places = np.random.default_rng(0).uniform(low, high, (100_000, 2))
+    size = np.bincount(cvt.cells_of(places), minlength=256) / (100_000 / 256)
+    assert 0.25 < size.min() <= size.max() < 2.5
+    np.testing.assert_array_equal(cvt.cells_of(cvt.centroid_C_B), np.arange(256))
+
+
+def test_centroids_lie_in_the_middle_of_their_cells():
+    cvt = make_geometry(map_config(kind="cvt", cells=[16]))
+    assert isinstance(cvt, Cvt)
+    places = np.random.default_rng(1).uniform(-1.0, 1.0, (50_000, 2))
+    cell = cvt.cells_of(places)
+    middle = np.array([places[cell == c].mean(axis=0) for c in range(16)])
+    assert np.abs(middle - cvt.centroid_C_B).max() < 0.1  # a cell is half as wide as the square is high
+
+
+def test_the_nearest_centroid_and_of_equally_near_ones_the_first():
+    cvt = Cvt(SQUARE, np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    assert cvt.cells_of([[0.4, 0.1], [0.5, 0.0], [1.0, 0.0], [0.5, 0.5], [-9.0, 9.0]]).tolist() == [0, 0, 1, 0, 3]
+
+
+def test_many_descriptors_equal_the_twin():
+    rng = np.random.default_rng(0)
+    cvt = Cvt(((0.0, 1.0),) * 3, rng.integers(0, 5, (40, 3)) / 4)  # many are equally near
+    descriptors = rng.integers(-1, 10, (500, 3)) / 8
+    assert cvt.cells_of(descriptors).tolist() == [twin.nearest_centroid(cvt.centroid_C_B, d) for d in descriptors]
+
+
+def test_descriptors_do_not_depend_on_how_many_are_asked_together():
+    rng = np.random.default_rng(0)
+    cvt = Cvt(SQUARE, rng.uniform(-1, 1, (5000, 2)))
+    descriptors = rng.uniform(-1, 1, (450, 2))  # more than are compared at once
+    assert cvt.cells_of(descriptors).tolist() == [int(cvt.cells_of(one[None])[0]) for one in descriptors]
+
+
+def test_a_centroid_s_place_is_its_number():
+    cvt = Cvt(SQUARE, np.zeros((5, 2)))
+    assert (cvt.size, cvt.shape, cvt.index_of(3)) == (5, (5,), (3,))
+    assert [cvt.cell_at(index) for index in ((4,), (5,), (-1,), (0, 0))] == [4, None, None, None]
+
+
+def test_geometries_come_back_as_they_were():
+    grid = make_geometry(map_config(cells=[7, 3], bounds=[[-1, 2.5], [0.1, 0.3]]))
+    assert grid == Grid(((-1.0, 2.5), (0.1, 0.3)), (7, 3)) == geometry_from_arrays(geometry_to_arrays(grid))
+    cvt = make_geometry(map_config(kind="cvt", cells=[9]))
+    again = geometry_from_arrays(geometry_to_arrays(cvt))
+    assert isinstance(cvt, Cvt)
+    assert isinstance(again, Cvt)
+    assert again.bounds == cvt.bounds == SQUARE
+    np.testing.assert_array_equal(again.centroid_C_B, cvt.centroid_C_B)
+
+
+def test_cells_of_a_cvt_are_even_in_oblong_bounds_too():
+    geometry = make_geometry(map_config(kind="cvt", cells=[64], bounds=[[0, 1], [0, 100]]))
+    places = np.random.default_rng(0).uniform((0, 0), (1, 100), (64_000, 2))
+    counts = np.bincount(geometry.cells_of(places), minlength=64)
+    assert counts.min() > 400
+    assert counts.max() < 2000

@@ -1,0 +1,40 @@
+"""Small ES runs in memory."""
+
+from es_service import driver
+from es_service.algorithms import ALGORITHMS
+from es_service.api import load_config
+from es_service.config.model import worker_spec
+from es_service.protocol import (
+    PolicyShape,
+)
+from es_service.statistics import no_observations
+from tests.helpers import DirectEvaluator, MemoryStore
+from workers.environments import TASKS
+from workers.policy import initial_parameters
+
+SHAPE = PolicyShape((2, 8, 8, 2))
+
+
+def small_config(**changes):
+    mapping = {
+        "task": {"environment": "point_maze"},
+        "policy": {"hidden": [8, 8]},
+        "search": {"algorithm": "es", "pairs": 48, "sigma": 0.1, "evaluation_episodes": 20, **changes},
+        "budget": {"generations": 20},
+        "compute": {"chunk_pairs": 16, "gradient_block_pairs": 20},
+    }
+    return load_config(mapping)
+
+
+def run_in_memory(config, evaluator=None):
+    evaluator = evaluator or DirectEvaluator(worker_spec(config, TASKS["point_maze"]))
+    first = initial_parameters(SHAPE, config.policy.init, config.seed)
+    search = driver.Search(
+        config,
+        ALGORITHMS["es"](config),
+        lambda: ([first], no_observations(2)),
+        TASKS["point_maze"],
+    )
+    store = MemoryStore()
+    state, reason = driver.run(search, evaluator, store, lambda row: None)
+    return state, store, evaluator, reason

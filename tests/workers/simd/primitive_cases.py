@@ -1,0 +1,337 @@
+"""Random functions of every primitive that simd compiles, with arguments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import strategies as st
+from jax import lax
+
+LANES = 21
+Case = tuple[Callable[..., Any], list[np.ndarray]]
+"""(function of one lane, arguments [lane, ...])."""
+Draw = Callable[..., Any]
+
+
+def floats(draw: Draw, shape: tuple[int, ...], low: float = -3.0, high: float = 3.0) -> np.ndarray:
+    """Ordinary numbers, and now and then the same one twice."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    x = rng.uniform(low, high, (LANES, *shape)).astype(np.float32)
+    return np.where(rng.random(x.shape) < 0.1, np.float32(min(max(1.0, low), high)), x)
+
+
+def special(draw: Draw, shape: tuple[int, ...]) -> np.ndarray:
+    """Numbers among which are zeros, infinities and NaN."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    pool = np.array([0.0, 1.0, -1.0, 2.5, np.inf, -np.inf, np.nan, 1e30], np.float32)
+    return rng.choice(pool, (LANES, *shape))
+
+
+def integers(draw: Draw, shape: tuple[int, ...], dtype: str = "int32") -> np.ndarray:
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    wide = rng.integers(0, 2**32, (LANES, *shape)).astype(np.uint32)
+    return np.where(rng.random(wide.shape) < 0.5, wide, wide % 7).astype(np.uint32).view(dtype)
+
+
+def booleans(draw: Draw, shape: tuple[int, ...]) -> np.ndarray:
+    return np.random.default_rng(draw(st.integers(0, 2**32 - 1))).random((LANES, *shape)) < 0.5
+
+
+def shape(draw: Draw, least: int = 0, most: int = 3) -> tuple[int, ...]:
+    return tuple(draw(st.lists(st.integers(1, 4), min_size=least, max_size=most)))
+
+
+def unary(function: Callable, low: float = -3.0, high: float = 3.0) -> Callable[[Draw], Case]:
+    return lambda draw: (function, [floats(draw, shape(draw), low, high)])
+
+
+def binary(function: Callable, make: Callable = floats) -> Callable[[Draw], Case]:
+    def case(draw: Draw) -> Case:
+        of = shape(draw)
+        return function, [make(draw, of), make(draw, of)]
+
+    return case
+
+
+def reduction(function: Callable, make: Callable = floats) -> Callable[[Draw], Case]:
+    def case(draw: Draw) -> Case:
+        of = shape(draw, least=1)
+        axes = tuple(draw(st.sets(st.integers(0, len(of) - 1), min_size=1)))
+        return lambda x: function(x, axes), [make(draw, of)]
+
+    return case
+
+
+def along(function: Callable, make: Callable = floats) -> Callable[[Draw], Case]:
+    def case(draw: Draw) -> Case:
+        of = shape(draw, least=1)
+        axis, reverse = draw(st.integers(0, len(of) - 1)), draw(st.booleans())
+        return lambda x: function(x, axis, reverse), [make(draw, of)]
+
+    return case
+
+
+def gather(draw: Draw) -> Case:
+    of = shape(draw, least=1)
+    axis = draw(st.integers(0, len(of) - 1))
+    indices = np.array(draw(st.lists(st.integers(-of[axis] - 2, of[axis] + 1), min_size=1, max_size=5)))
+    mode = draw(st.sampled_from(["clip", "fill", "wrap"]))
+    make = draw(st.sampled_from([floats, integers, booleans]))
+    return lambda x: jnp.take(x, indices, axis=axis, mode=mode), [make(draw, of)]
+
+
+def gather_along(draw: Draw) -> Case:
+    of = shape(draw, least=2)
+    indices = np.random.default_rng(draw(st.integers(0, 99))).integers(0, of[-1], (*of[:-1], 2))
+    return lambda x: jnp.take_along_axis(x, indices, axis=-1), [floats(draw, of)]
+
+
+def scatter(draw: Draw) -> Case:
+    of = shape(draw, least=1)
+    indices = np.array(draw(st.lists(st.integers(-of[0] - 2, of[0] + 1), min_size=1, max_size=5, unique=True)))
+    method = draw(st.sampled_from(["set", "add", "multiply"]))
+    mode = draw(st.sampled_from(["drop", "clip"]))
+    if method == "set":
+        indices = np.array(sorted({int(np.clip(i % of[0], 0, of[0] - 1)) for i in indices}))  # order is not defined
+    update = floats(draw, (len(indices), *of[1:]))
+    return lambda x, u: getattr(x.at[indices], method)(u, mode=mode), [floats(draw, of), update]
+
+
+def segment_sum(draw: Draw) -> Case:
+    segments = np.array(draw(st.lists(st.integers(-1, 4), min_size=3, max_size=6)))
+    return lambda x: jax.ops.segment_sum(x, segments, 4), [floats(draw, (len(segments), 2))]
+
+
+def slices(draw: Draw) -> Case:
+    of = shape(draw, least=1)
+    at = tuple(slice(draw(st.integers(0, n - 1)), n, draw(st.integers(1, 2))) for n in of)
+    return lambda x: x[at], [floats(draw, of)]
+
+
+def dynamic(draw: Draw) -> Case:
+    start, value = draw(st.integers(-3, 9)), floats(draw, (2, 3))
+    return (
+        lambda x, u: (lax.dynamic_slice(x, (start, 0), (2, 2)), lax.dynamic_update_slice(x, u, (start, start))),
+        [floats(draw, (5, 4)), value],
+    )
+
+
+def pads(draw: Draw) -> Case:
+    of = shape(draw, least=1, most=2)
+    how = [(draw(st.integers(-1, 2)), draw(st.integers(0, 2)), draw(st.integers(0, 2))) for _ in of]
+    return lambda x, v: lax.pad(x, v, how), [floats(draw, of), floats(draw, ())]
+
+
+def dots(draw: Draw) -> Case:
+    b, m, k, n = (draw(st.integers(1, 4)) for _ in range(4))
+    which = draw(st.sampled_from(["matrix", "batch", "integers"]))
+    if which == "matrix":
+        return jnp.dot, [floats(draw, (m, k)), floats(draw, (k, n))]
+    if which == "batch":
+        return lambda x, y: jnp.einsum("bmk,bkn->bmn", x, y), [floats(draw, (b, m, k)), floats(draw, (b, k, n))]
+    constant = np.arange(k * n, dtype=np.int32).reshape(k, n)
+    return lambda x: lax.dot_general(
+        x, constant, (((1,), (0,)), ((), ())), preferred_element_type=jnp.float32
+    ), [floats(draw, (m, k))]  # fmt: skip
+
+
+def choices(draw: Draw) -> Case:
+    of = shape(draw)
+    make = draw(st.sampled_from([floats, integers, booleans]))
+    return jnp.where, [booleans(draw, of), make(draw, of), make(draw, of)]
+
+
+def arg_extremes(draw: Draw) -> Case:
+    of, dtype = shape(draw, least=1), draw(st.sampled_from(["bool", "int32", "uint32"]))
+    axis = draw(st.integers(0, len(of) - 1))
+    x = booleans(draw, of) if dtype == "bool" else integers(draw, of, dtype) % 5
+    return lambda x: (jnp.argmin(x, axis), jnp.argmax(x, axis)), [x]
+
+
+def selections(draw: Draw) -> Case:
+    of, count = shape(draw), draw(st.integers(1, 4))
+    make = draw(st.sampled_from([floats, integers]))
+    conditions = [booleans(draw, of) for _ in range(count)]
+    return lambda conditions, x: jnp.select(list(conditions), [x * (k + 1) for k in range(count)], 3), [
+        np.stack(conditions, 1),
+        make(draw, of),
+    ]
+
+
+def branches(draw: Draw) -> Case:
+    functions = [lambda x: x + 1.0, lambda x: x * 2.0, lambda x: -x]
+    if draw(st.booleans()):
+        return lambda i, x: lax.switch(jnp.clip(i, -1, 4), functions, x), [
+            integers(draw, ()) % 5,
+            floats(draw, (3,)),
+        ]
+    return lambda p, x: lax.cond(p, *functions[:2], x), [booleans(draw, ()), floats(draw, (3,))]
+
+
+def scans(draw: Draw) -> Case:
+    reverse = draw(st.booleans())
+
+    def function(x):
+        return lax.scan(lambda carry, row: (carry * 0.5 + row.sum(), carry + row), 0.0, x, reverse=reverse)
+
+    return function, [floats(draw, (4, 2))]
+
+
+def loops(draw: Draw) -> Case:
+    trips = draw(st.integers(1, 5))
+    return lambda x: lax.while_loop(lambda c: c[0] < trips, lambda c: (c[0] + 1, c[1] * 0.5 + 1.0), (0, x)), [
+        floats(draw, (2,))
+    ]
+
+
+def conversions(draw: Draw) -> Case:
+    source = draw(st.sampled_from(["float32", "int32", "uint32", "bool"]))
+    target = draw(st.sampled_from(["float32", "int32", "bool"]))
+    of = shape(draw)
+    make = {"float32": lambda: floats(draw, of, -300, 300), "bool": lambda: booleans(draw, of)}
+    x = make.get(source, lambda: integers(draw, of, source))()
+    return lambda x: x.astype(target), [x]
+
+
+def compares(draw: Draw) -> Case:
+    make = draw(st.sampled_from([special, integers, lambda d, s: integers(d, s, "uint32")]))
+    return binary(lambda a, b: (a == b, a != b, a < b, a <= b, a > b, a >= b), make)(draw)
+
+
+def extremes(draw: Draw) -> Case:
+    make = draw(st.sampled_from([special, integers, booleans]))
+    return binary(lambda a, b: (lax.max(a, b), lax.min(a, b)), make)(draw)
+
+
+def constant_integers(draw: Draw) -> Case:
+    a = np.array(draw(st.lists(st.integers(-20, 20), min_size=2, max_size=4)), np.int32)
+    b = np.array([draw(st.integers(1, 5)) * draw(st.sampled_from([-1, 1])) for _ in a], np.int32)
+    return lambda x: x + lax.div(jnp.array(a), jnp.array(b)) + lax.rem(jnp.array(a), jnp.array(b)), [
+        integers(draw, a.shape)
+    ]
+
+
+def calls(draw: Draw) -> Case:
+    @jax.custom_vjp
+    def backward(x):
+        return x * 2.0
+
+    backward.defvjp(lambda x: (x * 2.0, None), lambda _, g: (g,))
+    safe = jax.custom_jvp(lambda x: x + 1.0)
+    safe.defjvp(lambda x, t: (x[0], t[0]))
+
+    def function(x):
+        chosen = lax.platform_dependent(x, cpu=lambda x: x + 3.0, default=lambda x: x)
+        return jax.jit(jax.checkpoint(backward))(safe(chosen)) + lax.stop_gradient(lax.optimization_barrier(x))
+
+    return function, [floats(draw, (2,))]
+
+
+def moves(draw: Draw) -> Case:
+    of = shape(draw, least=1)
+    order = draw(st.permutations(range(len(of))))
+
+    def function(x):
+        y = jnp.transpose(x, order)
+        return (
+            y.reshape(-1), jnp.flip(x, 0), jnp.concatenate([x, x], 0), jnp.stack([x, x], 0), jnp.tile(x, 2),
+            jnp.squeeze(x[None], 0), jnp.broadcast_to(x[None], (2, *of)), jnp.copy(x), jax.device_put(x),
+            x + lax.broadcasted_iota(jnp.float32, of, len(of) - 1), lax.expand_dims(x, (0,)),
+        )  # fmt: skip
+
+    return function, [floats(draw, of)]
+
+
+def bits(draw: Draw) -> Case:
+    def function(x, y, z):
+        unsigned = lax.bitcast_convert_type(x, jnp.uint32)
+        return (
+            lax.bitcast_convert_type(unsigned ^ 1, jnp.float32), lax.bitcast_convert_type(y, jnp.uint32),
+            y << 3, y >> 5, unsigned >> 7, jnp.bitwise_count(unsigned), y & 12, y | 3, y ^ y[::-1], ~y,
+            z & z[::-1], z | z[::-1], z ^ z[::-1], ~z,
+        )  # fmt: skip
+
+    return function, [floats(draw, (3,)), integers(draw, (3,)), booleans(draw, (3,))]
+
+
+CASES: dict[str, Callable[[Draw], Case]] = {
+    "add": binary(jnp.add),
+    "integer arithmetic": binary(lambda a, b: (a + b, a - b, a * b, -a, jnp.abs(a), lax.square(a)), integers),
+    "sub": binary(jnp.subtract),
+    "mul": binary(jnp.multiply),
+    "div": binary(jnp.divide),
+    "special values": binary(lambda a, b: (a + b, a - b, a * b, a / b, jnp.isfinite(a), jnp.sign(a)), special),
+    "neg, abs, sign, square": unary(lambda x: (-x, jnp.abs(x), jnp.sign(x), lax.square(x))),
+    "sqrt, rsqrt": unary(lambda x: (jnp.sqrt(x), lax.rsqrt(x)), 0.01, 9.0),
+    "floor, ceil, round": unary(lambda x: (jnp.floor(x), jnp.ceil(x), jnp.round(x), lax.round(x))),
+    "powers": unary(lambda x: (x**3, lax.integer_pow(x, -2), lax.integer_pow(x, 0), x**1.5), 0.5, 2.0),
+    "trigonometry": unary(lambda x: (jnp.sin(x), jnp.cos(x), jnp.tan(x * 0.4), jnp.arctan(x))),
+    "arcs": unary(lambda x: (jnp.arcsin(x), jnp.arccos(x)), -1.0, 1.0),
+    "atan2": binary(jnp.arctan2),
+    "exponentials": unary(lambda x: (jnp.exp(x), jnp.expm1(x), jnp.exp2(x), jnp.tanh(x), jax.nn.sigmoid(x))),
+    "logarithms": unary(lambda x: (jnp.log(x), jnp.log1p(x)), 0.01, 9.0),
+    "pow": lambda draw: (jnp.power, [floats(draw, (3,), 0.1, 3.0), floats(draw, (3,))]),
+    "clamp": lambda draw: (lambda x: jnp.clip(x, -1.0, 1.5), [special(draw, (4,))]),
+    "lax.clamp": lambda draw: (lambda x: lax.clamp(np.float32(-1), x, np.float32(2)), [floats(draw, (4,))]),
+    "of nothing": lambda draw: (
+        lambda x: (
+            x[:0].sum(0),
+            x[:0].prod(0),
+            x[:0].max(0, initial=-1.0),
+            (x[:0] > 0).all(0),
+            (x[:0] > 0).any(0),
+            jnp.cumsum(x[:0]),
+            x[:0].reshape(0, 2).T @ x[:0].reshape(0, 2),
+            lax.pad(x, 0.0, [(-5, 4, 0)]),
+        ),
+        [floats(draw, (3,))],
+    ),
+    "bytes": lambda draw: (
+        lambda x: jnp.bitwise_count(x)[::1].reshape(1, 3).astype(jnp.float32),
+        [integers(draw, (3,), "uint32")],
+    ),
+    "cumulations": along(
+        lambda x, axis, reverse: [f(x, axis, reverse) for f in (lax.cumsum, lax.cumprod, lax.cummax, lax.cummin)]
+    ),
+    "sums": reduction(lambda x, axes: (x.sum(axes), x.prod(axes))),
+    "integer sums": reduction(lambda x, axes: x.sum(axes), integers),
+    "extremes of axes": reduction(lambda x, axes: (x.max(axes), x.min(axes)), special),
+    "all and any": reduction(lambda x, axes: (x.all(axes), x.any(axes)), booleans),
+    "remainders": binary(lambda a, b: (lax.rem(a, b), jnp.mod(a, b), a // 1.5)),
+    "division of integers": binary(lambda a, b: (a // b, a % b, lax.div(a, b), lax.rem(a, b)), integers),
+    "division without signs": binary(
+        lambda a, b: (a // b, a % b, lax.div(a, b), lax.rem(a, b)), lambda draw, of: integers(draw, of, "uint32")
+    ),
+    "signs of integers": binary(lambda a, b: jnp.sign(a - b), integers),
+    "arg extremes of others": arg_extremes,
+    "select": selections,
+    "arg extremes": lambda draw: (lambda x: (jnp.argmin(x, 0), jnp.argmax(x, 0)), [special(draw, (4, 2))]),
+    "dots": dots,
+    "gather": gather,
+    "gather along": gather_along,
+    "scatter": scatter,
+    "segment sum": segment_sum,
+    "slices": slices,
+    "dynamic": dynamic,
+    "pads": pads,
+    "moves": moves,
+    "choices": choices,
+    "integer choice": lambda draw: (
+        lambda i, x: lax.select_n(jnp.clip(i, 0, 2), x, x * 2, x * 3),
+        [integers(draw, ()), floats(draw, ())],
+    ),
+    "branches": branches,
+    "scans": scans,
+    "loops": loops,
+    "conversions": conversions,
+    "compares": compares,
+    "boolean compares": binary(lambda a, b: (a == b, a != b), booleans),
+    "extremes": extremes,
+    "constant integers": constant_integers,
+    "calls": calls,
+    "bits": bits,
+}
