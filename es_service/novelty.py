@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 Distance = Literal["euclidean", "squared_euclidean"]
 
 TREE_STEP = 256
-"""Entries between two trees. Those after the newest tree are compared one by one."""
+"""Entries between two trees, at first. Those after the newest tree are compared one by one."""
+COPIES = 64
+"""Entries with equal descriptors that a tree holds at most: searches of policies that do not move, or end in a corner,
+make piles of them, and each query near a pile would look at all of it."""
 LEAST_ROOM = 256
 """Entries that an archive's arrays have room for, at first."""
 SPARE_CANDIDATES = 6
@@ -43,6 +46,21 @@ class _Room:
 
 
 @dataclass(frozen=True)
+class _Tree:
+    """A k-d tree over the first entries of an archive."""
+
+    kd: KDTree
+    entries: int
+    """How many."""
+    entry_K: NDArray[np.int64] | None
+    """Which of them are in it; None for all."""
+
+    def entries_of(self, points: ArrayLike) -> NDArray[np.int64]:
+        """Indices of the entries that points of the tree are."""
+        return np.asarray(points) if self.entry_K is None else self.entry_K[np.asarray(points)]
+
+
+@dataclass(frozen=True)
 class NoveltyArchive:
     """Descriptors of all centres evaluated so far, in order. N: entries; B: descriptor dimensions."""
 
@@ -51,8 +69,8 @@ class NoveltyArchive:
     """When each was evaluated; 0 for initial centres."""
     member_N: NDArray[np.int64]
     """Of which member each was the centre."""
-    tree: KDTree | None = None
-    """Over the first entries, a multiple of TREE_STEP of them; follows from `descriptor_N_B`."""
+    tree: _Tree | None = None
+    """Follows from `descriptor_N_B`."""
     room: _Room | None = None
     """What the arrays are the beginning of."""
 
@@ -170,16 +188,32 @@ def _copied(archive: NoveltyArchive) -> _Room:
     return room
 
 
-def _with_tree(room: _Room, tree: KDTree | None) -> NoveltyArchive:
+def _with_tree(room: _Room, tree: _Tree | None) -> NoveltyArchive:
     """The archive of what a room holds, with a tree over as many entries as its size asks for: `tree` if it is that
-    one, else a new one."""
+    one, else a new one. New trees grow as rare as they grow dear: every sqrt(size) entries, a power of two."""
     descriptor_N_B = room.descriptor_B[: room.used]
-    covered = room.used // TREE_STEP * TREE_STEP
-    if covered and (tree is None or tree.n != covered):
-        from scipy.spatial import KDTree  # a quarter of a second that most runs need not spend
-
-        tree = KDTree(descriptor_N_B[:covered])
+    step = max(TREE_STEP, 1 << room.used.bit_length() // 2)
+    covered = room.used // step * step
+    if covered and (tree is None or tree.entries != covered):
+        tree = _tree(descriptor_N_B[:covered])
     return NoveltyArchive(descriptor_N_B, room.generation[: room.used], room.member[: room.used], tree, room)
+
+
+def _tree(descriptor_N_B: NDArray[np.float64]) -> _Tree:
+    """A tree over all entries, but over the first COPIES of equal ones."""
+    from scipy.spatial import KDTree  # a quarter of a second that most runs need not spend
+
+    size = len(descriptor_N_B)
+    word_N = np.zeros(size, np.uint64)
+    for b in range(descriptor_N_B.shape[1]):  # equal descriptors give equal words, others hardly ever
+        word_N = word_N * np.uint64(0x9E3779B97F4A7C15) + np.ascontiguousarray(descriptor_N_B[:, b]).view(np.uint64)
+    sorted_N = np.sort(word_N)
+    if not (sorted_N[COPIES:] == sorted_N[:-COPIES]).any():
+        return _Tree(KDTree(descriptor_N_B), size, None)
+    order_N = np.lexsort(descriptor_N_B.T)
+    equal_N = (descriptor_N_B[order_N[COPIES:]] == descriptor_N_B[order_N[:-COPIES]]).all(axis=1)
+    entry_K = np.sort(np.concatenate([order_N[:COPIES], order_N[COPIES:][~equal_N]]))
+    return _Tree(KDTree(descriptor_N_B[entry_K]), size, entry_K)
 
 
 def _mean_nearest(
@@ -192,19 +226,21 @@ def _mean_nearest(
     """Mean distance to the nearest entries for finite queries: candidates of the tree where that is enough."""
     tree = archive.tree
     asked = neighbours + 1 + SPARE_CANDIDATES  # one more in case the excluded entry is among them
-    if tree is None or asked >= tree.n:
+    if tree is None or asked >= tree.kd.n or (tree.entry_K is not None and asked > COPIES):
         return _mean_smallest(_squared(archive, query_Q_B, excluded_Q), neighbours, distance)
-    reach_Q_K, candidate_Q_K = tree.query(query_Q_B, asked)
+    reach_Q_K, point_Q_K = tree.kd.query(query_Q_B, asked)
+    candidate_Q_K = tree.entries_of(point_Q_K)
     near_Q_K = _squared_to(query_Q_B, archive.descriptor_N_B[candidate_Q_K])
     near_Q_K[candidate_Q_K == excluded_Q[:, None]] = np.inf
-    tail_Q_N = _squared(archive, query_Q_B, excluded_Q, tree.n)
+    tail_Q_N = _squared(archive, query_Q_B, excluded_Q, tree.entries)
     squared_Q_K = _smallest(np.concatenate([near_Q_K, tail_Q_N], axis=1), neighbours)
     # Sure unless an entry that the tree left out could, after rounding, be among the nearest.
     sure_Q = np.sqrt(squared_Q_K[:, -1]) <= reach_Q_K[:, -1] * (1.0 - TREE_ROUNDING)
     mean_Q = _mean_smallest(squared_Q_K, neighbours, distance)
     for index in np.flatnonzero(~sure_Q):  # where many ends are the same, as at a border, the last candidates are equal
         one = slice(index, index + 1)
-        within = np.array(tree.query_ball_point(query_Q_B[index], reach_Q_K[index, -1] * (1.0 + TREE_ROUNDING)))
+        radius = reach_Q_K[index, -1] * (1.0 + TREE_ROUNDING)
+        within = tree.entries_of(tree.kd.query_ball_point(query_Q_B[index], radius))
         near_1_K = _squared_to(query_Q_B[one], archive.descriptor_N_B[None, within])
         near_1_K[:, within == excluded_Q[index]] = np.inf
         mean_Q[one] = _mean_smallest(np.concatenate([near_1_K, tail_Q_N[one]], axis=1), neighbours, distance)

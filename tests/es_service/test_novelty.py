@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from es_service.novelty import (
     BLOCK_ENTRIES,
+    COPIES,
     TREE_STEP,
     NoveltyArchive,
     archive_from_parts,
@@ -108,8 +109,9 @@ def test_equals_the_twin_bit_by_bit(entries, queries, neighbours):
 
 
 @pytest.mark.parametrize("dimensions", [1, 2, 4])
-@pytest.mark.parametrize("scatter", ["uniform", "grid", "one point", "line"])
-def test_the_tree_changes_no_bit(dimensions, scatter, monkeypatch):
+@pytest.mark.parametrize("scatter", ["uniform", "grid", "one point", "line", "piles"])
+@pytest.mark.parametrize("neighbours", [10, COPIES - 7, COPIES + 3])
+def test_the_tree_changes_no_bit(dimensions, scatter, neighbours):
     """Ties and duplicates, where a tree may choose other neighbours than we would, included."""
     rng = np.random.default_rng(0)
     entries = {
@@ -117,17 +119,58 @@ def test_the_tree_changes_no_bit(dimensions, scatter, monkeypatch):
         "grid": lambda n: rng.integers(0, 4, (n, dimensions)) / 3.0,
         "one point": lambda n: np.full((n, dimensions), 0.3),
         "line": lambda n: np.repeat(rng.uniform(-1, 1, (n, 1)) / 3, dimensions, axis=1),
+        "piles": lambda n: (
+            np.where(rng.random((n, 1)) < 0.6, rng.integers(0, 2, (n, 1)) / 3, rng.normal(size=(n, 1)))
+            + np.zeros(dimensions)
+        ),
     }[scatter]
     archive = many(entries(2 * TREE_STEP + 100))
     assert archive.tree is not None
-    assert archive.tree.n == 2 * TREE_STEP
+    assert archive.tree.entries == 2 * TREE_STEP
+    assert (archive.tree.kd.n < 2 * TREE_STEP) == (
+        scatter in ("one point", "piles") or (scatter, dimensions) == ("grid", 1)
+    )
     queries = np.concatenate([entries(40), archive.descriptor_N_B[:10], archive.descriptor_N_B[-10:]])
     exclude = np.concatenate([np.full(40, -1), np.arange(10), np.arange(archive.size - 10, archive.size)])
-    with_tree = of(archive, queries, 10, exclude=exclude)
+    with_tree = of(archive, queries, neighbours, exclude=exclude)
     brute = NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.member_N)
-    assert with_tree == of(brute, queries, 10, exclude=exclude)
-    some = [twin.novelty(archive.descriptor_N_B, queries[i], 10, without=int(exclude[i])) for i in (0, 41, 59)]
+    assert with_tree == of(brute, queries, neighbours, exclude=exclude)
+    some = [twin.novelty(archive.descriptor_N_B, queries[i], neighbours, without=int(exclude[i])) for i in (0, 41, 59)]
     assert [with_tree[i] for i in (0, 41, 59)] == some
+
+
+def test_a_pile_of_equal_ends_costs_no_more_than_its_copies(monkeypatch):
+    """Policies that do not move: each query near them would otherwise look at all that ever ended there."""
+    rng = np.random.default_rng(0)
+    archive = many(np.concatenate([np.full((4000, 2), 0.25), rng.uniform(-1, 1, (1000, 2))]))
+    assert archive.tree is not None
+    looked_at: list[int] = []
+    ball = type(archive.tree.kd).query_ball_point
+
+    def counted(self, point, radius):
+        found = ball(self, point, radius)
+        looked_at.append(len(found))
+        return found
+
+    monkeypatch.setattr(type(archive.tree.kd), "query_ball_point", counted)
+    queries = np.full((20, 2), 0.25) + rng.normal(size=(20, 2)) / 100
+    brute = NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.member_N)
+    assert of(archive, queries, 10) == of(brute, queries, 10)
+    assert looked_at
+    assert max(looked_at) < 2 * COPIES
+
+
+def test_trees_become_rare_where_they_are_large():
+    archive = many(np.random.default_rng(0).uniform(size=(2**18 + 700, 2)))
+    assert archive.tree is not None
+    assert archive.tree.entries == 2**18 + 512
+    same = archive
+    for _ in range(300):
+        same = extended(same, (0.5, 0.5), 0, 0)
+        assert same.tree is archive.tree
+    assert extended(same, (0.5, 0.5), 0, 0).size == 2**18 + 1001
+    brute = NoveltyArchive(same.descriptor_N_B, same.generation_N, same.member_N)
+    assert of(same, [(0.5, 0.5), (0.1, 0.7)], 10) == of(brute, [(0.5, 0.5), (0.1, 0.7)], 10)
 
 
 @pytest.mark.parametrize("off", [-1e-12, 0.0, 1e-12])
@@ -136,7 +179,8 @@ def test_a_tree_that_rounds_otherwise_changes_no_bit(monkeypatch, off):
     archive = many(np.random.default_rng(1).integers(0, 6, (2 * TREE_STEP, 2)) / 7.0)
     queries = archive.descriptor_N_B[:50] + 1 / 3
     expected = of(NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.member_N), queries, 3)
-    tree, undecided = type(archive.tree), []
+    assert archive.tree is not None
+    tree, undecided = type(archive.tree.kd), []
     query, ball = tree.query, tree.query_ball_point
 
     def rounded(self, points, count):
