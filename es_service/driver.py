@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.algorithms.base import NO_CELL, Algorithm, Judgement, Member, SearchState
+from es_service.algorithms.base import Algorithm, Judgement, Member, SearchState
 from es_service.algorithms.me_es import restarted
 from es_service.algorithms.steps import first_state
 from es_service.clock import Clock
@@ -150,7 +150,7 @@ def _first_generation(
     for member, (point, evaluation) in enumerate(zip(points, evaluations, strict=True)):
         judgement = judge(0, member, evaluation)
         moved = search.algorithm.absorb(moved, judgement)
-        elites |= _entered(moved, member, point, evaluation)
+        elites |= _entered(moved, judgement, point, evaluation)
         better = _better(best, point, judgement)
         best, fittest = better, fittest if better is best else member
     state = RunState(
@@ -165,7 +165,7 @@ def _first_generation(
     )
     row: HistoryRow = {
         **search_columns(fittest, search.algorithm.fitness_weight, None, moved.archive.size),
-        **_map_columns(search, reachable, moved, fittest, None),
+        **_map_columns(search, reachable, moved, 0, fittest, None),
         **step_columns(None, centres[fittest]),
         **population_columns(None, 0),
         **evaluation_columns(evaluations[fittest], search.task),
@@ -213,7 +213,7 @@ def _next_generation(
 
     row: HistoryRow = {
         **search_columns(plan.member, plan.fitness_weight, float(centre_novelty), learned.archive.size),
-        **_map_columns(search, reachable, learned, plan.member, start_cell),
+        **_map_columns(search, reachable, learned, generation, plan.member, start_cell),
         **step_columns(plan.centre_D, new_centre_D),
         **population_columns(population, invalid),
         **evaluation_columns(evaluation, search.task),
@@ -229,7 +229,7 @@ def _next_generation(
         + population.fitness.size * search.config.task.episodes_per_member
         + evaluation.fitness.size,
         wall_clock_s=clock.total(),
-        elites=_entered(learned, plan.member, new_centre, evaluation),
+        elites=_entered(learned, judgement, new_centre, evaluation),
     )
     return state, row
 
@@ -271,10 +271,10 @@ def _centre(
     return Centre(generation, centre_D, search.config.search.sigma, mean_O, std_O)
 
 
-def _entered(state: SearchState, member: int, centre: Centre, evaluation: EpisodesResult) -> dict[int, Elite]:
-    """The centre just evaluated as an elite, by its cell, if it entered the map."""
-    cell = state.members[member].cell
-    if cell == NO_CELL:
+def _entered(state: SearchState, judged: Judgement, centre: Centre, evaluation: EpisodesResult) -> dict[int, Elite]:
+    """The centre just evaluated as an elite, by its cell, if it entered the map. The map says so, not its member: a
+    search of the user's need not keep `Member.cell`."""
+    if state.map is None or (cell := state.map.cell_of(judged.generation, judged.member)) is None:
         return {}
     assert evaluation.trace_T_B is not None, "an evaluation has a trace"
     return {cell: make_elite(centre, evaluation.trace_T_B)}
@@ -285,14 +285,13 @@ def _reachable(search: Search, map_: BehaviourMap | None) -> Reachable:
 
 
 def _map_columns(
-    search: Search, reachable: Reachable, after: SearchState, member: int, start_cell: int | None
+    search: Search, reachable: Reachable, after: SearchState, generation: int, member: int, start_cell: int | None
 ) -> HistoryRow:
     if after.map is None:
         return {}
-    cell = after.members[member].cell
     return {
         "start_cell": start_cell,
-        "cell": None if cell == NO_CELL else cell,
+        "cell": after.map.cell_of(generation, member),
         **map_columns(after.map, search.config.map.qd_offset, reachable),
     }
 

@@ -22,6 +22,7 @@ from es_service.errors import StoreError
 from es_service.maps.behaviour_map import (
     CELL_PREFIX,
     ELITE_PREFIX,
+    BehaviourMap,
     Elite,
     elite_part,
     elite_to_arrays,
@@ -69,10 +70,13 @@ def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
     Raises:
         StoreError: the search's state is none that can follow `before`; see `SearchState`.
     """
-    if before is not None and (wrong := _not_followed(before.search, state.search)):
+    wrong = _not_followed(before.search, state.search) if before is not None else ""
+    wrong = wrong or _foreign_elite(before.search.map if before is not None else None, state.search.map, state.elites)
+    if wrong:
+        saved = f"Everything up to generation {before.generation} is saved." if before is not None else ""
         raise StoreError(
             f"generation {state.generation} cannot be kept: {wrong}; es_service/algorithms/base.py says of SearchState "
-            f"what a search may change. Everything up to generation {before.generation} is saved."
+            f"what a search may change. {saved}".rstrip()
         )
     parts = {
         "observations": moments_to_arrays(state.observations),
@@ -110,6 +114,19 @@ def _not_followed(before: SearchState, after: SearchState) -> str:
     if not np.array_equal(after.map.cell_N[: before.map.size], before.map.cell_N):
         return "the map has lost cells, or has them in another order"
     return ""
+
+
+def _foreign_elite(before: BehaviourMap | None, after: BehaviourMap | None, elites: Mapping[int, Elite]) -> str:
+    """What is wrong with the elites that a map has and an earlier one had not, when `elites` entered it."""
+    if after is None or after is before:
+        return ""
+    new_N = np.ones(after.size, bool)
+    if before is not None:
+        known = slice(before.size)
+        same_N = (after.generation_N[known] == before.generation_N) & (after.member_N[known] == before.member_N)
+        new_N[known] = ~same_N
+    foreign = set(after.cell_N[new_N].tolist()) - set(elites)
+    return f"the new elite of cell {min(foreign)} is not the centre that was evaluated" if foreign else ""
 
 
 def state_from_parts(

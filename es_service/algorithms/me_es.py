@@ -121,9 +121,18 @@ def elite_novelty(map_: BehaviourMap, archive: NoveltyArchive, settings: Novelty
         map_.descriptor_N_B,
         neighbours=settings.neighbours,
         distance=settings.distance,
-        # One member evaluates one centre a generation, so that generations name entries; they ascend.
-        exclude_Q=np.searchsorted(archive.generation_N, map_.generation_N),
+        exclude_Q=_own_entries(map_, archive),
     )
+
+
+def _own_entries(map_: BehaviourMap, archive: NoveltyArchive) -> NDArray[np.int64]:
+    """Index of the entry that each elite made, [N]; -1 of one that made none. Entries ascend by generation and, among
+    those of generation 0, member."""
+    members = 1 + max(map_.member_N.max(initial=0), archive.member_N.max(initial=0))
+    entry_N, elite_N = (one.generation_N * members + one.member_N for one in (archive, map_))
+    found_N = np.searchsorted(entry_N, elite_N)
+    is_there_N = np.append(entry_N, -1)[found_N] == elite_N
+    return np.where(is_there_N, found_N, -1)
 
 
 def restarted(state: SearchState, cell: int, elite: Elite, own_statistics: bool) -> SearchState:

@@ -48,6 +48,11 @@ class BehaviourMap:
         found = np.flatnonzero(self.cell_N == cell)
         return int(found[0]) if found.size else None
 
+    def cell_of(self, generation: int, member: int) -> int | None:
+        """The cell whose elite the centre is that a member had in a generation; None if it is none's."""
+        found = np.flatnonzero((self.generation_N == generation) & (self.member_N == member))
+        return int(self.cell_N[found[0]]) if found.size else None
+
 
 @dataclass(frozen=True)
 class Elite:

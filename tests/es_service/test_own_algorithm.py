@@ -12,6 +12,7 @@ from es_service.algorithms import ALGORITHMS
 from es_service.algorithms.base import Judgement, Plan
 from es_service.algorithms.steps import archived, first_state
 from es_service.errors import ConfigError, StoreError
+from es_service.maps.behaviour_map import insert
 from es_service.novelty import NoveltyArchive
 from es_service.protocol import EpisodesResult
 from es_service.statistics import no_observations
@@ -95,6 +96,28 @@ def emptying(config):
     return _absorbing(config, lambda state: replace(state, map=_rows(state.map, slice(-1, None))))
 
 
+def foreign(config):
+    """An elite of a cell far away, which no centre of the run has been to."""
+
+    def absorb(state, judgement):
+        elsewhere = np.array([-0.9, 0.9])
+        return replace(state, map=insert(state.map, elsewhere, 1.0 * judgement.generation, 10**6, 0, 0.0)[0])
+
+    return replace(ALGORITHMS["es"](config), absorb=absorb)
+
+
+def choosy(config):
+    """Offers every third centre to the map, and does not tell its member."""
+
+    def absorb(state, judgement):
+        if judgement.generation % 3 != 1:
+            return state
+        fitness = 1.0 * judgement.generation  # later ones are fitter, wherever they are
+        return replace(state, map=insert(state.map, judgement.descriptor_B, fitness, judgement.generation, 0, 0.0)[0])
+
+    return replace(ALGORITHMS["es"](config), absorb=absorb)
+
+
 def _absorbing(config, change):
     ours = ALGORITHMS["es"](config)
     return replace(ours, absorb=lambda state, judgement: change(ours.absorb(state, judgement)))
@@ -116,9 +139,22 @@ def _rows(map_, rows):
         ("forgetful", r"generation 3 cannot be kept: the novelty archive has lost or changed entries; .* 2 is saved"),
         ("growing", r"generation 1 cannot be kept: the search has 3 members, and had 2"),
         ("emptying", r"the map has lost cells, or has them in another order"),
+        ("foreign", r"generation 0 cannot be kept: the new elite of cell \d+ is not the centre that was evaluated"),
     ],
 )
 def test_a_state_that_the_store_could_not_give_back_ends_the_run(tmp_path, name, reason):
     settings = [f"search.algorithm={__name__}:{name}", "map.cells=[200, 200]", "search.learning_rate=1"]
     with pytest.raises(StoreError, match=reason):
         api.run(api.load_config(CONFIG, settings), tmp_path / "run")
+
+
+def test_elites_are_those_that_the_map_says_entered(tmp_path):
+    settings = [f"search.algorithm={__name__}:choosy", "map.cells=[2, 2]"]
+    run = api.run(api.load_config(CONFIG, settings), tmp_path / "run").run
+    assert run.history["cell"].notna().tolist() == [False, True, False, False, True, False, False]
+    map_, elites = run.elites()
+    assert set(map_.generation_N.tolist()) <= {1, 4}
+    norms = run.history["parameter_norm"]
+    for cell, generation in zip(map_.cell_N.tolist(), map_.generation_N.tolist(), strict=True):
+        norm = np.linalg.norm(elites[cell].centre_D.astype(np.float64))
+        assert norm == pytest.approx(norms[generation], rel=1e-6)

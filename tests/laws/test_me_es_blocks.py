@@ -126,6 +126,16 @@ def test_an_elite_s_own_entry_is_no_neighbour_but_an_equal_one_is():
     assert elite_novelty(map_, archive, squared).tolist() == [8.0, 68.0]  # (0 + 16) / 2, (36 + 100) / 2
 
 
+def test_of_several_initial_centres_each_elite_leaves_out_its_own_entry():
+    """And one that made none leaves out nothing."""
+    map_ = replace(line([0, 10, 25, 40], generations=[0, 0, 0, 7]), member_N=np.array([0, 2, 1, 0]))
+    archive = empty_archive(1)
+    for member, descriptor in enumerate([0.0, 25.0, 10.0]):
+        archive = extended(archive, [descriptor], 0, member)
+    novelty_N = elite_novelty(map_, archive, config_of(neighbours=1).novelty)
+    assert novelty_N.tolist() == [10.0, 10.0, 15.0, 15.0]
+
+
 def state_at(map_):
     return replace(first_state([np.zeros(3, np.float32)], 1, 0.0, map_), archive=archive_of(map_))
 

@@ -9,11 +9,19 @@ from es_service import driver
 from es_service.algorithms import ALGORITHMS
 from es_service.algorithms.base import FitnessWeight, Judgement, Member
 from es_service.algorithms.nsra_es import adapted_weight
-from es_service.algorithms.steps import MEMBER_CHOICE, archived, choose_member, first_state, member_novelty
+from es_service.algorithms.steps import (
+    MEMBER_CHOICE,
+    archived,
+    choose_member,
+    first_state,
+    member_novelty,
+    mixed_utilities,
+)
 from es_service.api import load_config
 from es_service.config.model import worker_spec
+from es_service.generation import invalidate
 from es_service.noise import Domain, normals, stream_keys, uniforms
-from es_service.protocol import EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.protocol import EpisodesResult, EvaluationChunk, PolicyShape, TrainingChunk
 from es_service.run_state import state_from_parts
 from es_service.statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
@@ -26,7 +34,7 @@ RULE = {"fitness_weight_start": 0.6, "fitness_weight_step": 0.15, "fitness_weigh
 STARTS = {"es": 1.0, "ns_es": 0.0, "nsr_es": 0.5, "nsra_es": 0.6}
 
 
-def config_of(algorithm, **search):
+def config_of(algorithm, distance="euclidean", **search):
     return load_config(
         {
             "task": {"environment": "point_maze"},
@@ -40,7 +48,7 @@ def config_of(algorithm, **search):
                 **RULE,
                 **search,
             },
-            "novelty": {"neighbours": 3},
+            "novelty": {"neighbours": 3, "distance": distance},
             "budget": {"generations": 20},
             "compute": {"chunk_pairs": 16},
         }
@@ -73,15 +81,18 @@ def episodes(evaluator, kind, generation, centre=None):
     return np.concatenate([r.fitness for r in results]), np.concatenate([r.descriptor for r in results])
 
 
-@pytest.mark.parametrize("algorithm", ["ns_es", "nsr_es", "nsra_es"])
-def test_twenty_generations_equal_the_twin(algorithm):
-    config = config_of(algorithm)
+@pytest.mark.parametrize(
+    ("algorithm", "distance"),
+    [("ns_es", "euclidean"), ("nsr_es", "euclidean"), ("nsra_es", "euclidean"), ("nsr_es", "squared_euclidean")],
+)
+def test_twenty_generations_equal_the_twin(algorithm, distance):
+    config, squared = config_of(algorithm, distance), distance == "squared_euclidean"
     state, store, evaluator = run_in_memory(config)
     search = config.search
     rule = (search.fitness_weight_step, search.fitness_weight_patience, 0.0) if algorithm == "nsra_es" else None
     centres = [initial_parameters(SHAPE, config.policy.init, 0, member) for member in range(5)]
     other = twin.NoveltySearch(
-        centres, search.learning_rate, search.l2, neighbours=3, weight=STARTS[algorithm], rule=rule
+        centres, search.learning_rate, search.l2, neighbours=3, weight=STARTS[algorithm], rule=rule, squared=squared
     )
     for member, centre in enumerate(centres):
         _, descriptor = episodes(evaluator, EvaluationChunk, 0, centre)
@@ -98,7 +109,7 @@ def test_twenty_generations_equal_the_twin(algorithm):
         other.generation(member, noise, *episodes(evaluator, TrainingChunk, generation))
         fitness, descriptor = (x[:20] for x in episodes(evaluator, EvaluationChunk, generation))
         mean = descriptor.astype(float).mean(axis=0)
-        assert row["centre_novelty"] == pytest.approx(twin.novelty(other.archive, mean, 3), rel=1e-12)
+        assert row["centre_novelty"] == pytest.approx(twin.novelty(other.archive, mean, 3, squared), rel=1e-12)
         other.evaluated(member, fitness.astype(float).mean(), mean)
         assert row["archive_size"] == len(other.archive) == 5 + generation
     for ours, theirs in zip(state.search.members, other.members, strict=True):
@@ -247,6 +258,19 @@ def test_presets_are_the_published_rules():
 
 
 # Invalid results
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.5, 1.0])
+def test_invalid_members_are_last_whatever_is_climbed(weight):
+    """One would be the most novel, but its fitness is NaN; one would be the fittest, but ended nowhere."""
+    fitness = np.array([[1.0, np.nan], [9.0, 2.0]], np.float32)
+    descriptor = np.array([[(1.0, 0.0), (50.0, 0.0)], [(np.inf, 0.0), (2.0, 0.0)]], np.float32)
+    population = EpisodesResult(fitness, fitness, descriptor, np.ones((2, 2), np.int32), fitness, no_observations(2))
+    population, invalid = invalidate(population, 0.5, 1)
+    assert invalid == 2
+    state = archived(first_state([np.zeros(1, np.float32)], 2, weight), Judgement(0, 0, True, 0.0, np.zeros(2)))
+    utility = mixed_utilities(state, weight, population, config_of("nsr_es").novelty)
+    assert utility[0, 1] == utility[1, 0] == utility.min() < utility[0, 0] < utility[1, 1] == utility.max()
 
 
 class Spoiling(DirectEvaluator):

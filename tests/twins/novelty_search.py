@@ -24,16 +24,17 @@ def novelty(archive, descriptor, neighbours, squared=False, without=None):
 
 
 class NoveltySearch:
-    def __init__(self, centres, learning_rate, l2, *, neighbours, weight, rule=None):
+    def __init__(self, centres, learning_rate, l2, *, neighbours, weight, rule=None, squared=False):
         """rule: None, or (step, patience, minimum relative gain) of the adaptive weight."""
         self.members = [ES(centre, learning_rate, l2) for centre in centres]
         self.archive, self.newest_entry = [], [None] * len(centres)
-        self.neighbours, self.weight, self.rule = neighbours, weight, rule
+        self.neighbours, self.squared, self.weight, self.rule = neighbours, squared, weight, rule
         self.record, self.stagnant = None, 0
 
     def chosen(self, uniform):
         """Roulette over the members' novelties, for a number drawn from [0, 1)."""
-        shares = [novelty(self.archive, self.archive[i], self.neighbours, without=i) for i in self.newest_entry]
+        newest = [(i, self.archive[i]) for i in self.newest_entry]
+        shares = [novelty(self.archive, x, self.neighbours, self.squared, without=i) for i, x in newest]
         if sum(shares) == 0.0:
             shares = [1.0] * len(shares)
         below = 0.0
@@ -47,7 +48,7 @@ class NoveltySearch:
         pairs = len(noise_P_D)
         reward = averaged_centred_ranks(fitness_P_S.ravel())
         novel = averaged_centred_ranks(
-            [novelty(self.archive, x, self.neighbours) for x in descriptor_P_S_B.reshape(2 * pairs, -1)]
+            [novelty(self.archive, x, self.neighbours, self.squared) for x in descriptor_P_S_B.reshape(2 * pairs, -1)]
         )
         mixed = self.weight * reward + (1 - self.weight) * novel
         self.members[member].climb(noise_P_D, mixed.reshape(pairs, 2))
