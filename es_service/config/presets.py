@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 PRESETS = MappingProxyType(
     {
-        "literature": "what papers and independent implementations agree on; ours where they say nothing",
+        "literature": "what independent implementations do; ours where they say nothing",
         "uber": "what the authors' released ME-ES code does",
     }
 )
