@@ -14,10 +14,12 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+from tests.system.processes import ROOT, running
 
+Started = AbstractContextManager[subprocess.Popen[str]]
 SMALL = {
     "task": {"environment": "point_maze", "episode_steps": 30},
     "policy": {"hidden": [8]},
@@ -28,22 +30,16 @@ SMALL = {
 """A run of some milliseconds a generation: five members, archive, adaptive weight."""
 
 
-def start(folder: Path, *, config: dict | None = None, kill: dict | None = None) -> subprocess.Popen[str]:
+def start(folder: Path, *, config: dict | None = None, kill: dict | None = None) -> Started:
     """Start a session; it resumes unless a config is given."""
     arguments = json.dumps({"folder": str(folder), "config": config, "kill": kill})
-    return subprocess.Popen(
-        [sys.executable, "-m", "tests.system.session", arguments],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    return running(sys.executable, "-m", "tests.system.session", arguments, cwd=ROOT)
 
 
 def finish(folder: Path, *, config: dict | None = None, kill: dict | None = None) -> int:
     """Run a session to its end; the exit code. A session that fails by itself shows its error."""
-    process = start(folder, config=config, kill=kill)
-    _, errors = process.communicate(timeout=300)
+    with start(folder, config=config, kill=kill) as process:
+        _, errors = process.communicate(timeout=300)
     assert process.returncode in (0, -signal.SIGKILL), errors
     return process.returncode
 

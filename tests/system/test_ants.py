@@ -12,7 +12,7 @@ import pytest
 from es_service import api
 from es_service.digest import digest_parts
 from tests.benchmarks import ants
-from tests.system.test_workers import children
+from tests.system.processes import children
 
 pytestmark = pytest.mark.slow
 

@@ -23,6 +23,7 @@ from es_service.store.reader import read_generation
 from tests.dispatch_checker import check_dispatch
 from tests.system import cluster
 from tests.system.cluster import Cluster
+from tests.system.processes import committed, wait_for
 from tests.system.session import SMALL
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
@@ -41,15 +42,6 @@ def entries(folder: Path, name: str, since: float) -> list[dict]:
     if not (folder / FILE).exists():
         return []
     return [entry for entry in read_dispatch_log(folder) if entry["is"] == name and entry["time"] >= since]
-
-
-def wait_for(what, timeout_s: float = 60.0):
-    """The first true answer."""
-    until = time.monotonic() + timeout_s
-    while not (answer := what()):
-        assert time.monotonic() < until
-        time.sleep(0.1)
-    return answer
 
 
 def inline_digest(folder: Path, config: dict, generations: int) -> dict[str, str]:
@@ -176,7 +168,7 @@ def test_a_job_is_submitted_followed_stopped_and_goes_on_in_another_cluster(tmp_
         hosts.start("one", 1)
         wait_for(lambda: es(hosts, "jobs")[0] == 0)  # the dashboard takes its time
         job = submit(hosts)
-        wait_for(lambda: (run / "run.db").exists() and (read_generation(run) or 0) > 3)
+        wait_for(lambda: (committed(run) or 0) > 3)
         code, printed = es(hosts, "jobs")
         assert (code, printed.split()) == (0, [job, "RUNNING", str(run)])
         assert es(hosts, "stop", job) == (0, f"{job} stopped\n")
@@ -260,7 +252,7 @@ def test_a_driver_whose_head_dies_says_so_and_goes_on_alone(tmp_path):
     with Cluster(tmp_path) as hosts:
         hosts.start("one", 1)
         driver = hosts.popen("one", "es-service", "run", config, "--out", run, "--address", hosts.address)
-        wait_for(lambda: (run / "run.db").exists() and (read_generation(run) or 0) > 3)
+        wait_for(lambda: (committed(run) or 0) > 3)
         died = time.monotonic()
         hosts.end("head")
         try:

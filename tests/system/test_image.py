@@ -22,7 +22,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.system.session import ROOT
+from tests.system.processes import ROOT, wait_for
 
 TOOLS = ("debootstrap", "podman", "buildah", "ip")
 missing = [tool for tool in TOOLS if shutil.which(tool) is None] + ["root"] * (os.geteuid() != 0)
@@ -116,23 +116,16 @@ class Containers:
         return f"es-test-{service}"
 
 
-def wait_for(what, timeout_s: float = 120.0):
-    until = time.monotonic() + timeout_s
-    while not what():
-        assert time.monotonic() < until
-        time.sleep(0.5)
-
-
 def test_two_containers_run_a_job(image, tmp_path):
     config = "/opt/es-service/configs/point_maze_nsra_es.yaml"
     with Containers(tmp_path) as containers:
         assert containers.run("head", "id", "--user").strip() == "1000"
         containers.start("head")
-        wait_for(containers.healthy)
+        wait_for(containers.healthy, timeout_s=120)
         containers.start("worker")
-        wait_for(lambda: containers.run("head", "ray", "status").count("node_") == 2)
+        wait_for(lambda: containers.run("head", "ray", "status").count("node_") == 2, timeout_s=120)
         submit = ("es-service", "submit", config, "--out", "/runs/first", "--set", "budget.generations=200")
-        wait_for(lambda: "es-" in containers.run("head", *submit, "--address", URL))
+        wait_for(lambda: "es-" in containers.run("head", *submit, "--address", URL), timeout_s=120)
         (job,) = [
             line.split()[0] for line in containers.run("head", "es-service", "jobs", "--address", URL).splitlines()
         ]

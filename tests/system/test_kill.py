@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 import random
 import signal
 import time
@@ -11,8 +10,8 @@ import time
 import pytest
 
 from es_service.digest import digest_parts
-from es_service.errors import StoreError
 from es_service.store.reader import read_generation
+from tests.system.processes import committed, wait_until
 from tests.system.session import SMALL, finish, start
 
 SEARCH = {"algorithm": "me_es", "pairs": 16, "evaluation_episodes": 4, "block_generations": 5}
@@ -73,11 +72,9 @@ def test_killed_during_start_up(tmp_path, reference):
     begun, delay_s = [], 0.1
     while begun.count(True) < 3:  # later and later, until three kills have come after the run's creation
         folder = tmp_path / f"run{len(begun)}"
-        process = start(folder, config=SMALL)
-        time.sleep(delay_s)
-        assert process.poll() is None
-        process.kill()
-        process.communicate()
+        with start(folder, config=SMALL) as process:
+            time.sleep(delay_s)
+            assert process.poll() is None
         begun.append((folder / "run.db").exists())
         assert finish(folder, config=None if begun[-1] else SMALL) == 0
         assert digest_parts(folder) == reference
@@ -106,16 +103,13 @@ def test_killed_fifty_times_in_one_run(tmp_path):
     between = 0
     for kill in range(50):
         before = committed(folder)
-        process = start(folder, config=LONG if not (folder / "run.db").exists() else None)
-        if kill % 10 == 9:  # some before this session commits anything
-            time.sleep(rng.uniform(0.2, 1.5))
-        else:
-            while committed(folder) == before and process.poll() is None:
-                time.sleep(0.002)
-            time.sleep(rng.uniform(0.0, 0.03))
-        assert process.poll() is None, "the run ended before its kill; give it more generations"
-        os.kill(process.pid, signal.SIGKILL)
-        process.communicate()
+        with start(folder, config=LONG if not (folder / "run.db").exists() else None) as process:
+            if kill % 10 == 9:  # some before this session commits anything
+                time.sleep(rng.uniform(0.2, 1.5))
+            else:
+                wait_until(process, lambda before=before: committed(folder) != before)
+                time.sleep(rng.uniform(0.0, 0.03))
+            assert process.poll() is None, "the run ended before its kill; give it more generations"
         between += committed(folder) is not None
     assert between >= 40
     print(
@@ -123,10 +117,3 @@ def test_killed_fifty_times_in_one_run(tmp_path):
     )
     assert finish(folder) == 0
     assert digest_parts(folder) == digest_parts(undisturbed)
-
-
-def committed(folder) -> int | None:
-    try:
-        return read_generation(folder)
-    except StoreError:
-        return None

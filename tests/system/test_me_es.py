@@ -24,7 +24,7 @@ from es_service.export import arrays, ribs_archive
 from es_service.maps.geometry import Grid
 from es_service.report.evaluations import csv_file
 from es_service.run_view import map_places
-from tests.system.test_workers import children
+from tests.system.processes import children
 
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 60, "options": {"start": "corner"}},

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pickle
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -21,9 +20,11 @@ from es_service.dispatch.ray_cluster import Claim
 from es_service.dispatch.ray_engine import Actors, ray_engine
 from es_service.errors import EvaluationError
 from es_service.protocol import TrainingChunk, WorkerPlace, worker_environment
+from es_service.store.reader import read_generation
 from tests.dispatch_checker import check_dispatch
 from tests.helpers import centre, random_parameters, spec
-from tests.system.session import ROOT, SMALL
+from tests.system.processes import ROOT, running, wait_until
+from tests.system.session import SMALL
 from workers.actor import WorkerActor
 
 pytestmark = [
@@ -98,17 +99,12 @@ def test_a_run_that_began_inline_goes_on_with_ray_where_home_cannot_be_written(t
     )
     api.run(config, tmp_path / "run")
     long = ["--engine", "ray", "--workers", "1", "--set", "budget.generations=1000000"]
-    driver = subprocess.Popen(
-        [*program, "resume", tmp_path / "run", *long], env=home, stdout=subprocess.PIPE, text=True
-    )
-    assert driver.stdout is not None
-    driver.stdout.readline()
-    driver.terminate()
-    driver.communicate(timeout=60)
-    assert driver.returncode == 143
-    reached = api.open_run(tmp_path / "run").generation
-    assert reached is not None
-    assert reached > 7
+    with running(*program, "resume", tmp_path / "run", *long, env=home) as driver:
+        wait_until(driver, lambda: (read_generation(tmp_path / "run") or 0) > 7, timeout_s=120)
+        driver.terminate()
+        _, errors = driver.communicate(timeout=60)
+    assert driver.returncode == 143, errors
+    reached = read_generation(tmp_path / "run")
     inline = api.load_config(
         CONFIG | {"budget": {"generations": reached}, "compute": CONFIG["compute"] | {"engine": "inline"}}
     )

@@ -5,15 +5,14 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
 
 from es_service import open_run
 from es_service.store.reader import read_generation
-from tests.system.command_line import COMMAND, digest, es
-from tests.system.session import ROOT
+from tests.system.command_line import PROGRAM, digest, es
+from tests.system.processes import running, wait_until
 
 
 def test_resume_in_pieces_equals_one_run_and_another_seed_does_not(config, finished, tmp_path):
@@ -31,13 +30,8 @@ def test_a_longer_budget_stays_with_the_run(config, tmp_path):
     """`resume` with a budget, killed: a plain `resume` then goes on to that budget, not to the first one."""
     folder = tmp_path / "run"
     assert es("run", config, "--out", folder, "--set", "budget.generations=3")[0] == 0
-    process = subprocess.Popen(
-        [*COMMAND, "resume", str(folder), "--set", "budget.generations=400"], cwd=ROOT, stdout=subprocess.DEVNULL
-    )
-    while (read_generation(folder) or 0) < 4:
-        time.sleep(0.005)
-    process.kill()
-    process.wait()
+    with running(PROGRAM, "resume", folder, "--set", "budget.generations=400") as process:
+        wait_until(process, lambda: (read_generation(folder) or 0) >= 4)
     assert (read_generation(folder) or 0) < 400
     assert es("resume", folder)[0] == 0
     assert read_generation(folder) == 400

@@ -22,7 +22,8 @@ from es_service.store.lock import acquire_lock
 from es_service.store.reader import read_generation
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import finished, flip_bit, without_root_rights
-from tests.system.session import ROOT, SMALL
+from tests.system.processes import ROOT, running, wait_until
+from tests.system.session import SMALL
 
 
 def es(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -137,8 +138,7 @@ def test_a_run_goes_on_where_nobody_reads_its_output(tmp_path, errors):
     """With STDOUT, nobody reads its notes either."""
     folder, config = tmp_path / "run", tmp_path / "config.yaml"
     config.write_text(api.load_config(SMALL | {"budget": {"generations": 10**6}}).resolved_yaml())
-    arguments = [sys.executable, "-m", "es_service", "run", str(config), "--out", str(folder)]
-    with subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.PIPE, stderr=errors, text=True) as run:
+    with running(sys.executable, "-m", "es_service", "run", config, "--out", folder, stderr=errors) as run:
         assert run.stdout is not None
         assert run.stdout.readline().startswith("generation 0")
         run.stdout.close()
@@ -146,8 +146,7 @@ def test_a_run_goes_on_where_nobody_reads_its_output(tmp_path, errors):
         if run.stderr:
             assert run.stderr.readline().endswith(f"the run goes on: es-service status {folder} --follow\n")
         reached = read_generation(folder) or 0
-        time.sleep(0.5)
-        assert (read_generation(folder) or 0) > reached
+        wait_until(run, lambda: (read_generation(folder) or 0) > reached)
         run.terminate()
         assert run.wait(timeout=60) == 143
 

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -19,7 +18,7 @@ from es_service.dispatch import inline_engine
 from es_service.dispatch.engine import Engine
 from es_service.errors import EvaluationError
 from es_service.protocol import TrainingChunk, child_environment
-from tests.system.session import ROOT
+from tests.system.processes import children, committed, is_running, running, wait_for, wait_until
 
 CONFIG = {
     "task": {"environment": "point_maze"},
@@ -40,20 +39,6 @@ def reference(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reference") / "run"
     run(folder, workers=1)
     return digest_parts(folder)
-
-
-def children() -> list[int]:
-    """Process ids of this process's worker processes."""
-    found = []
-    for pid in filter(str.isdigit, os.listdir("/proc")):
-        try:
-            parent = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
-            command = Path(f"/proc/{pid}/cmdline").read_text()
-        except OSError:
-            continue
-        if parent == os.getpid() and "workers.process" in command:
-            found.append(int(pid))
-    return sorted(found)
 
 
 @pytest.mark.parametrize("kind", ["processes", "threads"])
@@ -178,25 +163,9 @@ def test_a_killed_driver_leaves_no_workers(tmp_path):
 from es_service import load_config, run
 run(load_config({CONFIG | {"budget": {"generations": 100_000}}!r}), {str(tmp_path / "run")!r})
 """
-    process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
-    workers: list[str] = []
-    for _ in range(200):
-        listed = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-        if len(listed) == 2 and (tmp_path / "run" / "run.db").exists():
-            workers = listed
-            break
-        time.sleep(0.05)
-    assert len(workers) == 2
-    time.sleep(1.0)
-    process.kill()
-    process.wait()
-    time.sleep(0.5)
-    assert not any(is_running(pid) for pid in workers)
-
-
-def is_running(pid: str) -> bool:
-    """Whether a process exists and is more than a zombie that nobody has reaped."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+    with running(sys.executable, "-c", script) as process:
+        wait_until(process, lambda: committed(tmp_path / "run") is not None)
+        workers = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        assert len(workers) == 2
+        assert all(map(is_running, workers))
+    wait_for(lambda: not any(map(is_running, workers)), timeout_s=5.0)
