@@ -21,7 +21,7 @@ def es(*arguments, cwd=ROOT, **environment):
         env={**os.environ, **environment},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         check=False,
     )
     assert "Traceback" not in result.stderr, result.stderr

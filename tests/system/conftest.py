@@ -20,7 +20,7 @@ def config(tmp_path):
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory):
-    """A finished run of thirty generations."""
+    """A finished run of thirty generations, for reading only: `resume` writes its config.yaml anew."""
     folder = tmp_path_factory.mktemp("finished")
     path = folder / "small.yaml"
     path.write_text(yaml.safe_dump(SMALL))

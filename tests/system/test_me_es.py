@@ -49,7 +49,7 @@ def run(folder: Path, *overrides: str, config=CONFIG, **callbacks):
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def mapped(tmp_path_factory):
     return run(tmp_path_factory.mktemp("me_es") / "run")
 
 
@@ -63,18 +63,18 @@ def command(*arguments: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_a_map_has_filled_and_blocks_began_in_several_cells(finished):
-    history = finished.history
-    assert history["map_cells"].iloc[-1] == len(finished.map) >= 10
+def test_a_map_has_filled_and_blocks_began_in_several_cells(mapped):
+    history = mapped.history
+    assert history["map_cells"].iloc[-1] == len(mapped.map) >= 10
     assert history["start_cell"].notna().sum() == 10
     assert history["start_cell"].nunique() >= 4
     assert set(history["fitness_weight"].iloc[1:]) == {0.0, 1.0}
-    assert history["coverage"].iloc[-1] == history["coverage_reachable"].iloc[-1] == len(finished.map) / 256
+    assert history["coverage"].iloc[-1] == history["coverage_reachable"].iloc[-1] == len(mapped.map) / 256
     assert (history["qd_score"].diff().iloc[1:] >= 0).all()
 
 
 @pytest.mark.slow
-def test_two_workers_of_which_one_is_killed(tmp_path, finished):
+def test_two_workers_of_which_one_is_killed(tmp_path, mapped):
     notices = []
 
     def strike(row):
@@ -83,25 +83,25 @@ def test_two_workers_of_which_one_is_killed(tmp_path, finished):
 
     other = run(tmp_path / "two", "compute.workers=2", on_generation=strike, on_notice=notices.append)
     assert other.history["lost_workers"].sum() == 1
-    assert digest_parts(tmp_path / "two") == digest_parts(finished.folder)
+    assert digest_parts(tmp_path / "two") == digest_parts(mapped.folder)
 
 
-def test_resumed_inside_a_block_and_forked(tmp_path, finished):
+def test_resumed_inside_a_block_and_forked(tmp_path, mapped):
     folder = tmp_path / "stopped"
     run(folder, "budget.generations=13")
     api.resume(folder, ["budget.generations=18"])
     api.fork(folder, ["budget.generations=40"], out=tmp_path / "fork")
-    assert digest_parts(tmp_path / "fork") == digest_parts(finished.folder)
+    assert digest_parts(tmp_path / "fork") == digest_parts(mapped.folder)
     api.resume(folder, ["budget.generations=40"])
-    assert digest_parts(folder) == digest_parts(finished.folder)
+    assert digest_parts(folder) == digest_parts(mapped.folder)
 
 
-def test_a_fork_with_another_task_begins_with_an_empty_map(tmp_path, finished):
+def test_a_fork_with_another_task_begins_with_an_empty_map(tmp_path, mapped):
     changes = ["task.options.start=default", "budget.generations=41"]
-    forked = api.fork(finished.folder, changes, out=tmp_path / "fork").run
+    forked = api.fork(mapped.folder, changes, out=tmp_path / "fork").run
     assert len(forked.map) <= 1
     changes = ["task.episode_steps=30", "budget.generations=40"]  # which are spent already
-    forked = api.fork(finished.folder, changes, out=tmp_path / "empty").run
+    forked = api.fork(mapped.folder, changes, out=tmp_path / "empty").run
     assert forked.constants["map.qd_offset"] == pytest.approx(-2.3431 * 30)
     assert len(forked.map) == 0
     assert arrays(forked)["parameters"].shape == (0, forked.policy_shape.parameters)
@@ -111,7 +111,7 @@ def test_a_fork_with_another_task_begins_with_an_empty_map(tmp_path, finished):
         assert result.returncode == 2
         assert "is empty" in result.stderr
     with pytest.raises(ConfigError, match=r"map\.cells"):
-        api.fork(finished.folder, ["map.cells=[4, 4]"], out=tmp_path / "other")
+        api.fork(mapped.folder, ["map.cells=[4, 4]"], out=tmp_path / "other")
 
 
 def test_every_algorithm_fills_the_same_map(tmp_path):
@@ -137,70 +137,70 @@ def test_cvt_maps_run_resume_and_refuse_ribs(tmp_path):
         ribs_archive(whole)
 
 
-def test_policies_of_cells_and_their_traces(finished):
-    map_ = finished.map
+def test_policies_of_cells_and_their_traces(mapped):
+    map_ = mapped.map
     place = tuple(map_[["cell_x", "cell_y"]].iloc[-1])
-    elite = finished.elite(place)
-    assert finished.cell([float(number) for number in place]) == finished.cell(place)  # as a row of the table has it
+    elite = mapped.elite(place)
+    assert mapped.cell([float(number) for number in place]) == mapped.cell(place)  # as a row of the table has it
     assert elite.trace_T_B.shape == (61, 2)  # of 60 steps, the start and every one
     np.testing.assert_allclose(elite.trace_T_B[0], (0.9, -0.9), atol=1e-6)
     np.testing.assert_allclose(elite.trace_T_B[-1], map_[["x", "y"]].iloc[-1], atol=1e-5)
-    geometry = finished.behaviour_map.geometry
+    geometry = mapped.behaviour_map.geometry
     assert isinstance(geometry, Grid)
     assert geometry.index_of(int(geometry.cells_of(elite.trace_T_B[-1:])[0])) == place
     # The trace is what the policy does: stepping PointMaze with it goes the same way.
     moved = elite.trace_T_B[1] - elite.trace_T_B[0]
-    np.testing.assert_allclose(moved, finished.policy(place)(elite.trace_T_B[0]) / 10, atol=1e-5)
+    np.testing.assert_allclose(moved, mapped.policy(place)(elite.trace_T_B[0]) / 10, atol=1e-5)
 
 
-def test_a_cell_that_is_empty_or_not_there_names_the_nearest_filled_one(finished):
-    filled = {tuple(row) for row in finished.map[["cell_x", "cell_y"]].to_numpy().tolist()}
+def test_a_cell_that_is_empty_or_not_there_names_the_nearest_filled_one(mapped):
+    filled = {tuple(row) for row in mapped.map[["cell_x", "cell_y"]].to_numpy().tolist()}
     empty = next((i, j) for i in range(16) for j in range(16) if (i, j) not in filled)
     near = min(filled, key=lambda cell: (cell[0] - empty[0]) ** 2 + (cell[1] - empty[1]) ** 2)
     distance = (near[0] - empty[0]) ** 2 + (near[1] - empty[1]) ** 2
     for place, what in ((empty, "is empty"), ((16, 0), "is not in the map"), ((1, 2, 3), "is not in the map")):
         with pytest.raises(NotInRunError, match=what) as error:
-            finished.policy(place)
+            mapped.policy(place)
         named = tuple(map(int, re.findall(r"(\d+),(\d+)(?:, the first|$)", str(error.value))[0]))
         assert named in filled
         if place == empty:
             assert (named[0] - empty[0]) ** 2 + (named[1] - empty[1]) ** 2 == distance
 
 
-def test_evaluate_puts_fresh_values_beside_stored_ones(tmp_path, finished):
+def test_evaluate_puts_fresh_values_beside_stored_ones(tmp_path, mapped):
     file = tmp_path / "rows.csv"
-    result = command("evaluate", finished.folder, "--best", "--centre", "--all", "--episodes", 5, "--out", file)
+    result = command("evaluate", mapped.folder, "--best", "--centre", "--all", "--episodes", 5, "--out", file)
     assert result.returncode == 0, result.stderr
     rows = list(csv.DictReader(file.read_text().splitlines()))
-    assert len(rows) == 2 + len(finished.map)
+    assert len(rows) == 2 + len(mapped.map)
     assert [row["policy"] for row in rows[:2]] == ["best", "centre"]
     # From one corner and without noise, fresh episodes are the old ones.
-    for row, fitness in zip(rows[2:], finished.map["fitness"], strict=True):
+    for row, fitness in zip(rows[2:], mapped.map["fitness"], strict=True):
         assert float(row["stored_fitness"]) == fitness
         assert float(row["fresh_fitness"]) == pytest.approx(fitness, abs=1e-3)
         assert float(row["fresh_standard_error"]) == pytest.approx(0.0, abs=1e-4)
-    assert f"{len(finished.map)} elites: {len(finished.map)} still end in their cell" in result.stdout
-    one = ",".join(map(str, finished.map[["cell_x", "cell_y"]].iloc[0]))
-    assert command("evaluate", finished.folder, "--cell", one).returncode == 0
+    assert f"{len(mapped.map)} elites: {len(mapped.map)} still end in their cell" in result.stdout
+    one = ",".join(map(str, mapped.map[["cell_x", "cell_y"]].iloc[0]))
+    assert command("evaluate", mapped.folder, "--cell", one).returncode == 0
     for wrong, message in (
         ("99,0", "is not in the map"),
         ("a", "whole numbers"),
         ("3", "has 2 numbers there, such as"),
     ):
-        result = command("evaluate", finished.folder, "--cell", wrong)
+        result = command("evaluate", mapped.folder, "--cell", wrong)
         assert result.returncode == 2
         assert message in result.stderr
 
 
-def test_evaluate_overwrites_nothing_but_csv_files(tmp_path, finished):
-    for out, code in ((finished.folder / "run.db", 2), (tmp_path / "no" / "rows.csv", 1)):
-        result = command("evaluate", finished.folder, "--out", out)
+def test_evaluate_overwrites_nothing_but_csv_files(tmp_path, mapped):
+    for out, code in ((mapped.folder / "run.db", 2), (tmp_path / "no" / "rows.csv", 1)):
+        result = command("evaluate", mapped.folder, "--out", out)
         assert result.returncode == code
         assert str(out) in result.stderr
-    assert command("evaluate", finished.folder, "--all", "--cell", "1,1").returncode == 2
+    assert command("evaluate", mapped.folder, "--all", "--cell", "1,1").returncode == 2
 
 
-def test_evaluate_replaces_a_file_when_it_has_all_rows(tmp_path, finished):
+def test_evaluate_replaces_a_file_when_it_has_all_rows(tmp_path, mapped):
     file, notes = tmp_path / "rows.csv", []
     file.write_text("of last week\n")
 
@@ -214,9 +214,9 @@ def test_evaluate_replaces_a_file_when_it_has_all_rows(tmp_path, finished):
     assert file.read_text() == "of last week\n"
     assert (tmp_path / "rows.csv.new").read_text() == "policy,fitness\nbest,1.5\n"
     assert notes == [f"what was evaluated until then is in {file}.new"]
-    assert command("evaluate", finished.folder, "--cell", "99,9", "--out", file).returncode == 2
+    assert command("evaluate", mapped.folder, "--cell", "99,9", "--out", file).returncode == 2
     assert file.read_text() == "of last week\n"
-    assert command("evaluate", finished.folder, "--episodes", 2, "--out", file).returncode == 0
+    assert command("evaluate", mapped.folder, "--episodes", 2, "--out", file).returncode == 0
     assert file.read_text().startswith("policy,generation,episodes")
     assert [path.name for path in tmp_path.iterdir()] == ["rows.csv"]
     (tmp_path / "full.csv.new").symlink_to("/dev/full")
@@ -229,16 +229,16 @@ def test_evaluate_replaces_a_file_when_it_has_all_rows(tmp_path, finished):
         pass
 
 
-def test_elites_at_the_edges_of_cells_keep_their_cells_in_pyribs(monkeypatch, finished):
-    map_, elites = finished.elites()
+def test_elites_at_the_edges_of_cells_keep_their_cells_in_pyribs(monkeypatch, mapped):
+    map_, elites = mapped.elites()
     geometry = map_.geometry
     assert isinstance(geometry, Grid)
     low_N_2 = np.stack([edges[place] for edges, place in zip(geometry.edges, map_places(map_).T, strict=True)], axis=1)
     for shifted in (low_N_2, np.nextafter(low_N_2 + 1 / 8, -9)):
         moved = replace(map_, descriptor_N_B=shifted)
         np.testing.assert_array_equal(geometry.cells_of(shifted), map_.cell_N)
-        monkeypatch.setattr(type(finished), "elites", lambda self, moved=moved: (moved, elites))
-        archive = ribs_archive(finished)
+        monkeypatch.setattr(type(mapped), "elites", lambda self, moved=moved: (moved, elites))
+        archive = ribs_archive(mapped)
         assert archive.stats.num_elites == map_.size
 
 
@@ -255,41 +255,41 @@ def test_fresh_episodes_differ_from_those_that_chose(tmp_path):
     assert again.read_text() == rows.read_text()
 
 
-def test_exports_hold_what_the_run_holds(tmp_path, finished):
+def test_exports_hold_what_the_run_holds(tmp_path, mapped):
     for to in ("csv", "parquet", "npz", "ribs"):
-        result = command("export", finished.folder, "--to", to, "--out", tmp_path)
+        result = command("export", mapped.folder, "--to", to, "--out", tmp_path)
         assert result.returncode == 0, result.stderr
     for read, ending in ((pd.read_csv, "csv"), (pd.read_parquet, "parquet")):
-        pd.testing.assert_frame_equal(read(tmp_path / f"map.{ending}"), finished.map)
+        pd.testing.assert_frame_equal(read(tmp_path / f"map.{ending}"), mapped.map)
         history = read(tmp_path / f"history.{ending}").set_index("generation")
-        pd.testing.assert_frame_equal(history, finished.history, check_dtype=False)
+        pd.testing.assert_frame_equal(history, mapped.history, check_dtype=False)
     with np.load(tmp_path / "policies.npz") as arrays:
         assert arrays["widths"].tolist() == [2, 8, 2]
-        assert arrays["cell"].tolist() == finished.map[["cell_x", "cell_y"]].to_numpy().tolist()
-        np.testing.assert_array_equal(arrays["fitness"], finished.map["fitness"])
-        np.testing.assert_array_equal(arrays["best_parameters"], finished.policy("best").parameters_D)
-        elite = finished.elite(arrays["cell"][3])
+        assert arrays["cell"].tolist() == mapped.map[["cell_x", "cell_y"]].to_numpy().tolist()
+        np.testing.assert_array_equal(arrays["fitness"], mapped.map["fitness"])
+        np.testing.assert_array_equal(arrays["best_parameters"], mapped.policy("best").parameters_D)
+        elite = mapped.elite(arrays["cell"][3])
         np.testing.assert_array_equal(arrays["parameters"][3], elite.centre_D)
         np.testing.assert_array_equal(arrays["trace"][3], elite.trace_T_B)
-    result = command("export", finished.folder, "--to", "pdf")
+    result = command("export", mapped.folder, "--to", "pdf")
     assert result.returncode == 2
     assert "must be csv, parquet, npz or ribs" in result.stderr
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_ribs_archive_opens_and_plots(tmp_path, finished):
+def test_a_ribs_archive_opens_and_plots(tmp_path, mapped):
     import matplotlib
     from ribs import visualize
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    assert command("export", finished.folder, "--to", "ribs", "--out", tmp_path).returncode == 0
+    assert command("export", mapped.folder, "--to", "ribs", "--out", tmp_path).returncode == 0
     with (tmp_path / "archive.pickle").open("rb") as file:
         archive = pickle.load(file)
-    assert archive.stats.num_elites == len(finished.map)
-    assert archive.stats.obj_max == pytest.approx(finished.map["fitness"].max())
-    assert archive.stats.qd_score == pytest.approx(finished.history["qd_score"].iloc[-1])
+    assert archive.stats.num_elites == len(mapped.map)
+    assert archive.stats.obj_max == pytest.approx(mapped.map["fitness"].max())
+    assert archive.stats.qd_score == pytest.approx(mapped.history["qd_score"].iloc[-1])
     visualize.grid_archive_heatmap(archive)
     plt.savefig(tmp_path / "heatmap.png")
     plt.close()
