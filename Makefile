@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 CONFIG ?= configs/point_maze_me_es.yaml
 
-.PHONY: run test lint clean
+.PHONY: run test quick lint clean
 
 run: .venv/installed
 	$(BIN)/es-service run $(CONFIG)
@@ -12,6 +12,10 @@ run: .venv/installed
 test: .venv/installed-dev lint
 	$(BIN)/python -m pytest -n auto --dist loadfile tests/es_service tests/laws tests/workers
 	$(BIN)/python -m pytest tests/system
+
+# While writing code: no lint, no tests of more than ten seconds, none of the whole system.
+quick: .venv/installed-dev
+	$(BIN)/python -m pytest -n auto --dist loadfile -m 'not slow' tests/es_service tests/laws tests/workers
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .
