@@ -7,16 +7,15 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.system.session import ROOT
+from tests.system.processes import ROOT
 
 PROGRAM = Path(sys.executable).with_name("es-service")
-COMMAND = [str(PROGRAM)]
 
 
-def es(*arguments, cwd=ROOT, **environment):
-    """Run `es-service ...` to its end: (exit code, all it printed, without line breaks inside paragraphs)."""
+def command(*arguments: object, cwd: Path = ROOT, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run `es-service ...` to its end, which is no traceback."""
     result = subprocess.run(
-        [*COMMAND, *map(str, arguments)],
+        [PROGRAM, *map(str, arguments)],
         cwd=cwd,
         env={**os.environ, **environment},
         capture_output=True,
@@ -25,6 +24,12 @@ def es(*arguments, cwd=ROOT, **environment):
         check=False,
     )
     assert "Traceback" not in result.stderr, result.stderr
+    return result
+
+
+def es(*arguments: object, cwd: Path = ROOT, **environment: str) -> tuple[int, str]:
+    """The same: (exit code, all it printed)."""
+    result = command(*arguments, cwd=cwd, **environment)
     return result.returncode, result.stdout + result.stderr
 
 

@@ -7,8 +7,6 @@ import os
 import pickle
 import re
 import signal
-import subprocess
-import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +22,7 @@ from es_service.export import arrays, ribs_archive
 from es_service.maps.geometry import Grid
 from es_service.report.evaluations import csv_file
 from es_service.run_view import map_places
+from tests.system.command_line import command
 from tests.system.processes import children
 
 CONFIG = {
@@ -51,16 +50,6 @@ def run(folder: Path, *overrides: str, config=CONFIG, **callbacks):
 @pytest.fixture(scope="module")
 def mapped(tmp_path_factory):
     return run(tmp_path_factory.mktemp("me_es") / "run")
-
-
-def command(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "es_service", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
 
 
 def test_a_map_has_filled_and_blocks_began_in_several_cells(mapped):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import shlex
 import subprocess
@@ -22,23 +21,9 @@ from es_service.store.lock import acquire_lock
 from es_service.store.reader import read_generation
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import finished, flip_bit, without_root_rights
-from tests.system.processes import ROOT, running, wait_until
+from tests.system.command_line import command
+from tests.system.processes import running, wait_until
 from tests.system.session import SMALL
-
-
-def es(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    """A command in a process of its own; its end is no traceback."""
-    result = subprocess.run(
-        [sys.executable, "-m", "es_service", *map(str, arguments)],
-        cwd=ROOT,
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert "Traceback" not in result.stderr, result.stderr
-    return result
 
 
 def words_after(text: str, verb: str) -> list[str]:
@@ -95,7 +80,7 @@ def test_run_or_resume_goes_on_where_only_the_copy_is_left(tmp_path):
     (folder / "run.db").rename(folder / "run.db.copy")
     config = tmp_path / "config.yaml"
     config.write_text(api.load_config(wanted).resolved_yaml())
-    assert es("run", config, "--or-resume", "--out", folder).returncode == 0
+    assert command("run", config, "--or-resume", "--out", folder).returncode == 0
 
 
 @pytest.mark.parametrize("folder", ["locked/run", "a" * 300])
@@ -107,7 +92,7 @@ def test_a_folder_that_cannot_be_looked_at(tmp_path, folder):
     assert str(tmp_path / folder) in str(error.value)
     config = tmp_path / "config.yaml"
     config.write_text(api.load_config(SMALL).resolved_yaml())
-    result = es("run", config, "--or-resume", "--out", tmp_path / ("a" * 300))
+    result = command("run", config, "--or-resume", "--out", tmp_path / ("a" * 300))
     assert result.returncode == 1
     assert "Check that the folder" in result.stderr
 
@@ -118,7 +103,7 @@ def test_a_repair_is_told_once_also_if_the_command_is_then_refused(tmp_path):
     sound = (folder / "run.db").read_bytes()
     at = sound.rindex(run.policy("centre").parameters_D.tobytes())
     flip_bit(folder / "run.db", at + 8)
-    refusal = es("digest", folder, "--parts")
+    refusal = command("digest", folder, "--parts")
     assert (refusal.returncode, refusal.stdout) == (1, "")
     assert re.search(r"state of 'member_\d' at generation 3 does not match its SHA-256", refusal.stderr)
     assert words_after(refusal.stderr, "resume") == [str(folder)]
@@ -153,4 +138,4 @@ def test_a_run_goes_on_where_nobody_reads_its_output(tmp_path, errors):
 
 def test_output_that_has_no_sign_for_plus_or_minus(tmp_path):
     outcome = api.run(SMALL | {"budget": {"generations": 1}}, tmp_path / "run")
-    assert " ? " in es("status", outcome.run.folder, PYTHONIOENCODING="ascii").stdout
+    assert " ? " in command("status", outcome.run.folder, PYTHONIOENCODING="ascii").stdout
