@@ -1,6 +1,10 @@
-"""The smallest config, and tasks to load one for."""
+"""The smallest config, and tasks to load one for; words that try a reader of YAML."""
 
 from __future__ import annotations
+
+import string
+
+from hypothesis import strategies as st
 
 from es_service.algorithms import ALGORITHMS
 from es_service.config.loading import load_config
@@ -11,6 +15,7 @@ POINT_MAZE = environments.TASKS["point_maze"]
 TASKS = {"point_maze": POINT_MAZE}
 MINIMAL = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 3}}
 MINIMAL_TEXT = "task: {environment: point_maze}\nsearch: {algorithm: es}\nbudget: {generations: 3}\n"
+WORDS = st.text(string.ascii_letters + string.digits + " .:#'\"-_+~/&*!%[]{}", max_size=12)
 
 
 def load(source=MINIMAL, *overrides: str) -> RunConfig:

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import pickle
-import string
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
-from es_service import cli_options
 from es_service.algorithms import ALGORITHMS
 from es_service.config.changes import changed_constants
 from es_service.config.loading import load_config
@@ -27,22 +23,7 @@ from es_service.config.resolution import (
 )
 from es_service.config.yaml_text import dump_yaml, parse_value
 from es_service.errors import ConfigError
-from es_service.tasks import Tasks
-from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, load
-
-ALL_TASKS = Tasks()
-CONFIGS = Path(__file__).parents[2] / "configs"
-
-
-@pytest.fixture
-def file(tmp_path):
-    def write(text: str | bytes) -> Path:
-        path = tmp_path / "my.yaml"
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return path
-
-    return write
-
+from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS, load
 
 # What a config resolves to
 
@@ -188,61 +169,9 @@ def test_members_follow_from_the_algorithm():
         load(MINIMAL, "search.members=3")
 
 
-def test_config_is_frozen():
-    with pytest.raises(ValidationError):
-        load().search.sigma = 0.1  # pyright: ignore[reportAttributeAccessIssue]
-
-
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
-def test_shipped_configs_load_and_are_named_after_task_and_algorithm(path):
-    config = load_config(path, tasks=ALL_TASKS, algorithms=ALGORITHMS)
-    assert path.stem == f"{config.task.environment.replace(':', '_')}_{config.search.algorithm}"
-    assert config_warnings(config, ALL_TASKS[config.task.environment]) == []
-
-
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
-def test_shipped_configs_hide_no_preset_key(path):
-    """But the size of the population: or `--set search.preset=uber` would do nothing."""
-    uber = preset_values("uber") | {"search.pairs": 64}
-    config = load_config(path, ["search.preset=uber"], tasks=ALL_TASKS, algorithms=ALGORITHMS)
-    assert config.constants().items() >= uber.items()
-
-
-# Options of the command line
-
-
-def test_options_win_over_the_file_and_over_set():
-    file = MINIMAL | {"compute": {"engine": "ray", "address": "head:6379", "worker_resources": {"gpu": 0.5}}}
-    compute = load(file, *cli_options.overrides(["compute.workers=3"], seed=4, workers=2, engine="inline")).compute
-    assert (compute.engine, compute.address, compute.worker_resources.gpu, compute.workers) == ("inline", None, 0.0, 2)
-    compute = load(MINIMAL | {"compute": {"engine": "inline"}}, *cli_options.overrides(None, address="auto")).compute
-    assert (compute.engine, compute.address) == ("ray", "auto")
-    threads = MINIMAL | {"compute": {"engine": "inline", "inline_workers": "threads"}}
-    for options in ({"engine": "ray"}, {"address": "auto"}, {"engine": "ray", "address": "auto"}):
-        compute = load(threads, *cli_options.overrides(None, **options)).compute
-        assert (compute.engine, compute.inline_workers) == ("ray", "processes")
-
-
-def test_what_options_imply_does_not_silence_set():
-    for wanted, problem in (
-        (
-            cli_options.overrides(["compute.address=h:1"], engine="inline"),
-            "compute.address: h:1 needs compute.engine = ray",
-        ),
-        (cli_options.overrides(["compute.worker_resources.gpu=1"], engine="inline"), "worker_resources.gpu: 1 needs"),
-        (
-            cli_options.overrides(["compute.engine=inline"], address="h:1"),
-            "compute.address: h:1 needs compute.engine = ray",
-        ),
-    ):
-        with pytest.raises(ConfigError, match=problem):
-            load(MINIMAL, *wanted)
-
-
 # Round trip and constants
 
 
-WORDS = st.text(string.ascii_letters + string.digits + " .:#'\"-_+~/&*!%[]{}", max_size=12)
 POSITIVE = st.floats(min_value=1e-9, max_value=1e9)
 
 
@@ -297,6 +226,6 @@ def test_worker_spec_says_what_the_config_says():
 
 def test_every_field_says_what_it_means():
     for section in ("task", "policy", "search", "map", "novelty", "budget", "compute"):
-        fields = RunConfig.model_fields[section].annotation.model_fields  # pyright: ignore
+        fields = RunConfig.model_fields[section].annotation.model_fields
         for name, field in fields.items():
             assert field.description, f"{section}.{name}"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import string
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -14,15 +12,11 @@ from es_service.config.loading import load_config
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
 from es_service.protocol import TaskSpec
+from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS
 from tests.es_service.store_examples import without_root_rights
-from workers import environments
 
-POINT_MAZE = environments.TASKS["point_maze"]
 NO_FINAL = TaskSpec("no_final", 2, 2, 50, ("x",), ((0.0, 1.0),), final_fitness=False, has_goal=False)
 TASKS = {"point_maze": POINT_MAZE, "no_final": NO_FINAL}
-MINIMAL = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 3}}
-MINIMAL_TEXT = "task: {environment: point_maze}\nsearch: {algorithm: es}\nbudget: {generations: 3}\n"
-WORDS = st.text(string.ascii_letters + string.digits + " .:#'\"-_+~/&*!%[]{}", max_size=12)
 
 
 def load(source=MINIMAL, *overrides: str) -> RunConfig:
@@ -36,16 +30,6 @@ def problems(source=MINIMAL, *overrides: str) -> list[str]:
     heading, *lines = str(caught.value).splitlines()
     assert heading.endswith(f": {len(lines)} problem" + "s" * (len(lines) > 1))
     return [line.strip() for line in lines]
-
-
-@pytest.fixture
-def file(tmp_path):
-    def write(text: str | bytes) -> Path:
-        path = tmp_path / "my.yaml"
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return path
-
-    return write
 
 
 @pytest.mark.parametrize(

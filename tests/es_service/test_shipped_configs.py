@@ -1,0 +1,52 @@
+"""The configs that come with the package: they load, and what their comments say of their numbers is so."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from es_service.algorithms import ALGORITHMS
+from es_service.config.loading import load_config
+from es_service.config.model import worker_spec
+from es_service.config.presets import preset_values
+from es_service.config.resolution import config_warnings
+from es_service.tasks import Tasks
+
+ALL_TASKS = Tasks()
+CONFIGS = Path(__file__).parents[2] / "configs"
+EACH = pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
+
+
+@EACH
+def test_shipped_configs_load_and_are_named_after_task_and_algorithm(path):
+    config = load_config(path, tasks=ALL_TASKS, algorithms=ALGORITHMS)
+    assert path.stem == f"{config.task.environment.replace(':', '_')}_{config.search.algorithm}"
+    assert config_warnings(config, ALL_TASKS[config.task.environment]) == []
+
+
+@EACH
+def test_shipped_configs_hide_no_preset_key(path):
+    """But the size of the population: or `--set search.preset=uber` would do nothing."""
+    uber = preset_values("uber") | {"search.pairs": 64}
+    config = load_config(path, ["search.preset=uber"], tasks=ALL_TASKS, algorithms=ALGORITHMS)
+    assert config.constants().items() >= uber.items()
+
+
+@EACH
+def test_comments_of_shipped_configs_say_the_numbers_that_are_used(path):
+    config = load_config(path, tasks=ALL_TASKS, algorithms=ALGORITHMS)
+    spec, compute = worker_spec(config, ALL_TASKS[config.task.environment]), config.compute
+    said = dict(re.findall(r"^ *(\w+):.*?# (.*)$", path.read_text(), re.MULTILINE))
+    inputs, *_, outputs = spec.policy.widths
+    assert f" {inputs} observations -> {outputs} actions " in said["policy"]
+    assert said["hidden"].endswith(f"; here {spec.policy.parameters:,} parameters")
+    assert said["episode_steps"].endswith(f", here {spec.episode_steps:,}")
+    assert f"auto: here {list(config.map.cells)}" in said["cells"]
+    assert said.get("members", "auto: 1").endswith(f"auto: {config.search.members}")
+    assert said["chunk_pairs"].endswith(f"auto: {compute.chunk_pairs} for {config.search.pairs}")
+    block = compute.rollout_block_pairs
+    assert said["rollout_block_pairs"].endswith((f"auto: here {block}", f"auto: {block} for {compute.chunk_pairs}"))
+    block = compute.gradient_block_pairs
+    assert said["gradient_block_pairs"].endswith((f"auto: here {block}", f"auto: here all {block}"))
