@@ -29,7 +29,7 @@ PARAMETERS = SPEC.policy.parameters
 
 
 def spec(**changes: object) -> WorkerSpec:
-    return replace(SPEC, **changes)  # pyright: ignore[reportArgumentType]
+    return replace(SPEC, **changes)
 
 
 def centre(parameters_D: np.ndarray, generation: int = 1, sigma: float = 0.1, observation_size: int = 2) -> Centre:

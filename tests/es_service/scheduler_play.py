@@ -48,6 +48,6 @@ def tasks(keys: str) -> Submit:
 
 def ready(workers: int = 2, **changes: object) -> SchedulerState:
     """All workers up at time 0."""
-    state, commands = step(initial_state(replace(POLICY, workers=workers, **changes)), Tick(), 0.0)  # type: ignore[arg-type]
+    state, commands = step(initial_state(replace(POLICY, workers=workers, **changes)), Tick(), 0.0)
     assert commands == [StartWorker(worker) for worker in range(workers)]
     return play(state, *((0.0, WorkerUp(worker)) for worker in range(workers)))[0]

@@ -378,7 +378,7 @@ class World:
             due = next_deadline(self.state)
             if self.heap and self.heap[0][0] <= due:
                 self.now, _, function, args = heapq.heappop(self.heap)
-                function(*args)  # type: ignore[operator]
+                function(*args)
             elif due < math.inf:
                 self.now = max(self.now, due)
                 before = self.state

@@ -202,7 +202,7 @@ def test_what_a_lost_worker_still_says_is_dropped(before):
     transport = Scripted()
 
     def contradict(sent: Sent):
-        last_words = Answer(0, sent.key, sent.attempt, ["not to be trusted"])  # pyright: ignore[reportArgumentType]
+        last_words = Answer(0, sent.key, sent.attempt, ["not to be trusted"])
         if sent.worker == 0:
             transport.inbox.extend([WorkerLost(0, "gone"), WorkerUp(0), sent.failure()])
         else:

@@ -24,7 +24,7 @@ def test_an_export_without_its_package_says_how_to_get_it(tmp_path, monkeypatch,
     run = SimpleNamespace(generation=0)
     said = f"needs py{package.removeprefix('py').partition('.')[0]}; {install_command(to)}"
     with pytest.raises(ConfigError, match=f"^--to {to} {re.escape(said)}$"):
-        export.export(run, to, tmp_path)  # pyright: ignore[reportArgumentType]
+        export.export(run, to, tmp_path)
     assert to in EXTRAS
 
 

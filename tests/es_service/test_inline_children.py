@@ -139,7 +139,7 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
 
 
 def test_an_error_says_in_which_of_the_chunks_that_travelled_together_it_was():
-    broken = [*CHUNKS[:3], TrainingChunk(3, "four")]  # type: ignore[arg-type]
+    broken = [*CHUNKS[:3], TrainingChunk(3, "four")]
     with inline_engine(SPEC, Policy(workers=1, task_s=60.0, restart_backoff_s=0.0)) as engine:
         engine.evaluate(FIRST, CHUNKS)
         with pytest.raises(EvaluationError, match=r"(?s)task TrainingChunk 0 and 3 more of.*in TrainingChunk four of"):

@@ -58,7 +58,7 @@ def test_an_answer_that_has_begun_to_come_is_there(transport):
     message = transport.receive(0.0)
     sender.join()
     assert isinstance(message, Answer)
-    np.testing.assert_array_equal(message.results, [LARGE])  # type: ignore[arg-type]
+    np.testing.assert_array_equal(message.results, [LARGE])
 
 
 def test_a_message_that_stops_half_way_keeps_nobody_waiting(transport):
@@ -76,7 +76,7 @@ def test_what_threads_have_said_is_heard_before_they_are_lost_with_another(trans
     ends[1].sendall(framed(("results", "key", 1, ["theirs"])))
     ends[0].close()
     heard = [transport.receive(1.0) for _ in range(3)]
-    assert heard[0] == Answer(1, "key", 1, ["theirs"])  # type: ignore[arg-type]
+    assert heard[0] == Answer(1, "key", 1, ["theirs"])
     assert [message.worker for message in heard[1:] if isinstance(message, WorkerLost)] == [0, 1]
     assert transport.receive(0.0) is None
 
@@ -88,7 +88,7 @@ def test_a_thread_that_has_answered_everything_is_a_bystander_of_its_child_s_end
     ends[0].sendall(framed(("results", 0, 1, ["its own"])))
     ends[1].close()
     heard = [transport.receive(1.0) for _ in range(3)]
-    assert heard[0] == Answer(0, 0, 1, ["its own"])  # type: ignore[arg-type]
+    assert heard[0] == Answer(0, 0, 1, ["its own"])
     assert {message.worker: message.bystander for message in heard[1:]} == {0: True, 1: False}
 
 

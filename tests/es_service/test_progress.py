@@ -43,7 +43,7 @@ def test_where_no_table_can_be_shown_lines_come_at_once(terminal, environment):
     with show_progress(console, console, "runs/a") as (show, note):
         show(ROW)
         note("a worker was lost")
-        shown = console.file.getvalue()  # type: ignore[attr-defined]
+        shown = console.file.getvalue()
     assert shown.splitlines() == [
         "generation 123456  centre -1234.56  best -1234.56  env steps 123,456,789,012  steps/s 4,567,890  "
         "workers replaced 1",

@@ -142,7 +142,7 @@ class PretendedWatch:
 def transport(
     ray: PretendedRay, policy: Policy, watch: PretendedWatch | None = None, room: int | None = None
 ) -> Actors:
-    return Actors(ray, SPEC, type(None), ONE_CORE, watch, room, policy)  # type: ignore[arg-type]
+    return Actors(ray, SPEC, type(None), ONE_CORE, watch, room, policy)
 
 
 def ray_engine(ray: PretendedRay, policy: Policy, watch: PretendedWatch | None = None) -> Engine[Actors]:
@@ -249,7 +249,7 @@ def test_nodes_that_are_about_to_go_are_alive_and_give_no_room():
     ]
     state = SimpleNamespace(get_draining_nodes=lambda: {"leaves": 0})
     ray = SimpleNamespace(nodes=lambda: nodes, _private=SimpleNamespace(state=SimpleNamespace(state=state)))
-    seen = look(ray, ONE_CORE)  # type: ignore[arg-type]
+    seen = look(ray, ONE_CORE)
     assert seen == Membership(4, frozenset({"leaves"}), frozenset({"stays", "leaves"}))
 
 

@@ -224,7 +224,7 @@ def test_a_worker_busy_with_an_old_copy_does_not_answer_for_the_new_one():
 def test_a_policy_without_workers_or_attempts_is_refused():
     for name in ("workers", "in_flight", "max_attempts", "max_failures_in_a_row", "max_start_failures"):
         with pytest.raises(ValueError, match=rf"{name} \(0\) must be at least 1"):
-            replace(POLICY, **{name: 0})  # type: ignore[arg-type]
+            replace(POLICY, **{name: 0})
 
 
 def test_an_event_costs_little():

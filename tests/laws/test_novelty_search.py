@@ -1,13 +1,11 @@
 """NS-ES, NSR-ES and NSRA-ES against their twin; choice of members, weight rule, invalid centres."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from es_service import driver
 from es_service.algorithms import ALGORITHMS
-from es_service.algorithms.base import FitnessWeight, Judgement, Member
+from es_service.algorithms.base import FitnessWeight, Judgement
 from es_service.algorithms.nsra_es import adapted_weight
 from es_service.algorithms.steps import (
     MEMBER_CHOICE,
@@ -294,9 +292,3 @@ def test_an_invalid_centre_never_enters_the_archive():
     assert 3 not in state.search.archive.generation_N
     assert all(row["invalid_members"] == 2 for row in store.rows[1:])
     assert all(np.isfinite(member.centre_D).all() for member in state.search.members)
-
-
-def test_members_are_frozen():
-    member = Member(np.zeros(2, np.float32), None)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        member.entry = 3  # pyright: ignore[reportAttributeAccessIssue]
