@@ -1,4 +1,4 @@
-"""ES against its twin, and the laws any rank-based antithetic ES obeys."""
+"""ES against its twin; budgets, invalid members, and what the driver holds."""
 
 import dataclasses
 import tracemalloc

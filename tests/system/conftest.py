@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from tests.system.command_line import es
+from tests.system.me_es_runs import run
 from tests.system.session import SMALL
 
 
@@ -28,3 +29,9 @@ def finished(tmp_path_factory):
     code, printed = es("run", path, "--out", folder / "run", PATH=os.defpath)
     assert code == 0, printed
     return folder / "run", printed
+
+
+@pytest.fixture(scope="session")
+def mapped(tmp_path_factory):
+    """A finished run of ME-ES, for reading only."""
+    return run(tmp_path_factory.mktemp("me_es") / "run")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from tests.workers.simd.test_kernels import kinds
+from tests.workers.simd.rollouts import kinds
 from workers.simd import division
 from workers.simd.kernel import compile_kernel
 from workers.simd.target import host_target

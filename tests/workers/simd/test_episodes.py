@@ -13,67 +13,19 @@ import numpy as np
 import pytest
 
 import workers.rollout
-import workers.simd.episodes
 from es_service.noise import NORMAL_STD, TEST_VECTORS, Domain, normal_integers, stream_keys
-from es_service.protocol import EvaluationChunk, PolicyShape, TrainingChunk, WorkerSpec
-from tests.helpers import centre, random_parameters, spec
-from workers.environments import TASKS, describe_environment, make_environment
+from es_service.protocol import PolicyShape
+from tests.helpers import random_parameters, spec
+from tests.workers.simd.rollouts import arguments, both, targets, task_spec
+from workers.environments import make_environment
 from workers.episode import Episodes
-from workers.policy import initial_parameters
-from workers.simd import noise, rollout
+from workers.simd import rollout
 from workers.simd.code import Code, module
 from workers.simd.episodes import compile_episodes
 from workers.simd.kernel import load_compiled
 from workers.simd.layout import plan
 from workers.simd.noise import UNROLLED, fill_function
-from workers.simd.primitives import UnsupportedError
-from workers.simd.target import NoVectorsError, host_target
-from workers.worker import make_worker
-
-WIDTHS = ("avx512", "avx2", "four")
-
-
-def targets() -> list[Any]:
-    """Of this processor, the widest first."""
-    found = []
-    for kind in WIDTHS:
-        try:
-            found.append(host_target(kind))
-        except NoVectorsError:
-            continue
-    return found
-
-
-def task_spec(task: str, **changes: Any) -> WorkerSpec:
-    size = TASKS[task]
-    hidden = (64, 64) if task == "point_maze" else (256, 256)
-    shape = PolicyShape((size.observation_size, *hidden, size.action_size))
-    return spec(environment=task, policy=shape, episode_steps=size.episode_steps, **changes)
-
-
-def arguments(worker_spec: WorkerSpec, scale: float = 1.0, generation: int = 1, sigma: float = 0.05) -> tuple[Any, ...]:
-    """Of a training rollout; the centre is a random policy, statistics not trivial."""
-    shape, pairs = worker_spec.policy, np.arange(worker_spec.chunk_pairs)
-    centre_D = scale * initial_parameters(shape, "unit_columns", 5)
-    rng = np.random.default_rng(generation)
-    mean_O = rng.normal(0, 0.1, shape.widths[0]).astype(np.float32)
-    std_O = rng.uniform(0.5, 2.0, shape.widths[0]).astype(np.float32)
-    keys = stream_keys(3, Domain.PARAMETER_NOISE, generation, pairs)
-    resets = stream_keys(
-        3, Domain.TRAINING_RESET, generation, pairs[:, None, None], np.arange(2)[None, :, None], np.arange(1)
-    )
-    actions = stream_keys(
-        3, Domain.ACTION_NOISE, generation, pairs[:, None, None], np.arange(2)[None, :, None], np.arange(1)
-    )
-    return centre_D, np.float32(sigma / NORMAL_STD), mean_O, std_O, keys, resets, actions
-
-
-def both(worker_spec: WorkerSpec, *given: Any) -> tuple[Episodes, Episodes]:
-    """(simd's, xla's)."""
-    environment = make_environment(worker_spec.environment, {})
-    ours = rollout.make_training_rollout(environment, worker_spec)(*given)
-    theirs = workers.rollout.make_training_rollout(environment, worker_spec)(*given)
-    return ours, Episodes(*map(np.asarray, theirs))
+from workers.simd.target import WIDTHS, host_target
 
 
 def test_episodes_of_point_maze_are_xlas():
@@ -244,69 +196,3 @@ def test_a_centre_that_changes_in_place_is_seen():
     np.testing.assert_array_equal(
         second.returns, rollout.make_training_rollout(environment, worker_spec)(*given).returns
     )
-
-
-def test_another_generator_is_not_what_was_compiled(monkeypatch: pytest.MonkeyPatch):
-    """Kernels are kept on disk; the noise's definition stands outside of the compiler's own files."""
-    weights_P, keys_P = np.ones(1, np.float32), stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(1))
-    before = rollout.make_gradient_sum(50)(weights_P, keys_P)
-    monkeypatch.setattr(noise, "normal_integers", lambda xp, key, at: 3 * normal_integers(xp, key, at))
-    np.testing.assert_allclose(rollout.make_gradient_sum(50)(weights_P, keys_P), 3 * before, rtol=1e-6)
-
-
-def test_a_step_that_makes_other_arrays_than_a_reset_is_refused():
-    wider = dataclasses.replace(
-        make_environment("point_maze", {}),
-        observe=lambda state: state[:2],
-        descriptor=lambda state: state[:2],
-        step=lambda state, action: (jnp.zeros(3), jnp.float32(0.0), jnp.array(False)),
-    )
-    with pytest.raises(TypeError, match="other arrays than a reset"):
-        compile_episodes(wider, spec(), np.arange(2), training=True)
-
-
-def test_why_a_task_cannot_have_it():
-    assert rollout.why_not(TASKS["point_maze"]) == ""
-    sorting = describe_environment("tests.examples.sorting:Sorting")
-    assert "the primitive sort, from" in rollout.why_not(sorting)
-
-
-class Heat:
-    """a plate is heated, and its heat spreads: the loop carries more than fits on a stack"""
-
-    observation_size, action_size, episode_steps = 1, 1, 5
-    descriptor_names, descriptor_bounds = ("corner",), ((0.0, 1.0),)
-
-    def reset(self, key: Any) -> Any:
-        return jnp.zeros((96, 96))
-
-    def observe(self, state: Any) -> Any:
-        return state[0, :1]
-
-    def step(self, state: Any, action: Any) -> tuple[Any, Any, Any]:
-        state = jax.lax.fori_loop(0, 50, lambda _, at: 0.9 * at + 0.1 * jnp.roll(at, 1, 0), state) + action[0]
-        return state, state[0, 0], False
-
-    def descriptor(self, state: Any) -> Any:
-        return state[0, :1]
-
-
-def test_what_the_compiler_refuses_after_tracing_is_refused_beforehand():
-    task = describe_environment(f"{__name__}:Heat")
-    why = rollout.why_not(task)
-    assert why == "9,216 values that loops carry and look at; 8,192 fit"
-    worker = make_worker(spec(environment=task.name, policy=PolicyShape((1, 8, 1)), episode_steps=5, rollout="simd"))
-    point = centre(random_parameters(size=25), observation_size=1)
-    for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
-        with pytest.raises(UnsupportedError, match=why):
-            worker(point, chunk)
-
-
-def test_a_step_without_a_text_of_its_own_is_refused_beforehand(monkeypatch: pytest.MonkeyPatch):
-    """Kernels are kept under what they compute, so what has no such name is not compiled either."""
-
-    def nameless(*_: Any) -> str:
-        raise ValueError("<function at 0x7f>")
-
-    monkeypatch.setattr(workers.simd.episodes, "jaxpr_digest", nameless)
-    assert rollout.why_not(TASKS["point_maze"]) == "ValueError: <function at 0x7f>"

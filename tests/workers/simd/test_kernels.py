@@ -12,20 +12,16 @@ import pytest
 from jax import lax
 
 from tests.twins.scalar_graph import evaluate
+from tests.workers.simd.rollouts import kinds
 from workers.environments import make_environment
 from workers.simd import target
 from workers.simd.kernel import Kernel, compile_kernel, jaxpr_digest
 from workers.simd.operations import OPERATIONS
-from workers.simd.target import WIDTHS, host_target
+from workers.simd.target import host_target
 from workers.simd.trace import trace_jaxpr
 from workers.simd.words import aligned, pack
 
 LANES = 100
-
-
-def kinds() -> list[str]:
-    """Of code that this machine runs."""
-    return [kind for kind in WIDTHS if kind != "avx512" or host_target().kind == "avx512"]
 
 
 def step_of(name: str):

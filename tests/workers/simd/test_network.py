@@ -12,13 +12,13 @@ import pytest
 from es_service.noise import NORMAL_STD, Domain, normals, stream_keys
 from es_service.protocol import PolicyShape
 from tests.helpers import random_parameters
-from tests.workers.simd.test_episodes import WIDTHS, targets
+from tests.workers.simd.rollouts import targets
 from workers.simd.code import Code, module
 from workers.simd.kernel import load_compiled
 from workers.simd.layout import Network, plan
 from workers.simd.network import policy_function
 from workers.simd.noise import fill_function
-from workers.simd.target import Target
+from workers.simd.target import WIDTHS, Target
 from workers.simd.words import aligned
 
 SIGMA = 0.1

@@ -1,0 +1,65 @@
+"""What tests of whole episodes begin with: processors, tasks, arguments; and an episode of each kind."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+import workers.rollout
+from es_service.noise import NORMAL_STD, Domain, stream_keys
+from es_service.protocol import PolicyShape, WorkerSpec
+from tests.helpers import spec
+from workers.environments import TASKS, make_environment
+from workers.episode import Episodes
+from workers.policy import initial_parameters
+from workers.simd import rollout
+from workers.simd.target import WIDTHS, NoVectorsError, host_target
+
+
+def targets() -> list[Any]:
+    """Of this processor, the widest first."""
+    found = []
+    for kind in WIDTHS:
+        try:
+            found.append(host_target(kind))
+        except NoVectorsError:
+            continue
+    return found
+
+
+def kinds() -> list[str]:
+    """Of code that this machine runs."""
+    return [target.kind for target in targets()]
+
+
+def task_spec(task: str, **changes: Any) -> WorkerSpec:
+    size = TASKS[task]
+    hidden = (64, 64) if task == "point_maze" else (256, 256)
+    shape = PolicyShape((size.observation_size, *hidden, size.action_size))
+    return spec(environment=task, policy=shape, episode_steps=size.episode_steps, **changes)
+
+
+def arguments(worker_spec: WorkerSpec, scale: float = 1.0, generation: int = 1, sigma: float = 0.05) -> tuple[Any, ...]:
+    """Of a training rollout; the centre is a random policy, statistics not trivial."""
+    shape, pairs = worker_spec.policy, np.arange(worker_spec.chunk_pairs)
+    centre_D = scale * initial_parameters(shape, "unit_columns", 5)
+    rng = np.random.default_rng(generation)
+    mean_O = rng.normal(0, 0.1, shape.widths[0]).astype(np.float32)
+    std_O = rng.uniform(0.5, 2.0, shape.widths[0]).astype(np.float32)
+    keys = stream_keys(3, Domain.PARAMETER_NOISE, generation, pairs)
+    resets = stream_keys(
+        3, Domain.TRAINING_RESET, generation, pairs[:, None, None], np.arange(2)[None, :, None], np.arange(1)
+    )
+    actions = stream_keys(
+        3, Domain.ACTION_NOISE, generation, pairs[:, None, None], np.arange(2)[None, :, None], np.arange(1)
+    )
+    return centre_D, np.float32(sigma / NORMAL_STD), mean_O, std_O, keys, resets, actions
+
+
+def both(worker_spec: WorkerSpec, *given: Any) -> tuple[Episodes, Episodes]:
+    """(simd's, xla's)."""
+    environment = make_environment(worker_spec.environment, {})
+    ours = rollout.make_training_rollout(environment, worker_spec)(*given)
+    theirs = workers.rollout.make_training_rollout(environment, worker_spec)(*given)
+    return ours, Episodes(*map(np.asarray, theirs))

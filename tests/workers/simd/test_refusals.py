@@ -1,0 +1,87 @@
+"""What is not compiled, or not again: each is refused beforehand, with the reason."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import workers.simd.episodes
+from es_service.noise import Domain, normal_integers, stream_keys
+from es_service.protocol import EvaluationChunk, PolicyShape, TrainingChunk
+from tests.helpers import centre, random_parameters, spec
+from workers.environments import TASKS, describe_environment, make_environment
+from workers.simd import noise, rollout
+from workers.simd.episodes import compile_episodes
+from workers.simd.primitives import UnsupportedError
+from workers.worker import make_worker
+
+
+def test_another_generator_is_not_what_was_compiled(monkeypatch: pytest.MonkeyPatch):
+    """Kernels are kept on disk; the noise's definition stands outside of the compiler's own files."""
+    weights_P, keys_P = np.ones(1, np.float32), stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(1))
+    before = rollout.make_gradient_sum(50)(weights_P, keys_P)
+    monkeypatch.setattr(noise, "normal_integers", lambda xp, key, at: 3 * normal_integers(xp, key, at))
+    np.testing.assert_allclose(rollout.make_gradient_sum(50)(weights_P, keys_P), 3 * before, rtol=1e-6)
+
+
+def test_a_step_that_makes_other_arrays_than_a_reset_is_refused():
+    wider = dataclasses.replace(
+        make_environment("point_maze", {}),
+        observe=lambda state: state[:2],
+        descriptor=lambda state: state[:2],
+        step=lambda state, action: (jnp.zeros(3), jnp.float32(0.0), jnp.array(False)),
+    )
+    with pytest.raises(TypeError, match="other arrays than a reset"):
+        compile_episodes(wider, spec(), np.arange(2), training=True)
+
+
+def test_why_a_task_cannot_have_it():
+    assert rollout.why_not(TASKS["point_maze"]) == ""
+    sorting = describe_environment("tests.examples.sorting:Sorting")
+    assert "the primitive sort, from" in rollout.why_not(sorting)
+
+
+class Heat:
+    """a plate is heated, and its heat spreads: the loop carries more than fits on a stack"""
+
+    observation_size, action_size, episode_steps = 1, 1, 5
+    descriptor_names, descriptor_bounds = ("corner",), ((0.0, 1.0),)
+
+    def reset(self, key: Any) -> Any:
+        return jnp.zeros((96, 96))
+
+    def observe(self, state: Any) -> Any:
+        return state[0, :1]
+
+    def step(self, state: Any, action: Any) -> tuple[Any, Any, Any]:
+        state = jax.lax.fori_loop(0, 50, lambda _, at: 0.9 * at + 0.1 * jnp.roll(at, 1, 0), state) + action[0]
+        return state, state[0, 0], False
+
+    def descriptor(self, state: Any) -> Any:
+        return state[0, :1]
+
+
+def test_what_the_compiler_refuses_after_tracing_is_refused_beforehand():
+    task = describe_environment(f"{__name__}:Heat")
+    why = rollout.why_not(task)
+    assert why == "9,216 values that loops carry and look at; 8,192 fit"
+    worker = make_worker(spec(environment=task.name, policy=PolicyShape((1, 8, 1)), episode_steps=5, rollout="simd"))
+    point = centre(random_parameters(size=25), observation_size=1)
+    for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
+        with pytest.raises(UnsupportedError, match=why):
+            worker(point, chunk)
+
+
+def test_a_step_without_a_text_of_its_own_is_refused_beforehand(monkeypatch: pytest.MonkeyPatch):
+    """Kernels are kept under what they compute, so what has no such name is not compiled either."""
+
+    def nameless(*_: Any) -> str:
+        raise ValueError("<function at 0x7f>")
+
+    monkeypatch.setattr(workers.simd.episodes, "jaxpr_digest", nameless)
+    assert rollout.why_not(TASKS["point_maze"]) == "ValueError: <function at 0x7f>"
