@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from es_service.commands import command
 from es_service.errors import StoreError
 from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict, row_sha256, text_sha256
-from es_service.store.folder import COPY, DATABASE, is_network_filesystem, require_run_folder
+from es_service.store.folder import COPY, DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.lock import lock_holder
 from es_service.store.schema import Damaged, RunMeta, history_select, load_meta
-from es_service.store.verify import KeptRows, rows_in_force, state_in_force
+from es_service.store.verify import KeptRows, is_no_damage, rows_in_force, state_in_force
 
 _BUSY_S = 5.0
 
@@ -70,7 +70,9 @@ def _connected_to(file: Path) -> tuple[sqlite3.Connection, RunMeta]:
         raise
 
 
-def _unreadable(folder: Path, error: Exception) -> StoreError:
+def _unreadable(folder: Path, error: sqlite3.Error | Damaged | OSError) -> StoreError:
+    if not isinstance(error, Damaged) and is_no_damage(error, folder):
+        return explained(error, folder, "reading it", "give the same command again, or give it a copy of the folder")
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     is_database = code != sqlite3.SQLITE_NOTADB and "no such table: meta" not in str(error)
     what = "cannot be read" if is_database else "is not a run folder"

@@ -16,6 +16,7 @@ from es_service.store.codec import (
     state_sum,
     text_sha256,
 )
+from es_service.store.folder import is_disk_full
 from es_service.store.schema import Damaged, RunMeta, history_select, load_meta, table_statements
 
 _NOT_DAMAGE = {
@@ -50,6 +51,13 @@ class Verdict:
     """Everything that is wrong, for a user to read."""
 
 
+def is_no_damage(error: BaseException, folder: Path) -> bool:
+    """Whether an error says nothing about the content of the database in `folder`: it was busy, out of reach, or there
+    was no space for what SQLite writes beside it, even to read it."""
+    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+    return isinstance(error, OSError) or code in _NOT_DAMAGE or is_disk_full(error, folder)
+
+
 def check_header(file: Path) -> None:
     """Look at the first bytes of a database that no connection of this process has open. Raises Damaged."""
     with file.open("rb") as stream:
@@ -70,7 +78,7 @@ def verify(connection: sqlite3.Connection, file: Path) -> Verdict:
     try:
         return _verify(connection, file)
     except sqlite3.Error as error:
-        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NOT_DAMAGE:
+        if is_no_damage(error, file.parent):
             raise
         raise Damaged(f"SQLite says: {error}") from error
     except (ValueError, TypeError, KeyError, OverflowError) as error:

@@ -83,6 +83,19 @@ def test_an_io_error_without_space_is_a_full_disk(tmp_path, monkeypatch, free, f
     assert ("disk full" in str(explained(error, tmp_path, "testing"))) is full
 
 
+def test_no_space_for_what_sqlite_needs_beside_the_log_of_a_killed_run_is_no_damage(small_disk):
+    """Its shared memory, without which a log cannot be read. The log itself has all generations."""
+    folder, killed = small_disk / "run", small_disk / "killed"
+    with create(folder, generations=3):
+        shutil.copytree(folder, killed, ignore=shutil.ignore_patterns("*-shm"))
+    fill(small_disk)
+    for use in (RunStore.open, read_history):
+        with pytest.raises(StoreError, match=r"disk full while .* Everything stored before is safe; free space"):
+            use(killed)
+    (small_disk / "ballast").unlink()
+    assert_sound(killed, 2)
+
+
 def test_creating_a_run_on_a_full_disk_says_so(small_disk):
     fill(small_disk)
     with pytest.raises(StoreError, match=r"disk full while .* free space, then give the same command again"):

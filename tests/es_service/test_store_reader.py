@@ -1,11 +1,16 @@
 """Reading beside a writer, of what is kept, and of what is no run."""
 
 import contextlib
+import os
+import shutil
 import sqlite3
+import tempfile
+from pathlib import Path
 
 import pytest
 
 from es_service.errors import StoreError
+from es_service.store import reader as store_reader
 from es_service.store import schema as store_schema
 from es_service.store.reader import read_generation, read_history, read_meta, read_parts, read_platforms
 from es_service.store.writer import RunStore
@@ -17,6 +22,7 @@ from tests.es_service.store_examples import (
     finished,
     state_at,
     verify_run,
+    without_root_rights,
 )
 
 
@@ -62,6 +68,30 @@ def test_what_is_no_run_folder_is_called_that(tmp_path):
             with pytest.raises(StoreError, match="not a run folder"):
                 use(tmp_path / name)
     assert not (tmp_path / "other" / "run.lock").exists()
+
+
+def test_a_log_that_cannot_be_opened_is_no_damage(tmp_path):
+    """That of a killed run, in a folder in which nothing may be made: SQLite needs a file of its own beside the log."""
+    with tempfile.TemporaryDirectory() as parent:
+        os.chmod(parent, 0o755)
+        with create(Path(parent) / "run", generations=3):
+            folder = shutil.copytree(
+                Path(parent) / "run", Path(parent) / "killed", ignore=shutil.ignore_patterns("*-shm")
+            )
+        os.chmod(folder, 0o555)
+        with without_root_rights(), pytest.raises(StoreError, match=r"may be read and written, then .* a copy of"):
+            read_history(folder)
+        assert_same_history(read_history(shutil.copytree(folder, tmp_path / "copy")), 3)
+        os.chmod(folder, 0o755)
+
+
+def test_a_database_that_somebody_locks_is_no_damage(tmp_path, monkeypatch):
+    monkeypatch.setattr(store_reader, "_BUSY_S", 0.0)
+    folder = finished(tmp_path / "run", 3)
+    with contextlib.closing(sqlite3.connect(folder / "run.db", isolation_level=None)) as connection:
+        connection.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(StoreError, match=r"Another program keeps .*run\.db open; close it, then"):
+            read_history(folder)
 
 
 @pytest.mark.parametrize(
