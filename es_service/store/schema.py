@@ -135,6 +135,13 @@ def history_select(columns: Sequence[Column]) -> str:
     return f"SELECT {', '.join(f'history.{quoted(name)}' for name in names)} FROM history"
 
 
+def history_shared(columns: Sequence[Column], other: str) -> str:
+    """The query for how many history rows the attached database `other` has just as this one has them."""
+    names = map(quoted, [column.name for column in columns] + list(_OWN_HISTORY_COLUMNS))
+    same = " AND ".join(f"ours.{name} IS theirs.{name}" for name in names)
+    return f"SELECT count(*) FROM {other}.history AS theirs JOIN main.history AS ours ON {same}"
+
+
 def quoted(name: str) -> str:
     """`name` as an SQL identifier."""
     return '"' + name.replace('"', '""') + '"'

@@ -1,6 +1,7 @@
 """Closing, verified copies, and network file systems."""
 
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from es_service.errors import StoreError
 from es_service.store import folder as run_folder
 from es_service.store import reader as store_reader
 from es_service.store import upkeep as store_upkeep
+from es_service.store import verify as store_verify
 from es_service.store import writer as store
 from es_service.store.folder import is_network_filesystem
 from es_service.store.reader import read_generation, read_history, read_parts
@@ -72,6 +74,33 @@ def test_the_copy_is_a_verified_single_file_refreshed_when_it_is_time(tmp_path, 
     with RunStore.open(folder) as run:
         assert run.generation == 4
         assert any("missing" in notice and "generation 4" in notice for notice in run.notices)
+
+
+@pytest.mark.parametrize("former", ["sound", "text", "another run", "missing"])
+def test_a_copy_checks_only_rows_that_the_former_one_has_not(tmp_path, monkeypatch, former):
+    """Each time all of a long run would keep its driver from its workers. Damage is noticed: test_store_damage."""
+    checked: list[int] = []
+    sound = store_verify._row_is_sound
+
+    def counted(columns, row, state, sha256):
+        checked.append(row[0])
+        return sound(columns, row, state, sha256)
+
+    copy_at_every_commit(monkeypatch)
+    copy = tmp_path / "run" / "run.db.copy"
+    with create(tmp_path / "run", generations=20) as run:
+        if former == "text":
+            copy.write_text("no database" * 1000)
+        elif former == "another run":
+            shutil.copy(finished(tmp_path / "other", 20, seed=1) / "run.db", copy)
+        elif former == "missing":
+            copy.unlink()
+        monkeypatch.setattr(store_verify, "_row_is_sound", counted)
+        advance(run, 20)
+        assert checked == (list(range(18, 21)) if former == "sound" else list(range(21)))
+        assert run.notices == []
+    copy.replace(tmp_path / "run" / "run.db")
+    assert_same_history(read_history(tmp_path / "run"), 21)
 
 
 def test_a_young_copy_of_an_earlier_session_is_not_refreshed_at_once(tmp_path, monkeypatch):
