@@ -30,6 +30,8 @@ from es_service.wire import BUFFER_BYTES, Channel, framed
 
 PIECE_S = 0.1
 """Longest wait for the next piece of a message that has begun to come."""
+LAST_WORDS_BYTES = 2000
+"""Told of what a lost child had written; read are no more, either, since it may have been writing for days."""
 
 
 def inline_engine(
@@ -231,8 +233,8 @@ def _end(child: _Child) -> tuple[str, str]:
     child.process.kill()
     code = child.process.wait()
     child.control.close()
-    child.log.seek(0)
-    last_words = child.log.read()[-2000:].decode(errors="replace").strip()
+    child.log.seek(max(0, child.log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
+    last_words = child.log.read(LAST_WORDS_BYTES).decode(errors="replace").strip()
     child.log.close()
     return f"signal {-code}" if code < 0 else f"exit code {code}", last_words
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import socket
@@ -43,6 +44,19 @@ def transport():
         yield transport, ends
         transport.close()
         assert process.wait() == -signal.SIGKILL
+
+
+def test_of_a_child_that_wrote_a_lot_only_the_end_is_read():
+    """More than fits into memory: a hole in the file, which takes no room on the disk either."""
+    with tempfile.TemporaryFile() as log, socket.socket() as control:
+        log.truncate(2**40)
+        process = subprocess.Popen(["sleep", "60"])
+        log.seek(0, os.SEEK_END)
+        log.write("ä".encode() * 1500 + b" the last words\n")
+        how, last_words = inline_module._end(inline_module._Child(process, log, control))
+    assert how == "signal 9"
+    assert last_words.endswith("ää the last words")
+    assert 990 < len(last_words) <= 2000
 
 
 LARGE = np.arange(1_000_000)
