@@ -26,9 +26,6 @@ from es_service.dispatch.ray_cluster import ONE_CORE, Claim, Watch, connect, dem
 from es_service.errors import EvaluationError
 from es_service.protocol import Centre, Chunk, WorkerPlace, WorkerSpec
 
-PLACEMENT_S = 30.0
-"""Longest wait for the first actor to say where it is, unless no_worker_timeout_s is longer; Ray itself would wait for
-ever. A cluster that was joined may have to grow first, or others there to end."""
 IN_CALL_BYTES = 64 * 2**10
 """A centre up to this size travels with every call; a larger one is stored once and fetched once per node."""
 
@@ -124,8 +121,9 @@ class Actors:
         """Workers to be asked for their place again before they are sent anything, since another was lost."""
         self._inbox: deque[Message] = deque()
         self._centre: tuple[Centre, Any] | None = None
-        self._patience_s = max(PLACEMENT_S, policy.no_worker_timeout_s)
-        self._placed_by_s = time.monotonic() + self._patience_s
+        # Ray itself would wait for ever: a cluster may have to grow, or others there to end. The scheduler counts as
+        # long from later on, so that it is said here, where it is known what is free.
+        self._placed_by_s = time.monotonic() + policy.no_worker_timeout_s
 
     def places(self) -> dict[int, WorkerPlace]:
         """Worker id -> where it is, of those that have a place."""
@@ -205,7 +203,7 @@ class Actors:
                 return message
             timeout_s = 0.0  # that was where a worker still is; None would say that no answer waits behind it
         if not self._places and time.monotonic() > self._placed_by_s:
-            time_s = f"{self._patience_s:g} s ({self._policy.name_of('no_worker_timeout_s')})"
+            time_s = f"{self._policy.no_worker_timeout_s:g} s ({self._policy.name_of('no_worker_timeout_s')})"
             if self._watch is None:  # which has a place for each: their processes do not start, or very slowly
                 raise EvaluationError(f"no worker's process answered in {time_s}. {demand(self._ray, self._claim)}")
             raise EvaluationError(
