@@ -10,12 +10,14 @@ import logging
 import os
 import platform
 import secrets
+import shutil
 import signal
 import socket
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -117,11 +119,22 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
     return ray
 
 
-def disconnect(ray: ModuleType) -> None:
-    """Leave the cluster; one of our own ends."""
+def disconnect(ray: ModuleType, *, forget: bool = False) -> None:
+    """Leave the cluster; one of our own ends.
+
+    Args:
+        forget: delete the folder in which a Ray of our own kept its logs, which Ray itself never does.
+    """
     _let_print(ray, True)
+    folder = _session_folder(ray) if forget else None
     with _signal_handlers_kept():
         ray.shutdown()
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)
+        latest = folder.with_name("session_latest")
+        with contextlib.suppress(OSError):
+            if not latest.exists():  # Ray puts no other link in the place of one that leads nowhere
+                latest.unlink()
 
 
 def look(ray: ModuleType, claim: Claim) -> Membership:
@@ -195,6 +208,13 @@ def _draining(ray: ModuleType) -> dict[str, int]:
     with contextlib.suppress(AttributeError):
         return ray._private.state.state.get_draining_nodes()
     return {}
+
+
+def _session_folder(ray: ModuleType) -> Path | None:
+    """Where Ray keeps logs and sockets of this session. It has no public way to ask; if this one goes, they stay."""
+    with contextlib.suppress(AttributeError):
+        return Path(ray._private.worker._global_node.get_session_dir_path())
+    return None
 
 
 def _let_print(ray: ModuleType, allowed: bool) -> None:

@@ -115,6 +115,7 @@ class Actors:
         self._places: dict[int, WorkerPlace] = {}
         self._platforms: set[str] = set()
         self._drained: set[int] = set()
+        self._has_lost = False
         self._nodes: frozenset[str] = frozenset()
         """All that were alive at some time."""
         self._to_ask: set[int] = set()
@@ -141,6 +142,7 @@ class Actors:
 
     def kill(self, worker: int) -> str:
         """Kill an actor's process and drop whatever it still owes. What it wrote is on its node, in Ray's logs."""
+        self._has_lost = True
         for ref in [ref for ref, call in self._calls.items() if call.worker == worker]:
             del self._calls[ref]
         self._places.pop(worker, None)
@@ -216,11 +218,13 @@ class Actors:
         """Kill all actors and leave the cluster, where they end seconds later; a Ray of our own has then ended."""
         if self._watch is not None:
             self._watch.close()
+        # Nobody reads the logs of a session of our own in which all went well: workers came up, and none was lost.
+        forget = self._watch is None and bool(self._places) and not self._has_lost
         for worker in list(self._handles):
             self.kill(worker)
         self._calls.clear()
         self._centre = None
-        disconnect(self._ray)
+        disconnect(self._ray, forget=forget)
 
     def _message(self, ref: Any) -> Message | None:
         call, errors = self._calls[ref], self._ray.exceptions

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+from types import SimpleNamespace
+
+import pytest
 
 from es_service.dispatch import ray_cluster
 
@@ -20,3 +23,21 @@ def test_variables_that_nobody_changed_are_never_touched(monkeypatch):
         assert os.environ["OLD"] == os.environ["NEW"] == "new"
     assert dict(os.environ) == before
     assert set(touched) == {b"OLD", b"NEW", b"RAYS_OWN"}
+
+
+@pytest.mark.parametrize("is_latest", [True, False])
+def test_a_session_is_forgotten_with_the_link_to_it_and_with_no_other(tmp_path, is_latest):
+    ours, other, latest = tmp_path / "session_ours", tmp_path / "session_other", tmp_path / "session_latest"
+    for folder in (ours, other):
+        (folder / "logs").mkdir(parents=True)
+    latest.symlink_to(ours if is_latest else other)
+    node = SimpleNamespace(get_session_dir_path=lambda: str(ours))
+    worker = SimpleNamespace(_global_node=node)
+    ray = SimpleNamespace(_private=SimpleNamespace(worker=worker), shutdown=lambda: delattr(worker, "_global_node"))
+    assert latest.exists()
+    ray_cluster.disconnect(ray, forget=True)  # type: ignore[arg-type]
+    assert (ours.exists(), other.exists(), latest.is_symlink()) == (False, True, not is_latest)
+    worker._global_node = node
+    node.get_session_dir_path = lambda: str(other)
+    ray_cluster.disconnect(ray)  # type: ignore[arg-type]
+    assert other.exists()

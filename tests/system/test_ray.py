@@ -41,6 +41,11 @@ CONFIG = SMALL | {
 }
 
 
+def sessions() -> set[Path]:
+    """Folders that Ray has made for sessions of this process and that are still there."""
+    return set(Path("/tmp/ray").glob(f"session_*_{os.getpid()}"))
+
+
 def run(folder: Path, on_notice=pytest.fail, **compute):
     config = api.load_config(CONFIG | {"compute": CONFIG["compute"] | compute})
     return api.run(config, folder, on_notice=on_notice)
@@ -54,19 +59,25 @@ def reference(tmp_path_factory):
 
 
 def test_the_same_bits_as_inline_and_nothing_of_the_caller_s_changed(tmp_path, reference, monkeypatch):
-    """A leftover RAY_ADDRESS captures nothing, settings of JAX reach no worker, handlers and environment stay."""
+    """A leftover RAY_ADDRESS captures nothing, settings of JAX reach no worker, handlers and environment stay; nothing
+    of Ray's is left in /tmp, nor a link to it, which would keep Ray from making another."""
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     monkeypatch.setenv("PJRT_NPROC", "2")
     monkeypatch.setenv("JAX_ENABLE_X64", "1")
     handlers, environment = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)], dict(os.environ)
+    before = sessions()
     run(tmp_path / "run", workers=1)
     assert digest_parts(tmp_path / "run") == reference
+    assert sessions() == before
+    latest = Path("/tmp/ray/session_latest")
+    assert latest.exists() or not latest.is_symlink()
     assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
     assert dict(os.environ) == environment
 
 
 def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatch):
-    """One of two workers is killed in mid-generation, then one is stopped, which only our own deadline notices."""
+    """One of two workers is killed in mid-generation, then one is stopped, which only our own deadline notices. Their
+    last words stay in Ray's logs."""
     faults = {4: signal.SIGKILL, 12: signal.SIGSTOP}
     send = Actors.send
 
@@ -77,10 +88,11 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
             os.kill(self.places()[worker].pid, number)
 
     monkeypatch.setattr(Actors, "send", send_and_strike)
-    notices = []
+    notices, before = [], sessions()
     outcome = run(tmp_path / "run", on_notice=notices.append, workers=2, chunk_timeout_s=1.0)
     assert digest_parts(tmp_path / "run") == reference
     assert not faults
+    assert len(sessions() - before) == 1
     assert outcome.run.history["lost_workers"].sum() == 2
     assert [notice.partition(" lost ")[0] for notice in notices] == ["generation 4:", "generation 12:"]
     assert "its process or its node died" in notices[0]
