@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from es_service.commands import command, install_command
 from es_service.config.yaml_text import did_you_mean, one_of
 from es_service.errors import ConfigError, NotInRunError, StoreError
-from es_service.maps.behaviour_map import BehaviourMap, Elite
+from es_service.maps.behaviour_map import ELITE_PREFIX, BehaviourMap, Elite
 from es_service.maps.geometry import Grid
 from es_service.run_view import Run, map_places
 
@@ -46,20 +47,43 @@ def export(run: Run, to: str, folder: Path) -> list[Path]:
         raise StoreError(f"cannot write into {folder}: {error.strerror or error}; choose another --out") from error
 
 
+@dataclass(frozen=True)
+class _Moment(Run):
+    """A run as it was after one generation, whatever its driver has stored since."""
+
+    at: int
+    state: dict[str, dict[str, np.ndarray]]
+
+    @property
+    def generation(self) -> int:
+        return self.at
+
+    def history_rows(self, since_generation: int | None = None) -> list[dict[str, Any]]:
+        return [row for row in super().history_rows(since_generation) if row["generation"] <= self.at]
+
+    def parts(
+        self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
+    ) -> tuple[int, dict[str, dict[str, np.ndarray]]]:
+        return self.at, {part: arrays for part, arrays in self.state.items() if wanted(part)}
+
+
 def tables(run: Run) -> dict[str, pd.DataFrame]:
-    """History, novelty archive and, where there is one, the map."""
+    """History, novelty archive and, where there is one, the map, as of one generation."""
+    run = _Moment(run.folder, *run.parts(wanted=lambda part: not part.startswith(ELITE_PREFIX)))
     found = {"history": run.history.reset_index(), "novelty": run.novelty}
     return found | ({"map": run.map} if run.constants["map.enabled"] else {})
 
 
 def arrays(run: Run) -> dict[str, np.ndarray]:
-    """All policies of a run, with what each needs to act: the best centre, the newest one, every elite of the map.
+    """All policies of a run after one generation, with what each needs to act: the best centre, the newest one, every
+    elite of the map.
 
     Names: `widths` of the layers, `observation_clip` (NaN: none); for the best and the newest centre `best_parameters`
     [D], `best_mean` [O], `best_std` [O], `centre_parameters`, ...; for N elites `cell` [N, dimensions of the map],
     `fitness` [N], `descriptor` [N, B], `generation` [N], `parameters` [N, D], `mean` [N, O], `std` [N, O], `trace`
     [N, T, B]. A layer's weights [inputs, outputs] come before its biases, layer after layer.
     """
+    run = _Moment(run.folder, *run.parts())
     clip = run.constants["policy.observation_clip"]
     found: dict[str, Any] = {
         "widths": np.array(run.policy_shape.widths),

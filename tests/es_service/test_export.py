@@ -1,0 +1,58 @@
+"""What is exported while a driver works."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from es_service import api, session
+from es_service.export import arrays, tables
+from es_service.store import reader
+from tests.benchmarks.science import in_this_process
+
+FIRST, LAST = 2, 8
+CONFIG = {
+    "task": {"environment": "point_maze", "episode_steps": 10},
+    "policy": {"hidden": [4]},
+    "search": {"algorithm": "me_es", "pairs": 16},
+    "compute": {"engine": "inline", "workers": 1},
+    "budget": {"generations": FIRST},
+}
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    monkeypatch.setattr(session, "_engine", in_this_process)
+    return api.run(api.load_config(CONFIG), tmp_path / "run").run
+
+
+def go_on(run):
+    return api.resume(run.folder, [f"budget.generations={run.generation + 1}"])
+
+
+def after_a_generation(run, read):
+    def read_later(*arguments):
+        go_on(run)
+        return read(*arguments)
+
+    return read_later
+
+
+def test_an_export_is_of_one_generation_although_one_more_is_stored_before_each_look(run, tmp_path, monkeypatch):
+    same = api.run(api.load_config(CONFIG), tmp_path / "same").run
+    expected = {}
+    for generation in range(FIRST, LAST):
+        expected[generation] = tables(same) | arrays(same)
+        go_on(same)
+    for name in ("read_parts", "read_history"):
+        monkeypatch.setattr(reader, name, after_a_generation(run, getattr(reader, name)))
+    found_tables, found_arrays = tables(run), arrays(run)
+    assert FIRST + 2 < run.generation < LAST
+    at = found_tables["history"]["generation"].iloc[-1]
+    assert found_tables["history"]["centre_fitness_mean"].equals(expected[at]["history"]["centre_fitness_mean"])
+    for name in ("novelty", "map"):
+        assert found_tables[name].equals(expected[at][name])
+    assert any(
+        all(np.array_equal(array, of_one[name], equal_nan=True) for name, array in found_arrays.items())
+        for of_one in expected.values()
+    )
