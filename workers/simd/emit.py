@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from workers.simd.code import Code, module
 from workers.simd.graph import Graph
 from workers.simd.operations import OPERATIONS
-from workers.simd.primitives.registry import UnsupportedError
+from workers.simd.primitives.registry import UnsupportedError, refusing
 from workers.simd.schedule import Region, schedule
 
 MOST_SLOTS = 8192
@@ -41,6 +41,7 @@ def emit(graph: Graph, outputs: Sequence[int], inputs: int, width: int) -> str:
     return module([block, inside])
 
 
+@refusing()
 def graph_function(
     name: str, graph: Graph, outputs: Sequence[int], sources: Sequence[tuple[str, int]], out: str, width: int
 ) -> Code:

@@ -19,6 +19,7 @@ from workers.simd import loops
 from workers.simd.emit import emit
 from workers.simd.graph import live
 from workers.simd.operations import OPERATIONS
+from workers.simd.primitives.registry import refusing
 from workers.simd.target import Target, compile_object, compiler_version, host_target, load_object
 from workers.simd.trace import trace_jaxpr
 from workers.simd.words import ALIGNMENT, Words, aligned, pack, unpack, words_of
@@ -179,11 +180,12 @@ def _compile(closed: ClosedJaxpr, target: Target, jaxpr_s: float) -> tuple[bytes
     return code, Facts(*seconds, graph.asked, computed, len(code), False)
 
 
+@refusing()
 def jaxpr_digest(closed: ClosedJaxpr) -> str:
     """A hash of everything a jaxpr computes: its equations, their parameters and its constants; not names of variables.
 
     Raises:
-        ValueError: a parameter has no text that is the same in every process.
+        UnsupportedError: a parameter or constant has no text that is the same in every process.
     """
     digests: dict[int, str] = {}
 

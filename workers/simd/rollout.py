@@ -26,8 +26,9 @@ from workers.simd.words import aligned
 def why_not(task: TaskSpec) -> str:
     """Why simd cannot run a task's episodes; empty if it can.
 
-    Goes through all that compiling them does but LLVM's part, with the task's default options; of training, since
-    evaluations have nothing besides that could be refused.
+    Goes through all that compiling their steps does but LLVM's part, with the task's default options; of training,
+    since evaluations have nothing besides that could be refused. A reset is no reason: JAX computes those that cannot
+    be compiled.
     """
     options = {name: values[0] for name, values in task.options.items()}
     spec = WorkerSpec(

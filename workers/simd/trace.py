@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from workers.simd.graph import Graph
 from workers.simd.loops import build_loop
 from workers.simd.primitives import PRIMITIVES, Nodes, UnsupportedError
-from workers.simd.primitives.registry import aval_of, check_bytes, kind_of
+from workers.simd.primitives.registry import aval_of, check_bytes, kind_of, refusing
 
 GRAPH_LIMIT = 2_000_000
 """Nodes; what needs more would not be compiled in useful time."""
 
 
+@refusing()
 def trace_jaxpr(closed: ClosedJaxpr) -> tuple[Graph, int, list[int]]:
     """The graph of a function of one lane: (graph, number of input words, output nodes).
 
@@ -69,7 +70,8 @@ class Tracer:
                 if rule is None:
                     raise UnsupportedError(f"the primitive {equation.primitive.name}")
                 check_bytes(equation)
-                outputs = rule(self, equation, *map(read, equation.invars))
+                with refusing():
+                    outputs = rule(self, equation, *map(read, equation.invars))
                 if len(self.graph.keys) > GRAPH_LIMIT:
                     raise UnsupportedError(f"more than {GRAPH_LIMIT:,} operations")
             except UnsupportedError as error:

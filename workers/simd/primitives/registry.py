@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,20 @@ PRIMITIVES: dict[str, Rule] = {}
 
 class UnsupportedError(Exception):
     """The function uses what this compiler cannot compile; the message names it and where it comes from."""
+
+
+@contextlib.contextmanager
+def refusing() -> Iterator[None]:
+    """Whatever goes wrong in here is an UnsupportedError: no rule foresees everything that JAX can trace.
+
+    Only for what depends on the function alone. Who may fall back to JAX must do so on every worker, or on none.
+    """
+    try:
+        yield
+    except (UnsupportedError, MemoryError):
+        raise
+    except Exception as error:
+        raise UnsupportedError(f"{type(error).__name__}: {error}") from error
 
 
 def primitive(*names: str) -> Callable[[Rule], Rule]:

@@ -1,0 +1,79 @@
+"""Resets that this compiler cannot do are JAX's, whatever is wrong with them; steps are compiled all the same."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from es_service.protocol import EvaluationChunk, PolicyShape, TrainingChunk
+from tests.helpers import centre, random_parameters, spec
+from workers.environments import describe_environment
+from workers.simd import rollout
+from workers.simd.kernel import compile_kernel
+from workers.simd.primitives import PRIMITIVES, UnsupportedError
+from workers.worker import make_worker
+
+
+class Drift:
+    """a point is pushed about"""
+
+    observation_size, action_size, episode_steps = 2, 2, 10
+    descriptor_names, descriptor_bounds = ("x", "y"), ((-9.0, 9.0), (-9.0, 9.0))
+
+    def reset(self, key: Any) -> Any:
+        return jnp.array([0.5, -0.5]) + 1e-9 * key[:2].astype(jnp.float32)
+
+    def observe(self, state: Any) -> Any:
+        return state
+
+    def step(self, state: Any, action: Any) -> tuple[Any, Any, Any]:
+        state = state + 0.1 * jnp.clip(action, -1.0, 1.0)
+        return state, -jnp.abs(state).sum(), False
+
+    def descriptor(self, state: Any) -> Any:
+        return state
+
+
+class Keyed(Drift):
+    """a key of JAX's own kind is a constant of its reset"""
+
+    def __init__(self) -> None:
+        self.layout = jax.random.key(7)
+
+    def reset(self, key: Any) -> Any:
+        return super().reset(key) + jax.random.uniform(self.layout, (2,))
+
+
+class Watched(Drift):
+    """its reset calls Python, by an address that no other process has"""
+
+    def reset(self, key: Any) -> Any:
+        state = super().reset(key)
+        jax.debug.callback(lambda at: None, state)
+        return state
+
+
+@pytest.mark.parametrize("task", [Drift, Keyed, Watched])
+def test_a_reset_that_the_compiler_chokes_on_is_jaxs(task: type) -> None:
+    name = f"{__name__}:{task.__name__}"
+    assert rollout.why_not(describe_environment(name)) == ""
+    worker_spec = spec(environment=name, policy=PolicyShape((2, 8, 2)), episode_steps=10)
+    simd, xla = (make_worker(spec(**vars(worker_spec) | {"rollout": kind})) for kind in ("simd", "xla"))
+    point = centre(random_parameters(size=worker_spec.policy.parameters))
+    for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
+        ours, theirs = simd(point, chunk), xla(point, chunk)
+        np.testing.assert_allclose(ours.returns, theirs.returns, rtol=1e-4)
+        np.testing.assert_allclose(ours.descriptor, theirs.descriptor, atol=1e-4)
+
+
+def test_what_a_rule_did_not_foresee_is_refused_by_name_and_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    def rule(*_: Any) -> Any:
+        raise KeyError("axis")
+
+    monkeypatch.setitem(PRIMITIVES, "sin", rule)
+    with pytest.raises(UnsupportedError, match=r"KeyError: 'axis', from .*test_resets\.py"):
+        compile_kernel(lambda x: jnp.sin(x) + 1.0, jax.ShapeDtypeStruct((), jnp.float32))
