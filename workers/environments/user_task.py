@@ -17,7 +17,8 @@ went; `options = {"name": ("default", "other")}`, keywords of its constructor, w
 descriptor is a place in the plane, `walls`, a tuple of segments ((x, y), (x, y)), and `wall_clearance`, how near to one
 nothing comes, for the map's coverage of what can be reached; `least_reward`, from which QD-scores count; a docstring,
 whose first line `es-service` shows. All methods are pure functions that JAX can trace, of one state: they are batched
-and compiled for you. `es_service.noise.uniforms(key, counters)` makes random numbers.
+and compiled for you. `es_service.noise.uniforms(key, counters)` makes random numbers. In training, actions leave
+[-1, 1] by up to 7.95 times `policy.action_noise`, which is added after the last tanh: a task that needs a bound clips.
 """
 
 from __future__ import annotations
