@@ -11,7 +11,6 @@ import io
 import sys
 from collections.abc import Callable
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,6 +37,7 @@ from es_service.cli_options import (
 from es_service.commands import command
 from es_service.config.resolution import config_warnings
 from es_service.errors import ConfigError, EvaluationError, Interrupted, NotInRunError, ServiceError
+from es_service.platform_info import VERSION
 from es_service.report.catalogue import print_catalogue
 from es_service.report.progress import Row, show_progress
 from es_service.report.status import follow_status, print_status, print_summary
@@ -54,7 +54,7 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        print(metadata.version("es-service"))
+        print(VERSION)
         raise typer.Exit
 
 

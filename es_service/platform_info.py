@@ -12,14 +12,17 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("es-service", "jax", "jaxlib", "numpy", "brax", "mujoco", "mujoco-mjx", "llvmlite")
-"""Packages whose version can change a bit of a result."""
+VERSION = "0.4.0"
+"""Of es-service itself: of the code that runs. What an editable installation says of it is as old as its last `pip
+install`."""
+PACKAGES = ("jax", "jaxlib", "numpy", "brax", "mujoco", "mujoco-mjx", "llvmlite")
+"""Others whose version can change a bit of a result."""
 
 
 def platform_info() -> dict[str, str]:
     """Versions and CPU kind of this machine; the same text wherever results repeat bit for bit."""
     versions = {name: metadata.version(name) for name in PACKAGES}
-    return {"python": platform.python_version(), **versions, "cpu": cpu_kind()}
+    return {"python": platform.python_version(), "es-service": VERSION, **versions, "cpu": cpu_kind()}
 
 
 def platform_text(info: Mapping[str, Any]) -> str:

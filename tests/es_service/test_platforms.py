@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import tomllib
 from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
 
 import pytest
 
 from es_service import api, session
 from es_service.digest import is_mixed
-from es_service.platform_info import computed_on, platform_info, platform_text
+from es_service.platform_info import VERSION, computed_on, platform_info, platform_text
 from es_service.platform_info import is_mixed as are_mixed
 from es_service.store.reader import read_platforms
 from tests.benchmarks.science import InThisProcess
@@ -74,3 +79,15 @@ def test_workers_of_several_kinds_make_a_run_mixed_from_the_generation_they_join
     assert [f"from generation {first} on" in notice for first, notice in zip(recorded[1:], told, strict=True)] == [
         True
     ] * len(told)
+
+
+def test_our_own_version_is_that_of_the_code_not_of_its_last_installation(monkeypatch):
+    """A clone that was pulled and not installed again runs new code under old metadata."""
+    installed = metadata.version
+    monkeypatch.setattr(metadata, "version", lambda name: "0.0.1" if name == "es-service" else installed(name))
+    assert platform_info()["es-service"] == VERSION
+    printed = subprocess.run([sys.executable, "-m", "es_service", "--version"], capture_output=True, text=True)
+    assert printed.stdout.strip() == VERSION
+    described = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    assert described["project"]["dynamic"] == ["version"]
+    assert described["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "es_service.platform_info.VERSION"}
