@@ -12,20 +12,21 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from es_service.algorithms import ALGORITHMS
 from es_service.commands import command
-from es_service.config import loading
 from es_service.config.changes import changed_constants, describe_changes
+from es_service.config.loading import Source
 from es_service.config.model import RunConfig
+from es_service.configs import changed_config, load_config
 from es_service.errors import ConfigError, StoreError
 from es_service.history import history_columns
 from es_service.lineage import fork_config, forked, started
 from es_service.run_view import open_run
-from es_service.session import TASKS, OnGeneration, OnNotice, Outcome, task_of, work
+from es_service.session import OnGeneration, OnNotice, Outcome, work
 from es_service.store.beginning import Beginning
 from es_service.store.folder import explained, holds_run, write_config
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook
+from es_service.tasks import task_of
 
 RUNS_FOLDER = Path("runs")
 """Where runs go unless told otherwise, relative to the current folder."""
@@ -39,22 +40,8 @@ def _warn(notice: str) -> None:
     warnings.warn(notice, RuntimeWarning, stacklevel=2)
 
 
-def load_config(source: loading.Source, overrides: Iterable[str] = (), *, new: bool = True) -> RunConfig:
-    """Read a YAML file (or a mapping like one), apply overrides such as "search.sigma=0.05", resolve and check it all.
-
-    Args:
-        new: whether a run is to be started with it here and now, so that the run it starts from must be there.
-
-    Raises:
-        ConfigError: lists every problem found.
-    """
-    config = loading.load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, new=new)
-    ALGORITHMS[config.search.algorithm](config)  # one of the user's own may refuse it
-    return config
-
-
 def run(
-    config: RunConfig | loading.Source,
+    config: RunConfig | Source,
     out: str | os.PathLike[str] | None = None,
     *,
     on_generation: OnGeneration = _ignore,
@@ -98,13 +85,13 @@ def resume(
     def changed(store: RunStore) -> RunConfig:
         recorded = store.folder / "config.yaml"
         source = recorded if recorded.exists() else store.meta.config
-        return loading.changed_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+        return changed_config(source, overrides)
 
     return _go_on(Path(folder), changed, on_generation, on_notice, hook)
 
 
 def run_or_resume(
-    config: RunConfig | loading.Source,
+    config: RunConfig | Source,
     out: str | os.PathLike[str],
     *,
     on_generation: OnGeneration = _ignore,

@@ -14,8 +14,7 @@ from es_service.config.yaml_text import did_you_mean, one_of
 from es_service.cores import cores
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol import child_environment
-from es_service.tasks import Tasks
-from workers.environments import TASKS
+from es_service.tasks import TASKS
 
 BATCHES = {"point_maze": (64,)}
 ANT_BATCHES = (8, 16, 64)
@@ -44,12 +43,11 @@ def bench_rollouts(
         ConfigError: a task cannot be had. EvaluationError: it cannot be run, or not by simd, and nothing else was asked
             for.
     """
-    known = Tasks()
     for task in tasks:
-        if task not in known:
+        if task not in TASKS:
             raise ConfigError(
-                f"--task {task}: no known task; must be {one_of(known)}, or brax:NAME, or module:Class"
-                f"{did_you_mean(task, known)}"
+                f"--task {task}: no known task; must be {one_of(TASKS)}, or brax:NAME, or module:Class"
+                f"{did_you_mean(task, TASKS)}"
             )
     every = sorted({1, cores()})
     for task in tasks or TASKS:

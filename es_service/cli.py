@@ -41,9 +41,8 @@ from es_service.platform_info import VERSION
 from es_service.report.catalogue import print_catalogue
 from es_service.report.progress import Row, show_progress
 from es_service.report.status import follow_status, print_status, print_summary
-from es_service.session import task_of
 from es_service.store.folder import holds_run
-from workers.environments import TASKS
+from es_service.tasks import TASKS, task_of
 
 app = typer.Typer(
     no_args_is_help=True,

@@ -28,7 +28,7 @@ from es_service.protocol import Centre, EpisodesResult, TrainingChunk
 from es_service.signals import stop_on_signals
 from es_service.statistics import no_observations, normalisation
 from es_service.store.folder import is_network_filesystem
-from workers.environments import TASKS
+from es_service.tasks import TASKS
 from workers.policy import initial_parameters
 from workers.simd.kernel import compile_kernel
 from workers.simd.target import NoVectorsError, host_target

@@ -13,19 +13,19 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.algorithms import ALGORITHMS
 from es_service.commands import command
 from es_service.config.compute import ENGINE_IMPLIES
-from es_service.config.loading import changed_config
 from es_service.config.model import worker_spec
+from es_service.configs import changed_config
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError
 from es_service.generation import evaluate_centre
 from es_service.protocol import Centre, Evaluator, FloatArray
 from es_service.run_state import best_from_arrays
 from es_service.run_view import Policy, Run
-from es_service.session import TASKS, scheduling_policy, task_of
+from es_service.session import scheduling_policy
 from es_service.signals import stop_on_signals
+from es_service.tasks import task_of
 
 FRESH_GENERATION = 2**40
 """Of the resets of fresh episodes; no run counts so far."""
@@ -115,7 +115,7 @@ def evaluate(run: Run, chosen: Sequence[Candidate], episodes: int, workers: int 
     Raises EvaluationError where rollouts cannot go on; Interrupted when asked to stop.
     """
     overrides = ["compute.engine=inline", *ENGINE_IMPLIES["inline"], f"compute.workers={workers or 'auto'}"]
-    config = changed_config(run.present_config, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+    config = changed_config(run.present_config, overrides)
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     with (
         stop_on_signals() as should_stop,

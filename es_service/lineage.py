@@ -8,21 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from es_service.algorithms import ALGORITHMS
-from es_service.config import loading
 from es_service.config.changes import START_KEYS, STATE_KEYS, changed_constants, start_afresh
 from es_service.config.keys import parse_overrides
 from es_service.config.model import RunConfig, policy_shape
 from es_service.config.yaml_text import show
+from es_service.configs import changed_config
 from es_service.digest import digest_at
 from es_service.errors import ConfigError
 from es_service.maps.behaviour_map import ELITE_PREFIX
 from es_service.protocol import Moments
 from es_service.run_state import moments_from_arrays, moments_to_arrays, without_fitness, without_scores
 from es_service.run_view import Run, open_run
-from es_service.session import TASKS, task_of
 from es_service.store import reader
 from es_service.store.beginning import Beginning
+from es_service.tasks import task_of
 
 OBSERVED = ("policy.observation_clip", "policy.observation_normalization")
 """What a policy does with its observations."""
@@ -46,7 +45,7 @@ def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -
         )
     present = origin.present_config
     mapping = present | {"search": present["search"] | {"init_from": None}}  # it has the parent's state instead
-    config = loading.changed_config(mapping, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+    config = changed_config(mapping, overrides)
     changes = changed_constants(origin.constants, config.constants())
     unfit = [f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes if name in STATE_KEYS]
     names = task_of(config).descriptor_names

@@ -15,17 +15,16 @@ from es_service.dispatch.engine import Engine
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy as SchedulingPolicy
 from es_service.platform_info import computed_on, is_mixed, platform_info
-from es_service.protocol import FloatArray, Moments, TaskSpec, with_options
+from es_service.protocol import FloatArray, Moments
 from es_service.run_state import Arrays, moments_from_arrays
 from es_service.run_view import Run, open_run
 from es_service.signals import stop_on_signals
 from es_service.statistics import no_observations
 from es_service.store.writer import RunStore
-from es_service.tasks import Tasks
+from es_service.tasks import task_of
 from workers.actor import WorkerActor
 from workers.policy import initial_parameters
 
-TASKS = Tasks()
 LIMITS = {
     "start_deadline_s": "half of compute.no_worker_timeout_s",
     "first_deadline_s": "compute.compile_timeout_s",
@@ -149,11 +148,6 @@ def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) 
         elastic=compute.workers == "auto",
         log=log,
     )
-
-
-def task_of(config: RunConfig) -> TaskSpec:
-    """The task of a run, with the descriptor that its options choose."""
-    return with_options(TASKS[config.task.environment], config.task.options)
 
 
 def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Moments]:

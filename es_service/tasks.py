@@ -12,9 +12,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 
+from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
-from es_service.protocol import TaskSpec, child_environment
-from workers.environments import TASKS
+from es_service.protocol import TaskSpec, child_environment, with_options
+from workers import environments
 from workers.simd.target import NoVectorsError, host_target
 
 DESCRIBE_S = 120.0
@@ -26,13 +27,22 @@ class Tasks(Mapping[str, TaskSpec]):
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is none of ours, ConfigError for another that cannot be had."""
-        return replace(_described(name) if ":" in name else TASKS[name], no_vectors=_no_vectors())
+        return replace(_described(name) if ":" in name else environments.TASKS[name], no_vectors=_no_vectors())
 
     def __iter__(self) -> Iterator[str]:
-        return iter(TASKS)
+        return iter(environments.TASKS)
 
     def __len__(self) -> int:
-        return len(TASKS)
+        return len(environments.TASKS)
+
+
+TASKS = Tasks()
+"""Of the command line and the Python interface; the workers' table has ours alone."""
+
+
+def task_of(config: RunConfig) -> TaskSpec:
+    """The task of a run, with the descriptor that its options choose."""
+    return with_options(TASKS[config.task.environment], config.task.options)
 
 
 @cache

@@ -24,7 +24,7 @@ from es_service import api
 from es_service.config.model import RunConfig, worker_spec
 from es_service.platform_info import cpu_kind
 from es_service.protocol import Centre, EpisodesResult, TrainingChunk, WorkerSpec
-from es_service.session import task_of
+from es_service.tasks import task_of
 
 RESULTS = Path(__file__).parent / "results" / "episode_parity.csv"
 TASKS = ("ant_maze", "ant_trap")

@@ -24,7 +24,7 @@ from es_service import api
 from es_service.config.model import worker_spec
 from es_service.noise import KEY_WORDS, NORMAL_STD, Domain, stream_keys
 from es_service.protocol import WorkerSpec
-from es_service.session import task_of
+from es_service.tasks import task_of
 from tests.benchmarks.simd_physics import peak
 from workers.environments import make_environment
 from workers.episode import episode_steps

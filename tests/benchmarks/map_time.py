@@ -27,12 +27,12 @@ from es_service.history import history_columns
 from es_service.maps.behaviour_map import Elite, cell_part, elite_part, elite_to_arrays
 from es_service.protocol import DispatchCounts, EpisodesResult, GradientChunk, GradientResult, TrainingChunk
 from es_service.run_state import Arrays
-from es_service.session import task_of
 from es_service.statistics import no_observations
 from es_service.store.beginning import Beginning
 from es_service.store.folder import DATABASE
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
+from es_service.tasks import task_of
 from tests.helpers import MemoryStore
 
 CELLS = (50, 50)

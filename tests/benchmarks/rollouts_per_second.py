@@ -25,7 +25,7 @@ from es_service.config.model import worker_spec
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy
 from es_service.protocol import EpisodesResult, Evaluator, TrainingChunk
-from es_service.session import task_of
+from es_service.tasks import task_of
 from tests.helpers import centre
 from workers.policy import initial_parameters
 

@@ -35,6 +35,7 @@ from es_service.errors import Interrupted
 from es_service.platform_info import cpu_kind
 from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts, worker_environment
 from es_service.run_view import Policy, Run
+from es_service.tasks import task_of
 from tests.benchmarks import science_picture
 
 RESULTS = Path(__file__).parent / "results"
@@ -103,7 +104,7 @@ class InThisProcess:
     def __init__(self, config: RunConfig, should_stop: Callable[[], int | None]) -> None:
         from workers.worker import make_worker
 
-        self._run_chunk = make_worker(worker_spec(config, session.task_of(config)))
+        self._run_chunk = make_worker(worker_spec(config, task_of(config)))
         self._should_stop = should_stop
 
     def evaluate(self, centre: Centre, chunks: Sequence[Chunk]) -> list[ChunkResult]:

@@ -70,7 +70,22 @@ def test_what_is_no_algorithm_is_refused_with_the_reason(name, reason):
         api.load_config(CONFIG, [f"search.algorithm={name}"])
 
 
+def test_a_fork_that_its_search_refuses_leaves_no_folder(tmp_path):
+    wanted = [f"search.algorithm={__name__}:cautious", "search.sigma=0.1", "budget.generations=2"]
+    parent = api.run(api.load_config(CONFIG, wanted), tmp_path / "parent").run
+    for _ in range(2):
+        with pytest.raises(ConfigError, match=r"cautious raised ValueError: sigma is above 0\.1"):
+            api.fork(parent.folder, ["search.sigma=0.2"], out=tmp_path / "fork")
+    assert not (tmp_path / "fork").exists()
+
+
 NOT_CALLABLE = 3
+
+
+def cautious(config):
+    if config.search.sigma > 0.1:
+        raise ValueError("sigma is above 0.1")
+    return ALGORITHMS["es"](config)
 
 
 def raises(config):

@@ -9,7 +9,7 @@ from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Policy
 from es_service.errors import ConfigError
 from es_service.protocol import TrainingChunk
-from es_service.tasks import Tasks
+from es_service.tasks import TASKS
 from tests.helpers import SPEC, centre, random_parameters
 
 
@@ -19,7 +19,7 @@ def test_a_current_folder_with_modules_of_our_names_is_nobody_s_business(tmp_pat
         (tmp_path / f"{name}.py").write_text("raise RuntimeError('not this one')")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match="pathlib:Path has no observation_size"):
-        Tasks()["pathlib:Path"]
+        TASKS["pathlib:Path"]
     row = next(bench_rollouts(["point_maze"], policies=[False], rollouts=["xla"], batches=[8], seconds=0.0))
     assert row["batch"] == 8
     with inline_engine(SPEC, Policy(1, max_start_failures=1)) as engine:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
-from es_service import api, evaluation, lineage, open_run, session
+from es_service import api, configs, evaluation, lineage, open_run, tasks
 from es_service.config.changes import START_KEYS
 from es_service.digest import digest_at
 from es_service.errors import ConfigError
@@ -79,7 +79,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
             "place": (("x", "y"), bounds), "speed": (("u", "v"), bounds), "height": (("h",), bounds[:1])
         },
     )  # fmt: skip
-    for module in (api, lineage, session):
+    for module in (configs, tasks):
         monkeypatch.setattr(module, "TASKS", {"point_maze": told})
     monkeypatch.setattr(api, "work", lambda *arguments: None)  # as workers know of no such option
     api.run(SMALL, tmp_path / "run")
@@ -89,7 +89,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
     for other in ("speed", "height"):
         with pytest.raises(ConfigError, match=rf"task\.options\.descriptor: place -> {other}\n[^$]*search\.init_from="):
             lineage.fork_config(tmp_path / "run", [f"task.options.descriptor={other}"])
-    for module in (api, lineage, session):
+    for module in (configs, tasks):
         monkeypatch.setattr(module, "TASKS", {"point_maze": replace(told, descriptors={"place": (("a", "b"), bounds)})})
     with pytest.raises(ConfigError, match=r"the descriptor of point_maze: \[x, y\] -> \[a, b\]\n.*search\.init_from="):
         lineage.fork_config(tmp_path / "run")
@@ -98,7 +98,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
 def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkeypatch):
     """A user's own, edited: the same parameters would mean another network."""
     other = replace(TASKS["point_maze"], action_size=3)
-    for module in (api, lineage, session):
+    for module in (configs, tasks):
         monkeypatch.setattr(module, "TASKS", {"point_maze": other})
     with pytest.raises(ConfigError, match=r"point_maze is not what it was \(action_size: 2 -> 3\)"):
         api.resume(parent.folder, ["budget.generations=7"])

@@ -10,7 +10,7 @@ import pytest
 from es_service.errors import ConfigError
 from es_service.noise import Domain, stream_keys
 from es_service.protocol import PolicyShape, with_options
-from es_service.tasks import Tasks
+from es_service.tasks import TASKS
 from tests.examples.ant_slalom import AntSlalom
 from tests.helpers import centre, random_parameters, spec
 from workers.environments import TaskError, brax_parts, brax_task, describe_environment, make_environment, user_task
@@ -149,12 +149,11 @@ def test_methods_that_do_not_fit_what_is_declared_are_named(monkeypatch, name, v
 
 
 def test_the_driver_asks_a_process_and_gets_the_same_answer():
-    tasks = Tasks()
-    assert tasks["brax:ant"] == brax_task.describe("ant")
-    assert tasks[EXAMPLE] == user_task.describe(EXAMPLE)
-    assert tasks.get("no_such_task") is None
+    assert TASKS["brax:ant"] == brax_task.describe("ant")
+    assert TASKS[EXAMPLE] == user_task.describe(EXAMPLE)
+    assert TASKS.get("no_such_task") is None
     with pytest.raises(ConfigError, match=r"brax:nope is not in the installed Brax"):
-        tasks.get("brax:nope")
+        TASKS.get("brax:nope")
 
 
 def test_a_worker_runs_the_example():
