@@ -55,8 +55,8 @@ Reachable = NDArray[np.bool_] | None
 """Which cells of the map can be reached, [cells]; None where the task does not know."""
 
 
-class Store(Protocol):
-    """What the loop needs of a run store."""
+class Stored(Protocol):
+    """What a run store has of earlier sessions."""
 
     @property
     def generation(self) -> int | None:
@@ -64,8 +64,13 @@ class Store(Protocol):
         ...
 
     def load(self, without: str | None = None) -> Mapping[str, Arrays]: ...
-    def part(self, name: str) -> Arrays: ...
     def last_history(self) -> Mapping[str, Any] | None: ...
+
+
+class Store(Protocol):
+    """What the loop needs of a run store."""
+
+    def part(self, name: str) -> Arrays: ...
     def commit(self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow) -> None: ...
 
 
@@ -85,11 +90,13 @@ def run(
     search: Search,
     evaluator: Evaluator,
     store: Store,
+    state: RunState | None,
     report: Callable[[HistoryRow], None],
 ) -> tuple[RunState, str]:
-    """Run generations until the budget is spent, from the state in `store` or from the start.
+    """Run generations until the budget is spent.
 
     Args:
+        state: the newest in `store`, to go on from; None to begin, with a store that has none.
         report: called with each history row after it is safe in the store.
 
     Returns:
@@ -100,7 +107,7 @@ def run(
     """
     budget = search.config.budget
     clock = Clock(0.0)
-    if (state := stored_state(store, search.task)) is None:
+    if state is None:
         map_ = empty_map(make_geometry(search.config.map)) if search.config.map.enabled else None
         reachable = _reachable(search, map_)
         state = _keep(store, report, clock, None, *_first_generation(search, evaluator, clock, map_, reachable))
@@ -112,7 +119,7 @@ def run(
     return state, reason
 
 
-def stored_state(store: Store, task: TaskSpec) -> RunState | None:
+def stored_state(store: Stored, task: TaskSpec) -> RunState | None:
     """The newest state in the store, without the elites' policies; None before the first generation."""
     if store.generation is None:
         return None

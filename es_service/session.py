@@ -83,7 +83,7 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
                 on_notice(f"generation {row['generation']}: lost {who}; {engine.last_loss}")
             on_generation(row)
 
-        _, reason = driver.run(search, engine, _OnPlatforms(store, engine, on_notice), after_generation)
+        _, reason = driver.run(search, engine, _OnPlatforms(store, engine, on_notice), state, after_generation)
     return Outcome(open_run(store.folder), reason)
 
 
@@ -94,12 +94,7 @@ class _OnPlatforms:
         self._store, self._engine, self._on_notice = store, engine, on_notice
         self._driver = platform_info()
         self._workers: frozenset[str] | None = None
-        self.load, self.part, self.last_history = store.load, store.part, store.last_history
-
-    @property
-    def generation(self) -> int | None:
-        """The store's."""
-        return self._store.generation
+        self.part = store.part
 
     def commit(self, generation: int, parts: Mapping[str, Arrays], history: driver.HistoryRow) -> None:
         """Record the platform if it is not the one in force, and say so if it is not the first; then commit."""

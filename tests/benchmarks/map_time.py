@@ -103,7 +103,7 @@ def fill(place: Path, *case: Any) -> None:
     config, search, invented = prepared(*case)
     memory = MemoryStore()
     with contextlib.suppress(_Enough):
-        driver.run(search, invented, memory, _stop)
+        driver.run(search, invented, memory, None, _stop)
     parts = memory.parts
     if config.map.enabled:
         parts = filled(parts, policy_shape(config, search.task).parameters, search.task.observation_size)
@@ -123,7 +123,7 @@ def measure(place: Path, *case: Any) -> dict[str, Any]:
         opened_s = time.perf_counter() - started
         upkeep = store.upkeep.after_commit
         store.upkeep.after_commit = lambda log_bytes: (sizes.append(log_bytes), upkeep(log_bytes))[1]
-        driver.run(search, invented, store, rows.append)
+        driver.run(search, invented, store, driver.stored_state(store, search.task), rows.append)
     driver_ms, store_ms = (
         round(float(np.median([row[f"seconds_{part}"] for row in rows[5:]])) * 1e3, 2) for part in ("driver", "store")
     )

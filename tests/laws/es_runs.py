@@ -36,5 +36,5 @@ def run_in_memory(config, evaluator=None):
         TASKS["point_maze"],
     )
     store = MemoryStore()
-    state, reason = driver.run(search, evaluator, store, lambda row: None)
+    state, reason = driver.run(search, evaluator, store, None, lambda row: None)
     return state, store, evaluator, reason

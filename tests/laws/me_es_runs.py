@@ -86,7 +86,7 @@ def run_in_memory(config, evaluator=None, store=None):
     search = driver.Search(
         config, ALGORITHMS["me_es"](config), lambda: ([first], no_observations(2)), TASKS["point_maze"]
     )
-    state, _ = driver.run(search, evaluator, store, lambda row: None)
+    state, _ = driver.run(search, evaluator, store, driver.stored_state(store, search.task), lambda row: None)
     return state, store, evaluator
 
 

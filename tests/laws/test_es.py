@@ -193,7 +193,7 @@ def test_a_centre_that_is_not_finite_stops_the_run_before_it_is_kept():
     first = initial_parameters(SHAPE, config.policy.init, config.seed)
     search = driver.Search(config, ALGORITHMS["es"](config), lambda: ([first], no_observations(2)), TASKS["point_maze"])
     with pytest.raises(EvaluationError, match=r"generation 1: the centre is not finite.*learning_rate \(1e\+300 now\)"):
-        driver.run(search, evaluator, store, lambda row: None)
+        driver.run(search, evaluator, store, None, lambda row: None)
     assert store.generation == 0
 
 
@@ -241,7 +241,7 @@ def test_the_driver_holds_no_population_times_parameters_array():
     search = driver.Search(config, ALGORITHMS["es"](config), lambda: ([first], no_observations(2)), TASKS["point_maze"])
     evaluator = Inventing(shape.parameters)
     tracemalloc.start()
-    driver.run(search, evaluator, MemoryStore(), lambda row: None)
+    driver.run(search, evaluator, MemoryStore(), None, lambda row: None)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 2048 * shape.parameters * 4 / 10

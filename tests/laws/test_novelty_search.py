@@ -63,7 +63,7 @@ def run_in_memory(config, evaluator=None, store=None):
         TASKS["point_maze"],
     )
     store = store or MemoryStore()
-    state, _ = driver.run(search, evaluator, store, lambda row: None)
+    state, _ = driver.run(search, evaluator, store, driver.stored_state(store, search.task), lambda row: None)
     return state, store, evaluator
 
 

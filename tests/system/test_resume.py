@@ -59,6 +59,17 @@ def test_a_spent_budget_starts_no_engine(finished, tmp_path, monkeypatch, budget
     assert any(word in outcome.reason for word in ("is spent", "is reached"))
 
 
+def test_a_state_is_read_once(finished, tmp_path, monkeypatch):
+    """Its hash, and the tree of a long archive, take seconds."""
+    from es_service import api, driver
+
+    shutil.copytree(finished[0], tmp_path / "run")
+    read, inner = [], driver.state_from_parts
+    monkeypatch.setattr(driver, "state_from_parts", lambda *given: read.append(given[1]) or inner(*given))
+    assert api.resume(tmp_path / "run", ["budget.generations=31"]).run.generation == 31
+    assert read == [30]
+
+
 def test_a_disk_that_fills_up_stops_the_run_and_resume_goes_on(config, small_disk, tmp_path):
     folder, wide = small_disk / "run", ["--set", "policy.hidden=[64]", "--set", "budget.generations=400"]
     code, printed = es("run", config, "--out", folder, *wide)
