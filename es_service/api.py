@@ -61,7 +61,7 @@ def run(
         config = load_config(config)
     parent, beginning = None, Beginning()
     if config.search.init_from is not None:
-        parent, beginning = started(config, config.search.init_from)
+        parent, beginning = started(config, config.search.init_from, on_notice)
     return _create_and_work(config, out, parent, beginning, on_generation, on_notice, hook)
 
 
@@ -160,7 +160,8 @@ def fork(
     The history up to there comes along and generations count on, so a fork that changes nothing ends with the same
     bits as its parent would. Where a setting changes what an evaluation means, of the task or of how observations are
     normalised, no fitness seen so far counts any more: the best centre, nsra_es's record and the map begin anew; the
-    weight of fitness stays as it is.
+    weight of fitness stays as it is. A generation's number alone says what me_es does in it, so that other blocks
+    (`search.block_generations`, `mode`, `first_block`, `alternation`) count at once, also in the middle of one.
 
     Raises:
         ConfigError: a change that the state does not fit (another task, descriptor, network, algorithm or map), or that

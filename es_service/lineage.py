@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,17 @@ from es_service.maps.behaviour_map import ELITE_PREFIX
 from es_service.protocol import Moments
 from es_service.run_state import moments_from_arrays, moments_to_arrays, without_fitness, without_scores
 from es_service.run_view import Run, open_run
+from es_service.statistics import no_observations
 from es_service.store import reader
 from es_service.store.beginning import Beginning
+from es_service.store.codec import Part
 from es_service.tasks import task_of
 
-OBSERVED = ("policy.observation_clip", "policy.observation_normalization")
+NORMALISED = "policy.observation_normalization"
+OBSERVED = ("policy.observation_clip", NORMALISED)
 """What a policy does with its observations."""
+LUCK = ("task.episodes_per_member", "search.pairs", "search.sigma", "policy.action_noise")
+"""What the highest fitness of a population depends on, besides what an evaluation means."""
 
 
 def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -> RunConfig:
@@ -71,17 +76,29 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
     """
     at, parts = origin.parts(generation)
     changed = {name for name, _, _ in changed_constants(origin.constants, config.constants())}
-    if any(name in OBSERVED or name.startswith("task.") for name in changed - {"task.episodes_per_member"}):
+    if any(name in OBSERVED or name.startswith("task.") for name in changed.difference(LUCK)):
         parts = without_fitness(parts)
-    elif "task.episodes_per_member" in changed:
+    elif changed.intersection(LUCK):
         parts = without_scores(parts)
+    if "search.parent_statistics" in changed and config.search.parent_statistics == "global":
+        parts = _without_own_statistics(parts)
     history = [row for row in origin.history_rows() if row["generation"] <= at]
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
     return _lineage(origin, at), Beginning(history, parts, platforms)
 
 
-def started(config: RunConfig, folder: str) -> tuple[dict[str, Any], Beginning]:
+def _without_own_statistics(parts: Mapping[str, Part]) -> dict[str, Part]:
+    """The parts of a state whose members run with the whole run's observation statistics, also those in a block that
+    began with an elite's."""
+    own = ("own_mean_O", "own_std_O")
+    return {name: {key: values for key, values in part.items() if key not in own} for name, part in parts.items()}
+
+
+def started(config: RunConfig, folder: str, tell: Callable[[str], None]) -> tuple[dict[str, Any], Beginning]:
     """What a run that starts from the newest centre of the run in `folder` records of that, and begins with.
+
+    Args:
+        tell: called with a notice where the policy will see other observations than it did.
 
     Raises:
         ConfigError: the centre is of another network.
@@ -94,13 +111,29 @@ def started(config: RunConfig, folder: str) -> tuple[dict[str, Any], Beginning]:
         )
     at, parts = origin.parts(wanted=lambda part: not part.startswith(ELITE_PREFIX))
     member, moments = origin.newest_member(at, parts), moments_from_arrays(parts["observations"])
-    enabled = origin.constants["policy.observation_normalization"]
-    if enabled and member.own_mean_O is not None and member.own_std_O is not None:
+    if not origin.constants[NORMALISED]:
+        moments = no_observations(shape.widths[0])  # its policy was never given any, though they were gathered
+    elif member.own_mean_O is not None and member.own_std_O is not None:
         # Those that its policy runs with, as if that many observations had given them.
         mean_O, std_O = member.own_mean_O.astype(np.float64), member.own_std_O.astype(np.float64)
         moments = Moments(moments.count, mean_O, moments.count * np.square(std_O))
+    if other := _seen_otherwise(origin, config):
+        tell(
+            f"search.init_from: the policy of {origin.folder} acted on other observations than this run gives it "
+            f"({other}), so it may act otherwise from generation 0 on"
+        )
     start = {"centre_D": member.centre_D, **moments_to_arrays(moments)}
     return _lineage(origin, at), Beginning(start=start)
+
+
+def _seen_otherwise(origin: Run, config: RunConfig) -> str:
+    """Which settings make the origin's policy another one; empty if none. Normalisation that begins does not: it begins
+    with no statistics."""
+    new = config.constants()
+    changed = [name for name in OBSERVED if origin.constants[name] != new[name]]
+    if new[NORMALISED] and NORMALISED in changed:
+        changed.remove(NORMALISED)
+    return ", ".join(f"{name}: {show(origin.constants[name])} -> {show(new[name])}" for name in changed)
 
 
 def _lineage(origin: Run, generation: int) -> dict[str, Any]:

@@ -169,8 +169,8 @@ def without_fitness(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, 
 
 
 def without_scores(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, Arrays]:
-    """The parts of a state in which no elite has a score: the luckiest of a population whose fitness meant another
-    number of episodes is none to compare with."""
+    """The parts of a state in which no elite has a score: the luckiest of a population of another size, or whose
+    fitness came about otherwise, is none to compare with."""
     nothing = {"score": np.asarray(np.nan)}
     return {name: {**part, **nothing} if name.startswith(CELL_PREFIX) else dict(part) for name, part in parts.items()}
 

@@ -129,6 +129,37 @@ def test_without_normalisation_no_statistics_are_used_nor_a_member_s_own(parent,
         np.testing.assert_array_equal(policy.observation_mean_O, 0.0)
         np.testing.assert_array_equal(policy.observation_std_O, 1.0)
     assert len(elites) == 1
+    kept, gone = (
+        lineage.forked(begun, lineage.fork_config(begun.folder, overrides), None)[1].parts["member_0"]
+        for overrides in ([], ["search.parent_statistics=global"])
+    )
+    assert kept.keys() - gone.keys() == {"own_mean_O", "own_std_O"}
+
+
+def test_a_start_from_a_run_that_did_not_normalise_takes_no_statistics(parent, tmp_path):
+    """Which it has gathered, and its policy never saw."""
+    told: list[str] = []
+    raw = run(tmp_path / "raw", "policy.observation_normalization=false", "budget.generations=2")
+    assert raw.parts()[1]["observations"]["count"] > 0
+
+    def start(origin, *overrides):
+        wanted = api.load_config(SMALL, [f"search.init_from={origin.folder}", *overrides])
+        found = lineage.started(wanted, str(origin.folder), told.append)[1].start
+        assert found is not None
+        return found
+
+    begun = start(raw, "policy.observation_clip=null")
+    assert (begun["count"], told) == (0.0, [])
+    np.testing.assert_array_equal(begun["centre_D"], raw.policy("centre").parameters_D)
+    assert start(parent)["count"] > 0
+    assert told == []
+    for origin, overrides, change in (
+        (raw, [], "policy.observation_clip: null -> 5.0"),
+        (parent, ["policy.observation_normalization=false"],
+         "policy.observation_clip: 5.0 -> null, policy.observation_normalization: true -> false"),
+    ):  # fmt: skip
+        start(origin, *overrides)
+        assert f"acted on other observations than this run gives it ({change})" in told.pop()
 
 
 def test_what_a_resume_has_changed_is_so_for_a_fork_and_an_evaluation(parent, tmp_path, monkeypatch):
@@ -150,16 +181,21 @@ def test_what_a_resume_has_changed_is_so_for_a_fork_and_an_evaluation(parent, tm
     assert lineage.fork_config(folder).budget.generations == 6, "as it was created"
 
 
-def test_scores_of_another_number_of_episodes_are_forgotten(tmp_path):
-    """They are the highest fitness of a population, and a mean of more episodes is less lucky."""
+def test_scores_of_a_population_that_was_luckier_or_less_are_forgotten(tmp_path):
+    """They are the highest fitness of all its members, whose number, noise and episodes decide how high that gets."""
     search = {"algorithm": "me_es", "pairs": 16, "evaluation_episodes": 4, "cell_sampling": "score"}
     parent = run(tmp_path / "parent", "budget.generations=4", config=SMALL | {"search": search})
     assert np.isfinite(parent.behaviour_map.score_N).any()
-    config = lineage.fork_config(parent.folder, ["task.episodes_per_member=3"])
-    parts = lineage.forked(parent, config, None)[1].parts
-    scores = [part["score"] for name, part in parts.items() if name.startswith(CELL_PREFIX)]
-    assert len(scores) == parent.behaviour_map.size
-    assert np.isnan(scores).all()
+    known = parent.behaviour_map.score_N
+    for override, same in (
+        ("search.learning_rate=0.1", True), ("task.episodes_per_member=3", False), ("search.pairs=32", False),
+        ("search.sigma=0.5", False), ("policy.action_noise=0", False),
+    ):  # fmt: skip
+        config = lineage.fork_config(parent.folder, [override])
+        parts = lineage.forked(parent, config, None)[1].parts
+        scores = [float(part["score"]) for name, part in parts.items() if name.startswith(CELL_PREFIX)]
+        assert len(scores) == parent.behaviour_map.size
+        np.testing.assert_array_equal(sorted(scores), sorted(known if same else known * np.nan))
 
 
 def test_fork_without_changes_goes_on_as_its_parent_would(config, finished, tmp_path):
