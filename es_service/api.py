@@ -16,20 +16,26 @@ from es_service.commands import command
 from es_service.config.changes import changed_constants, describe_changes
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
+from es_service.config.yaml_text import show
 from es_service.configs import changed_config, load_config
 from es_service.errors import ConfigError, StoreError
 from es_service.history import history_columns
 from es_service.lineage import fork_config, forked, started
+from es_service.protocol import TaskSpec
 from es_service.run_view import open_run
 from es_service.session import OnGeneration, OnNotice, Outcome, work
 from es_service.store.beginning import Beginning
-from es_service.store.folder import explained, holds_run, write_config
+from es_service.store.folder import CONFIG, explained, holds_run, write_config
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook
 from es_service.tasks import task_of
 
 RUNS_FOLDER = Path("runs")
 """Where runs go unless told otherwise, relative to the current folder."""
+
+
+_KEPT_OF_A_TASK = ("observation_size", "action_size", "descriptor_names", "has_goal")
+"""What policies and history of a run depend on."""
 
 
 def _ignore(row: Mapping[str, Any]) -> None:
@@ -83,7 +89,8 @@ def resume(
     """
 
     def changed(store: RunStore) -> RunConfig:
-        recorded = store.folder / "config.yaml"
+        # All of the file, unlike `Run.present_config`: whoever has edited a constant there is to be told, not ignored.
+        recorded = store.folder / CONFIG
         source = recorded if recorded.exists() else store.meta.config
         return changed_config(source, overrides)
 
@@ -96,7 +103,6 @@ def run_or_resume(
     *,
     on_generation: OnGeneration = _ignore,
     on_notice: OnNotice = _warn,
-    hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Start a run, or go on with it if the folder holds it already: the same call again after whatever happened.
 
@@ -106,8 +112,8 @@ def run_or_resume(
     begun = holds_run(Path(out))
     wanted = config if isinstance(config, RunConfig) else load_config(config, new=not begun)
     if not begun:
-        return run(wanted, out, on_generation=on_generation, on_notice=on_notice, hook=hook)
-    return _go_on(Path(out), lambda store: wanted, on_generation, on_notice, hook)
+        return run(wanted, out, on_generation=on_generation, on_notice=on_notice)
+    return _go_on(Path(out), lambda store: wanted, on_generation, on_notice)
 
 
 def _go_on(
@@ -115,7 +121,7 @@ def _go_on(
     make_config: Callable[[RunStore], RunConfig],
     on_generation: OnGeneration,
     on_notice: OnNotice,
-    hook: Callable[[str], None],
+    hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Open a run, make sure that the config for this session is its own, and work."""
     with RunStore.open(folder, hook=hook) as store:
@@ -125,13 +131,12 @@ def _go_on(
         store.notices.clear()
         config = make_config(store)
         if changes := changed_constants(store.meta.constants, config.constants()):
-            raise ConfigError(f"{folder}: {describe_changes(changes, str(folder))}")
-        task, sizes = task_of(config), ("observation_size", "action_size")
-        if changed := [name for name in sizes if store.meta.task[name] != getattr(task, name)]:
-            told = ", ".join(f"{name}: {store.meta.task[name]} -> {getattr(task, name)}" for name in changed)
+            raise ConfigError(f"{folder}: {describe_changes(changes, str(folder), _budget_of_a_fork(config, store))}")
+        task = task_of(config)
+        if other := _other_task(store.meta.task, task):
             raise ConfigError(
-                f"{folder}: the task {config.task.environment} is not what it was ({told}), so the run's policies "
-                "do not fit it; undo that, or start a new run"
+                f"{folder}: the task {config.task.environment} is not what it was ({other}), so what the run has kept "
+                "does not fit it; undo that, or start a new run"
             )
         if store.meta.columns != history_columns(task, config.map.enabled):
             raise StoreError(
@@ -141,8 +146,23 @@ def _go_on(
         try:
             write_config(folder, config.resolved_yaml())
         except OSError as error:
-            raise explained(error, folder, "writing config.yaml") from error
+            raise explained(error, folder, f"writing {CONFIG}") from error
         return work(config, store, on_generation, on_notice)
+
+
+def _budget_of_a_fork(config: RunConfig, store: RunStore) -> list[tuple[str, int]]:
+    """The key that a fork has to set besides those that are to change, so that there is anything left to do."""
+    wanted, done = config.budget.generations, store.generation or 0
+    if wanted is None or (wanted > done and wanted == store.meta.config["budget"]["generations"]):
+        return []
+    return [("budget.generations", wanted if wanted > done else 2 * max(1, done))]
+
+
+def _other_task(recorded: Mapping[str, Any], task: TaskSpec) -> str:
+    """Where a task, a user's that was edited, has other policies or another history than it had; empty if nowhere."""
+    present = asdict(task) | {"descriptor_names": list(task.descriptor_names)}
+    values = [(name, recorded[name], present[name]) for name in _KEPT_OF_A_TASK]
+    return ", ".join(f"{name}: {show(old)} -> {show(new)}" for name, old, new in values if old != new)
 
 
 def fork(
@@ -169,7 +189,13 @@ def fork(
     """
     config = fork_config(parent, overrides)
     lineage, beginning = forked(open_run(parent), config, generation)
-    return _create_and_work(config, out, lineage, beginning, on_generation, on_notice, hook)
+    outcome = _create_and_work(config, out, lineage, beginning, on_generation, on_notice, hook)
+    if outcome.run.generation == (begun := lineage["generation"]):
+        on_notice(
+            f"nothing was run: {outcome.reason} at generation {begun} already, where this fork begins; with a larger "
+            f"budget: {command('resume', outcome.run.folder, '--set', f'budget.generations={2 * max(1, begun)}')}"
+        )
+    return outcome
 
 
 def default_folder(config: RunConfig) -> Path:

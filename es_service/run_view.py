@@ -91,6 +91,7 @@ class Run:
     def present_config(self) -> dict[str, Any]:
         """`config` as the run would go on with it: budget, engine and time limits as they were last set.
 
+        Other edits of `config.yaml` are left aside: they are for `resume` to refuse, and no part of what the run has.
         Raises ConfigError if the folder's `config.yaml`, which has them, cannot be read.
         """
         file = self.folder / CONFIG

@@ -57,10 +57,16 @@ def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tu
     ]
 
 
-def describe_changes(changes: Sequence[tuple[str, Any, Any]], run: str = "RUN") -> str:
-    """What to tell someone whose resume would change constants of the run: all of them, and the way out."""
+def describe_changes(
+    changes: Sequence[tuple[str, Any, Any]], run: str = "RUN", besides: Sequence[tuple[str, Any]] = ()
+) -> str:
+    """What to tell someone whose resume would change constants of the run: all of them, and the way out.
+
+    Args:
+        besides: keys that a fork has to set as well, and their values.
+    """
     forkable = [(name, new) for name, _, new in changes if name not in (*STATE_KEYS, *START_KEYS) and new != ABSENT]
-    settings = [word for name, new in forkable for word in ("--set", f"{name}={show(new)}")]
+    settings = [word for name, new in (*forkable, *besides) for word in ("--set", f"{name}={show(new)}")]
     fixed = [name for name, _, _ in changes if name in (*STATE_KEYS, *START_KEYS)]
     lines = [
         "a run keeps its task, policy, search, novelty, map, seed and chunk shapes for life; this would change:",

@@ -106,6 +106,31 @@ def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkey
         lineage.fork_config(parent.folder)
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"descriptor_names": ("x", "z")}, r"descriptor_names: \[x, y\] -> \[x, z\]"),
+        ({"has_goal": False}, "has_goal: true -> false"),
+    ],
+)
+def test_a_task_with_other_columns_is_no_other_version(parent, monkeypatch, change, told):
+    for module in (configs, tasks):
+        monkeypatch.setattr(module, "TASKS", {"point_maze": replace(TASKS["point_maze"], **change)})
+    with pytest.raises(ConfigError, match=rf"the task point_maze is not what it was \({told}\)"):
+        api.resume(parent.folder, ["budget.generations=7"])
+
+
+def test_a_fork_whose_budget_is_spent_says_so(parent, tmp_path):
+    told: list[str] = []
+    forked = api.fork(parent.folder, ["search.sigma=0.1"], out=tmp_path / "fork", on_notice=told.append).run
+    assert forked.generation == 6
+    (notice,) = told
+    assert notice.startswith("nothing was run: the budget of 6 generations is spent at generation 6 already")
+    assert notice.endswith(f": es-service resume {tmp_path / 'fork'} --set budget.generations=12")
+    api.resume(forked.folder, ["budget.generations=7"], on_notice=told.append)
+    assert (forked.generation, len(told)) == (7, 1)
+
+
 @pytest.mark.parametrize("key", START_KEYS)
 def test_what_would_change_nothing_is_refused(parent, key):
     with pytest.raises(ConfigError) as caught:

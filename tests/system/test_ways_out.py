@@ -68,6 +68,21 @@ def test_a_folder_with_spaces_is_one_word_of_every_command(tmp_path, capsys):
     assert words_after(str(empty.value), "resume") == [str(tmp_path / "no generation")]
 
 
+def test_the_fork_that_a_refused_resume_names_goes_on(tmp_path):
+    """Where the run's own budget is spent, a fork with it would do nothing."""
+    folder = tmp_path / "run"
+    api.run(SMALL | {"budget": {"generations": 2}}, folder)
+    for wanted, budget in (([], 4), (["budget.generations=3"], 3)):
+        with pytest.raises(ConfigError) as refused:
+            api.resume(folder, ["search.sigma=0.3", *wanted])
+        settings = ["--set", "search.sigma=0.3", "--set", f"budget.generations={budget}"]
+        assert words_after(str(refused.value), "fork") == [str(folder), *settings]
+    (folder / "config.yaml").unlink()
+    with pytest.raises(ConfigError) as refused:
+        api.run_or_resume(SMALL | {"budget": {"env_steps": 10**6}, "seed": 1}, folder)
+    assert words_after(str(refused.value), "fork") == [str(folder), "--set", "seed=1"]
+
+
 def test_run_or_resume_goes_on_where_only_the_copy_is_left(tmp_path):
     """As a kill between the renames of a restoration leaves it."""
     folder = tmp_path / "run"
