@@ -28,6 +28,13 @@ FIELDS = {name: field for name, field in RunConfig.model_fields.items() if name 
 """Dotted key -> what it may be; the task's options, whose names are the task's, are not among them."""
 GROUPS = (*SECTIONS, OPTIONS.removesuffix("."), RESOURCES.removesuffix("."))
 """What holds keys and is no value itself."""
+ALIASES = {
+    "population": "search.pairs",
+    "popsize": "search.pairs",
+    "lr": "search.learning_rate",
+    "std": "search.sigma",
+}
+"""What others call a key of ours."""
 BUDGET = [name for name in FIELDS if name.startswith("budget.")]
 """Keys of which one must be set."""
 
@@ -56,7 +63,7 @@ def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, An
         elif name in FIELDS or group == OPTIONS:
             values[name] = value
         else:
-            problems.append(_unknown_key(name))
+            problems.append(_unknown_key(name, (*GROUPS, *FIELDS) if isinstance(value, Mapping) else FIELDS))
     return values, unusable, problems
 
 
@@ -82,7 +89,7 @@ def parse_overrides(overrides: Iterable[str]) -> tuple[dict[str, Any], list[str]
             is_word = _is_option(name) and isinstance(value, bool | int | float)  # such as off, or 10
             values[name] = text if is_word else value
         else:
-            problems.append(f"{where}: {_unknown_key(name)}")
+            problems.append(f"{where}: {_unknown_key(name, FIELDS)}")
     return values, problems
 
 
@@ -92,15 +99,20 @@ def _is_option(name: str) -> bool:
     return option not in ("", name) and "." not in option
 
 
-def _unknown_key(name: str) -> str:
-    """The message for a key that is none: the same key elsewhere, else the nearest one, else what there is."""
+def _unknown_key(name: str, candidates: Iterable[str]) -> str:
+    """The message for a key that is none: the same key elsewhere, else the nearest one, else what there is.
+
+    Args:
+        candidates: what may have been meant.
+    """
     section, _, leaf = name.rpartition(".")
-    everywhere = {_leaf(key): key for key in (*GROUPS, *FIELDS)}
-    siblings = {leaf: key for leaf, key in everywhere.items() if key.rpartition(".")[0] == section}
-    for keys in ({leaf: everywhere[leaf]} if leaf in everywhere else {}, siblings, everywhere):
+    everywhere = {_leaf(key): key for key in candidates}
+    near_by = {leaf: key for leaf, key in everywhere.items() if key.rpartition(".")[0] == section}
+    exactly = everywhere | ALIASES
+    for keys in ({leaf: exactly[leaf]} if leaf in exactly else {}, near_by, everywhere):
         if near := get_close_matches(leaf, keys, n=1):
             return f"{name}: unknown key; did you mean {keys[near[0]]}?"
-    if siblings:
+    if siblings := [_leaf(key) for key in (*GROUPS, *FIELDS) if key.rpartition(".")[0] == section]:
         return f"{name}: unknown key; {section or 'the top level'} has {', '.join(siblings)}"
     return f"{name}: unknown key; the sections are {', '.join(SECTIONS)}"
 
