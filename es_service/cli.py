@@ -163,6 +163,7 @@ def evaluate(
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="Every elite of the map.")] = False,
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="Fresh episodes of each.")] = 100,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Which fresh episodes.")] = 0,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Also write the rows to this CSV file.")] = None,
 ) -> None:
@@ -181,7 +182,8 @@ def evaluate(
         every=every,
     )
     with csv_file(out, print_note) as write:
-        print_evaluations(console, found, evaluation.evaluate(found, chosen, episodes, workers), write, every=every)
+        results = evaluation.evaluate(found, chosen, episodes, workers, seed)
+        print_evaluations(console, found, results, write, every=every)
 
 
 @app.command()

@@ -1,7 +1,8 @@
 """`es-service evaluate`: fresh episodes for policies that a run has kept, beside what the run believed of them.
 
 An elite, or a best centre, is the highest of many noisy means: part of its fitness is luck. Episodes that selection has
-never seen tell how much. Every policy gets the same fresh episodes, and the same command again gets them too.
+never seen tell how much. Every policy gets the same fresh episodes, and the same command again gets them too;
+another seed makes others.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from es_service.signals import stop_on_signals
 from es_service.tasks import task_of
 
 FRESH_GENERATION = 2**40
-"""Of the resets of fresh episodes; no run counts so far."""
+"""Of the resets of fresh episodes with seed 0; no run counts so far."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +110,13 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
     return found
 
 
-def evaluate(run: Run, chosen: Sequence[Candidate], episodes: int, workers: int | None = None) -> Iterator[Fresh]:
+def evaluate(
+    run: Run, chosen: Sequence[Candidate], episodes: int, workers: int | None = None, seed: int = 0
+) -> Iterator[Fresh]:
     """Fresh episodes without noise for each candidate, on this machine: results one by one, in order.
+
+    Args:
+        seed: which fresh episodes, as wide as a run's.
 
     Raises EvaluationError where rollouts cannot go on; Interrupted when asked to stop.
     """
@@ -122,7 +128,7 @@ def evaluate(run: Run, chosen: Sequence[Candidate], episodes: int, workers: int 
         inline_engine(worker_spec(config, task_of(config)), scheduling_policy(config), should_stop) as engine,
     ):
         for candidate in chosen:
-            fitness_E, descriptor_E_B = _episodes(engine, candidate.policy, config.search.sigma, episodes)
+            fitness_E, descriptor_E_B = _episodes(engine, candidate.policy, config.search.sigma, episodes, seed)
             mean_B = descriptor_E_B.mean(axis=0, dtype=np.float64)
             cell = None
             if geometry is not None and np.isfinite(mean_B).all():
@@ -130,7 +136,8 @@ def evaluate(run: Run, chosen: Sequence[Candidate], episodes: int, workers: int 
             yield Fresh(candidate, fitness_E, descriptor_E_B, cell)
 
 
-def _episodes(engine: Evaluator, policy: Policy, sigma: float, count: int) -> tuple[FloatArray, FloatArray]:
-    centre = Centre(FRESH_GENERATION, policy.parameters_D, sigma, policy.observation_mean_O, policy.observation_std_O)
+def _episodes(engine: Evaluator, policy: Policy, sigma: float, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    mean_O, std_O = policy.observation_mean_O, policy.observation_std_O
+    centre = Centre(FRESH_GENERATION + seed, policy.parameters_D, sigma, mean_O, std_O)
     result = evaluate_centre(engine, centre, count)
     return result.fitness, result.descriptor

@@ -23,7 +23,6 @@ from es_service.config.resolution import (
 )
 from es_service.config.yaml_text import dump_yaml, parse_value
 from es_service.errors import ConfigError
-from es_service.tasks import TASKS as ALL_TASKS
 from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS, load
 
 # What a config resolves to

@@ -12,32 +12,31 @@ from es_service.config.loading import load_config
 from es_service.config.model import worker_spec
 from es_service.config.presets import preset_values
 from es_service.config.resolution import config_warnings
-from es_service.tasks import Tasks
+from es_service.tasks import TASKS
 
-ALL_TASKS = Tasks()
 CONFIGS = Path(__file__).parents[2] / "configs"
 EACH = pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
 
 
 @EACH
 def test_shipped_configs_load_and_are_named_after_task_and_algorithm(path):
-    config = load_config(path, tasks=ALL_TASKS, algorithms=ALGORITHMS)
+    config = load_config(path, tasks=TASKS, algorithms=ALGORITHMS)
     assert path.stem == f"{config.task.environment.replace(':', '_')}_{config.search.algorithm}"
-    assert config_warnings(config, ALL_TASKS[config.task.environment]) == []
+    assert config_warnings(config, TASKS[config.task.environment]) == []
 
 
 @EACH
 def test_shipped_configs_hide_no_preset_key(path):
     """But the size of the population: or `--set search.preset=uber` would do nothing."""
     uber = preset_values("uber") | {"search.pairs": 64}
-    config = load_config(path, ["search.preset=uber"], tasks=ALL_TASKS, algorithms=ALGORITHMS)
+    config = load_config(path, ["search.preset=uber"], tasks=TASKS, algorithms=ALGORITHMS)
     assert config.constants().items() >= uber.items()
 
 
 @EACH
 def test_comments_of_shipped_configs_say_the_numbers_that_are_used(path):
-    config = load_config(path, tasks=ALL_TASKS, algorithms=ALGORITHMS)
-    spec, compute = worker_spec(config, ALL_TASKS[config.task.environment]), config.compute
+    config = load_config(path, tasks=TASKS, algorithms=ALGORITHMS)
+    spec, compute = worker_spec(config, TASKS[config.task.environment]), config.compute
     said = dict(re.findall(r"^ *(\w+):.*?# (.*)$", path.read_text(), re.MULTILINE))
     inputs, *_, outputs = spec.policy.widths
     assert f" {inputs} observations -> {outputs} actions " in said["policy"]

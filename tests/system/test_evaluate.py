@@ -86,3 +86,8 @@ def test_fresh_episodes_differ_from_those_that_chose(tmp_path):
     again = tmp_path / "again.csv"
     command("evaluate", luck.folder, "--all", "--episodes", 32, "--out", again, "--workers", 1)
     assert again.read_text() == rows.read_text()
+    other = tmp_path / "other.csv"
+    command("evaluate", luck.folder, "--all", "--episodes", 32, "--out", other, "--seed", 2**63 - 1)
+    fitness = pd.read_csv(other)["fresh_fitness"]
+    assert (fitness != table["fresh_fitness"]).all()
+    assert ((fitness - table["fresh_fitness"]).abs() / table["fresh_standard_error"]).median() < 5
