@@ -5,21 +5,21 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from typing import Any
 
 from rich.console import Console
 
 from es_service.commands import command
-from es_service.report.progress import plain_line
+from es_service.report.progress import Row, plain_line
 from es_service.run_view import Run
 from es_service.store.lock import lock_holder
+from es_service.store.reader import read_newest, read_totals
 
 FOLLOW_INTERVAL_S = 1.0
 
 
 def print_status(console: Console, run: Run) -> None:
     """Settings, progress, best result, who is writing."""
-    rows = run.history_rows()
+    newest = read_newest(run.folder)
     constants, parent, holder = run.constants, run.meta.parent, lock_holder(run.folder)
     fields = {
         "run": str(run.folder),
@@ -29,7 +29,7 @@ def print_status(console: Console, run: Run) -> None:
     if parent:
         fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
     fields["driver"] = f"running on {holder['host']}, pid {holder['pid']}" if holder else "none is running"
-    _print_fields(console, fields | (_progress(rows) if rows else {"generation": "none is finished yet"}))
+    _print_fields(console, fields | (_progress(run, newest) if newest else {"generation": "none is finished yet"}))
 
 
 def follow_status(console: Console, run: Run) -> None:
@@ -37,10 +37,10 @@ def follow_status(console: Console, run: Run) -> None:
     next_generation = 0
     while True:
         running = lock_holder(run.folder) is not None  # asked before reading, so that the last rows are not missed
-        rows = run.history_rows(next_generation)
-        if rows:
-            next_generation = rows[-1]["generation"] + 1
-            console.print(plain_line(rows[-1]), highlight=False, soft_wrap=True)
+        newest = read_newest(run.folder)
+        if newest and newest["generation"] >= next_generation:
+            next_generation = newest["generation"] + 1
+            console.print(plain_line(newest), highlight=False, soft_wrap=True)
         if not running:
             _print_line(console, f"no driver is running; go on with: {command('resume', run.folder)}")
             return
@@ -49,10 +49,11 @@ def follow_status(console: Console, run: Run) -> None:
 
 def print_summary(console: Console, run: Run, reason: str) -> None:
     """What a session ends with: the result, the folder, the next commands."""
-    rows = run.history_rows()
-    folder, twice = run.folder, ("--set", f"budget.generations={max(1, rows[-1]['generation']) * 2}")
+    newest = read_newest(run.folder)
+    assert newest is not None, "a session ends after a generation"
+    folder, twice = run.folder, ("--set", f"budget.generations={max(1, newest['generation']) * 2}")
     _print_line(console, f"\nDone: {reason}.")
-    _print_fields(console, _progress(rows))
+    _print_fields(console, _progress(run, newest))
     _print_line(console, f"\nThe run is in {folder}. Next:")
     program = "es-service" if shutil.which("es-service") else sys.argv[0]  # `make run` has it in .venv/bin only
     for words in (
@@ -65,8 +66,7 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
         _print_line(console, f"  {command(*words, program=program)}")
 
 
-def _progress(rows: list[dict[str, Any]]) -> dict[str, str]:
-    last = rows[-1]
+def _progress(run: Run, last: Row) -> dict[str, str]:
     goal = {}
     if "goal_distance" in last:
         goal["goal distance"] = f"{last['goal_distance']:.3f} at the end, {last['goal_distance_min']:.3f} at its least"
@@ -74,7 +74,7 @@ def _progress(rows: list[dict[str, Any]]) -> dict[str, str]:
     if "map_cells" in last:
         filled["map"] = f"{last['map_cells']:,} cells, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
-    lost, retries = (sum(row[name] for row in rows) for name in ("lost_workers", "retries"))
+    lost, retries = read_totals(run.folder, ("lost_workers", "retries"))
     faults = {}
     if lost or retries:
         faults["faults survived"] = f"{lost} workers replaced, {retries} chunks handed out again"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from es_service.errors import StoreError
 from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict, row_sha256, text_sha256
 from es_service.store.folder import COPY, DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.lock import lock_holder
-from es_service.store.schema import Damaged, RunMeta, history_select, load_meta
+from es_service.store.schema import Damaged, RunMeta, history_select, load_meta, quoted
 from es_service.store.verify import KeptRows, is_no_damage, rows_in_force, state_in_force
 
 _BUSY_S = 5.0
@@ -91,31 +91,60 @@ def read_generation(folder: Path) -> int | None:
         return connection.execute("SELECT max(generation) FROM history").fetchone()[0]
 
 
-def read_history(folder: Path, since_generation: int | None = None) -> list[dict[str, int | float]]:
+def read_history(
+    folder: Path, since_generation: int | None = None, limit: int | None = None
+) -> list[dict[str, int | float]]:
     """History rows in order, from `since_generation` on (itself included; all if None); NaN where there is no value.
+
+    Args:
+        limit: at most so many of them.
 
     Raises StoreError for a row that is missing or does not match its SHA-256.
     """
     with reading(folder) as (connection, meta):
-        first = max(since_generation or 0, 0)
-        query = history_select(meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation"
-        columns = column_bytes(meta.columns)
-        rows: list[dict[str, int | float]] = []
-        for *values, state, sha256 in connection.execute(query, (first,)):
-            row = tuple(values)
-            named = row_dict(meta.columns, row)
-            try:
-                sound = row_sha256(columns, row, str(state)) == sha256
-            except ValueError:
-                sound = False
-            if not sound or named["generation"] != first + len(rows):
-                raise Damaged(f"the history row of generation {first + len(rows)} is damaged or missing")
-            rows.append(named)
-        # Damage can hide the end of a table from SQLite itself; every generation has state rows, too.
-        newest = connection.execute("SELECT max(generation) FROM state").fetchone()[0]
-        if newest is not None and newest >= first + len(rows):
-            raise Damaged(f"the history after generation {first + len(rows) - 1} is missing; the state is of {newest}")
-        return rows
+        return _sound_rows(connection, meta, max(since_generation or 0, 0), limit)
+
+
+def read_newest(folder: Path) -> dict[str, int | float] | None:
+    """The newest history row, at the same cost however many there are; None before the first generation.
+
+    Raises StoreError if it is missing or does not match its SHA-256.
+    """
+    with reading(folder) as (connection, meta):
+        newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
+        rows = _sound_rows(connection, meta, newest or 0)
+        return rows[-1] if rows else None
+
+
+def read_totals(folder: Path, names: Sequence[str]) -> list[int | float]:
+    """Sums of some columns over the whole history, which is not checked for it, nor held in memory."""
+    sums = ", ".join(f"coalesce(sum(history.{quoted(name)}), 0)" for name in names)
+    with reading(folder) as (connection, _):
+        return list(connection.execute(f"SELECT {sums} FROM history").fetchone())
+
+
+def _sound_rows(
+    connection: sqlite3.Connection, meta: RunMeta, first: int, limit: int | None = None
+) -> list[dict[str, int | float]]:
+    """History rows from generation `first` on. Raises Damaged for one that is missing or is not as it was stored."""
+    query = history_select(meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation LIMIT ?"
+    columns = column_bytes(meta.columns)
+    rows: list[dict[str, int | float]] = []
+    for *values, state, sha256 in connection.execute(query, (first, -1 if limit is None else limit)):
+        row = tuple(values)
+        named = row_dict(meta.columns, row)
+        try:
+            sound = row_sha256(columns, row, str(state)) == sha256
+        except ValueError:
+            sound = False
+        if not sound or named["generation"] != first + len(rows):
+            raise Damaged(f"the history row of generation {first + len(rows)} is damaged or missing")
+        rows.append(named)
+    # Damage can hide the end of a table from SQLite itself; every generation has state rows, too.
+    newest = connection.execute("SELECT max(generation) FROM state").fetchone()[0]
+    if newest is not None and newest >= first + len(rows) and len(rows) != limit:
+        raise Damaged(f"the history after generation {first + len(rows) - 1} is missing; the state is of {newest}")
+    return rows
 
 
 def read_parts(

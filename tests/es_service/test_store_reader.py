@@ -12,7 +12,15 @@ import pytest
 from es_service.errors import StoreError
 from es_service.store import reader as store_reader
 from es_service.store import schema as store_schema
-from es_service.store.reader import read_generation, read_history, read_meta, read_parts, read_platforms
+from es_service.store.reader import (
+    read_generation,
+    read_history,
+    read_meta,
+    read_newest,
+    read_parts,
+    read_platforms,
+    read_totals,
+)
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     advance,
@@ -30,6 +38,8 @@ def test_readers_follow_a_writer(tmp_path):
     folder = tmp_path / "run"
     with create(folder) as run:
         assert read_history(folder) == []
+        assert read_newest(folder) is None
+        assert read_totals(folder, ["env_steps"]) == [0]
         with pytest.raises(StoreError, match="no generation yet"):
             read_parts(folder)
         for generation in range(5):
@@ -37,6 +47,12 @@ def test_readers_follow_a_writer(tmp_path):
             assert read_generation(folder) == generation
             assert_same_history(read_history(folder), generation + 1)
             assert [row["generation"] for row in read_history(folder, 3)] == list(range(3, generation + 1))
+            assert [row["generation"] for row in read_history(folder, 1, limit=2)] == [1, 2][:generation]
+            assert read_newest(folder) == pytest.approx(read_history(folder)[-1], nan_ok=True)
+            rows = read_history(folder)
+            assert read_totals(folder, ["env_steps", "seconds_rollout"]) == [
+                sum(row[name] for row in rows) for name in ("env_steps", "seconds_rollout")
+            ]
             assert_same_state(read_parts(folder)[1], state_at(generation))
 
 
@@ -119,3 +135,22 @@ def test_history_that_ends_before_the_state_is_noticed(tmp_path):
     for since in (None, 3, 4):
         with pytest.raises(StoreError, match="the history after generation 3 is missing"):
             read_history(folder, since)
+    assert len(read_history(folder, 1, limit=3)) == 3, "those are there"
+    with pytest.raises(StoreError, match="the history after generation 3 is missing"):
+        read_history(folder, 1, limit=4)
+
+
+def test_the_newest_row_is_checked_alone(tmp_path):
+    """What says where a run stands must not take the longer the longer it has been running."""
+    folder = finished(tmp_path / "run", 6)
+    for generation, problem in ((2, None), (5, "the history row of generation 5 is damaged")):
+        with contextlib.closing(sqlite3.connect(folder / "run.db")) as connection:
+            connection.execute("UPDATE history SET seconds_rollout = 99 WHERE generation = ?", (generation,))
+            connection.commit()
+        with pytest.raises(StoreError, match=problem) if problem else contextlib.nullcontext():
+            read_newest(folder)
+    with contextlib.closing(sqlite3.connect(folder / "run.db")) as connection:
+        connection.execute("DELETE FROM history WHERE generation = 5")
+        connection.commit()
+    with pytest.raises(StoreError, match="the history after generation 4 is missing"):
+        read_newest(folder)
