@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,8 @@ OBSERVED = ("policy.observation_clip", NORMALISED)
 """What a policy does with its observations."""
 LUCK = ("task.episodes_per_member", "search.pairs", "search.sigma", "policy.action_noise")
 """What the highest fitness of a population depends on, besides what an evaluation means."""
+ROWS_AT_ONCE = 4096
+"""Of a history, in memory."""
 
 
 def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -> RunConfig:
@@ -82,9 +84,15 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
         parts = without_scores(parts)
     if "search.parent_statistics" in changed and config.search.parent_statistics == "global":
         parts = _without_own_statistics(parts)
-    history = [row for row in origin.history_rows() if row["generation"] <= at]
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
-    return _lineage(origin, at), Beginning(history, parts, platforms)
+    return _lineage(origin, at), Beginning(_history(origin, at), parts, platforms, newest=at)
+
+
+def _history(origin: Run, newest: int) -> Iterator[dict[str, int | float]]:
+    """Rows up to a generation, some at a time: all of a long run's do not fit into memory, and a driver at work cannot
+    end its log while it is being read."""
+    for first in range(0, newest + 1, ROWS_AT_ONCE):
+        yield from reader.read_history(origin.folder, first, min(ROWS_AT_ONCE, newest + 1 - first))
 
 
 def _without_own_statistics(parts: Mapping[str, Part]) -> dict[str, Part]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,20 +35,22 @@ _START = "start"
 class Beginning:
     """What to begin with; empty for an ordinary run."""
 
-    history: Sequence[Mapping[str, int | float | None]] = ()
-    """A fork's parent's rows of generations 0, 1, ... n. Columns this run does not have are left out, those that the
-    parent did not have are empty."""
+    history: Iterable[Mapping[str, int | float | None]] = ()
+    """A fork's parent's rows of generations 0, 1, ... n, gone through once: they need not fit into memory. Columns this
+    run does not have are left out, those that the parent did not have are empty."""
     parts: Mapping[str, Part] = field(default_factory=dict)
     """The state of generation n."""
     platforms: Sequence[tuple[int, dict[str, Any]]] = ()
     """(first generation, platform) of the parent, up to n."""
     start: Part | None = None
     """Arrays that generation 0 is to start from; `RunStore.start` gives them back."""
+    newest: int = -1
+    """n."""
 
 
 def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Beginning) -> None:
     """Write `beginning` into the database of a new run, in one transaction."""
-    newest = len(beginning.history) - 1
+    newest = beginning.newest
     connection.execute("BEGIN IMMEDIATE")
     in_force: dict[str, tuple[int, str]] = {}
     for part, arrays in beginning.parts.items():

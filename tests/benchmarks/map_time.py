@@ -109,7 +109,7 @@ def fill(place: Path, *case: Any) -> None:
         parts = filled(parts, policy_shape(config, search.task).parameters, search.task.observation_size)
     columns = history_columns(search.task, config.map.enabled)
     meta = RunMeta("benchmark", "", config.model_dump(mode="json"), config.constants(), asdict(search.task), columns)
-    beginning = Beginning(history=[memory.rows[0]], parts=parts)
+    beginning = Beginning(history=[memory.rows[0]], parts=parts, newest=0)
     RunStore.create(place, config.resolved_yaml(), meta, beginning).close()
 
 

@@ -224,7 +224,7 @@ def test_the_log_is_emptied_by_bytes_and_by_time(tmp_path, monkeypatch):
 def test_a_fork_begins_with_its_parent_s_history_and_state(tmp_path):
     history = [history_row(generation) for generation in range(4)]
     platforms = [(0, {"jax": "1"}), (2, {"jax": "2"})]
-    beginning = Beginning(history, state_at(3), platforms)
+    beginning = Beginning(iter(history), state_at(3), platforms, newest=3)
     with RunStore.create(tmp_path / "run", CONFIG_YAML, meta(), beginning) as run:
         assert run.generation == 3
         assert run.start is None
@@ -242,7 +242,7 @@ def test_a_fork_s_columns_are_its_own(tmp_path):
     """A newer version may have more columns than the parent's run, or fewer."""
     history = [{**history_row(0), "gone": 1.0}]
     del history[0]["goal_distance"]
-    with RunStore.create(tmp_path / "run", CONFIG_YAML, meta(), Beginning(history, state_at(0))) as run:
+    with RunStore.create(tmp_path / "run", CONFIG_YAML, meta(), Beginning(history, state_at(0), newest=0)) as run:
         advance(run, 2)
     first = read_history(tmp_path / "run")[0]
     assert math.isnan(first["goal_distance"])

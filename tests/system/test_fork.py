@@ -20,6 +20,7 @@ from es_service.digest import digest_at
 from es_service.errors import ConfigError
 from es_service.maps.behaviour_map import CELL_PREFIX
 from es_service.session import scheduling_policy
+from es_service.store import reader
 from es_service.store.reader import read_generation
 from tests.system.command_line import digest, es
 from tests.system.session import ROOT, SMALL, finish
@@ -204,6 +205,22 @@ def test_what_a_resume_has_changed_is_so_for_a_fork_and_an_evaluation(parent, tm
     assert seen[0].compute.compile_timeout_s == 77.0
     recorded.unlink()
     assert lineage.fork_config(folder).budget.generations == 6, "as it was created"
+
+
+def test_a_history_comes_along_in_pieces(parent, tmp_path, monkeypatch):
+    """All at once, that of a night takes gigabytes."""
+    monkeypatch.setattr(lineage, "ROWS_AT_ONCE", 4)
+    read = reader.read_history
+    lengths = []
+
+    def counted(*arguments):
+        lengths.append(len(rows := read(*arguments)))
+        return rows
+
+    monkeypatch.setattr(reader, "read_history", counted)
+    child = fork(parent, tmp_path / "fork")
+    assert lengths == [4, 3]
+    assert child.digest() == parent.digest()
 
 
 def test_scores_of_a_population_that_was_luckier_or_less_are_forgotten(tmp_path):
