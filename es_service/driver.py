@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service import budget as budgets
 from es_service.algorithms.base import Algorithm, Judgement, Member, SearchState
 from es_service.algorithms.me_es import restarted
 from es_service.algorithms.steps import first_state
@@ -129,16 +130,14 @@ def stored_state(store: Stored, task: TaskSpec) -> RunState | None:
 
 
 def spent(budget: BudgetConfig, state: RunState) -> str | None:
-    """Why the run is over, or None if it is not. Budgets are checked between generations, so steps may overshoot."""
-    if budget.generations is not None and state.generation >= budget.generations:
-        return f"the budget of {budget.generations:,} generations is spent"
-    if budget.env_steps is not None and state.env_steps >= budget.env_steps:
-        return f"the budget of {budget.env_steps:,} environment steps is spent"
-    if budget.wall_clock_s is not None and state.wall_clock_s >= budget.wall_clock_s:
-        return f"the budget of {budget.wall_clock_s:g} s is spent"
-    if budget.target_fitness is not None and state.best.fitness >= budget.target_fitness:
-        return f"the target fitness {budget.target_fitness:g} is reached"
-    return None
+    """Why the run is over, or None if it is not."""
+    reached = {
+        "generation": state.generation,
+        "env_steps": state.env_steps,
+        "wall_clock_s": state.wall_clock_s,
+        "best_fitness": state.best.fitness,
+    }
+    return next(iter(budgets.spent(budgets.limits_of(budget), reached).values()), None)
 
 
 def _first_generation(

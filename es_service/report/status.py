@@ -9,18 +9,18 @@ import time
 from rich.console import Console
 
 from es_service.commands import command
-from es_service.report.progress import Row, plain_line
+from es_service.report.progress import plain_line
+from es_service.report.standing import Standing, look, more, state, way_on
 from es_service.run_view import Run
-from es_service.store.lock import lock_holder
-from es_service.store.reader import read_newest, read_totals
+from es_service.store.reader import read_totals
 
 FOLLOW_INTERVAL_S = 1.0
 
 
 def print_status(console: Console, run: Run) -> None:
-    """Settings, progress, best result, who is writing."""
-    newest = read_newest(run.folder)
-    constants, parent, holder = run.constants, run.meta.parent, lock_holder(run.folder)
+    """Settings, progress, best result, whether it is running or over."""
+    standing = look(run)
+    constants, parent = run.constants, run.meta.parent
     fields = {
         "run": str(run.folder),
         "task": f"{constants['task.environment']}, {constants['task.episode_steps']} steps an episode",
@@ -28,45 +28,45 @@ def print_status(console: Console, run: Run) -> None:
     }
     if parent:
         fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
-    fields["driver"] = f"running on {holder['host']}, pid {holder['pid']}" if holder else "none is running"
-    _print_fields(console, fields | (_progress(run, newest) if newest else {"generation": "none is finished yet"}))
+    fields["state"] = state(standing) if standing.driver else f"{state(standing)}; go on with: {way_on(standing)}"
+    _print_fields(console, fields | _progress(standing))
 
 
 def follow_status(console: Console, run: Run) -> None:
     """Print a line for the newest generation, at most one a second, until no driver is running."""
     next_generation = 0
     while True:
-        running = lock_holder(run.folder) is not None  # asked before reading, so that the last rows are not missed
-        newest = read_newest(run.folder)
-        if newest and newest["generation"] >= next_generation:
-            next_generation = newest["generation"] + 1
-            console.print(plain_line(newest), highlight=False, soft_wrap=True)
-        if not running:
-            _print_line(console, f"no driver is running; go on with: {command('resume', run.folder)}")
+        standing = look(run)
+        if standing.row and standing.row["generation"] >= next_generation:
+            next_generation = standing.row["generation"] + 1
+            console.print(plain_line(standing.row), highlight=False, soft_wrap=True)
+        if not standing.driver:
+            _print_line(console, f"no driver is running: {state(standing)}; go on with: {way_on(standing)}")
             return
         time.sleep(FOLLOW_INTERVAL_S)
 
 
 def print_summary(console: Console, run: Run, reason: str) -> None:
     """What a session ends with: the result, the folder, the next commands."""
-    newest = read_newest(run.folder)
-    assert newest is not None, "a session ends after a generation"
-    folder, twice = run.folder, ("--set", f"budget.generations={max(1, newest['generation']) * 2}")
+    standing, folder = look(run), run.folder
     _print_line(console, f"\nDone: {reason}.")
-    _print_fields(console, _progress(run, newest))
+    _print_fields(console, _progress(standing))
     _print_line(console, f"\nThe run is in {folder}. Next:")
     program = "es-service" if shutil.which("es-service") else sys.argv[0]  # `make run` has it in .venv/bin only
     for words in (
         ("status", folder),
         ("evaluate", folder),
         ("digest", folder),
-        ("resume", folder, *twice),
-        ("fork", folder, "--set", f"search.sigma={run.constants['search.sigma'] * 2:g}", *twice),
+        ("resume", folder, *more(standing)),
+        ("fork", folder, "--set", f"search.sigma={run.constants['search.sigma'] * 2:g}", *more(standing)),
     ):
         _print_line(console, f"  {command(*words, program=program)}")
 
 
-def _progress(run: Run, last: Row) -> dict[str, str]:
+def _progress(standing: Standing) -> dict[str, str]:
+    last, limits = standing.row, standing.limits
+    if last is None:
+        return {"generation": "none is finished yet"}
     goal = {}
     if "goal_distance" in last:
         goal["goal distance"] = f"{last['goal_distance']:.3f} at the end, {last['goal_distance_min']:.3f} at its least"
@@ -74,20 +74,22 @@ def _progress(run: Run, last: Row) -> dict[str, str]:
     if "map_cells" in last:
         filled["map"] = f"{last['map_cells']:,} cells, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
-    lost, retries = read_totals(run.folder, ("lost_workers", "retries"))
+    lost, retries = read_totals(standing.run.folder, ("lost_workers", "retries"))
     faults = {}
     if lost or retries:
         faults["faults survived"] = f"{lost} workers replaced, {retries} chunks handed out again"
+    of = {key: f" of {limit:,}" for key, limit in limits.items()}
+    target = f" (target: {limits['target_fitness']:g})" if "target_fitness" in limits else ""
     return {
-        "generation": str(last["generation"]),
-        "best fitness": f"{last['best_fitness']:.2f}",
+        "generation": f"{last['generation']:,}{of.get('generations', '')}",
+        "best fitness": f"{last['best_fitness']:.2f}{target}",
         "centre fitness": f"{last['centre_fitness_mean']:.2f} ± {last['centre_fitness_std']:.2f}",
         **goal,
         **filled,
         "novelty archive": f"{last['archive_size']:,} centres",
         "weight of fitness": f"{last['fitness_weight']:g} (novelty: {1.0 - last['fitness_weight']:g})",
-        "environment steps": f"{last['env_steps']:,} in {last['episodes']:,} episodes",
-        "time": f"{last['wall_clock_s']:.1f} s, {rate:,.0f} steps/s overall",
+        "environment steps": f"{last['env_steps']:,}{of.get('env_steps', '')} in {last['episodes']:,} episodes",
+        "time": f"{last['wall_clock_s']:.1f}{of.get('wall_clock_s', '')} s, {rate:,.0f} steps/s overall",
         **faults,
     }
 

@@ -6,8 +6,10 @@ import pytest
 from rich.console import Console
 
 from es_service import api
+from es_service.report.standing import Standing, look, more, state
 from es_service.report.status import follow_status, print_status, print_summary
 from es_service.store import reader
+from es_service.store.lock import acquire_lock
 from tests.system.session import SMALL
 
 
@@ -33,3 +35,83 @@ def test_of_a_long_history_only_the_newest_row_is_read(run, console, monkeypatch
     follow_status(console, run)
     print_summary(console, run, "")
     assert "\ngeneration 5 " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("budget", "spent", "options"),
+    [
+        ({"generations": 3}, "generations is spent", {"budget.generations=6"}),
+        ({"env_steps": 6000, "generations": 90}, "steps is spent", {"budget.env_steps=12000"}),
+        ({"env_steps": 10}, "steps is spent", {"budget.env_steps=1200"}),
+        ({"wall_clock_s": 1e-6}, "s is spent", None),
+        ({"target_fitness": -1e9, "generations": 4}, "is reached", {"budget.target_fitness=null"}),
+        ({"target_fitness": -1e9}, "is reached", {"budget.target_fitness=null", "budget.generations=2"}),
+    ],
+)
+def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, capsys):
+    """With more of the budget that is spent: more of another one would change nothing."""
+    run = api.run(SMALL | {"budget": budget}, tmp_path / "run").run
+    print_summary(console, run, "")
+    print_status(console, run)
+    printed = capsys.readouterr().out
+    suggested = more(look(run))
+    assert f"state              finished: the {'target' if 'reached' in spent else 'budget'}" in printed
+    assert spent in printed
+    assert printed.count(f"resume {run.folder} {' '.join(suggested)}") == 2
+    assert suggested[::2] == ["--set"] * len(suggested[1::2])
+    assert options is None or set(suggested[1::2]) == options
+    before = run.generation or 0
+    assert (api.resume(run.folder, suggested[1::2]).run.generation or 0) > before
+
+
+def test_budgets_are_shown_beside_what_is_reached(run, console, capsys):
+    api.resume(run.folder, ["budget.env_steps=1_000_000", "budget.target_fitness=-1.5", "budget.wall_clock_s=600"])
+    print_status(console, run)
+    printed = capsys.readouterr().out
+    assert "\ngeneration         5 of 5\n" in printed
+    assert " of 1,000,000 in " in printed
+    assert "(target: -1.5)" in printed
+    assert " of 600.0 s, " in printed
+
+
+def test_stopped_and_running(run, console, capsys):
+    api.resume(run.folder, ["budget.generations=5", "budget.wall_clock_s=1e9"])
+    config = run.folder / "config.yaml"
+    text = config.read_text()
+    config.write_text(text.replace("generations: 5", "generations: 8000"))  # as a driver leaves it that was killed
+    print_status(console, run)
+    assert (
+        f"stopped before its budget is spent; go on with: es-service resume {run.folder}\n" in capsys.readouterr().out
+    )
+    lock = acquire_lock(run.folder)
+    print_status(console, run)
+    lock.release()
+    assert "state              running on " in (printed := capsys.readouterr().out)
+    assert " to go\n" in printed
+    assert "\ngeneration         5 of 8,000\n" in printed
+    config.write_text(text)
+
+
+def test_time_to_go_is_that_of_the_budget_that_is_spent_first(run):
+    row = {"generation": 100, "env_steps": 10**6, "wall_clock_s": 3600.0, "best_fitness": 0.0}
+
+    def running(limits):
+        return state(Standing(run, {"host": "a", "pid": 1}, row, limits))
+
+    assert running({}) == running({"target_fitness": 1.0}) == "running on a, pid 1"
+    assert running({"generations": 500}) == "running on a, pid 1; about 4 h to go"
+    assert running({"generations": 500, "env_steps": 1_500_000}) == "running on a, pid 1; about 30 min to go"
+    assert running({"wall_clock_s": 3610.0}) == "running on a, pid 1; about 10 s to go"
+
+
+@pytest.mark.parametrize("budget", ["budget: {generations: many}", "budget: 3", "[", "budget: null"])
+def test_a_config_that_cannot_be_read_is_told_of_and_hides_nothing(run, console, budget, capsys):
+    config = run.folder / "config.yaml"
+    text = config.read_text()
+    config.write_text(budget)
+    print_status(console, run)
+    print_summary(console, run, "")
+    config.write_text(text)
+    printed = capsys.readouterr().out
+    assert f"stopped, and its budget cannot be read: {config}" in printed
+    assert printed.count("best fitness ") == 2

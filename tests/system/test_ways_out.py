@@ -44,7 +44,7 @@ def test_a_folder_with_spaces_is_one_word_of_every_command(tmp_path, capsys):
     assert [shlex.split(line)[1:3] for line in commands] == [
         [verb, str(folder)] for verb in ("status", "evaluate", "digest", "resume", "fork")
     ]
-    assert words_after(printed.splitlines()[-1], "resume") == [str(folder)]
+    assert words_after(printed.splitlines()[-1], "resume") == [str(folder), "--set", "budget.generations=2"]
     assert words_after(describe_changes([("seed", 0, 1)], str(folder)), "fork") == [str(folder), "--set", "seed=1"]
     lock = acquire_lock(folder)
     with pytest.raises(StoreError) as locked:

@@ -1,0 +1,37 @@
+"""When a run is over: its budget against how far it has come."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from es_service.config.model import BudgetConfig
+
+REACHED = {
+    "generations": "generation",
+    "env_steps": "env_steps",
+    "wall_clock_s": "wall_clock_s",
+    "target_fitness": "best_fitness",
+}
+"""The column of the history that each key of the budget limits."""
+_REASONS = {
+    "generations": "the budget of {:,} generations is spent",
+    "env_steps": "the budget of {:,} environment steps is spent",
+    "wall_clock_s": "the budget of {:g} s is spent",
+    "target_fitness": "the target fitness {:g} is reached",
+}
+
+
+def limits_of(budget: BudgetConfig) -> dict[str, float]:
+    """What is set, by key."""
+    return {key: limit for key in REACHED if (limit := getattr(budget, key)) is not None}
+
+
+def spent(limits: Mapping[str, float], row: Mapping[str, float]) -> dict[str, str]:
+    """Why a run is over, in words, by key of the budget; nothing if it is not.
+
+    Budgets are checked between generations, so steps may overshoot.
+
+    Args:
+        row: the newest generation's, of which the columns in REACHED are needed.
+    """
+    return {key: _REASONS[key].format(limit) for key, limit in limits.items() if row[REACHED[key]] >= limit}
