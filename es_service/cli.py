@@ -39,6 +39,7 @@ from es_service.config.resolution import config_warnings
 from es_service.errors import ConfigError, EvaluationError, Interrupted, NotInRunError, ServiceError
 from es_service.platform_info import VERSION
 from es_service.report.catalogue import print_catalogue
+from es_service.report.overview import print_overview
 from es_service.report.progress import Row, show_progress
 from es_service.report.status import follow_status, print_status, print_summary
 from es_service.store.folder import holds_run
@@ -124,14 +125,19 @@ def fork(
 
 @app.command()
 def status(
-    folder: RunArgument,
-    follow: Annotated[bool, typer.Option("--follow", help="Keep watching until the driver ends.")] = False,
+    folders: Annotated[list[Path], typer.Argument(help="Folders of runs.", show_default=False)],
+    follow: Annotated[bool, typer.Option("--follow", help="Keep watching one run until its driver ends.")] = False,
 ) -> None:
-    """Show where a run stands, also while it is being written."""
+    """Show where a run stands, also while it is being written; of several runs, a line each."""
+    if follow and len(folders) > 1:
+        raise ConfigError(f"--follow: watches one run, got {len(folders)} folders; name one, or leave --follow out")
+    if len(folders) > 1:
+        raise typer.Exit(0 if print_overview(console, folders) else 1)
+    run = api.open_run(folders[0])
     if follow:
-        follow_status(console, api.open_run(folder))
+        follow_status(console, run)
     else:
-        print_status(console, api.open_run(folder))
+        print_status(console, run)
 
 
 @app.command(name="digest")

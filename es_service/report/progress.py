@@ -51,8 +51,8 @@ def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group
         "generation": lambda row: str(row["generation"]),
         "centre fitness": lambda row: f"{row['centre_fitness_mean']:.2f} ± {row['centre_fitness_std']:.2f}",
         "best so far": lambda row: f"{row['best_fitness']:.2f}",
-        "env steps": lambda row: _short(row["env_steps"]),
-        "steps/s": lambda row: _short(row["steps_per_second"]),
+        "env steps": lambda row: short(row["env_steps"]),
+        "steps/s": lambda row: short(row["steps_per_second"]),
         "population median": lambda row: _number(row["population_fitness_median"]),
         "cells": lambda row: str(row.get("map_cells", "-")),
         "invalid": lambda row: str(row["invalid_members"]),
@@ -105,7 +105,7 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _short(value: float) -> str:
+def short(value: float) -> str:
     """A count with three digits: 850, 12.3 k, 4.56 M."""
     for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
         if value >= size:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
 from es_service import api
+from es_service.cli import app
+from es_service.errors import ConfigError
+from es_service.report.overview import print_overview
 from es_service.report.standing import Standing, look, more, state
 from es_service.report.status import follow_status, print_status, print_summary
 from es_service.store import reader
@@ -115,3 +121,31 @@ def test_a_config_that_cannot_be_read_is_told_of_and_hides_nothing(run, console,
     printed = capsys.readouterr().out
     assert f"stopped, and its budget cannot be read: {config}" in printed
     assert printed.count("best fitness ") == 2
+
+
+def test_several_runs_are_a_line_each(run, console, tmp_path, capsys):
+    api.resume(run.folder, ["budget.generations=5", "budget.env_steps=1_000_000", "budget.wall_clock_s=1e9"])
+    (tmp_path / "empty").mkdir()
+    assert print_overview(console, [run.folder])
+    assert not print_overview(console, [run.folder, tmp_path / "empty", run.folder])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 6, "none is wrapped"
+    assert " ".join(lines[0].split()) == "run algorithm task seed generation env steps best cells state"
+    row = reader.read_newest(run.folder)
+    steps, best, cells = f"{row['env_steps'] / 1000:.3g}", f"{row['best_fitness']:.2f}", str(row["map_cells"])
+    shown = f"{run.folder} nsra_es point_maze 0 5 of 5 {steps} k of 1 M {best} {cells} finished: the budget of 5 gen"
+    assert " ".join(lines[1].split()).startswith(shown)
+    assert lines[3].split() == lines[5].split() == lines[1].split()
+    assert re.match(rf"{tmp_path}/empty .* - +error: .* is not a run folder", lines[4])
+    assert {line.index(word) for line, word in zip(lines[2:], ("state", "fini", "error", "fini"), strict=True)} == {
+        lines[2].index("state")
+    }
+
+
+def test_the_command_takes_several_runs_and_follows_one(run, tmp_path):
+    cli = CliRunner()
+    assert cli.invoke(app, ["status", str(run.folder), str(run.folder)]).exit_code == 0
+    assert cli.invoke(app, ["status", str(run.folder), str(tmp_path)]).exit_code == 1
+    refused = cli.invoke(app, ["status", str(run.folder), str(run.folder), "--follow"])
+    assert isinstance(refused.exception, ConfigError)
+    assert "--follow: watches one run, got 2 folders" in str(refused.exception)
