@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 import shlex
+import shutil
+import sys
+from pathlib import Path
+
+PROGRAM = "es-service"
 
 
-def command(*words: object, program: str = "es-service") -> str:
-    """A command that can be copied into a shell, whatever its words contain: a folder's name may have spaces."""
-    return shlex.join([program, *map(str, words)])
+def command(*words: object) -> str:
+    """A command of this program that can be copied into a shell, whatever its words contain: a folder's name may have
+    spaces."""
+    return shlex.join([*_program(), *map(str, words)])
 
 
 def install_command(extra: str) -> str:
     """How to get what an extra of this package names; no package index has es-service itself, so from a clone."""
-    return (
-        f"in a clone of es-service: {command('install', '-c', 'constraints.txt', '-e', f'.[{extra}]', program='pip')}"
-    )
+    return f"in a clone of es-service: {shlex.join(['pip', 'install', '-c', 'constraints.txt', '-e', f'.[{extra}]'])}"
+
+
+def _program() -> list[str]:
+    """What the shell starts this program by: its name may not be in PATH, as after `make run`."""
+    if shutil.which(PROGRAM):
+        return [PROGRAM]
+    python = Path(sys.executable or "python")  # a program that has Python inside may not know one
+    script = python.with_name(PROGRAM)
+    return [str(script)] if script.exists() else [str(python), "-m", "es_service"]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import sys
 import time
 
 from rich.console import Console
@@ -52,7 +50,6 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
     _print_line(console, f"\nDone: {reason}.")
     _print_fields(console, _progress(standing))
     _print_line(console, f"\nThe run is in {folder}. Next:")
-    program = "es-service" if shutil.which("es-service") else sys.argv[0]  # `make run` has it in .venv/bin only
     for words in (
         ("status", folder),
         ("evaluate", folder),
@@ -60,7 +57,7 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
         ("resume", folder, *more(standing)),
         ("fork", folder, "--set", f"search.sigma={run.constants['search.sigma'] * 2:g}", *more(standing)),
     ):
-        _print_line(console, f"  {command(*words, program=program)}")
+        _print_line(console, f"  {command(*words)}")
 
 
 def _progress(standing: Standing) -> dict[str, str]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -12,7 +14,7 @@ import time
 import pytest
 from rich.console import Console
 
-from es_service import api
+from es_service import api, commands
 from es_service.config.changes import describe_changes
 from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.evaluation import candidates
@@ -21,7 +23,7 @@ from es_service.store.lock import acquire_lock
 from es_service.store.reader import read_generation
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import finished, flip_bit, without_root_rights
-from tests.system.command_line import command
+from tests.system.command_line import PROGRAM, command
 from tests.system.processes import running, wait_until
 from tests.system.session import SMALL
 
@@ -81,6 +83,33 @@ def test_the_fork_that_a_refused_resume_names_goes_on(tmp_path):
     with pytest.raises(ConfigError) as refused:
         api.run_or_resume(SMALL | {"budget": {"env_steps": 10**6}, "seed": 1}, folder)
     assert words_after(str(refused.value), "fork") == [str(folder), "--set", "seed=1"]
+
+
+def test_commands_start_what_is_there(tmp_path, monkeypatch):
+    """`make run` leaves es-service in .venv/bin, which is not in PATH; from a clone without an installation there is
+    only the package."""
+    assert commands.command("list") == "es-service list"
+    monkeypatch.setenv("PATH", os.defpath)
+    assert shlex.split(commands.command("list")) == [str(PROGRAM), "list"]
+    (tmp_path / "a b").mkdir()
+    python = tmp_path / "a b" / "python"
+    python.symlink_to(sys.executable)
+    monkeypatch.setattr(sys, "executable", str(python))
+    assert shlex.split(commands.command("list")) == [str(python), "-m", "es_service", "list"]
+    for name, words in ((sys.executable, f"'{python}' -m es_service"), ("", "python -m es_service")):
+        monkeypatch.setattr(sys, "executable", name)
+        assert commands.command("list") == f"{words} list"
+
+
+def test_an_interruption_names_a_command_that_is_there(config, tmp_path):
+    """Not in PATH, as after `make run`."""
+    folder = tmp_path / "run"
+    arguments = ["run", config, "--out", folder, "--set", "budget.generations=10000"]
+    with running(PROGRAM, *arguments, env=os.environ | {"PATH": os.defpath}) as run:
+        assert run.stdout is not None
+        assert run.stdout.readline().startswith("generation 0")
+        run.send_signal(signal.SIGINT)
+        assert run.communicate(timeout=60)[1].endswith(f"Go on with: {PROGRAM} resume {folder}\n")
 
 
 def test_run_or_resume_goes_on_where_only_the_copy_is_left(tmp_path):
