@@ -20,7 +20,7 @@ def command(*arguments: object, cwd: Path = ROOT, **environment: str) -> subproc
         env={**os.environ, **environment},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=600,
         check=False,
     )
     assert "Traceback" not in result.stderr, result.stderr
