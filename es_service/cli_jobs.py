@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +16,8 @@ from es_service.config.yaml_text import read_yaml_file
 from es_service.errors import ConfigError
 
 job_commands = typer.Typer()
+of_jobs = partial(job_commands.command, rich_help_panel="Cluster jobs")
+"""What makes a command one of these, in `--help` too."""
 
 JobsOption = Annotated[
     str, typer.Option("--address", help="The cluster's dashboard, such as http://127.0.0.1:8265.", show_default=False)
@@ -22,7 +25,7 @@ JobsOption = Annotated[
 JobArgument = Annotated[str, typer.Argument(help="Id of a job, as `submit` printed it.", show_default=False)]
 
 
-@job_commands.command()
+@of_jobs()
 def submit(
     config: ConfigArgument,
     address: JobsOption,
@@ -49,20 +52,20 @@ def _require_absolute_start(config: Path, wanted: list[str]) -> None:
         raise ConfigError(f"search.init_from: {start} must be absolute, a path as the cluster's head sees it")
 
 
-@job_commands.command(name="jobs")
+@of_jobs(name="jobs")
 def jobs_(address: JobsOption) -> None:
-    """List the cluster's jobs, newest first: id, state, run folder."""
+    """List the jobs of a cluster, newest first: id, state, run folder."""
     for job in jobs.list_jobs(address):
         print(f"{job.id}  {job.state:<9}  {job.folder}")
 
 
-@job_commands.command()
+@of_jobs()
 def logs(
     job: JobArgument,
     address: JobsOption,
     follow: Annotated[bool, typer.Option("--follow", help="Keep printing until the job ends.")] = False,
 ) -> None:
-    """Print what a job has printed."""
+    """Print what a job of a cluster has printed."""
     for text in jobs.logs(job, address, follow=follow):
         print(text, end="", flush=True)
     if follow:
@@ -71,7 +74,7 @@ def logs(
         raise typer.Exit(0 if state == "SUCCEEDED" else 1)
 
 
-@job_commands.command()
+@of_jobs()
 def stop(job: JobArgument, address: JobsOption) -> None:
-    """Stop a job; what is committed stays, and submitting it again goes on from there."""
+    """Stop a job of a cluster; what is committed stays, and submitting it again goes on from there."""
     print_note(f"{job} {jobs.stop(job, address).lower()}")

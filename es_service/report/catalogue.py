@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from es_service.algorithms import ALGORITHMS
@@ -15,26 +16,17 @@ from es_service.protocol import TaskSpec
 
 def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> None:
     """Tables of tasks, algorithms, and of the keys on which presets differ."""
-    tasks = Table(title="tasks (task.environment)", title_justify="left")
-    for name in ("name", "observation", "action", "steps", "descriptor", "options"):
-        tasks.add_column(name)
+    tasks = _table("tasks (task.environment)")
     for task in known_tasks.values():
-        bounds = zip(task.descriptor_names, task.descriptor_bounds, strict=True)
-        tasks.add_row(
-            task.name,
-            str(task.observation_size),
-            str(task.action_size),
-            str(task.episode_steps),
-            ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in bounds),
-            "; ".join(f"{name}: {' | '.join(values)}" for name, values in task.options.items()),
-        )
+        tasks.add_row(task.name, _about(task))
+    tasks.add_row("brax:NAME", "any environment of the installed Brax")
+    tasks.add_row("module:Class", "one of your own; the README says what it has to have")
     console.print(tasks)
 
-    algorithms = Table(title="algorithms (search.algorithm)", title_justify="left")
-    algorithms.add_column("name")
-    algorithms.add_column("what it is")
+    algorithms = _table("algorithms (search.algorithm)")
     for name, factory in ALGORITHMS.items():
         algorithms.add_row(name, (factory.__doc__ or "").strip().splitlines()[0])
+    algorithms.add_row("module:function", "One of your own; es_service/algorithms/own.py says what it has to give.")
     console.print(algorithms)
 
     presets = Table(title="presets (search.preset): the keys on which they differ", title_justify="left")
@@ -44,6 +36,24 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
     for row in preset_table():
         presets.add_row(row.key, *(_value(getattr(row, name)) for name in PRESETS))
     console.print(presets)
+
+
+def _table(title: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    table.add_column("name", no_wrap=True)
+    table.add_column("what it is")
+    return table
+
+
+def _about(task: TaskSpec) -> str:
+    bounds = zip(task.descriptor_names, task.descriptor_bounds, strict=True)
+    lines = [
+        task.summary,
+        f"observation {task.observation_size}, action {task.action_size}, steps {task.episode_steps}",
+        "descriptor: " + ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in bounds),
+        *(f"option {name}: {' | '.join(values)}" for name, values in task.options.items()),
+    ]
+    return escape("\n".join(lines))
 
 
 def _value(value: object) -> str:

@@ -6,9 +6,11 @@ import re
 import sys
 
 import pytest
+from typer.testing import CliRunner
 
 from es_service import cli_jobs, jobs
 from es_service.api import load_config
+from es_service.cli import app
 from es_service.config.yaml_text import dump_yaml
 from es_service.errors import ConfigError, EvaluationError
 
@@ -65,3 +67,12 @@ def test_a_start_that_is_another_folder_on_the_head_is_refused(tmp_path, start, 
         cli_jobs.submit(file, "http://127.0.0.1:1", "/runs/x", set_=set_)
     with pytest.raises(EvaluationError, match="did not do it"):  # past this check: nothing answers there
         cli_jobs.submit(file, "http://127.0.0.1:1", "/runs/x", set_=["search.init_from=/runs/a"])
+
+
+def test_help_tells_commands_of_a_cluster_from_those_of_this_machine():
+    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "100"}).stdout
+    here, there = shown.split("Cluster jobs")
+    for command in ("submit", "jobs", "logs", "stop"):
+        assert f" {command} " in there
+        assert f"│ {command} " not in here
+    assert "│ run " in here

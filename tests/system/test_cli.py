@@ -122,10 +122,18 @@ def test_unwritable_home_does_not_matter(config, tmp_path):
 
 
 def test_list_and_doctor(tmp_path):
-    code, printed = es("list")
+    code, printed = es("list", COLUMNS="80")
     assert code == 0
-    assert "point_maze" in printed
-    assert "search.pairs" in printed
+    words = " ".join(printed.replace("│", " ").split())
+    for wanted in (
+        "point_maze a point crosses a square behind two walls; the straight way to the goal is blocked twice "
+        "observation 2, action 2, steps 200 descriptor: x in [-1, 1], y in [-1, 1] option start: default | corner",
+        "brax:NAME any environment",
+        "module:Class one of your own",
+        "module:function One of your own",
+        "search.pairs",
+    ):
+        assert wanted in words
     code, printed = es("doctor", cwd=tmp_path, PYTHONPATH=str(ROOT))
     assert code == 0, printed
     assert "noise equals its" in printed
