@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,8 @@ class Column:
     name: str
     type: Literal["INTEGER", "REAL"]
     deterministic: bool
-    meaning: str
+    meaning: str = field(compare=False)
+    """Words for a reader: a run whose columns were explained in others is continued all the same."""
 
 
 _FITNESS = (
@@ -47,9 +48,13 @@ _GOAL = (
     Column("goal_distance", "REAL", True, "mean distance to the goal at the end of the evaluation episodes"),
     Column("goal_distance_min", "REAL", True, "least distance to the goal along any evaluation episode"),
 )
+_CELL = (
+    "cell of the map that the new centre entered; none if it did not. A number: those of a grid run along its last "
+    "dimension first, so that of 20 by 20 cells 90 is 4,10; the map's table has both"
+)
 _MAP = (
     Column("start_cell", "INTEGER", True, "me_es: cell whose elite this generation began with; none inside a block"),
-    Column("cell", "INTEGER", True, "cell of the map that the new centre entered; none if it did not"),
+    Column("cell", "INTEGER", True, _CELL),
     Column("map_cells", "INTEGER", True, "filled cells of the map after this generation"),
     Column("coverage", "REAL", True, "filled cells as a fraction of all"),
     Column("coverage_reachable", "REAL", True, "the same of the cells that can be reached, where the task knows them"),

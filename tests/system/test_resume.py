@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import pytest
 
@@ -43,6 +44,18 @@ def test_resume_of_a_finished_run_does_nothing(finished, tmp_path):
     assert code == 0
     assert "the budget of 30 generations is spent" in printed
     assert digest(tmp_path / "run") == digest(finished[0])
+
+
+def test_columns_explained_in_other_words_are_the_same_columns(finished, tmp_path, monkeypatch):
+    """So a version may explain them better and go on with the runs of those before it."""
+    from es_service import api
+    from es_service.history import history_columns
+
+    shutil.copytree(finished[0], tmp_path / "run")
+    monkeypatch.setattr(
+        api, "history_columns", lambda *about: tuple(replace(at, meaning="new") for at in history_columns(*about))
+    )
+    assert "is spent" in api.resume(tmp_path / "run").reason
 
 
 @pytest.mark.parametrize("budget", ["generations=30", "env_steps=100", "wall_clock_s=1e-3", "target_fitness=-1e9"])
