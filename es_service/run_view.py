@@ -110,11 +110,14 @@ class Run:
 
     @property
     def history(self) -> pd.DataFrame:
-        """One row per generation, indexed by generation; columns are documented in `es_service.history`."""
+        """One row per generation, indexed by generation; columns are documented in `es_service.history`. Whole numbers
+        stay whole where some are missing: pandas' Int64."""
         import pandas as pd  # a quarter of a second that starting a run need not spend
 
-        columns = [column.name for column in self.meta.columns]
-        return pd.DataFrame(self.history_rows(), columns=pd.Index(columns)).set_index("generation")
+        columns = self.meta.columns
+        table = pd.DataFrame(self.history_rows(), columns=pd.Index([column.name for column in columns]))
+        whole = [column.name for column in columns if column.type == "INTEGER"]
+        return table.astype({name: "Int64" for name in whole if table[name].hasnans}).set_index("generation")
 
     def history_rows(self, since_generation: int | None = None) -> list[dict[str, Any]]:
         """History as dictionaries, oldest first; only from `since_generation` on if given."""
@@ -144,15 +147,15 @@ class Run:
 
     @property
     def map(self) -> pd.DataFrame:
-        """The map, one row per filled cell in the order of discovery: the cell's place along each dimension (or, of a
-        cvt, its number), fitness when it entered, descriptor, generation, member."""
+        """The map, one row per filled cell in the order of discovery: the cell's number, as the history has it, and its
+        place along each dimension (none of a cvt), fitness when it entered, descriptor, generation, member."""
         import pandas as pd
 
         map_, names = self.behaviour_map, self.descriptor_names
-        places = map_places(map_)
-        labels = [f"cell_{name}" for name in names] if isinstance(map_.geometry, Grid) else ["cell"]
+        labels = [f"cell_{name}" for name in names]
         return pd.DataFrame(
-            dict(zip(labels, places.T, strict=True))
+            {"cell": map_.cell_N}
+            | (dict(zip(labels, map_places(map_).T, strict=True)) if isinstance(map_.geometry, Grid) else {})
             | {"fitness": map_.fitness_N}
             | dict(zip(names, map_.descriptor_N_B.T, strict=True))
             | {"generation": map_.generation_N, "member": map_.member_N}

@@ -101,7 +101,7 @@ def best_way(run: Run) -> np.ndarray | None:
     """Of the best centre's first evaluation episode, if it is still in its cell."""
     history = run.history
     best = history.loc[history.centre_fitness_mean.idxmax()]
-    if "cell" not in history or not np.isfinite(best.cell):
+    if "cell" not in history or pd.isna(best.cell):
         return None
     _, elites = run.elites([int(best.cell)])
     return np.asarray(elites[int(best.cell)].trace_T_B)
