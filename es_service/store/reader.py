@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from es_service.commands import command
 from es_service.errors import StoreError
-from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict, row_sha256, text_sha256
+from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict
 from es_service.store.folder import COPY, DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.lock import lock_holder
 from es_service.store.schema import Damaged, RunMeta, history_select, load_meta, quoted
-from es_service.store.verify import KeptRows, is_no_damage, rows_in_force, state_in_force
+from es_service.store.verify import KeptRows, is_no_damage, row_is_sound, rows_in_force, sound_platforms, state_in_force
 
 _BUSY_S = 5.0
 
@@ -133,11 +133,7 @@ def _sound_rows(
     for *values, state, sha256 in connection.execute(query, (first, -1 if limit is None else limit)):
         row = tuple(values)
         named = row_dict(meta.columns, row)
-        try:
-            sound = row_sha256(columns, row, str(state)) == sha256
-        except ValueError:
-            sound = False
-        if not sound or named["generation"] != first + len(rows):
+        if not row_is_sound(columns, row, state, sha256) or named["generation"] != first + len(rows):
             raise Damaged(f"the history row of generation {first + len(rows)} is damaged or missing")
         rows.append(named)
     # Damage can hide the end of a table from SQLite itself; every generation has state rows, too.
@@ -206,9 +202,4 @@ def read_platforms(folder: Path) -> list[tuple[int, dict[str, Any]]]:
 
 def platforms(connection: sqlite3.Connection) -> list[tuple[int, dict[str, Any]]]:
     """`read_platforms` of a connection inside `reading`."""
-    found: list[tuple[int, dict[str, Any]]] = []
-    for at, text, sha256 in connection.execute("SELECT generation, platform, sha256 FROM platform ORDER BY generation"):
-        if text_sha256(f"platform {at}", text) != sha256:
-            raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
-        found.append((at, json.loads(text)))
-    return found
+    return [(at, json.loads(text)) for at, text in sound_platforms(connection)]

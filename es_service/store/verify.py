@@ -97,9 +97,7 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
     tables = dict(connection.execute("SELECT name, sql FROM sqlite_schema"))
     if tables != table_statements(meta.columns):
         raise Damaged("its tables are not those of a run")
-    for generation, platform, sha256 in connection.execute("SELECT generation, platform, sha256 FROM platform"):
-        if text_sha256(f"platform {generation}", platform) != sha256:
-            raise Damaged(f"the platform recorded at generation {generation} does not match its SHA-256")
+    sound_platforms(connection)
 
     problems: list[str] = []
     states = _history(connection, meta, first, problems)
@@ -137,18 +135,29 @@ def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems
             problems.append(f"history row of generation {generation} is missing")
             states.append(None)
             break
-        sound = _row_is_sound(columns, row, state, sha256)
+        sound = row_is_sound(columns, row, state, sha256)
         if not sound:
             problems.append(f"history row of generation {generation} does not match its SHA-256")
         states.append(state if sound else None)
     return states
 
 
-def _row_is_sound(columns: bytes, row: tuple, state: object, sha256: object) -> bool:
+def row_is_sound(columns: bytes, row: tuple, state: object, sha256: object) -> bool:
+    """Whether a history row matches its SHA-256; `columns` are `column_bytes`."""
     try:
         return row_sha256(columns, row, str(state)) == sha256
     except ValueError:
         return False
+
+
+def sound_platforms(connection: sqlite3.Connection) -> list[tuple[int, str]]:
+    """(first generation, what was recorded) in order. Raises Damaged for one that does not match its SHA-256."""
+    found: list[tuple[int, str]] = []
+    for at, text, sha256 in connection.execute("SELECT generation, platform, sha256 FROM platform ORDER BY generation"):
+        if text_sha256(f"platform {at}", text) != sha256:
+            raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
+        found.append((at, text))
+    return found
 
 
 def _state(connection: sqlite3.Connection, problems: list[str]) -> tuple[KeptRows, list[tuple[str, int]]]:

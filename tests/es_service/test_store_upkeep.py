@@ -80,7 +80,7 @@ def test_the_copy_is_a_verified_single_file_refreshed_when_it_is_time(tmp_path, 
 def test_a_copy_checks_only_rows_that_the_former_one_has_not(tmp_path, monkeypatch, former):
     """Each time all of a long run would keep its driver from its workers. Damage is noticed: test_store_damage."""
     checked: list[int] = []
-    sound = store_verify._row_is_sound
+    sound = store_verify.row_is_sound
 
     def counted(columns, row, state, sha256):
         checked.append(row[0])
@@ -95,7 +95,7 @@ def test_a_copy_checks_only_rows_that_the_former_one_has_not(tmp_path, monkeypat
             shutil.copy(finished(tmp_path / "other", 20, seed=1) / "run.db", copy)
         elif former == "missing":
             copy.unlink()
-        monkeypatch.setattr(store_verify, "_row_is_sound", counted)
+        monkeypatch.setattr(store_verify, "row_is_sound", counted)
         advance(run, 20)
         assert checked == (list(range(18, 21)) if former == "sound" else list(range(21)))
         assert run.notices == []

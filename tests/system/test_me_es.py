@@ -8,6 +8,7 @@ import signal
 import threading
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from es_service import api
@@ -26,9 +27,9 @@ def test_a_map_has_filled_and_blocks_began_in_several_cells(mapped):
     assert history["start_cell"].notna().sum() == 10
     assert history["start_cell"].nunique() >= 4
     assert pd.api.types.is_integer_dtype(history["start_cell"].dtype), "though most have none"
-    numbers = finished.map.set_index("cell")[["cell_x", "cell_y"]]
+    numbers = mapped.map.set_index("cell")[["cell_x", "cell_y"]]
     entered = int(history["cell"].dropna().iloc[-1])
-    assert finished.cell(tuple(numbers.loc[entered])) == entered
+    assert mapped.cell(tuple(numbers.loc[entered])) == entered
     assert entered == numbers.loc[entered, "cell_x"] * 16 + numbers.loc[entered, "cell_y"]
     assert set(history["fitness_weight"].iloc[1:]) == {0.0, 1.0}
     assert history["coverage"].iloc[-1] == history["coverage_reachable"].iloc[-1] == len(mapped.map) / 256
