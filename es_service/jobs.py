@@ -26,6 +26,8 @@ from es_service.errors import ConfigError, EvaluationError, ServiceError
 FOLDER = "es_service_run"
 """Key of a job's metadata: the run folder."""
 POLL_S = 1.0
+FOLLOWED_PER_S = 250_000
+"""Characters of a log that following it may ask for in a second: the cluster sends all of it whenever it is asked."""
 ENDED = ("SUCCEEDED", "FAILED", "STOPPED")
 STOP_S = 15.0
 """Longest wait for a stopped job to end; Ray kills it after three seconds."""
@@ -83,8 +85,12 @@ def list_jobs(address: str) -> list[Job]:
 
 def state(job: str, address: str) -> str:
     """Ray's word for where a job stands. Raises EvaluationError as `submit`, or if there is no such job."""
+    return _state(_client(address), job, address)
+
+
+def _state(client: Any, job: str, address: str) -> str:
     with _explained(address, job):
-        return str(_client(address).get_job_status(job).value)
+        return str(client.get_job_status(job).value)
 
 
 def logs(job: str, address: str, *, follow: bool = False) -> Iterator[str]:
@@ -94,13 +100,15 @@ def logs(job: str, address: str, *, follow: bool = False) -> Iterator[str]:
         with _explained(address, job):
             yield client.get_job_logs(job)
         return
-    printed = 0
+    printed, due_s = 0, time.monotonic()
     while True:
-        with _explained(address, job):
-            ended = client.get_job_status(job).value in ENDED  # asked first, so that nothing printed after is missed
-            text = client.get_job_logs(job)
-        yield text[printed:]
-        printed = len(text)
+        ended = _state(client, job, address) in ENDED  # asked first, so that nothing printed after is missed
+        if ended or time.monotonic() >= due_s:
+            with _explained(address, job):
+                text = client.get_job_logs(job)
+            yield text[printed:]
+            printed = len(text)
+            due_s = time.monotonic() + printed / FOLLOWED_PER_S
         if ended:
             return
         time.sleep(POLL_S)
@@ -108,10 +116,11 @@ def logs(job: str, address: str, *, follow: bool = False) -> Iterator[str]:
 
 def stop(job: str, address: str) -> str:
     """Stop a job and wait for its end; its state then. Raises EvaluationError as `state`, or if it does not end."""
+    client = _client(address)
     with _explained(address, job):
-        _client(address).stop_job(job)
+        client.stop_job(job)
     until = time.monotonic() + STOP_S
-    while (now := state(job, address)) not in ENDED:
+    while (now := _state(client, job, address)) not in ENDED:
         if time.monotonic() > until:
             raise EvaluationError(f"{job} is still {now} {STOP_S:g} s after it was told to stop; see its logs")
         time.sleep(0.2)
