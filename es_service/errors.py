@@ -1,6 +1,6 @@
 """The error family. Each one carries a message for a tired user: what is wrong, the value seen, the way out.
 
-Every error survives pickling, because workers raise them in other processes.
+Every error survives pickling, for callers that have runs in processes of a pool.
 """
 
 
