@@ -12,10 +12,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-VERSION = "0.4.0"
+VERSION = "0.5.0"
 """Of es-service itself: of the code that runs. What an editable installation says of it is as old as its last `pip
 install`."""
-PACKAGES = ("jax", "jaxlib", "numpy", "brax", "mujoco", "mujoco-mjx", "llvmlite")
+PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "brax", "mujoco", "mujoco-mjx", "llvmlite")
 """Others whose version can change a bit of a result."""
 
 
