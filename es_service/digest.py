@@ -61,7 +61,8 @@ def digest_at(folder: Path, generation: int) -> str | None:
 
 
 def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
-    """`digest_parts` and `is_mixed` of one moment, after everything stored was checked against its SHA-256.
+    """`digest_parts`, and whether the stored generations were computed on more than one platform (versions, CPU or GPU
+    kind), by the driver or by workers; of one moment, after everything stored was checked against its SHA-256.
 
     Raises StoreError that names what is damaged.
     """
@@ -72,13 +73,6 @@ def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
                 "generation that is sound."
             )
         return _parts(folder, connection, meta), _is_mixed(connection)
-
-
-def is_mixed(folder: Path) -> bool:
-    """Whether the stored generations were computed on more than one platform (versions, CPU or GPU kind), by the driver
-    or by workers."""
-    with reading(folder) as (connection, _):
-        return _is_mixed(connection)
 
 
 def _is_mixed(connection: Connection) -> bool:

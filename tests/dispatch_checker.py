@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+import json
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-from es_service.dispatch.dispatch_log import read_dispatch_log
+from es_service.dispatch.dispatch_log import FILE
+
+
+def read_dispatch_log(folder: Path) -> list[dict[str, Any]]:
+    """All entries, oldest first; lines cut short by a kill or a full disk are left out."""
+    entries = []
+    for line in (folder / FILE).read_text(encoding="utf-8").split("\n"):
+        with suppress(ValueError):
+            entries.append(json.loads(line))
+    return entries
 
 
 def check_dispatch(folder: Path) -> dict[str, int]:

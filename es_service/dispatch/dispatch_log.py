@@ -11,7 +11,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -80,12 +80,3 @@ def dispatch_log(folder: Path, after_generation: int | None, *, enabled: bool) -
 def _plain(value: Any) -> Any:
     """What JSON has no form for: a task is its key."""
     return value.key if isinstance(value, Task) else str(value)
-
-
-def read_dispatch_log(folder: Path) -> list[dict[str, Any]]:
-    """All entries, oldest first; lines cut short by a kill or a full disk are left out."""
-    entries = []
-    for line in (folder / FILE).read_text(encoding="utf-8").split("\n"):
-        with suppress(ValueError):
-            entries.append(json.loads(line))
-    return entries

@@ -6,7 +6,7 @@ import sqlite3
 import numpy as np
 import pytest
 
-from es_service.digest import arrays_sha256, checked_parts, digest, digest_at, digest_of, digest_parts, is_mixed
+from es_service.digest import arrays_sha256, checked_parts, digest, digest_at, digest_of, digest_parts
 from es_service.errors import StoreError
 from es_service.store import schema as store_schema
 from es_service.store.codec import encode_part
@@ -166,7 +166,7 @@ def test_the_digest_after_the_generation_before_is_that_of_a_run_that_ended_ther
 
 def test_parts_and_total_are_of_one_moment_and_of_a_sound_run(folder):
     parts, mixed = checked_parts(folder)
-    assert (parts, digest_of(parts), mixed) == (digest_parts(folder), digest(folder), is_mixed(folder))
+    assert (parts, digest_of(parts), mixed) == (digest_parts(folder), digest(folder), False)
     change(folder, "UPDATE history SET seconds_rollout = 1e9 WHERE generation = 3")  # which no digest would show
     with pytest.raises(StoreError, match=r"damaged: history row of generation 3 .*; .*\. `es-service resume "):
         checked_parts(folder)
@@ -180,14 +180,14 @@ def test_a_run_without_a_generation_has_a_digest(tmp_path):
 def test_a_run_is_mixed_from_the_first_generation_on_another_platform(tmp_path):
     folder = tmp_path / "run"
     with create(folder) as store:
-        assert not is_mixed(folder)
+        assert not checked_parts(folder)[1]
         store.record_platform(0, {"cpu": "a"})
         advance(store, 2)
-        assert not is_mixed(folder)
+        assert not checked_parts(folder)[1]
         store.record_platform(3, {"cpu": "b"})
-        assert not is_mixed(folder)
+        assert not checked_parts(folder)[1]
         advance(store, 3)
-        assert is_mixed(folder)
+        assert checked_parts(folder)[1]
         store.record_platform(4, {"cpu": "a"})
         advance(store, 4)
-    assert is_mixed(folder)
+    assert checked_parts(folder)[1]

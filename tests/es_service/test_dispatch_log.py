@@ -5,8 +5,9 @@ from contextlib import suppress
 
 import pytest
 
-from es_service.dispatch.dispatch_log import FILE, Committed, dispatch_log, read_dispatch_log
+from es_service.dispatch.dispatch_log import FILE, Committed, dispatch_log
 from es_service.errors import StoreError
+from tests.dispatch_checker import read_dispatch_log
 
 
 def test_sessions_append_and_torn_lines_are_left_out(tmp_path):

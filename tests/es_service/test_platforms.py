@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from es_service import api, session
-from es_service.digest import is_mixed
-from es_service.platform_info import VERSION, computed_on, platform_info, platform_text
-from es_service.platform_info import is_mixed as are_mixed
+from es_service.digest import checked_parts
+from es_service.platform_info import VERSION, computed_on, is_mixed, platform_info, platform_text
 from es_service.store.reader import read_platforms
 from tests.benchmarks.science import InThisProcess
 
@@ -43,8 +42,8 @@ def test_workers_are_recorded_where_they_are_not_like_the_driver(workers, record
     platform = computed_on(DRIVER, workers)
     assert platform.get("workers") == recorded
     assert {**platform, "workers": None} == {**DRIVER, "workers": None}
-    assert are_mixed([platform]) is mixed
-    assert are_mixed([platform, DRIVER]) is (recorded is not None)
+    assert is_mixed([platform]) is mixed
+    assert is_mixed([platform, DRIVER]) is (recorded is not None)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +73,7 @@ def test_workers_of_several_kinds_make_a_run_mixed_from_the_generation_they_join
     monkeypatch.setattr(session, "_engine", engine)
     told: list[str] = []
     run = api.run(api.load_config(CONFIG), tmp_path / "run", on_notice=told.append).run
-    assert is_mixed(run.folder) is mixed
+    assert checked_parts(run.folder)[1] is mixed
     assert [first for first, _ in read_platforms(run.folder)] == recorded
     assert [f"from generation {first} on" in notice for first, notice in zip(recorded[1:], told, strict=True)] == [
         True

@@ -18,9 +18,9 @@ import yaml
 
 from es_service import api
 from es_service.digest import digest_parts
-from es_service.dispatch.dispatch_log import FILE, read_dispatch_log
+from es_service.dispatch.dispatch_log import FILE
 from es_service.store.reader import read_generation
-from tests.dispatch_checker import check_dispatch
+from tests.dispatch_checker import check_dispatch, read_dispatch_log
 from tests.system import cluster
 from tests.system.cluster import Cluster
 from tests.system.processes import committed, wait_for
