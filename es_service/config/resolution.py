@@ -14,8 +14,9 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from es_service.config.fields import OPTIONS, RESOURCES
+from es_service.config.keys import FIELDS
 from es_service.config.map_rules import default_cells, default_kind, default_qd_offset, options_of
-from es_service.config.model import PolicyConfig, RunConfig
+from es_service.config.model import RunConfig
 from es_service.config.yaml_text import did_you_mean, one_of, show
 from es_service.protocol import PolicyShape, TaskSpec, with_options
 
@@ -120,8 +121,7 @@ def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpe
         values["compute.chunk_pairs"] = default_chunk_pairs(pairs)
     chunk_pairs = values.get("compute.chunk_pairs")
     if chunk_pairs is not None and task is not None:
-        hidden = values.get("policy.hidden", PolicyConfig.model_fields["hidden"].default)
-        parameters = PolicyShape((task.observation_size, *hidden, task.action_size)).parameters
+        parameters = _policy_shape(values, task).parameters
         if "compute.rollout_block_pairs" in left_open:
             values["compute.rollout_block_pairs"] = default_rollout_block_pairs(chunk_pairs, parameters)
         if "compute.gradient_block_pairs" in left_open and pairs is not None:
@@ -158,13 +158,17 @@ def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
 
 def policy_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
     """Where the network is larger than a run can keep."""
-    hidden = values.get("policy.hidden", PolicyConfig.model_fields["hidden"].default)
-    if PolicyShape((task.observation_size, *hidden, task.action_size)).parameters <= MOST_PARAMETERS:
+    shape = _policy_shape(values, task)
+    if shape.parameters <= MOST_PARAMETERS:
         return []
     return [
-        f"policy.hidden: {show(list(hidden))} makes more than {MOST_PARAMETERS:,} parameters for {task.name}, the most "
-        "that the run store takes; must be narrower"
+        f"policy.hidden: {show(list(shape.widths[1:-1]))} makes more than {MOST_PARAMETERS:,} parameters for "
+        f"{task.name}, the most that the run store takes; must be narrower"
     ]
+
+
+def _policy_shape(values: Mapping[str, Any], task: TaskSpec) -> PolicyShape:
+    return PolicyShape((task.observation_size, *_value(values, "policy.hidden"), task.action_size))
 
 
 def member_problems(values: Mapping[str, Any]) -> list[str]:
@@ -204,12 +208,11 @@ def shape_problems(values: Mapping[str, Any]) -> list[str]:
 def engine_problems(values: Mapping[str, Any]) -> list[str]:
     """Where the config asks for a cluster or a GPU without Ray, or for a share of a GPU that Ray cannot give."""
     problems = []
-    if values.get("compute.engine", "ray") != "ray":
-        needy = {"compute.address": None, f"{RESOURCES}cpu": 1, f"{RESOURCES}gpu": 0.0}
+    if _value(values, "compute.engine") != "ray":
         problems = [
             f"{name}: {show(values[name])} needs compute.engine = ray, which is {values['compute.engine']}"
-            for name, without in needy.items()
-            if values.get(name, without) != without
+            for name in ("compute.address", f"{RESOURCES}cpu", f"{RESOURCES}gpu")
+            if _value(values, name) != FIELDS[name].default
         ]
     inline, threads = values.get("compute.engine") == "inline", values.get("compute.inline_workers") == "threads"
     if threads and not (inline and values.get("compute.rollout", "simd") == "simd"):
@@ -217,14 +220,19 @@ def engine_problems(values: Mapping[str, Any]) -> list[str]:
             "compute.inline_workers: threads needs compute.engine = inline and compute.rollout = simd, in whose code "
             "threads do not wait for each other; must be processes"
         )
-    gpus = values.get(f"{RESOURCES}gpu", 0.0)
+    gpus = _value(values, f"{RESOURCES}gpu")
     if gpus > 1 and gpus != int(gpus):
         problems.append(f"{RESOURCES}gpu: {show(gpus)} is not allowed; must be a whole number or a fraction below 1")
     return problems
 
 
 def _on_gpu(values: Mapping[str, Any]) -> bool:
-    return values.get(f"{RESOURCES}gpu", 0.0) > 0
+    return _value(values, f"{RESOURCES}gpu") > 0
+
+
+def _value(values: Mapping[str, Any], key: str) -> Any:
+    """What the config says, or the field's default."""
+    return values.get(key, FIELDS[key].default)
 
 
 def _why_no_simd(values: Mapping[str, Any], task: TaskSpec) -> str:
