@@ -192,7 +192,7 @@ def _contacts(system: System, x: Transform, walls: tuple[Segment, ...]) -> Conta
 
 @contextlib.contextmanager
 def _replaced(module: Any, name: str, value: Any) -> Iterator[None]:
-    """A name of a module means something else, while one substep is traced."""
+    """A name of a module means something else, while one substep is traced; inside of `quietly`, so for one thread."""
     before = getattr(module, name)
     setattr(module, name, value)
     try:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
+import threading
 import warnings
 from collections.abc import Iterator
 from importlib import metadata
@@ -33,18 +34,25 @@ def check_versions() -> None:
             )
 
 
+_ONE_THREAD = threading.RLock()
+
+
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """Brax says nothing in here, while it is imported, loads a model or is traced."""
+    """Brax says nothing in here, while it is imported, loads a model or is traced.
+
+    One thread at a time, as what is changed for that, and what callers change of Brax in here, is the whole process's.
+    """
     mujoco: Any = importlib.import_module("mujoco")
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)  # it would write them into a file where we are
-    try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        mujoco.set_mju_user_warning(before)
+    with _ONE_THREAD:
+        before = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(lambda message: None)  # it would write them into a file where we are
+        try:
+            with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+                warnings.simplefilter("ignore")
+                yield
+        finally:
+            mujoco.set_mju_user_warning(before)
 
 
 check_versions()
