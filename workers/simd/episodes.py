@@ -62,6 +62,10 @@ class EpisodeKernel:
     ) -> Episodes:
         """Episodes [L] of NumPy arrays; weights as `network.pack` makes them."""
         width, lanes = self.network.width, len(reset_keys_L)
+        # What native code reads beyond an array's end would be somebody's numbers, without a word.
+        assert (noise_keys_P is not None) == self.training
+        assert action_keys_L.shape == reset_keys_L.shape == (lanes, KEY_WORDS)
+        assert noise_keys_P is None or (noise_keys_P.shape[1:] == (KEY_WORDS,) and 2 * len(noise_keys_P) >= lanes)
         carries = self.begin(reset_keys_L)
         blocks = len(carries)
         carries[-1, self.alive_word, lanes - width * (blocks - 1) :] = 0  # nobody is there
