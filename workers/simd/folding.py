@@ -40,9 +40,9 @@ def _fold_add(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
         if _is(value, 0.0):
             return x
     if (minus := g.negated(b)) is not None:
-        return g.op_again("sub", a, minus)
+        return g.op("sub", a, minus)
     if (minus := g.negated(a)) is not None:
-        return g.op_again("sub", b, minus)
+        return g.op("sub", b, minus)
     return None
 
 
@@ -51,11 +51,11 @@ def _fold_sub(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
     if _is(values[1], 0.0):
         return a
     if _is(values[0], 0.0) and np.signbit(values[0]):
-        return g.op_again("neg", b)
+        return g.op("neg", b)
     if (minus := g.negated(b)) is not None:
-        return g.op_again("add", a, minus)
+        return g.op("add", a, minus)
     if (minus := g.negated(a)) is not None:
-        return g.op_again("neg", g.op_again("add", minus, b))
+        return g.op("neg", g.op("add", minus, b))
     return None
 
 
@@ -65,24 +65,16 @@ def _fold_mul(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
         if _is(value, 1.0):
             return x
         if _is(value, -1.0):
-            return g.op_again("neg", x)
+            return g.op("neg", x)
         if _is(value, 0.0):
             return g.f(0.0)
     minus_a, minus_b = g.negated(a), g.negated(b)
     if minus_a is not None and minus_b is not None:
-        return g.op_again("mul", minus_a, minus_b)
+        return g.op("mul", minus_a, minus_b)
     if minus_a is not None:
-        return (
-            g.op_again("mul", minus_a, g.op_again("neg", b))
-            if values[1] is not None
-            else g.op_again("neg", g.op_again("mul", minus_a, b))
-        )
+        return g.op("mul", minus_a, g.op("neg", b)) if values[1] is not None else g.op("neg", g.op("mul", minus_a, b))
     if minus_b is not None:
-        return (
-            g.op_again("mul", minus_b, g.op_again("neg", a))
-            if values[0] is not None
-            else g.op_again("neg", g.op_again("mul", a, minus_b))
-        )
+        return g.op("mul", minus_b, g.op("neg", a)) if values[0] is not None else g.op("neg", g.op("mul", a, minus_b))
     return None
 
 
@@ -93,7 +85,7 @@ def _fold_div(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
     if values[1] is not None and np.isfinite(values[1]) and values[1] != 0.0:
         mantissa, exponent = np.frexp(abs(float(values[1])))
         if mantissa == 0.5 and abs(exponent) < 100:  # the reciprocal of a power of two is exact
-            return g.op_again("mul", a, g.f(1.0 / float(values[1])))
+            return g.op("mul", a, g.f(1.0 / float(values[1])))
     return None
 
 
@@ -101,14 +93,14 @@ def _fold_neg(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
     key = g.keys[args[0]]
     if key[0] == "neg":
         return key[1]
-    return g.op_again("sub", key[2], key[1]) if key[0] == "sub" else None
+    return g.op("sub", key[2], key[1]) if key[0] == "sub" else None
 
 
 def _fold_abs(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
     key = g.keys[args[0]]
     if key[0] in ("abs", "sqrt"):
         return args[0]
-    return g.op_again("abs", key[1]) if key[0] == "neg" else None
+    return g.op("abs", key[1]) if key[0] == "neg" else None
 
 
 def _fold_less(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
@@ -124,7 +116,7 @@ def _fold_select(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | No
     key = g.keys[mask]
     for one, other in ((key[1], key[2]), (key[2], key[1])) if key[0] == "xor" else ():
         if _is(g.constant(one), True):  # a negation
-            return g.op_again("iselect" if g.kinds[a] == "i" else "select", other, b, a)
+            return g.op("iselect" if g.kinds[a] == "i" else "select", other, b, a)
     return None
 
 

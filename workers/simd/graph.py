@@ -43,8 +43,6 @@ class Graph:
         self.keys: list[Key] = []
         self.kinds: list[str] = []
         self.loops: list[Loop] = []
-        self.asked = 0
-        """Operations asked for, before any folding."""
         self._known: dict[Key, int] = {}
 
     def const(self, kind: str, value: float | int | bool) -> int:
@@ -108,11 +106,6 @@ class Graph:
 
     def op(self, name: str, *arguments: int) -> int:
         """The node of an operation on nodes, after folding."""
-        self.asked += 1
-        return self.op_again(name, *arguments)
-
-    def op_again(self, name: str, *arguments: int) -> int:
-        """As `op`, of what was asked for before."""
         operation = OPERATIONS[name]
         if operation.commutes and arguments[0] > arguments[1]:
             arguments = (arguments[1], arguments[0])

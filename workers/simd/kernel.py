@@ -15,7 +15,6 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from workers.simd import cache as kernel_cache
-from workers.simd import loops
 from workers.simd.emit import emit
 from workers.simd.graph import live
 from workers.simd.operations import OPERATIONS
@@ -31,19 +30,12 @@ OWN_VERSION = hashlib.sha256(
 
 
 class Facts(NamedTuple):
-    """What compiling took; seconds."""
+    """What compiling took and gave."""
 
     jaxpr_s: float
-    """JAX's own tracing, which xla needs as well."""
-    trace_s: float
-    """From the jaxpr to the scalar graph. 0 from the cache."""
-    emit_s: float
-    compile_s: float
-    """LLVM's part. From the cache: hashing the jaxpr, finding and reading."""
-    asked: int
-    """Scalar operations of the function, loops' bodies once; 0 from the cache."""
+    """Seconds of JAX's own tracing, which xla needs as well."""
     computed: int
-    """Those that are left of them."""
+    """Scalar operations that are left after folding, loops' bodies once; 0 from the cache."""
     code_bytes: int
     cached: bool
 
@@ -118,17 +110,15 @@ def compile_kernel(
     started = time.perf_counter()
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     jaxpr_s = time.perf_counter() - started
-    facts = Facts(jaxpr_s, 0.0, 0.0, 0.0, 0, 0, 0, True)
+    computed, cached = 0, True
 
     def compile_now() -> bytes:
-        nonlocal facts
-        code, facts = _compile(closed, target, jaxpr_s)
-        return code
+        nonlocal computed, cached
+        graph, inputs, outputs = trace_jaxpr(closed)
+        computed, cached = sum(graph.keys[node][0] in OPERATIONS for node in live(graph, outputs)), False
+        return compile_object(emit(graph, outputs, inputs, target.width), target)
 
-    started = time.perf_counter()
     code, address, alive = _cached(jaxpr_digest(closed), compile_now, target, folder)
-    if facts.cached:
-        facts = facts._replace(compile_s=time.perf_counter() - started, code_bytes=len(code))
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(address)
     leaves, out_tree = jax.tree.flatten(shape)
     return Kernel(
@@ -137,7 +127,7 @@ def compile_kernel(
         in_avals=tuple(variable.aval for variable in closed.jaxpr.invars),
         out_tree=out_tree,
         out_avals=tuple(leaves),
-        facts=facts,
+        facts=Facts(jaxpr_s, computed, len(code), cached),
         _function=call,
         _alive=alive,
     )
@@ -157,7 +147,7 @@ def _cached(
     name: str, compile_now: Callable[[], bytes], target: Target, folder: Path | None
 ) -> tuple[bytes, int, object]:
     folder = folder or kernel_cache.cache_folder()
-    versions = f"{target} {compiler_version()} {OWN_VERSION} {loops.UNROLLED_OPERATIONS}"
+    versions = f"{target} {compiler_version()} {OWN_VERSION}"
     key = hashlib.sha256(f"{name} {versions}".encode()).hexdigest()
     code = kernel_cache.load(folder, key) if folder else None
     if code is None:
@@ -165,19 +155,6 @@ def _cached(
         if folder:
             kernel_cache.save(folder, key, code)
     return code, *load_object(code, target)
-
-
-def _compile(closed: ClosedJaxpr, target: Target, jaxpr_s: float) -> tuple[bytes, Facts]:
-    started = time.perf_counter()
-    graph, inputs, outputs = trace_jaxpr(closed)
-    traced = time.perf_counter()
-    text = emit(graph, outputs, inputs, target.width)
-    emitted = time.perf_counter()
-    code = compile_object(text, target)
-    compiled = time.perf_counter()
-    computed = sum(graph.keys[node][0] in OPERATIONS for node in live(graph, outputs))
-    seconds = (jaxpr_s, traced - started, emitted - traced, compiled - emitted)
-    return code, Facts(*seconds, graph.asked, computed, len(code), False)
 
 
 @refusing()

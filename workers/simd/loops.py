@@ -129,5 +129,5 @@ def substitute(graph: Graph, node: int, replaced: Mapping[int, int], *, itself: 
         waiting.pop()
         if top not in copies:
             key = graph.keys[top]
-            copies[top] = graph.op_again(key[0], *(copies[a] for a in key[1:])) if graph.arguments(top) else top
+            copies[top] = graph.op(key[0], *(copies[a] for a in key[1:])) if graph.arguments(top) else top
     return copies[node]

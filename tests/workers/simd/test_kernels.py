@@ -202,7 +202,8 @@ def test_digests_tell_functions_apart_and_know_them_again() -> None:
 def test_facts_say_what_compiling_took() -> None:
     first = compile_kernel(swing, jax.ShapeDtypeStruct((5,), jnp.float32)).facts
     assert not first.cached
-    assert first.computed < first.asked
+    assert first.computed > 0
     assert first.code_bytes > 0
     again: Kernel = compile_kernel(swing, jax.ShapeDtypeStruct((5,), jnp.float32))
     assert again.facts.cached
+    assert again.facts.code_bytes == first.code_bytes
