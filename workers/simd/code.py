@@ -71,20 +71,20 @@ class Code:
         """A pointer `index` elements of a type further on."""
         return self.value(f"getelementptr {kind}, ptr {pointer}, i64 {index}")
 
-    def load(self, kind: str, pointer: str, index: str | int = 0, align: int | None = None) -> str:
+    def load(self, kind: str, pointer: str, index: str | int = 0) -> str:
         """Element `index` of a type in memory; vectors of 32-bit words are aligned."""
         place = self.at(pointer, index, kind)
-        return self.value(f"load {kind}, ptr {place}, align {align or self._alignment(kind)}")
+        return self.value(f"load {kind}, ptr {place}, align {self._alignment(kind)}")
 
-    def store(self, kind: str, value: str, pointer: str, index: str | int = 0, align: int | None = None) -> None:
+    def store(self, kind: str, value: str, pointer: str, index: str | int = 0) -> None:
         """Put a value into element `index` of a type in memory."""
         place = self.at(pointer, index, kind)
-        self.do(f"store {kind} {value}, ptr {place}, align {align or self._alignment(kind)}")
+        self.do(f"store {kind} {value}, ptr {place}, align {self._alignment(kind)}")
 
     def _alignment(self, kind: str) -> int:
         if kind == self.vector["f"] or kind == self.vector["i"]:
             return 4 * self.width
-        return {"i8": 1, "i64": 8}.get(kind, 1 if kind.endswith("x i8>") else 4)
+        return 1 if kind.endswith("x i8>") else 4
 
     def index(self, *terms: tuple[str | int, int]) -> str:
         """Sum of (i64 value, factor)."""

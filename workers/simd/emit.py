@@ -63,7 +63,8 @@ def graph_function(
         places += [(f"%{pointer}", used[pointer] + word) for word in range(words)]
         used[pointer] += words
     writer = _Writer(code, graph, outputs, places)
-    stored = [writer.in_memory(node) for node in writer.compute_all(outputs)]
+    writer.compute_all()
+    stored = [writer.in_memory(node) for node in outputs]
     for word, (kind, value) in enumerate(stored):
         code.store(kind, value, f"%{out}", word)
     return code
@@ -73,7 +74,8 @@ def inline(code: Code, graph: Graph, outputs: Sequence[int], given: Mapping[int,
     """Write a graph without loops into a function: names of its outputs, where those of its inputs are given."""
     writer = _Writer(code, graph, outputs, [])
     writer.values.update(given)
-    return [writer.value(node) for node in writer.compute_all(outputs)]
+    writer.compute_all()
+    return [writer.value(node) for node in outputs]
 
 
 class _Writer:
@@ -81,10 +83,8 @@ class _Writer:
 
     def __init__(self, code: Code, graph: Graph, outputs: Sequence[int], places: Sequence[tuple[str, int]]) -> None:
         self.code, self.graph, self.places = code, graph, places
-        self.words = {
-            **{"F": code.vector["f"], "I": code.vector["i"], "B": code.vector["b"]},
-            **{"N": f"v{code.width}f32", "M": f"v{code.width}i32"},
-        }
+        self.words = {kind.upper(): vector for kind, vector in code.vector.items()}
+        self.words |= {"N": f"v{code.width}f32", "M": f"v{code.width}i32"}
         self.schedule = schedule(graph, outputs)
         self.absorbed = set(self.schedule.fused.values())
         self.slots: dict[int, int] = {}
@@ -94,14 +94,13 @@ class _Writer:
         self.values: dict[int, str] = {}
         """Node -> its name in the present block; what is loaded once stays known."""
 
-    def compute_all(self, outputs: Sequence[int]) -> Sequence[int]:
-        """All instructions, in order; gives the outputs back."""
+    def compute_all(self) -> None:
+        """All instructions, in order."""
         self.region(self.schedule.region)
         if self.slot_count > MOST_SLOTS:
             raise UnsupportedError(f"{self.slot_count:,} values that loops carry and look at; {MOST_SLOTS:,} fit")
         if self.slot_count:
             self.code.memory.append(f"  {self.memory} = alloca [{self.slot_count} x {self.words['I']}], align 64")
-        return outputs
 
     def region(self, region: Region) -> None:
         """Straight code, and the loops in it."""
@@ -140,7 +139,7 @@ class _Writer:
             name, values = "fma", self.fused_values(node)
         else:
             values = [self.value(a) for a in arguments]
-        self.values[node] = self.code.value(self.form(name, values))
+        self.values[node] = self.operation(name, values)
 
     def fused_values(self, node: int) -> list[str]:
         """Arguments of the fused operation that a sum or difference becomes."""
@@ -149,19 +148,19 @@ class _Writer:
         factors = [self.value(a) for a in self.graph.arguments(product)]
         other = self.value(second if product == first else first)
         if name == "sub" and product == second:
-            factors[0] = self.code.value(self.form("neg", factors[:1]))
+            factors[0] = self.operation("neg", factors[:1])
         elif name == "sub":
-            other = self.code.value(self.form("neg", [other]))
+            other = self.operation("neg", [other])
         return [*factors, other]
 
-    def form(self, name: str, values: Sequence[str]) -> str:
-        """The text of an operation; what it calls is declared."""
-        text = OPERATIONS[name].llvm.format(*values, **self.words)
-        if text.startswith("call"):
-            intrinsic = text[text.index("@") : text.index("(")]
-            kinds = ", ".join(self.code.vector[kind] for kind in OPERATIONS[name].takes)
-            self.code.declarations.add(f"declare {self.code.vector[OPERATIONS[name].gives]} {intrinsic}({kinds})")
-        return text
+    def operation(self, name: str, values: Sequence[str]) -> str:
+        """Name of an operation's value."""
+        operation, vector = OPERATIONS[name], self.code.vector
+        text = operation.llvm.format(*values, **self.words)
+        if not text.startswith("llvm."):
+            return self.code.value(text)
+        typed = [(vector[kind], value) for kind, value in zip(operation.takes, values, strict=True)]
+        return self.code.call(vector[operation.gives], text, *typed)
 
     def value(self, node: int) -> str:
         """Name of a node's value, which is loaded where it lies in memory."""

@@ -24,8 +24,8 @@ class Operation(NamedTuple):
     meaning: Callable[..., Any]
     """In NumPy: folds constants, and is the twin that tests hold machine code against."""
     llvm: str
-    """Its instruction: {0}, {1}, {2} are arguments; {F}, {I}, {B} the vector types; {N} and {M} the suffixes
-    of intrinsics on floats and on integers."""
+    """Its instruction: {0}, {1}, {2} are arguments; {F}, {I}, {B} the vector types. Or the intrinsic that it calls,
+    with {N} or {M}, the suffixes of those on floats and on integers."""
     commutes: bool = False
 
 
@@ -63,13 +63,13 @@ OPERATIONS: dict[str, Operation] = {
     "sub": Operation("ff", "f", np.subtract, "fsub {F} {0}, {1}"),
     "mul": Operation("ff", "f", np.multiply, "fmul {F} {0}, {1}", commutes=True),
     "div": Operation("ff", "f", np.divide, "fdiv {F} {0}, {1}"),
-    "fma": Operation("fff", "f", _fused, "call {F} @llvm.fma.{N}({F} {0}, {F} {1}, {F} {2})"),
+    "fma": Operation("fff", "f", _fused, "llvm.fma.{N}"),
     "neg": Operation("f", "f", np.negative, "fneg {F} {0}"),
-    "abs": Operation("f", "f", np.abs, "call {F} @llvm.fabs.{N}({F} {0})"),
-    "sqrt": Operation("f", "f", np.sqrt, "call {F} @llvm.sqrt.{N}({F} {0})"),
-    "floor": Operation("f", "f", np.floor, "call {F} @llvm.floor.{N}({F} {0})"),
-    "ceil": Operation("f", "f", np.ceil, "call {F} @llvm.ceil.{N}({F} {0})"),
-    "round": Operation("f", "f", np.rint, "call {F} @llvm.roundeven.{N}({F} {0})"),
+    "abs": Operation("f", "f", np.abs, "llvm.fabs.{N}"),
+    "sqrt": Operation("f", "f", np.sqrt, "llvm.sqrt.{N}"),
+    "floor": Operation("f", "f", np.floor, "llvm.floor.{N}"),
+    "ceil": Operation("f", "f", np.ceil, "llvm.ceil.{N}"),
+    "round": Operation("f", "f", np.rint, "llvm.roundeven.{N}"),
     # Comparisons with NaN are false, but for `ne`.
     "eq": Operation("ff", "b", np.equal, "fcmp oeq {F} {0}, {1}", commutes=True),
     "ne": Operation("ff", "b", np.not_equal, "fcmp une {F} {0}, {1}", commutes=True),
@@ -91,9 +91,7 @@ OPERATIONS: dict[str, Operation] = {
     "shl": Operation("ii", "i", np.left_shift, "shl {I} {0}, {1}"),
     "lshr": Operation("ii", "i", lambda a, b: (_unsigned(a) >> _unsigned(b)).view(np.int32), "lshr {I} {0}, {1}"),
     "ashr": Operation("ii", "i", np.right_shift, "ashr {I} {0}, {1}"),
-    "popcount": Operation(
-        "i", "i", lambda a: np.bitwise_count(_unsigned(a)).astype(np.int32), "call {I} @llvm.ctpop.{M}({I} {0})"
-    ),
+    "popcount": Operation("i", "i", lambda a: np.bitwise_count(_unsigned(a)).astype(np.int32), "llvm.ctpop.{M}"),
     "ieq": Operation("ii", "b", np.equal, "icmp eq {I} {0}, {1}", commutes=True),
     "slt": Operation("ii", "b", np.less, "icmp slt {I} {0}, {1}"),
     "ult": Operation("ii", "b", lambda a, b: _unsigned(a) < _unsigned(b), "icmp ult {I} {0}, {1}"),

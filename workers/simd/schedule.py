@@ -51,7 +51,7 @@ def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
         while waiting:
             node = waiting[-1]
             key = graph.keys[node]
-            if node in done or home[node] != number or key[0] in ("const", "input", "carry"):
+            if node in done or home[node] != number or not _is_made(graph, node):
                 waiting.pop()
                 continue
             first = outside[key[2]] if key[0] == "result" else graph.arguments(node)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from workers.simd.graph import Graph
 from workers.simd.loops import build_loop
 from workers.simd.primitives import PRIMITIVES, Nodes, UnsupportedError
-from workers.simd.primitives.registry import aval_of, check_bytes, kind_of, refusing
+from workers.simd.primitives.registry import check_bytes, kind_of, refusing
 
 GRAPH_LIMIT = 2_000_000
 """Nodes; what needs more would not be compiled in useful time."""
@@ -60,9 +60,8 @@ class Tracer:
         values: dict[Any, Nodes] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
         def read(atom: Any) -> Nodes:
-            return (
-                self.constants(np.asarray(atom.val, aval_of(atom).dtype)) if isinstance(atom, Literal) else values[atom]
-            )
+            aval: Any = atom.aval
+            return self.constants(np.asarray(atom.val, aval.dtype)) if isinstance(atom, Literal) else values[atom]
 
         for equation in jaxpr.eqns:
             rule = PRIMITIVES.get(equation.primitive.name)
@@ -83,7 +82,7 @@ class Tracer:
             if not isinstance(outputs, list):
                 outputs = [outputs]
             for variable, nodes in zip(equation.outvars, outputs, strict=True):
-                aval = aval_of(variable)
+                aval: Any = variable.aval
                 assert nodes.shape == aval.shape, (equation.primitive.name, nodes.shape, aval)
                 kinds = {self.graph.kinds[node] for node in nodes.reshape(-1).tolist()}
                 assert kinds <= {kind_of(aval.dtype)}, (equation.primitive.name, kinds, aval)

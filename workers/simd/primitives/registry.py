@@ -66,14 +66,9 @@ BYTES = {"convert_element_type", "population_count", "broadcast_in_dim", "reshap
 
 def check_bytes(equation: Any) -> None:
     """Raise UnsupportedError for arithmetic of uint8."""
-    dtypes = {str(aval_of(atom).dtype) for atom in (*equation.invars, *equation.outvars)}
+    dtypes = {str(atom.aval.dtype) for atom in (*equation.invars, *equation.outvars)}
     if "uint8" in dtypes and equation.primitive.name not in BYTES:
         raise UnsupportedError(f"{equation.primitive.name} of uint8")
-
-
-def aval_of(atom: Any) -> Any:
-    """Shape and dtype of a variable or literal."""
-    return atom.aval
 
 
 def dtype_in(equation: Any, position: int = 0) -> str:
