@@ -120,7 +120,7 @@ def compile_episodes(
         spec=spec,
         inputs_O=inputs_O,
         network=written.network,
-        begin=_begin(written.steps, jax.tree.leaves(carry), target, folder),
+        begin=_begin(written.steps, target, folder),
         alive_word=written.alive_word,
         episode_avals=carry.episode,
         episode_words=sum(map(words_of, carry.episode)),
@@ -174,9 +174,7 @@ def write_episodes(
     return Written(steps, carry, alive_word, network, name, text)
 
 
-def _begin(
-    steps: EpisodeSteps, leaves: list[Any], target: Target, folder: Path | None
-) -> Callable[[np.ndarray], np.ndarray]:
+def _begin(steps: EpisodeSteps, target: Target, folder: Path | None) -> Callable[[np.ndarray], np.ndarray]:
     """Resets, compiled; or by JAX, where they cannot be, as those of Brax's own environments: few beside the steps, but
     their bits are those of XLA on one kind of processor."""
     key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
@@ -188,7 +186,7 @@ def _begin(
 
     def begin(keys_L: np.ndarray) -> np.ndarray:
         keys = pack([keys_L], target.width)
-        out = aligned((len(keys), sum(map(words_of, leaves)), target.width))
+        out = aligned((len(keys), kernel.words_out, target.width))
         kernel.run(keys, out)
         return out
 

@@ -78,3 +78,8 @@ def test_every_primitive_has_a_case() -> None:
 def test_what_cannot_be_compiled_is_named_with_where_it_comes_from(function: Callable, says: str) -> None:
     with pytest.raises(UnsupportedError, match=f"(?s){says}.*from .*test_primitives.py:[0-9]+"):
         compile_kernel(function, jax.ShapeDtypeStruct((3,), jnp.float32))
+
+
+@pytest.mark.parametrize("dtype", [bool, np.int32])
+def test_a_choice_of_one_case_is_that_case(dtype: type) -> None:
+    check(lax.select_n, [np.zeros(5, dtype), np.arange(5, dtype=np.float32)])

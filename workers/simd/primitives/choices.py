@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -98,16 +98,22 @@ def choose(g: Graph, mask: int, if_true: int, if_false: int) -> int:
     return g.op("or", g.op("and", mask, if_true), g.op("and", g.op("xor", g.const("b", True), mask), if_false))
 
 
-@primitive("select_n")
-def _select_n(t: Tracer, equation: Any, which: Nodes, *cases: Nodes) -> Nodes:
-    g = t.graph
-    if kind_of(dtype_in(equation)) == "b":
-        return t.map(lambda mask, a, b: choose(g, mask, b, a), which, *cases)
-    chosen = cases[-1]  # indices are clamped by JAX to what there is
-    for number in reversed(range(len(cases) - 1)):
-        first = t.map(lambda n, number=number: g.op("slt", n, g.i(number + 1)), which)
-        chosen = t.map(lambda mask, a, b: choose(g, mask, a, b), first, cases[number], chosen)
+def select(t: Tracer, dtype: str, which: Nodes, cases: Sequence[Sequence[Nodes]]) -> list[Nodes]:
+    """Arrays of one of some cases, element by element; a number below or beyond means the first or the last."""
+    g, is_truth, chosen = t.graph, kind_of(dtype) == "b", list(cases[-1])
+
+    def one(mask: int, early: int, late: int) -> int:
+        return choose(g, mask, late, early) if is_truth else choose(g, mask, early, late)
+
+    for number, case in reversed(list(enumerate(cases[:-1]))):
+        mask = which if is_truth else t.map(lambda n, end=number + 1: g.op("slt", n, g.i(end)), which)
+        chosen = [t.map(one, mask, early, late) for early, late in zip(case, chosen, strict=True)]
     return chosen
+
+
+@primitive("select_n")
+def _select_n(t: Tracer, equation: Any, which: Nodes, *cases: Nodes) -> list[Nodes]:
+    return select(t, dtype_in(equation), which, [[case] for case in cases])
 
 
 @primitive("convert_element_type")

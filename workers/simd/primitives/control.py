@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from workers.simd.primitives.choices import choose
-from workers.simd.primitives.registry import Nodes, UnsupportedError, primitive
+from workers.simd.primitives.choices import select
+from workers.simd.primitives.registry import Nodes, UnsupportedError, dtype_in, primitive
 
 if TYPE_CHECKING:
     from workers.simd.trace import Tracer
@@ -38,17 +38,7 @@ def _cond(t: Tracer, equation: Any, which: Nodes, *arrays: Nodes) -> list[Nodes]
     value = t.values(which)
     if value is not None:
         return t.closed(branches[min(max(int(value), 0), len(branches) - 1)], arrays)
-    g = t.graph
-    boolean = g.kinds[int(which)] == "b"
-    cases = [t.closed(branch, arrays) for branch in branches]
-    chosen = cases[-1]
-    for number in reversed(range(len(branches) - 1)):
-        first = g.op("xor", g.const("b", True), int(which)) if boolean else g.op("slt", int(which), g.i(number + 1))
-        chosen = [
-            t.map(lambda a, b, first=first: choose(g, first, a, b), one, other)
-            for one, other in zip(cases[number], chosen, strict=True)
-        ]
-    return chosen
+    return select(t, dtype_in(equation), which, [t.closed(branch, arrays) for branch in branches])
 
 
 @primitive("scan")

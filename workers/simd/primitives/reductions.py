@@ -46,14 +46,12 @@ def _of_nothing(t: Tracer, equation: Any) -> int:
     return t.graph.const(kind, neutral[name])
 
 
-def _adder(t: Tracer, equation: Any) -> Callable[[int, int], int]:
-    name = "add" if kind_of(dtype_in(equation)) == "f" else "iadd"
-    return lambda a, b: t.graph.op(name, a, b)
+def _numbers(name: str) -> Callable[[Tracer, Any], Callable[[int, int], int]]:
+    def combine(t: Tracer, equation: Any) -> Callable[[int, int], int]:
+        own = name if kind_of(dtype_in(equation)) == "f" else f"i{name}"
+        return lambda a, b: t.graph.op(own, a, b)
 
-
-def _multiplier(t: Tracer, equation: Any) -> Callable[[int, int], int]:
-    name = "mul" if kind_of(dtype_in(equation)) == "f" else "imul"
-    return lambda a, b: t.graph.op(name, a, b)
+    return combine
 
 
 def _logic(name: str) -> Callable[[Tracer, Any], Callable[[int, int], int]]:
@@ -65,8 +63,8 @@ def _logic(name: str) -> Callable[[Tracer, Any], Callable[[int, int], int]]:
     return combine
 
 
-PRIMITIVES["reduce_sum"] = _reduce(_adder)
-PRIMITIVES["reduce_prod"] = _reduce(_multiplier)
+PRIMITIVES["reduce_sum"] = _reduce(_numbers("add"))
+PRIMITIVES["reduce_prod"] = _reduce(_numbers("mul"))
 PRIMITIVES["reduce_max"] = _reduce(lambda t, equation: extreme_of(t.graph, "max", dtype_in(equation)))
 PRIMITIVES["reduce_min"] = _reduce(lambda t, equation: extreme_of(t.graph, "min", dtype_in(equation)))
 PRIMITIVES["reduce_and"] = _reduce(_logic("and"))
@@ -126,8 +124,8 @@ def _cumulate(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Ru
     return rule
 
 
-PRIMITIVES["cumsum"] = _cumulate(_adder)
-PRIMITIVES["cumprod"] = _cumulate(_multiplier)
+PRIMITIVES["cumsum"] = _cumulate(_numbers("add"))
+PRIMITIVES["cumprod"] = _cumulate(_numbers("mul"))
 PRIMITIVES["cummax"] = _cumulate(lambda t, equation: extreme_of(t.graph, "max", dtype_in(equation)))
 PRIMITIVES["cummin"] = _cumulate(lambda t, equation: extreme_of(t.graph, "min", dtype_in(equation)))
 
