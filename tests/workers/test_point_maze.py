@@ -1,5 +1,8 @@
 """PointMaze against a scalar twin of the published rules, and against landmarks worked out by hand."""
 
+import importlib
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -84,8 +87,11 @@ def test_reset_covers_its_rectangle_and_corner_is_fixed():
 def test_task_table_tells_the_truth(name):
     """The driver plans with the table and never sees the module; a wrong size would only show in a worker."""
     task = TASKS[name]
+    takes = inspect.signature(importlib.import_module(f"workers.environments.{name}").make).parameters
+    assert {option: values[0] for option, values in task.options.items()} == {x.name: x.default for x in takes.values()}
     environment = make_environment(name, {option: values[0] for option, values in task.options.items()})
     state = environment.reset(stream_keys(0, Domain.TRAINING_RESET, 0))
+    assert np.isfinite(environment.goal_distance(state)) == task.has_goal
     assert environment.observe(state).shape == (task.observation_size,)
     assert environment.descriptor(state).shape == (len(task.descriptor_names),) == (len(task.descriptor_bounds),)
     _, reward, done = environment.step(state, jnp.zeros(task.action_size))

@@ -10,23 +10,12 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from workers.environments import Environment
+from workers.environments import TASKS, Environment
 from workers.environments.ant import AntState, make_ant, observe
 
-LOW, HIGH = -35.0, 40.0
+WALLS = TASKS["ant_maze"].walls or ()
+LOW, HIGH = TASKS["ant_maze"].descriptor_bounds[0]
 """Of x and of y: the arena is a square."""
-BORDERS = (
-    ((LOW, LOW), (HIGH, LOW)),
-    ((LOW, HIGH), (HIGH, HIGH)),
-    ((LOW, LOW), (LOW, HIGH)),
-    ((HIGH, LOW), (HIGH, HIGH)),
-)
-INNER_WALLS = (
-    ((-15.0, 3.0), (-15.0, 37.0)),
-    ((-16.0, -15.0), (10.0, -15.0)),
-    ((10.0, -35.0), (10.0, 0.0)),
-)
-WALLS = BORDERS + INNER_WALLS
 START = (-25.0, -25.0)
 GOAL = (35.0, -25.0)
 MIDDLE, HALF = (LOW + HIGH) / 2.0, (HIGH - LOW) / 2.0

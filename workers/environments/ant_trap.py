@@ -10,16 +10,12 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from workers.environments import Environment
+from workers.environments import TASKS, Environment
 from workers.environments.ant import STEP_S, AntState, contact_forces, make_ant, observe
 
-WALLS = (
-    ((12.0, -2.0), (12.0, 2.0)),
-    ((7.0, 3.0), (12.0, 3.0)),
-    ((7.0, -3.0), (12.0, -3.0)),
-)
+WALLS = TASKS["ant_trap"].walls or ()
+DESCRIPTOR_BOUNDS = TASKS["ant_trap"].descriptor_bounds
 START = (0.0, 0.0)
-DESCRIPTOR_BOUNDS = ((0.0, 30.0), (-8.0, 8.0))
 HEALTHY_Z = (0.2, 1.0)
 SURVIVAL_REWARD = 1.0
 CONTROL_COST, CONTACT_COST = 0.5, 5e-4
