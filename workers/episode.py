@@ -29,8 +29,10 @@ class Episodes(NamedTuple):
     goal_distance: Any
     """[..., 2]: at the end and at its least."""
     shifted_sum_O: Any
-    """Sum over counted steps of (observation - statistics' mean); float32, exact enough for one episode. Of
-    evaluations, which feed no statistics: empty."""
+    """Sum over counted steps of (observation - statistics' mean); float32. Exact enough for one episode if that mean is
+    near the observations'; before any are known (in generation 1, or in blocks that run with an elite's statistics from
+    random weights) if their mean is below a thousand standard deviations. Of evaluations, which feed no statistics:
+    empty."""
     shifted_square_sum_O: Any
     trace_T_B: Any
     """Of evaluations: the descriptor along the episode; empty in training. Point k is where it was after

@@ -19,6 +19,7 @@ nothing comes, for the map's coverage of what can be reached; `least_reward`, fr
 whose first line `es-service` shows. All methods are pure functions that JAX can trace, of one state: they are batched
 and compiled for you. `es_service.noise.uniforms(key, counters)` makes random numbers. In training, actions leave
 [-1, 1] by up to 7.95 times `policy.action_noise`, which is added after the last tanh: a task that needs a bound clips.
+Observations are summed in float32: in units in which they are not thousands of their standard deviations from 0.
 """
 
 from __future__ import annotations
