@@ -35,9 +35,9 @@ def test_a_session_is_forgotten_with_the_link_to_it_and_with_no_other(tmp_path, 
     worker = SimpleNamespace(_global_node=node)
     ray = SimpleNamespace(_private=SimpleNamespace(worker=worker), shutdown=lambda: delattr(worker, "_global_node"))
     assert latest.exists()
-    ray_cluster.disconnect(ray, forget=True)  # type: ignore[arg-type]
+    ray_cluster.disconnect(ray, forget=True)
     assert (ours.exists(), other.exists(), latest.is_symlink()) == (False, True, not is_latest)
     worker._global_node = node
     node.get_session_dir_path = lambda: str(other)
-    ray_cluster.disconnect(ray)  # type: ignore[arg-type]
+    ray_cluster.disconnect(ray)
     assert other.exists()
