@@ -24,7 +24,7 @@ def run(tmp_path):
             "policy": {"hidden": [8]},
             "search": {"algorithm": "es", "pairs": 8, "evaluation_episodes": 4},
             "budget": {"generations": 3},
-            "compute": {"chunk_pairs": 2, "gradient_block_pairs": 4},
+            "compute": {"chunk_pairs": 2, "gradient_block_pairs": 4, "no_worker_timeout_s": 600},
         }
         (tmp_path / "my.yaml").write_text(yaml.safe_dump(config))
         code, printed = es(*words, cwd=tmp_path)
