@@ -13,7 +13,7 @@ from typing import Any
 from es_service.config.yaml_text import did_you_mean, one_of
 from es_service.cores import cores
 from es_service.errors import ConfigError, EvaluationError
-from es_service.protocol import child_environment
+from es_service.process_environment import child_environment
 from es_service.tasks import TASKS
 
 BATCHES = {"point_maze": (64,)}

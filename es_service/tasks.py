@@ -14,7 +14,8 @@ from functools import cache
 
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
-from es_service.protocol import TaskSpec, child_environment, with_options
+from es_service.process_environment import child_environment
+from es_service.protocol import TaskSpec, with_options
 from workers import environments
 from workers.simd.target import NoVectorsError, host_target
 

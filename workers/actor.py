@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from es_service.platform_info import platform_info, platform_text
-from es_service.protocol import Centre, Chunk, ChunkResult, WorkerPlace, worker_environment
+from es_service.process_environment import worker_environment
+from es_service.protocol import Centre, Chunk, ChunkResult, WorkerPlace
 
 
 class WorkerActor:

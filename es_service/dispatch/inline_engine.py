@@ -25,7 +25,8 @@ from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
-from es_service.protocol import Centre, Chunk, WorkerSpec, child_environment
+from es_service.process_environment import child_environment
+from es_service.protocol import Centre, Chunk, WorkerSpec
 from es_service.wire import BUFFER_BYTES, Channel, framed
 
 PIECE_S = 0.1

@@ -33,7 +33,8 @@ from es_service import api, session
 from es_service.config.model import RunConfig, worker_spec
 from es_service.errors import Interrupted
 from es_service.platform_info import cpu_kind
-from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts, worker_environment
+from es_service.process_environment import worker_environment
+from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts
 from es_service.run_view import Policy, Run
 from es_service.tasks import task_of
 from tests.benchmarks import science_picture

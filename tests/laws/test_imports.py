@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-LEAVES = {"es_service.protocol", "es_service.noise", "es_service.wire", "es_service.platform_info"}
+LEAVES = {f"es_service.{name}" for name in ("protocol", "noise", "wire", "platform_info", "process_environment")}
 JOINERS = {"api.py", "bench.py", "cli.py", "doctor.py", "run_view.py", "session.py", "tasks.py"}
 """Files of es_service that know both sides: the Python interface and the command line. `run_view` is the interface's
 reading half (a policy runs in NumPy), `doctor` the command's."""

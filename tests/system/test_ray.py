@@ -19,7 +19,8 @@ from es_service.dispatch.messages import Policy
 from es_service.dispatch.ray_cluster import Claim
 from es_service.dispatch.ray_engine import Actors, ray_engine
 from es_service.errors import EvaluationError
-from es_service.protocol import TrainingChunk, WorkerPlace, worker_environment
+from es_service.process_environment import worker_environment
+from es_service.protocol import TrainingChunk, WorkerPlace
 from es_service.store.reader import read_generation
 from tests.dispatch_checker import check_dispatch
 from tests.helpers import centre, random_parameters, spec
