@@ -5,6 +5,8 @@ Importing takes half a second; a Ctrl-C in it should not end in a traceback eith
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
 import sys
 
@@ -21,7 +23,11 @@ def main() -> None:
 
         run_command()
     except Interrupted as stop:
-        sys.exit(128 + stop.signal_number)
+        # All is closed and told. Python's own end crashes where the signal met Ray while Ray's handlers were in force.
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError):
+                stream.flush()
+        os._exit(128 + stop.signal_number)
 
 
 if __name__ == "__main__":
