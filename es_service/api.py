@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from es_service.budget import REACHED, limits_of, raised
 from es_service.commands import command
 from es_service.config.changes import changed_constants, describe_changes
 from es_service.config.loading import Source
@@ -22,6 +23,7 @@ from es_service.errors import ConfigError, StoreError
 from es_service.history import history_columns
 from es_service.lineage import fork_config, forked, started
 from es_service.protocol import TaskSpec
+from es_service.report.standing import Standing, look, way_on
 from es_service.run_view import open_run
 from es_service.session import OnGeneration, OnNotice, Outcome, work
 from es_service.store.beginning import Beginning
@@ -131,7 +133,8 @@ def _go_on(
         store.notices.clear()
         config = make_config(store)
         if changes := changed_constants(store.meta.constants, config.constants()):
-            raise ConfigError(f"{folder}: {describe_changes(changes, str(folder), _budget_of_a_fork(config, store))}")
+            besides = _budget_of_a_fork(config, look(open_run(folder)))
+            raise ConfigError(f"{folder}: {describe_changes(changes, str(folder), besides)}")
         task = task_of(config)
         if other := _other_task(store.meta.task, task):
             raise ConfigError(
@@ -150,12 +153,13 @@ def _go_on(
         return work(config, store, on_generation, on_notice)
 
 
-def _budget_of_a_fork(config: RunConfig, store: RunStore) -> list[tuple[str, int]]:
-    """The key that a fork has to set besides those that are to change, so that there is anything left to do."""
-    wanted, done = config.budget.generations, store.generation or 0
-    if wanted is None or (wanted > done and wanted == store.meta.config["budget"]["generations"]):
-        return []
-    return [("budget.generations", wanted if wanted > done else 2 * max(1, done))]
+def _budget_of_a_fork(config: RunConfig, standing: Standing) -> dict[str, Any]:
+    """The keys of the budget that a fork has to set besides those that are to change: what it would not take over from
+    the run, and what it would find spent."""
+    limits = limits_of(config.budget)
+    wanted = {key: limits.get(key) for key in REACHED if limits.get(key) != standing.limits.get(key)}
+    wanted |= raised(limits, standing.row) if standing.row else {}
+    return {f"budget.{key}": value for key, value in wanted.items()}
 
 
 def _other_task(recorded: Mapping[str, Any], task: TaskSpec) -> str:
@@ -193,7 +197,7 @@ def fork(
     if outcome.run.generation == (begun := lineage["generation"]):
         on_notice(
             f"nothing was run: {outcome.reason} at generation {begun} already, where this fork begins; with a larger "
-            f"budget: {command('resume', outcome.run.folder, '--set', f'budget.generations={2 * max(1, begun)}')}"
+            f"budget: {way_on(look(outcome.run))}"
         )
     return outcome
 

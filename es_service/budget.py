@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import Any
 
 from es_service.config.model import BudgetConfig
 
@@ -35,3 +37,15 @@ def spent(limits: Mapping[str, float], row: Mapping[str, float]) -> dict[str, st
         row: the newest generation's, of which the columns in REACHED are needed.
     """
     return {key: _REASONS[key].format(limit) for key, limit in limits.items() if row[REACHED[key]] >= limit}
+
+
+def raised(limits: Mapping[str, float], row: Mapping[str, Any]) -> dict[str, float | None]:
+    """What to set, by key, so that a run that is over goes on: twice as much of what is spent, no target that is
+    reached; nothing if it is not over."""
+    wanted: dict[str, float | None] = {}
+    for key in spent(limits, row):
+        limit, reached = limits[key], row[REACHED[key]]  # steps may have overshot it by more than it is
+        wanted[key] = None if key == "target_fitness" else math.ceil(2 * (limit if 2 * limit > reached else reached))
+    if "target_fitness" in wanted and limits.keys() == {"target_fitness"}:
+        wanted["generations"] = 2 * max(1, row["generation"])  # something must end it
+    return wanted

@@ -5,7 +5,11 @@ from __future__ import annotations
 import shlex
 import shutil
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+from es_service.config.yaml_text import show
 
 PROGRAM = "es-service"
 
@@ -14,6 +18,11 @@ def command(*words: object) -> str:
     """A command of this program that can be copied into a shell, whatever its words contain: a folder's name may have
     spaces."""
     return shlex.join([*_program(), *map(str, words)])
+
+
+def settings(values: Mapping[str, Any]) -> list[str]:
+    """Options of a command that set these keys."""
+    return [word for key, value in values.items() for word in ("--set", f"{key}={show(value)}")]
 
 
 def install_command(extra: str) -> str:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
-from es_service.commands import command
+from es_service.commands import command, settings
 from es_service.config.fields import OPTIONS
 from es_service.config.yaml_text import show
 
@@ -58,22 +59,22 @@ def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tu
 
 
 def describe_changes(
-    changes: Sequence[tuple[str, Any, Any]], run: str = "RUN", besides: Sequence[tuple[str, Any]] = ()
+    changes: Sequence[tuple[str, Any, Any]], run: str = "RUN", besides: Mapping[str, Any] = MappingProxyType({})
 ) -> str:
     """What to tell someone whose resume would change constants of the run: all of them, and the way out.
 
     Args:
         besides: keys that a fork has to set as well, and their values.
     """
-    forkable = [(name, new) for name, _, new in changes if name not in (*STATE_KEYS, *START_KEYS) and new != ABSENT]
-    settings = [word for name, new in (*forkable, *besides) for word in ("--set", f"{name}={show(new)}")]
+    forkable = {name: new for name, _, new in changes if name not in (*STATE_KEYS, *START_KEYS) and new != ABSENT}
     fixed = [name for name, _, _ in changes if name in (*STATE_KEYS, *START_KEYS)]
     lines = [
         "a run keeps its task, policy, search, novelty, map, seed and chunk shapes for life; this would change:",
         *(f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes),
     ]
     if forkable:
-        lines.append(f"to go on from its state with other settings: {command('fork', run, *settings)}")
+        way = command("fork", run, *settings({**forkable, **besides}))
+        lines.append(f"to go on from its state with other settings: {way}")
     if fixed:
         lines.append(f"a fork has to keep {', '.join(fixed)}; {start_afresh(run)}")
     return "\n".join(lines)
@@ -81,5 +82,5 @@ def describe_changes(
 
 def start_afresh(run: str) -> str:
     """The way out where the state of a run is of no use with the settings that are wanted."""
-    way = command("run", "CONFIG", "--set", f"search.init_from={run}")
+    way = command("run", "CONFIG", *settings({"search.init_from": run}))
     return f"to start anew from its centre (same task and network): {way}"

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from pydantic import ValidationError
 
-from es_service.budget import REACHED, limits_of, spent
-from es_service.commands import command
+from es_service.budget import REACHED, limits_of, raised, spent
+from es_service.commands import command, settings
 from es_service.config.model import BudgetConfig
-from es_service.config.yaml_text import show
 from es_service.errors import ConfigError
 from es_service.report.progress import Row
 from es_service.run_view import Run
@@ -74,17 +72,10 @@ def way_on(standing: Standing) -> str:
 
 
 def more(standing: Standing) -> list[str]:
-    """Options with which a run that is over goes on: twice as much of what is spent, no target that is reached."""
-    row, limits = standing.row, standing.limits
-    if row is None:
+    """Options with which a run that is over goes on."""
+    if standing.row is None:
         return []
-    wanted: dict[str, float | None] = {}
-    for key in standing.reasons:
-        limit, reached = limits[key], row[REACHED[key]]  # steps may have overshot it by more than it is
-        wanted[key] = None if key == "target_fitness" else math.ceil(2 * (limit if 2 * limit > reached else reached))
-    if "target_fitness" in wanted and limits.keys() == {"target_fitness"}:
-        wanted["generations"] = 2 * max(1, row["generation"])  # something must end it
-    return [word for key, value in wanted.items() for word in ("--set", f"budget.{key}={show(value)}")]
+    return settings({f"budget.{key}": value for key, value in raised(standing.limits, standing.row).items()})
 
 
 def to_go(standing: Standing) -> str:

@@ -67,7 +67,24 @@ def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, cap
     assert suggested[::2] == ["--set"] * len(suggested[1::2])
     assert options is None or set(suggested[1::2]) == options
     before = run.generation or 0
-    assert (api.resume(run.folder, suggested[1::2]).run.generation or 0) > before
+    with pytest.raises(ConfigError, match="to go on from its state") as refused:
+        api.resume(run.folder, ["search.sigma=0.05"])
+    [way] = [line for line in str(refused.value).splitlines() if " fork " in line]
+    assert way.endswith(f" fork {run.folder} {' '.join(['--set', 'search.sigma=0.05', *suggested])}")
+    with pytest.warns(RuntimeWarning, match="nothing was run") as told:
+        empty = api.fork(run.folder, ["search.sigma=0.05"], out=tmp_path / "empty").run
+    assert str(told[0].message).endswith(f" resume {empty.folder} {' '.join(suggested)}")
+    for going_on in (
+        api.fork(run.folder, ["search.sigma=0.05", *suggested[1::2]], out=tmp_path / "fork"),
+        api.resume(empty.folder, suggested[1::2]),
+        api.resume(run.folder, suggested[1::2]),
+    ):
+        assert (going_on.run.generation or 0) > before
+
+
+def test_the_way_out_of_a_refused_change_keeps_the_budget_that_was_wanted(run):
+    with pytest.raises(ConfigError, match=r" --set search\.sigma=0\.05 --set budget\.generations=50$"):
+        api.resume(run.folder, ["search.sigma=0.05", "budget.generations=50"])
 
 
 def test_budgets_are_shown_beside_what_is_reached(run, console, capsys):
