@@ -20,7 +20,7 @@ from es_service.api import load_config
 from es_service.config.model import worker_spec
 from es_service.cores import cores
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.messages import Policy
+from es_service.dispatch.messages import Limits
 from es_service.errors import Interrupted, ServiceError
 from es_service.noise import TEST_VECTORS, normal_integers, stream_keys
 from es_service.platform_info import platform_info
@@ -132,7 +132,7 @@ def _rollout() -> Iterator[Finding]:
     mean_O, std_O = normalisation(no_observations(task.observation_size), enabled=False)
     centre = Centre(0, initial_parameters(spec.policy, config.policy.init, 0), config.search.sigma, mean_O, std_O)
     started = time.perf_counter()
-    with stop_on_signals() as should_stop, inline_engine(spec, Policy(workers=1), should_stop) as engine:
+    with stop_on_signals() as should_stop, inline_engine(spec, Limits(workers=1), should_stop) as engine:
         engine.evaluate(centre, [TrainingChunk(0, 0)])
         ready = time.perf_counter()
         results = engine.evaluate(centre, [TrainingChunk(1, chunk) for chunk in range(8)])

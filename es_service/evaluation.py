@@ -24,7 +24,7 @@ from es_service.generation import evaluate_centre
 from es_service.protocol import Centre, Evaluator, FloatArray
 from es_service.run_state import best_from_arrays
 from es_service.run_view import Policy, Run
-from es_service.session import scheduling_policy
+from es_service.session import dispatch_limits
 from es_service.signals import stop_on_signals
 from es_service.tasks import task_of
 
@@ -125,7 +125,7 @@ def evaluate(
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     with (
         stop_on_signals() as should_stop,
-        inline_engine(worker_spec(config, task_of(config)), scheduling_policy(config), should_stop) as engine,
+        inline_engine(worker_spec(config, task_of(config)), dispatch_limits(config), should_stop) as engine,
     ):
         for candidate in chosen:
             fitness_E, descriptor_E_B = _episodes(engine, candidate.policy, config.search.sigma, episodes, seed)

@@ -13,7 +13,7 @@ from es_service.cores import cores
 from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.messages import Policy as SchedulingPolicy
+from es_service.dispatch.messages import Limits
 from es_service.platform_info import computed_on, is_mixed, platform_info
 from es_service.protocol import FloatArray, Moments
 from es_service.run_state import Arrays, moments_from_arrays
@@ -25,7 +25,7 @@ from es_service.tasks import task_of
 from workers.actor import WorkerActor
 from workers.policy import initial_parameters
 
-LIMITS = {
+LIMIT_NAMES = {
     "start_deadline_s": "half of compute.no_worker_timeout_s",
     "first_deadline_s": "compute.compile_timeout_s",
     "min_deadline_s": "at least compute.chunk_timeout_s",
@@ -111,31 +111,31 @@ class _OnPlatforms:
         self._store.commit(generation, parts, history)
 
 
-def scheduling_policy(config: RunConfig) -> SchedulingPolicy:
+def dispatch_limits(config: RunConfig) -> Limits:
     """How patient the engine is, and with how many workers."""
     compute = config.compute
-    return SchedulingPolicy(
+    return Limits(
         workers=worker_count(config),
         max_attempts=compute.max_attempts,
         start_deadline_s=compute.no_worker_timeout_s / 2,  # two tries fit in
         first_deadline_s=compute.compile_timeout_s,
         min_deadline_s=compute.chunk_timeout_s,
         no_worker_timeout_s=compute.no_worker_timeout_s,
-        names=LIMITS,
+        names=LIMIT_NAMES,
     )
 
 
 def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) -> Engine[Any]:
     """What runs the workers, as configured; they are starting."""
-    spec, compute, scheduling = worker_spec(config, task_of(config)), config.compute, scheduling_policy(config)
+    spec, compute, limits = worker_spec(config, task_of(config)), config.compute, dispatch_limits(config)
     if compute.engine == "inline":
-        return inline_engine(spec, scheduling, should_stop, threads=compute.inline_workers == "threads", log=log)
+        return inline_engine(spec, limits, should_stop, threads=compute.inline_workers == "threads", log=log)
     from es_service.dispatch.ray_cluster import Claim
     from es_service.dispatch.ray_engine import ray_engine
 
     return ray_engine(
         spec,
-        scheduling,
+        limits,
         should_stop,
         actor=WorkerActor,
         address=compute.address,

@@ -17,7 +17,7 @@ from es_service.dispatch.scheduler_state import SchedulerState, Slot, Worker, us
 def assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
     """Give queued tasks to workers with room, idle ones first; changes the containers of `s`, which are this step's."""
     retries = s.retries
-    for load in range(s.policy.in_flight):
+    for load in range(s.limits.in_flight):
         if not s.queue:
             break
         for worker in [worker for worker, record in s.up.items() if len(record.slots) == load]:
@@ -40,12 +40,12 @@ def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worke
     """The worker with the clock of its first slot started, and how long that may take."""
     if not worker.slots:
         return worker._replace(deadline_s=math.inf)
-    task, policy = worker.slots[0].task, state.policy
+    task, limits = worker.slots[0].task, state.limits
     usual_s = usual_chunk_s(state, task.kind)
-    limit, limit_s = "min_deadline_s", max(policy.min_deadline_s, policy.deadline_factor * task.size * (usual_s or 0.0))
+    limit, limit_s = "min_deadline_s", max(limits.min_deadline_s, limits.deadline_factor * task.size * (usual_s or 0.0))
     compiles = usual_s is None or task.kind not in worker.warm
-    if compiles and limit_s < policy.first_deadline_s:
-        limit, limit_s = "first_deadline_s", policy.first_deadline_s
+    if compiles and limit_s < limits.first_deadline_s:
+        limit, limit_s = "first_deadline_s", limits.first_deadline_s
     return worker._replace(started_s=now, deadline_s=now + limit_s, limit=limit)
 
 

@@ -107,11 +107,11 @@ class Engine(Generic[AnyTransport]):
     def __init__(
         self,
         transport: AnyTransport,
-        policy: messages.Policy,
+        limits: messages.Limits,
         should_stop: Callable[[], int | None] = lambda: None,
         log: Log = no_log,
     ) -> None:
-        """Start `policy.workers` workers; if that raises, as the log may, the transport is closed.
+        """Start `limits.workers` workers; if that raises, as the log may, the transport is closed.
 
         Args:
             transport: belongs to the engine from now on, which closes it.
@@ -121,7 +121,7 @@ class Engine(Generic[AnyTransport]):
         self.transport = transport
         self._should_stop = should_stop
         self._log = log
-        self._state = initial_state(policy)
+        self._state = initial_state(limits)
         self._centre: Centre | None = None
         self._phase = 0
         self._chunks: dict[Hashable, Sequence[Chunk]] = {}
@@ -187,8 +187,8 @@ class Engine(Generic[AnyTransport]):
         """Chunks, all of one kind, as they are to travel. What is known of their duration never changes a result."""
         if not chunks:
             return []
-        kind, policy = type(chunks[0]).__name__, self._state.policy
-        sizes = task_sizes(len(chunks), self._state.wanted, usual_chunk_s(self._state, kind), policy.task_s)
+        kind, limits = type(chunks[0]).__name__, self._state.limits
+        sizes = task_sizes(len(chunks), self._state.wanted, usual_chunk_s(self._state, kind), limits.task_s)
         ends = list(itertools.accumulate(sizes))
         parts = [chunks[end - size : end] for end, size in zip(ends, sizes, strict=True)]
         return [(TaskKey(self._phase, kind, part[0].generation, part[0].chunk_id, len(part)), part) for part in parts]

@@ -23,7 +23,7 @@ from typing import IO
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp, with_last_words
+from es_service.dispatch.messages import Failure, Limits, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
 from es_service.process_environment import child_environment
 from es_service.protocol import Centre, Chunk, WorkerSpec
@@ -37,18 +37,18 @@ LAST_WORDS_BYTES = 2000
 
 def inline_engine(
     spec: WorkerSpec,
-    policy: Policy,
+    limits: Limits,
     should_stop: Callable[[], int | None] = lambda: None,
     *,
     threads: bool = False,
     log: Log = no_log,
 ) -> Engine[ChildProcesses]:
-    """An Evaluator on this machine, its `policy.workers` workers starting.
+    """An Evaluator on this machine, its `limits.workers` workers starting.
 
     Args:
         threads: of one child, instead of a child each: less memory, and one that is lost takes the others with it.
     """
-    return Engine(ChildProcesses(spec, threads=threads), policy, should_stop, log)
+    return Engine(ChildProcesses(spec, threads=threads), limits, should_stop, log)
 
 
 @dataclass(eq=False)

@@ -1,4 +1,4 @@
-"""What the scheduler and its engines say to each other: tasks, policy, events in, commands out."""
+"""What the scheduler and its engines say to each other: tasks, limits, events in, commands out."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Policy:
+class Limits:
     """How work is handed out and faults are handled: config data. Raises ValueError for a count below 1."""
 
     workers: int

@@ -21,7 +21,7 @@ from typing import Any
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.messages import Drain, Failure, Placed, Policy, SetWorkers, WorkerLost, WorkerUp
+from es_service.dispatch.messages import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import ONE_CORE, Claim, Watch, connect, demand, disconnect, look
 from es_service.errors import EvaluationError
 from es_service.protocol import Centre, Chunk, WorkerPlace, WorkerSpec
@@ -32,7 +32,7 @@ IN_CALL_BYTES = 64 * 2**10
 
 def ray_engine(
     spec: WorkerSpec,
-    policy: Policy,
+    limits: Limits,
     should_stop: Callable[[], int | None] = lambda: None,
     *,
     actor: type,
@@ -48,22 +48,22 @@ def ray_engine(
         address: a cluster's "HOST:PORT", or "auto" for the one on this machine; None starts a Ray of our own here,
             whatever other Ray or RAY_ADDRESS there may be, and ends it with the engine.
         claim: what one worker needs of a node.
-        elastic: as many workers as there is room for, instead of `policy.workers`; in a cluster, also when it changes.
+        elastic: as many workers as there is room for, instead of `limits.workers`; in a cluster, also when it changes.
 
     Raises:
         EvaluationError: Ray is missing, does not start, has no room for a worker on this machine, or no cluster answers
             at the address. Interrupted: SIGTERM arrived meanwhile.
     """
-    ray = connect(address, claim, policy.workers if elastic else policy.workers * claim.cpus)
+    ray = connect(address, claim, limits.workers if elastic else limits.workers * claim.cpus)
     try:
         room = look(ray, claim).room
         if address is None and not room:  # nor will there ever be
             raise EvaluationError(f"this machine has no place for a worker. {demand(ray, claim)}")
         if elastic:
-            policy = replace(policy, workers=max(1, room))
+            limits = replace(limits, workers=max(1, room))
         watch = None if address is None else Watch(ray, claim)
-        transport = Actors(ray, spec, actor, claim, watch, policy.workers if elastic else None, policy)
-        return Engine(transport, policy, should_stop, log)
+        transport = Actors(ray, spec, actor, claim, watch, limits.workers if elastic else None, limits)
+        return Engine(transport, limits, should_stop, log)
     except BaseException:
         disconnect(ray)
         raise
@@ -91,17 +91,17 @@ class Actors:
         claim: Claim,
         watch: Watch | None,
         room: int | None,
-        policy: Policy,
+        limits: Limits,
     ) -> None:
         """Start nobody yet.
 
         Args:
             watch: of the cluster that was joined; None in a Ray of our own, whose one node is this machine.
             room: workers to ask for as the cluster is now; from then on follow its room. None: never ask.
-            policy: how long to wait for the first place.
+            limits: how long to wait for the first place.
         """
         self._ray = ray
-        self._spec, self._claim, self._policy = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim, policy
+        self._spec, self._claim, self._limits = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim, limits
         self._class = ray.remote(
             num_cpus=claim.cpus,
             num_gpus=claim.gpus,
@@ -124,7 +124,7 @@ class Actors:
         self._centre: tuple[Centre, Any] | None = None
         # Ray itself would wait for ever: a cluster may have to grow, or others there to end. The scheduler counts as
         # long from later on, so that it is said here, where it is known what is free.
-        self._placed_by_s = time.monotonic() + policy.no_worker_timeout_s
+        self._placed_by_s = time.monotonic() + limits.no_worker_timeout_s
 
     def places(self) -> dict[int, WorkerPlace]:
         """Worker id -> where it is, of those that have a place."""
@@ -205,7 +205,7 @@ class Actors:
                 return message
             timeout_s = 0.0  # that was where a worker still is; None would say that no answer waits behind it
         if not self._places and time.monotonic() > self._placed_by_s:
-            time_s = f"{self._policy.no_worker_timeout_s:g} s ({self._policy.name_of('no_worker_timeout_s')})"
+            time_s = f"{self._limits.no_worker_timeout_s:g} s ({self._limits.name_of('no_worker_timeout_s')})"
             if self._watch is None:  # which has a place for each: their processes do not start, or very slowly
                 raise EvaluationError(f"no worker's process answered in {time_s}. {demand(self._ray, self._claim)}")
             raise EvaluationError(

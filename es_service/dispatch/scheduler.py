@@ -4,7 +4,7 @@ Dispatch station, between the driver's tasks and the engines that own the worker
 next state and the commands the engine must carry out, in order. No I/O, no clock, no randomness, no threads: the same
 arguments give the same answer, and a published state never changes, so a simulation can try every interleaving.
 
-An engine starts with `initial_state(policy)` of scheduler_state.py and a `Tick`, feeds every message of its workers as
+An engine starts with `initial_state(limits)` of scheduler_state.py and a `Tick`, feeds every message of its workers as
 an event, and sends a `Tick` whenever `next_deadline(state)` has come. It must feed the messages that already wait
 *before* a late `Tick`: otherwise a driver that was busy elsewhere would kill workers whose answers it had not read.
 
@@ -83,7 +83,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
             _submit(s, tasks)
         case Placed(worker):
             if worker in s.starting:
-                s.starting[worker] = now + s.policy.start_deadline_s
+                s.starting[worker] = now + s.limits.start_deadline_s
         case WorkerUp(worker):
             if s.starting.pop(worker, None) is not None:
                 s.up[worker] = Worker()
@@ -156,7 +156,7 @@ def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) 
         return s._replace(duplicates=s.duplicates + 1)
     record = record._replace(failures_in_a_row=record.failures_in_a_row + 1)
     _close_slot(s, out, worker, record, index, now)
-    if worker in s.up and record.failures_in_a_row >= s.policy.max_failures_in_a_row:
+    if worker in s.up and record.failures_in_a_row >= s.limits.max_failures_in_a_row:
         reason = f"{record.failures_in_a_row} tasks in a row raised; the last: {event.message}"
         out.append(StopWorker(worker, reason))
         # What it began a moment ago is not to blame.
@@ -211,9 +211,9 @@ def _lose(
         s = s._replace(start_failures=s.start_failures + 1, tried=s.next_worker)
     if now >= s.start_at_s:  # else a replacement already waits, and this one with it
         doublings = min(s.losses_in_a_row - 1, 30)
-        wait_s = min(s.policy.max_backoff_s, s.policy.restart_backoff_s * 2**doublings) if doublings >= 0 else 0.0
+        wait_s = min(s.limits.max_backoff_s, s.limits.restart_backoff_s * 2**doublings) if doublings >= 0 else 0.0
         s = s._replace(losses_in_a_row=s.losses_in_a_row + 1, start_at_s=now + wait_s)
-    if starting and s.start_failures >= s.policy.max_start_failures and not s.up and not s.draining:
+    if starting and s.start_failures >= s.limits.max_start_failures and not s.up and not s.draining:
         return _fail(s, out, f"{s.start_failures} tries in a row brought no worker up; last loss: {s.last_loss}")
     if running is not None and charge:
         return _charge(s, out, running, f"it took worker {worker} with it: {reason}")
@@ -228,7 +228,7 @@ def _requeue(s: SchedulerState, worker: int, key: Hashable) -> None:
 def _charge(s: SchedulerState, out: list[Command], key: Hashable, message: str) -> SchedulerState:
     """One fault more for this task; too many fail the run."""
     waiting = s.tasks[key] = s.tasks[key]._replace(faults=s.tasks[key].faults + 1)
-    if waiting.faults < s.policy.max_attempts:
+    if waiting.faults < s.limits.max_attempts:
         return s
     return _fail(s, out, f"task {key} failed in {waiting.faults} attempts; the last time {message}")
 
@@ -241,13 +241,13 @@ def _fail(s: SchedulerState, out: list[Command], message: str) -> SchedulerState
 
 def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int, ...]) -> SchedulerState:
     """Stop every worker whose deadline has passed; fail if no worker was up for too long."""
-    policy = s.policy
-    reason = f"did not come up in {_plain(policy.start_deadline_s)} s ({policy.name_of('start_deadline_s')})"
+    limits = s.limits
+    reason = f"did not come up in {_plain(limits.start_deadline_s)} s ({limits.name_of('start_deadline_s')})"
     late = {worker: reason for worker, at in s.starting.items() if now >= at}
     for worker, record in (*s.up.items(), *s.draining.items()):
         if now >= record.deadline_s:
             limit_s = record.deadline_s - record.started_s
-            key, name = record.slots[0].task.key, policy.name_of(record.limit)
+            key, name = record.slots[0].task.key, limits.name_of(record.limit)
             late[worker] = f"no answer to task {key} in {_plain(limit_s)} s ({name})"
     for worker, reason in late.items():
         if s.failed is None:
@@ -255,8 +255,8 @@ def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int
             is_silent = worker in silent
             has_no_place = is_silent and worker in s.starting
             s = _lose(s, out, worker, reason, now, fault=not has_no_place, charge=not is_silent)
-    if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + policy.no_worker_timeout_s:
-        for_s = f"{_plain(policy.no_worker_timeout_s)} s ({policy.name_of('no_worker_timeout_s')})"
+    if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + limits.no_worker_timeout_s:
+        for_s = f"{_plain(limits.no_worker_timeout_s)} s ({limits.name_of('no_worker_timeout_s')})"
         return _fail(s, out, f"{len(s.tasks)} tasks wait and no worker was up for {for_s}; last loss: {s.last_loss}")
     return s
 
@@ -279,6 +279,6 @@ def _start_workers(s: SchedulerState, out: list[Command], now: float) -> Schedul
     if missing <= 0 or now < s.start_at_s:
         return s
     for worker in range(s.next_worker, s.next_worker + missing):
-        s.starting[worker] = now + s.policy.start_deadline_s
+        s.starting[worker] = now + s.limits.start_deadline_s
         out.append(StartWorker(worker))
     return s._replace(next_worker=s.next_worker + missing)

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Hashable
 from typing import NamedTuple
 
-from es_service.dispatch.messages import Policy, Task, with_last_words
+from es_service.dispatch.messages import Limits, Task, with_last_words
 
 
 class Waiting(NamedTuple):
@@ -39,7 +39,7 @@ class Worker(NamedTuple):
     deadline_s: float = math.inf
     """When it must have answered the first slot."""
     limit: str = ""
-    """Field of the policy that this comes from."""
+    """Field of the limits that this comes from."""
     warm: frozenset[str] = frozenset()
     """Kinds it has finished a task of, hence compiled."""
     failures_in_a_row: int = 0
@@ -48,7 +48,7 @@ class Worker(NamedTuple):
 class SchedulerState(NamedTuple):
     """Everything the scheduler remembers. Treat the containers as read-only; times are in the seconds of `now`."""
 
-    policy: Policy
+    limits: Limits
     wanted: int
     starting: dict[int, float]
     """Deadline of each worker that has not come up yet."""
@@ -82,9 +82,9 @@ class SchedulerState(NamedTuple):
     """Results and failures that were dropped: stale, repeated, or of an unknown worker."""
 
 
-def initial_state(policy: Policy) -> SchedulerState:
+def initial_state(limits: Limits) -> SchedulerState:
     """No task and no worker yet; the first step, whatever its event, starts the workers."""
-    return SchedulerState(policy, policy.workers, {}, {}, {}, {}, deque(), {})
+    return SchedulerState(limits, limits.workers, {}, {}, {}, {}, deque(), {})
 
 
 def pending(state: SchedulerState) -> int:
@@ -107,7 +107,7 @@ def next_deadline(state: SchedulerState) -> float:
     if len(state.starting) + len(state.up) < state.wanted:
         times.append(state.start_at_s)
     if state.down_since_s is not None:
-        times.append(state.down_since_s + state.policy.no_worker_timeout_s)
+        times.append(state.down_since_s + state.limits.no_worker_timeout_s)
     return min(times, default=math.inf)
 
 

@@ -23,7 +23,7 @@ from typing import Any
 from es_service import api
 from es_service.config.model import worker_spec
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.messages import Policy
+from es_service.dispatch.messages import Limits
 from es_service.protocol import EpisodesResult, Evaluator, TrainingChunk
 from es_service.tasks import task_of
 from tests.helpers import centre
@@ -68,7 +68,7 @@ def compare(task: str, seconds: float, *, threads: bool) -> dict[str, Any]:
         engines = {}
         for rollout, workers in itertools.product(("xla", "simd"), (1, 2)):
             used = threads and rollout == "simd"
-            made = inline_engine(replace(spec, rollout=rollout), Policy(workers), threads=used)
+            made = inline_engine(replace(spec, rollout=rollout), Limits(workers), threads=used)
             engine = engines[rollout, workers] = stack.enter_context(made)
             measure(engine, point, chunks, 0.0)  # compiles
         for _ in range(ROUNDS):

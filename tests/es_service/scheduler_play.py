@@ -1,4 +1,4 @@
-"""The scheduler by hand: a policy, tasks named by letters, workers that are ready."""
+"""The scheduler by hand: limits, tasks named by letters, workers that are ready."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 from es_service.dispatch.messages import (
     Command,
     Event,
-    Policy,
+    Limits,
     StartWorker,
     Submit,
     Task,
@@ -17,7 +17,7 @@ from es_service.dispatch.messages import (
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import SchedulerState, initial_state
 
-POLICY = Policy(
+LIMITS = Limits(
     workers=2,
     in_flight=2,
     max_attempts=3,
@@ -48,6 +48,6 @@ def tasks(keys: str) -> Submit:
 
 def ready(workers: int = 2, **changes: object) -> SchedulerState:
     """All workers up at time 0."""
-    state, commands = step(initial_state(replace(POLICY, workers=workers, **changes)), Tick(), 0.0)
+    state, commands = step(initial_state(replace(LIMITS, workers=workers, **changes)), Tick(), 0.0)
     assert commands == [StartWorker(worker) for worker in range(workers)]
     return play(state, *((0.0, WorkerUp(worker)) for worker in range(workers)))[0]

@@ -16,8 +16,8 @@ from es_service.dispatch.messages import (
     Event,
     Fail,
     Failure,
+    Limits,
     Placed,
-    Policy,
     Result,
     SetWorkers,
     StartWorker,
@@ -50,7 +50,7 @@ class World:
 
     def __init__(self, seed: int) -> None:
         r = self.random = Random(seed)
-        self.policy = Policy(
+        self.limits = Limits(
             workers=r.randint(1, 4),
             in_flight=r.randint(1, 2),
             max_attempts=r.randint(2, 5),
@@ -71,7 +71,7 @@ class World:
             self.rate[r.choice(("start_dies", "start_hangs", "task_raises", "task_dies"))] = 1.0
         self.poison_rate = harshness * r.choice((0.0, 0.0, 0.1))
         self.check_purity = seed % 31 == 0
-        self.state, self.now = initial_state(self.policy), 0.0
+        self.state, self.now = initial_state(self.limits), 0.0
         self.heap: list[tuple[float, int, object, tuple]] = []
         self.serial = itertools.count()
         self.seen: Counter[str] = Counter()
@@ -83,7 +83,7 @@ class World:
         self.last_word: dict[int, float] = {}
         self.poison: dict[tuple, str] = {}
         # What a correct scheduler must know.
-        self.wanted = self.policy.workers
+        self.wanted = self.limits.workers
         self.known: set[int] = set()
         self.up: set[int] = set()
         self.draining: set[int] = set()
@@ -116,11 +116,11 @@ class World:
     def start_process(self, worker: int) -> None:
         self.alive.add(worker)
         self.inbox[worker], self.open[worker] = deque(), []
-        self.start_due[worker] = self.now + self.policy.start_deadline_s
+        self.start_due[worker] = self.now + self.limits.start_deadline_s
         if self.happens("no_place"):
             self.unplaced.add(worker)
             if self.random.random() < 0.5:
-                self.at(1.2 * self.policy.start_deadline_s * self.random.random(), self.give_place, worker)
+                self.at(1.2 * self.limits.start_deadline_s * self.random.random(), self.give_place, worker)
         else:
             self.build(worker)
 
@@ -201,7 +201,7 @@ class World:
                 self.unplaced.discard(worker)
                 if worker in self.known:
                     self.seen["placed late"] += 1
-                    self.start_due[worker] = self.now + self.policy.start_deadline_s
+                    self.start_due[worker] = self.now + self.limits.start_deadline_s
             case WorkerUp(worker) if worker in self.known and worker not in self.up:
                 self.up.add(worker)
                 self.start_failures = 0
@@ -295,7 +295,7 @@ class World:
         assert worker in self.up - self.draining
         assert key in self.waiting
         assert all(key != held for slots in self.open.values() for held, _ in slots)
-        assert attempt == self.faults[key] + 1 <= self.policy.max_attempts
+        assert attempt == self.faults[key] + 1 <= self.limits.max_attempts
         if key in self.last_holder:
             self.again += self.size[key]
         else:
@@ -303,25 +303,25 @@ class World:
         assert self.last_holder.get(key) != worker or len(self.up - self.draining) == 1
         self.last_holder[key] = worker
         self.open[worker].append((key, attempt))
-        assert len(self.open[worker]) <= self.policy.in_flight
+        assert len(self.open[worker]) <= self.limits.in_flight
         self.inbox[worker].append((key, attempt))
         self.at(0.0, self.begin, worker)
 
     def check_fail(self, message: str) -> None:
-        worn_out = [key for key in self.waiting if self.faults[key] >= self.policy.max_attempts]
+        worn_out = [key for key in self.waiting if self.faults[key] >= self.limits.max_attempts]
         if message.startswith("task"):
             self.seen["poison"] += 1
             assert any(str(key) in message for key in worn_out)
         elif "tries in a row" in message:
             self.seen["start failures"] += 1
-            assert self.start_failures == self.policy.max_start_failures
+            assert self.start_failures == self.limits.max_start_failures
             assert not self.up
         else:
             self.seen["no worker"] += 1
             assert self.waiting
             assert not self.up
             assert self.down_since is not None
-            assert self.now - self.down_since >= self.policy.no_worker_timeout_s - 1e-9
+            assert self.now - self.down_since >= self.limits.no_worker_timeout_s - 1e-9
 
     def check_books(self) -> None:
         state = self.state
@@ -332,8 +332,8 @@ class World:
             assert state.failed == self.failed
             assert not self.known, "a worker was left running"
             return
-        assert all(self.faults[key] < self.policy.max_attempts for key in self.waiting), "poison went unnoticed"
-        assert self.start_failures < self.policy.max_start_failures, "a broken environment went unnoticed"
+        assert all(self.faults[key] < self.limits.max_attempts for key in self.waiting), "poison went unnoticed"
+        assert self.start_failures < self.limits.max_start_failures, "a broken environment went unnoticed"
         if not self.waiting or self.up:
             self.down_since = None
         elif self.down_since is None:
@@ -341,7 +341,7 @@ class World:
         usable = self.up - self.draining
         queued = self.waiting - {key for slots in self.open.values() for key, _ in slots}
         for worker in usable if queued else ():
-            if len(self.open[worker]) < self.policy.in_flight:
+            if len(self.open[worker]) < self.limits.in_flight:
                 assert len(usable) > 1
                 assert {self.last_holder.get(key) for key in queued} == {worker}, "work waits beside a free worker"
 

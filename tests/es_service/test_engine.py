@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from es_service.dispatch import engine as engine_module
 from es_service.dispatch.engine import POLL_S, Answer, Engine, task_sizes
-from es_service.dispatch.messages import Failure, Policy, WorkerLost, WorkerUp
+from es_service.dispatch.messages import Failure, Limits, WorkerLost, WorkerUp
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import TrainingChunk
 from tests.helpers import centre, random_parameters
@@ -105,7 +105,7 @@ def test_results_come_in_chunk_order_whatever_the_order_of_the_answers(seed):
             transport.inbox.append(held.pop().answer())
 
     transport.on_send, transport.on_wait = held.append, answer_some
-    with Engine(transport, Policy(workers=3)) as engine:
+    with Engine(transport, Limits(workers=3)) as engine:
         for point in (FIRST, SECOND, FIRST):
             chunks = rng.sample(CHUNKS, len(CHUNKS))
             assert engine.evaluate(point, chunks) == [expected(point, chunk) for chunk in chunks]
@@ -136,7 +136,7 @@ def test_short_chunks_travel_together_once_their_duration_is_known(monkeypatch):
         transport.inbox.append(sent.answer())
 
     transport.on_send = take_a_millisecond_each
-    with Engine(transport, Policy(workers=2, in_flight=1, task_s=0.01)) as engine:
+    with Engine(transport, Limits(workers=2, in_flight=1, task_s=0.01)) as engine:
         numbers = []
         for count in (8, 6, 200):
             transport.sent.clear()
@@ -163,7 +163,7 @@ def test_a_late_answer_of_an_earlier_call_is_not_taken_for_one_of_this(already_t
             transport.inbox.append(sent.answer())
 
     transport.on_send = contradict
-    with Engine(transport, Policy(workers=2)) as engine:
+    with Engine(transport, Limits(workers=2)) as engine:
         assert engine.evaluate(FIRST, CHUNKS) == [expected(FIRST, chunk) for chunk in CHUNKS]
         if already_there:
             transport.inbox.append(late[0])
@@ -174,7 +174,7 @@ def test_a_late_answer_of_an_earlier_call_is_not_taken_for_one_of_this(already_t
 
 def test_a_worker_lost_between_two_calls_gets_no_chunk_and_no_chunk_is_blamed():
     transport = Scripted()
-    with Engine(transport, Policy(workers=2)) as engine:
+    with Engine(transport, Limits(workers=2)) as engine:
         engine.evaluate(FIRST, CHUNKS)
         transport.inbox.append(WorkerLost(0, "gone"))
         transport.sent.clear()
@@ -191,7 +191,7 @@ def test_the_chunk_of_a_worker_lost_in_mid_call_runs_elsewhere():
         transport.inbox.append(WorkerLost(0, "gone") if sent.worker == 0 else sent.answer())
 
     transport.on_send = die_once
-    with Engine(transport, Policy(workers=2)) as engine:
+    with Engine(transport, Limits(workers=2)) as engine:
         assert engine.evaluate(FIRST, CHUNKS) == [expected(FIRST, chunk) for chunk in CHUNKS]
         assert (engine.counts.retries, engine.counts.lost_workers) == (2, 1)
 
@@ -209,7 +209,7 @@ def test_what_a_lost_worker_still_says_is_dropped(before):
             transport.inbox.extend([last_words, sent.answer()] if before else [sent.answer(), last_words])
 
     transport.on_send = contradict
-    with Engine(transport, Policy(workers=2)) as engine:
+    with Engine(transport, Limits(workers=2)) as engine:
         assert engine.evaluate(FIRST, CHUNKS) == [expected(FIRST, chunk) for chunk in CHUNKS]
         assert engine.counts.lost_workers == 1
 
@@ -219,7 +219,7 @@ def test_a_chunk_that_fails_everywhere_is_named_and_ends_the_engine():
     transport.on_send = lambda sent: transport.inbox.append(
         sent.failure() if CHUNKS[2] in sent.chunks else sent.answer()
     )
-    with Engine(transport, Policy(workers=2, restart_backoff_s=0.0)) as engine:
+    with Engine(transport, Limits(workers=2, restart_backoff_s=0.0)) as engine:
         for _ in range(2):  # and again, rather than wait for ever, if it is asked again
             with pytest.raises(EvaluationError, match=r"TrainingChunk 2 of generation 3 failed in 4 attempts.*: no"):
                 engine.evaluate(FIRST, CHUNKS)
@@ -238,7 +238,7 @@ def test_a_request_to_stop_is_noticed_at_the_next_message_or_poll(flood):
     transport.on_send = lambda sent: None
     if flood:
         transport.on_wait = lambda: transport.inbox.extend([WorkerUp(0)] * 1000)
-    with Engine(transport, Policy(workers=2), should_stop) as engine:
+    with Engine(transport, Limits(workers=2), should_stop) as engine:
         with pytest.raises(Interrupted) as caught:
             engine.evaluate(FIRST, CHUNKS)
         assert caught.value.signal_number == signal.SIGTERM
@@ -259,7 +259,7 @@ def test_answers_that_wait_are_read_before_the_clock(monkeypatch, answered):
             transport.inbox.append(sent.answer())
 
     transport.on_send = leap
-    with Engine(transport, Policy(workers=2, first_deadline_s=1.0, min_deadline_s=1.0)) as engine:
+    with Engine(transport, Limits(workers=2, first_deadline_s=1.0, min_deadline_s=1.0)) as engine:
         assert engine.evaluate(FIRST, CHUNKS) == [expected(FIRST, chunk) for chunk in CHUNKS]
         assert transport.killed == ([] if answered else [0, 1])
         assert engine.counts.lost_workers == (0 if answered else 2)
@@ -270,7 +270,7 @@ def test_the_next_deadline_bounds_the_wait(monkeypatch):
     now = [0.0]
     transport = scripted_with_clock(monkeypatch, now)
     transport.on_send = lambda sent: transport.inbox.append(sent.answer()) if sent.worker else None
-    with Engine(transport, Policy(workers=1, first_deadline_s=0.25, min_deadline_s=0.25)) as engine:
+    with Engine(transport, Limits(workers=1, first_deadline_s=0.25, min_deadline_s=0.25)) as engine:
         engine.evaluate(FIRST, CHUNKS)
     assert transport.killed == [0]
     assert now[0] == pytest.approx(0.25)
@@ -282,8 +282,8 @@ def test_what_a_hung_worker_had_written_is_told_with_its_loss(monkeypatch, is_la
     transport = scripted_with_clock(monkeypatch, [0.0])
     transport.last_words = {0: "no licence; retrying", 1: "all is well"}
     transport.on_send = lambda sent: transport.inbox.append(sent.answer()) if sent.worker else None
-    policy = Policy(workers=2, first_deadline_s=1.0, min_deadline_s=1.0, max_attempts=1 if is_last else 2)
-    with Engine(transport, policy) as engine:
+    limits = Limits(workers=2, first_deadline_s=1.0, min_deadline_s=1.0, max_attempts=1 if is_last else 2)
+    with Engine(transport, limits) as engine:
         if is_last:
             with pytest.raises(EvaluationError, match=r"failed in 1 attempts.*had written:\nno licence; retrying$"):
                 engine.evaluate(FIRST, CHUNKS)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.messages import Policy, StartWorker
+from es_service.dispatch.messages import Limits, StartWorker
 from es_service.errors import EvaluationError
 from es_service.protocol import EvaluationChunk, PolicyShape, TrainingChunk
 from tests.helpers import SPEC, centre, random_parameters, spec
@@ -45,8 +45,8 @@ def test_killed_children_change_no_result_and_leave_nothing_behind():
         if countdown == 0:
             os.kill(victim, signal.SIGKILL)
 
-    policy = Policy(workers=1, task_s=0.0, restart_backoff_s=0.01)
-    with inline_engine(SPEC, policy, kill_in_the_middle) as engine:
+    limits = Limits(workers=1, task_s=0.0, restart_backoff_s=0.01)
+    with inline_engine(SPEC, limits, kill_in_the_middle) as engine:
         first = engine.evaluate(FIRST, chunks)
         settled = footprint()
         for kill in range(1, 9):
@@ -70,7 +70,7 @@ def test_a_child_stopped_in_mid_message_blocks_nobody():
     assert one.parameters_D.nbytes > 5_000_000
     chunks = [EvaluationChunk(1, chunk_id) for chunk_id in range(3)]
     before = footprint()
-    with inline_engine(wide, Policy(workers=1, min_deadline_s=0.5)) as engine:
+    with inline_engine(wide, Limits(workers=1, min_deadline_s=0.5)) as engine:
         result = engine.evaluate(one, chunks)
         with pytest.raises(AssertionError):
             assert_same(engine.evaluate(other, chunks), result)
@@ -89,7 +89,7 @@ def test_children_that_cannot_be_started_are_lost_workers_and_leave_nothing_behi
     before = footprint()
     monkeypatch.setattr(subprocess, "Popen", no_more)
     with (
-        inline_engine(SPEC, Policy(workers=1, restart_backoff_s=0.0)) as engine,
+        inline_engine(SPEC, Limits(workers=1, restart_backoff_s=0.0)) as engine,
         pytest.raises(EvaluationError, match=r"(?s)3 tries in a row.*cannot be started.*Too many open files"),
     ):
         engine.evaluate(FIRST, CHUNKS)
@@ -97,7 +97,7 @@ def test_children_that_cannot_be_started_are_lost_workers_and_leave_nothing_behi
 
 
 def test_threads_that_are_lost_together_before_they_are_up_do_not_end_the_run():
-    with inline_engine(SPEC, Policy(workers=6, restart_backoff_s=0.01), threads=True) as engine:
+    with inline_engine(SPEC, Limits(workers=6, restart_backoff_s=0.01), threads=True) as engine:
         (victim,) = set(engine.transport.process_ids().values())
         os.kill(victim, signal.SIGKILL)
         assert len(engine.evaluate(FIRST, CHUNKS)) == len(CHUNKS)
@@ -111,7 +111,7 @@ def test_an_engine_whose_log_cannot_be_written_leaves_no_child_behind():
 
     before = footprint()
     with pytest.raises(OSError, match="No space left"):
-        inline_engine(SPEC, Policy(workers=2), log=full)
+        inline_engine(SPEC, Limits(workers=2), log=full)
     assert footprint() == before
 
 
@@ -121,8 +121,8 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
     blamed for the first."""
     before = footprint()
     long = spec(rollout="simd", episode_steps=200_000)
-    policy = Policy(workers=6, min_deadline_s=3.0, restart_backoff_s=0.01)
-    with inline_engine(long, policy, threads=True) as engine:
+    limits = Limits(workers=6, min_deadline_s=3.0, restart_backoff_s=0.01)
+    with inline_engine(long, limits, threads=True) as engine:
         expected = engine.evaluate(FIRST, CHUNKS[:1])
         engine.evaluate(FIRST, CHUNKS[:1])  # so that it is known how long it takes
         (victim,) = set(engine.transport.process_ids().values())
@@ -140,7 +140,7 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
 
 def test_an_error_says_in_which_of_the_chunks_that_travelled_together_it_was():
     broken = [*CHUNKS[:3], TrainingChunk(3, "four")]
-    with inline_engine(SPEC, Policy(workers=1, task_s=60.0, restart_backoff_s=0.0)) as engine:
+    with inline_engine(SPEC, Limits(workers=1, task_s=60.0, restart_backoff_s=0.0)) as engine:
         engine.evaluate(FIRST, CHUNKS)
         with pytest.raises(EvaluationError, match=r"(?s)task TrainingChunk 0 and 3 more of.*in TrainingChunk four of"):
             engine.evaluate(FIRST, broken)

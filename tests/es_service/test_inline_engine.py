@@ -19,7 +19,7 @@ import pytest
 from es_service.dispatch import inline_engine as inline_module
 from es_service.dispatch.engine import Answer
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.messages import Policy, WorkerLost, WorkerUp
+from es_service.dispatch.messages import Limits, WorkerLost, WorkerUp
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import TrainingChunk
 from es_service.wire import framed
@@ -168,7 +168,7 @@ def test_a_worker_that_has_said_its_last_is_lost_while_messages_still_wait_for_i
 def test_a_default_timeout_of_sockets_is_not_the_workers():
     socket.setdefaulttimeout(0.001)
     try:
-        with inline_engine(SPEC, Policy(workers=1)) as engine:
+        with inline_engine(SPEC, Limits(workers=1)) as engine:
             engine.evaluate(FIRST, CHUNKS[:2])
             assert engine.counts.lost_workers == 0
     finally:
@@ -178,7 +178,7 @@ def test_a_default_timeout_of_sockets_is_not_the_workers():
 def test_an_environment_that_exits_is_a_failure_with_its_traceback():
     exits = spec(environment="tests.examples.exits:Exits")
     with (
-        inline_engine(exits, Policy(workers=1, max_failures_in_a_row=1, max_attempts=2)) as engine,
+        inline_engine(exits, Limits(workers=1, max_failures_in_a_row=1, max_attempts=2)) as engine,
         pytest.raises(EvaluationError, match=r"(?s)SystemExit.*out of here"),
     ):
         engine.evaluate(FIRST, CHUNKS[:1])

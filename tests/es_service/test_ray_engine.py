@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from es_service.dispatch.engine import Answer, Engine
-from es_service.dispatch.messages import Drain, Failure, Placed, Policy, SetWorkers, WorkerLost, WorkerUp
+from es_service.dispatch.messages import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import ONE_CORE, Membership, look
 from es_service.dispatch.ray_engine import Actors
 from es_service.errors import EvaluationError
@@ -139,26 +139,26 @@ class PretendedWatch:
 
 
 def transport(
-    ray: PretendedRay, policy: Policy, watch: PretendedWatch | None = None, room: int | None = None
+    ray: PretendedRay, limits: Limits, watch: PretendedWatch | None = None, room: int | None = None
 ) -> Actors:
-    return Actors(ray, SPEC, type(None), ONE_CORE, watch, room, policy)
+    return Actors(ray, SPEC, type(None), ONE_CORE, watch, room, limits)
 
 
-def ray_engine(ray: PretendedRay, policy: Policy, watch: PretendedWatch | None = None) -> Engine[Actors]:
-    return Engine(transport(ray, policy, watch), policy)
+def ray_engine(ray: PretendedRay, limits: Limits, watch: PretendedWatch | None = None) -> Engine[Actors]:
+    return Engine(transport(ray, limits, watch), limits)
 
 
 @pytest.mark.parametrize("state", ["dead", "hung"])
 def test_a_node_that_dies_is_one_fault_of_what_it_ran_however_many_workers_it_held(state):
     """One chunk, and more idle actors on its node than it has attempts: they are called, in vain, and blame nobody."""
-    ray, policy = PretendedRay(), Policy(6, min_deadline_s=0.05, first_deadline_s=0.05, restart_backoff_s=0.01)
+    ray, limits = PretendedRay(), Limits(6, min_deadline_s=0.05, first_deadline_s=0.05, restart_backoff_s=0.01)
 
     def node_dies(actor: Actor) -> None:
         for number in range(5):
             ray.end(ray.actors[number], state)
         ray.on_run = lambda actor: None
 
-    with ray_engine(ray, policy) as engine:
+    with ray_engine(ray, limits) as engine:
         while not all(actor.ran for actor in ray.actors):  # so that all are up
             engine.evaluate(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)])
         ray.on_run = node_dies
@@ -169,7 +169,7 @@ def test_a_node_that_dies_is_one_fault_of_what_it_ran_however_many_workers_it_he
 def test_an_actor_that_waited_for_its_place_says_once_that_it_has_one():
     """And not again, when it is asked later whether it is still there."""
     ray = PretendedRay(room=0)
-    actors = transport(ray, Policy(2))
+    actors = transport(ray, Limits(2))
     actors.start(0)
     assert (actors.receive(0.0), actors.silent()) == (None, (0,))
     (actor,) = ray.actors
@@ -191,13 +191,13 @@ def test_an_actor_that_waited_for_its_place_says_once_that_it_has_one():
 
 def test_an_actor_that_is_given_no_place_is_not_lost():
     """Of three there is room for two. One of those hangs, long enough for the third to be started anew many times."""
-    ray, policy = PretendedRay(room=2), Policy(3, start_deadline_s=0.02, min_deadline_s=0.3, first_deadline_s=0.3)
+    ray, limits = PretendedRay(room=2), Limits(3, start_deadline_s=0.02, min_deadline_s=0.3, first_deadline_s=0.3)
 
     def hang(actor: Actor) -> None:
         ray.end(actor, "hung")
         ray.on_run = lambda actor: None
 
-    with ray_engine(ray, policy) as engine:
+    with ray_engine(ray, limits) as engine:
         ray.on_run = hang
         assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
         assert len(ray.actors) > 8
@@ -215,8 +215,8 @@ def test_an_actor_that_is_given_no_place_is_not_lost():
 def test_the_wait_for_a_first_place_is_the_policy_s(watch, message):
     """And ends before the scheduler's of the same length, which knows less. In a Ray of our own the process is slow,
     since it has room for all: more nodes would not help."""
-    policy = Policy(1, start_deadline_s=0.2, no_worker_timeout_s=0.4)
-    with pytest.raises(EvaluationError, match=message) as caught, ray_engine(PretendedRay(0), policy, watch) as engine:
+    limits = Limits(1, start_deadline_s=0.2, no_worker_timeout_s=0.4)
+    with pytest.raises(EvaluationError, match=message) as caught, ray_engine(PretendedRay(0), limits, watch) as engine:
         engine.evaluate(FIRST, [CHUNK])
     assert ("Add nodes" in str(caught.value)) == (watch is not None)
 
@@ -226,8 +226,8 @@ def test_a_node_that_dies_under_idle_workers_takes_none_of_the_others_along():
     was not seen yet, or when no node at all is seen."""
     ray, watch = PretendedRay(), PretendedWatch()
     ray.node_of = lambda number: "old" if number < 2 else "new"
-    actors = transport(ray, Policy(4), watch, room=4)
-    with Engine(actors, Policy(4)) as engine:
+    actors = transport(ray, Limits(4), watch, room=4)
+    with Engine(actors, Limits(4)) as engine:
         for alive in ({"old"}, {"old", "new"}, set(), {"old", "new"}):
             watch.now = Membership(4, frozenset(), frozenset(alive))
             engine.evaluate(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)])
@@ -256,7 +256,7 @@ def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
     """Those that leave with their node's consent, then those lost with theirs, then how many there should be."""
     ray, watch = PretendedRay(), PretendedWatch()
     ray.node_of = str
-    actors = transport(ray, Policy(3), watch, room=3)
+    actors = transport(ray, Limits(3), watch, room=3)
     watch.now = Membership(3, frozenset(), frozenset("012"))
     for worker in range(3):
         actors.start(worker)
@@ -276,7 +276,7 @@ def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
 def test_what_is_said_of_an_error_has_no_colours(error, call):
     """Neither of one in a place, a build or a run; it is for logs, too."""
     ray = PretendedRay()
-    actors = transport(ray, Policy(1))
+    actors = transport(ray, Limits(1))
     actors.start(0)
     actors.send(0, FIRST, "key", 1, [CHUNK])
     ray.actors[0].owed[call].error = error("\x1b[36mray::worker-0\x1b[39m: \x1b[1;31mno\x1b[0m")
@@ -290,7 +290,7 @@ def test_what_is_said_of_an_error_has_no_colours(error, call):
 def test_a_chunk_that_kills_its_workers_is_found_out_after_as_many_as_it_has_attempts():
     """Although all the others were asked whether they are still there: they are."""
     ray = PretendedRay()
-    with ray_engine(ray, Policy(9)) as engine:
+    with ray_engine(ray, Limits(9)) as engine:
         engine.evaluate(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)])
         ray.on_run = ray.end
         with pytest.raises(EvaluationError, match="TrainingChunk 0 of generation 3 failed in 4 attempts"):

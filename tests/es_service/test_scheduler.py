@@ -25,7 +25,7 @@ from es_service.dispatch.messages import (
 )
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, usual_chunk_s
-from tests.es_service.scheduler_play import POLICY, play, ready, tasks
+from tests.es_service.scheduler_play import LIMITS, play, ready, tasks
 
 
 def test_tasks_go_out_in_order_to_idle_workers_first():
@@ -37,7 +37,7 @@ def test_tasks_go_out_in_order_to_idle_workers_first():
 
 
 def test_tasks_submitted_before_any_worker_is_up_wait_for_it():
-    state, commands = step(initial_state(POLICY), tasks("ab"), 0.0)
+    state, commands = step(initial_state(LIMITS), tasks("ab"), 0.0)
     assert commands == [StartWorker(0), StartWorker(1)]
     assert step(state, WorkerUp(1), 1.0)[1] == [Assign(1, "a", 1), Assign(1, "b", 1)]
 
@@ -221,10 +221,10 @@ def test_a_worker_busy_with_an_old_copy_does_not_answer_for_the_new_one():
     assert step(held, Result(1, "a", 2), 6.0)[1] == [Deliver("a")]
 
 
-def test_a_policy_without_workers_or_attempts_is_refused():
+def test_limits_without_workers_or_attempts_is_refused():
     for name in ("workers", "in_flight", "max_attempts", "max_failures_in_a_row", "max_start_failures"):
         with pytest.raises(ValueError, match=rf"{name} \(0\) must be at least 1"):
-            replace(POLICY, **{name: 0})
+            replace(LIMITS, **{name: 0})
 
 
 def test_an_event_costs_little():

@@ -23,7 +23,7 @@ from es_service.dispatch.messages import (
 )
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline
-from tests.es_service.scheduler_play import POLICY, play, ready, tasks
+from tests.es_service.scheduler_play import LIMITS, play, ready, tasks
 
 
 def test_a_worker_that_keeps_raising_is_quarantined_without_blaming_its_next_task():
@@ -64,7 +64,7 @@ def test_losses_during_a_wait_share_it():
 
 def test_a_broken_environment_is_reported_soon():
     """Of two workers whose every start raises at once: after one wait of restart_backoff_s."""
-    state, _ = play(initial_state(POLICY), (0.0, Tick()), (0.1, WorkerLost(0, "no module")))
+    state, _ = play(initial_state(LIMITS), (0.0, Tick()), (0.1, WorkerLost(0, "no module")))
     state, _ = play(state, (0.2, WorkerLost(1, "no module")), (0.3, WorkerLost(2, "no module")))
     assert (state.failed, next_deadline(state)) == (None, 1.2)
     state, _ = step(state, Tick(), 1.2)
@@ -78,9 +78,9 @@ def test_a_broken_environment_is_reported_soon():
 @pytest.mark.parametrize("workers", range(1, 10))
 def test_workers_that_are_lost_together_before_they_come_up_are_one_try_however_many(workers, at_once):
     """At once, as those that are too slow are; or one after the other, as when their node or process dies."""
-    state, _ = step(initial_state(replace(POLICY, workers=workers)), Tick(), 0.0)
+    state, _ = step(initial_state(replace(LIMITS, workers=workers)), Tick(), 0.0)
     now = 0.0
-    for tries in range(POLICY.max_start_failures):
+    for tries in range(LIMITS.max_start_failures):
         assert (state.failed, state.start_failures, len(state.starting)) == (None, tries, workers)
         now += 50.0
         if at_once:
@@ -88,7 +88,7 @@ def test_workers_that_are_lost_together_before_they_come_up_are_one_try_however_
         else:
             losses = [(now + 0.01 * number, WorkerLost(worker, "")) for number, worker in enumerate(state.starting)]
             state, _ = play(state, *losses)
-        now += POLICY.max_backoff_s  # less than start_deadline_s
+        now += LIMITS.max_backoff_s  # less than start_deadline_s
         state, _ = step(state, Tick(), now)
     assert state.failed is not None
     assert state.failed.startswith("3 tries in a row")
@@ -96,7 +96,7 @@ def test_workers_that_are_lost_together_before_they_come_up_are_one_try_however_
 
 def test_a_place_gives_a_worker_all_its_time_to_come_up():
     """A cluster has room for three just before they would be started anew."""
-    state, _ = step(initial_state(replace(POLICY, workers=3)), Tick(), 0.0)
+    state, _ = step(initial_state(replace(LIMITS, workers=3)), Tick(), 0.0)
     state, _ = play(state, *((49.0, Placed(worker)) for worker in range(3)))
     assert next_deadline(state) == 99.0
     state, commands = play(state, (98.0, WorkerUp(0)), (99.0, Tick()))
@@ -121,7 +121,7 @@ def test_start_failures_are_forgiven_while_a_worker_is_up():
 
 
 def test_a_worker_that_never_comes_up_is_killed_and_replaced():
-    state, _ = play(initial_state(POLICY), (0.0, Tick()), (1.0, WorkerUp(1)))
+    state, _ = play(initial_state(LIMITS), (0.0, Tick()), (1.0, WorkerUp(1)))
     assert next_deadline(state) == 50.0
     state, commands = step(state, Tick(), 50.0)
     assert commands == [StopWorker(0, "did not come up in 50 s (start_deadline_s)"), StartWorker(2)]
@@ -131,7 +131,7 @@ def test_a_worker_that_never_comes_up_is_killed_and_replaced():
 
 def test_a_worker_without_a_place_is_started_anew_and_nobody_hears_of_it():
     """However often: then the last that is up is lost, and the run waits for others as long as it should."""
-    patient = initial_state(replace(POLICY, first_deadline_s=1000.0))
+    patient = initial_state(replace(LIMITS, first_deadline_s=1000.0))
     state, _ = play(patient, (0.0, Tick()), (1.0, WorkerUp(0)), (1.0, tasks("a")))
     for number in range(1, 6):
         state, commands = step(state, Tick(silent=(number,)), 50.0 * number)
@@ -150,15 +150,15 @@ def test_what_a_silent_worker_does_not_answer_in_time_is_not_to_blame():
 
 
 def test_no_worker_for_too_long_fails_the_run():
-    state, _ = play(initial_state(POLICY), (0.0, Tick()), (25.0, tasks("ab")))
+    state, _ = play(initial_state(LIMITS), (0.0, Tick()), (25.0, tasks("ab")))
     assert next_deadline(state) == 50.0
-    assert next_deadline(play(initial_state(POLICY), (0.0, Tick()), (5.0, tasks("a")))[0]) == 35.0
+    assert next_deadline(play(initial_state(LIMITS), (0.0, Tick()), (5.0, tasks("a")))[0]) == 35.0
     state, commands = play(state, (50.0, Tick()), (55.0, Tick()))
     assert commands[0] == Fail(
         "2 tasks wait and no worker was up for 30 s (no_worker_timeout_s); "
         "last loss: worker 1: did not come up in 50 s (start_deadline_s)"
     )
-    assert play(initial_state(POLICY), (0.0, Tick()), (40.0, Tick()))[0].failed is None, "nothing waits"
+    assert play(initial_state(LIMITS), (0.0, Tick()), (40.0, Tick()))[0].failed is None, "nothing waits"
 
 
 def test_a_drained_worker_finishes_what_it_has_and_is_replaced_without_blame():
@@ -171,7 +171,7 @@ def test_a_drained_worker_finishes_what_it_has_and_is_replaced_without_blame():
     assert commands == [Assign(2, "a", 1), Assign(2, "c", 1)]
     assert (done.lost_workers, lost.lost_workers) == (0, 0)
     assert step(ready(), Drain(0), 1.0)[1] == [StopWorker(0, "drained"), StartWorker(2)]
-    assert play(initial_state(POLICY), (0.0, Tick()), (1.0, Drain(0)))[1] == [StopWorker(0, "drained"), StartWorker(2)]
+    assert play(initial_state(LIMITS), (0.0, Tick()), (1.0, Drain(0)))[1] == [StopWorker(0, "drained"), StartWorker(2)]
     # One that hangs while draining is killed all the same.
     state, commands = play(state, (3.0, WorkerUp(2)), (101.0, Tick()))
     assert StopWorker(0, "no answer to task a in 100 s (first_deadline_s)") in commands

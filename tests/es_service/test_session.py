@@ -9,7 +9,7 @@ from es_service.config.compute import ComputeConfig
 from es_service.dispatch.messages import Result, StopWorker, Submit, Task, Tick, WorkerUp
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state
-from es_service.session import LIMITS, scheduling_policy
+from es_service.session import LIMIT_NAMES, dispatch_limits
 
 CONFIG = {
     "task": {"environment": "point_maze"},
@@ -21,7 +21,7 @@ CONFIG = {
 
 def messages_after(*events) -> list[str]:
     """Why workers are stopped, and the run, over all events; (seconds, event)."""
-    state, said = initial_state(scheduling_policy(load_config(CONFIG))), []
+    state, said = initial_state(dispatch_limits(load_config(CONFIG))), []
     for now, event in events:
         state, commands = step(state, event, now)
         said += [command.reason for command in commands if isinstance(command, StopWorker)]
@@ -43,6 +43,6 @@ def test_messages_of_deadlines_name_the_keys_that_set_them():
 
 
 def test_keys_that_messages_name_exist():
-    for name in LIMITS.values():
+    for name in LIMIT_NAMES.values():
         (key,) = re.findall(r"compute\.(\w+)", name)
         assert key in ComputeConfig.model_fields

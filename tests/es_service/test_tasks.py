@@ -6,7 +6,7 @@ import pytest
 
 from es_service.bench import bench_rollouts
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.messages import Policy
+from es_service.dispatch.messages import Limits
 from es_service.errors import ConfigError
 from es_service.protocol import TrainingChunk
 from es_service.tasks import TASKS
@@ -22,5 +22,5 @@ def test_a_current_folder_with_modules_of_our_names_is_nobody_s_business(tmp_pat
         TASKS["pathlib:Path"]
     row = next(bench_rollouts(["point_maze"], policies=[False], rollouts=["xla"], batches=[8], seconds=0.0))
     assert row["batch"] == 8
-    with inline_engine(SPEC, Policy(1, max_start_failures=1)) as engine:
+    with inline_engine(SPEC, Limits(1, max_start_failures=1)) as engine:
         assert len(engine.evaluate(centre(random_parameters()), [TrainingChunk(1, 0)])) == 1

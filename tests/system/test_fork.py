@@ -19,7 +19,7 @@ from es_service.config.changes import START_KEYS
 from es_service.digest import digest_at
 from es_service.errors import ConfigError
 from es_service.maps.behaviour_map import CELL_PREFIX
-from es_service.session import scheduling_policy
+from es_service.session import dispatch_limits
 from es_service.store import reader
 from es_service.store.reader import read_generation
 from tests.system.command_line import digest, es
@@ -198,9 +198,7 @@ def test_what_a_resume_has_changed_is_so_for_a_fork_and_an_evaluation(parent, tm
     config = lineage.fork_config(folder, ["search.sigma=0.1"])
     assert (config.budget.generations, config.compute.engine, config.compute.compile_timeout_s) == (7, "inline", 77.0)
     seen = []
-    monkeypatch.setattr(
-        evaluation, "scheduling_policy", lambda config: seen.append(config) or scheduling_policy(config)
-    )
+    monkeypatch.setattr(evaluation, "dispatch_limits", lambda config: seen.append(config) or dispatch_limits(config))
     list(evaluation.evaluate(run, [], episodes=1, workers=1))
     assert seen[0].compute.compile_timeout_s == 77.0
     recorded.unlink()

@@ -15,7 +15,7 @@ import pytest
 from es_service import api
 from es_service.digest import digest_parts
 from es_service.dispatch import ray_engine as module
-from es_service.dispatch.messages import Policy
+from es_service.dispatch.messages import Limits
 from es_service.dispatch.ray_cluster import Claim
 from es_service.dispatch.ray_engine import Actors, ray_engine
 from es_service.errors import EvaluationError
@@ -128,7 +128,7 @@ def test_a_run_that_began_inline_goes_on_with_ray_where_home_cannot_be_written(t
 def test_workers_that_raise_while_starting_stop_the_run_with_their_error():
     with (
         pytest.raises(EvaluationError, match=r"3 tries in a row brought no worker up(.|\n)*no_such_task"),
-        ray_engine(spec(environment="no_such_task"), Policy(1, restart_backoff_s=0.0), actor=WorkerActor) as engine,
+        ray_engine(spec(environment="no_such_task"), Limits(1, restart_backoff_s=0.0), actor=WorkerActor) as engine,
     ):
         engine.evaluate(centre(random_parameters()), [TrainingChunk(1, 0)])
 
@@ -137,7 +137,7 @@ def test_a_chunk_that_raises_everywhere_stops_the_run_with_its_error():
     wrong = random_parameters(size=3)  # parameters of another network
     with (
         pytest.raises(EvaluationError, match=r"TrainingChunk 0 of generation 1 failed in 2 attempts(.|\n)*TypeError"),
-        ray_engine(spec(), Policy(1, max_attempts=2), actor=WorkerActor) as engine,
+        ray_engine(spec(), Limits(1, max_attempts=2), actor=WorkerActor) as engine,
     ):
         engine.evaluate(centre(wrong), [TrainingChunk(1, 0)])
 
@@ -149,19 +149,19 @@ def test_a_cluster_without_room_is_named_with_what_it_has(monkeypatch):
     with pytest.raises(
         EvaluationError, match=r"this machine has no place for a worker\. Each needs 1 CPU; .*has 0 CPU, 0 GPU"
     ):
-        ray_engine(spec(), Policy(1), actor=WorkerActor)
+        ray_engine(spec(), Limits(1), actor=WorkerActor)
     assert time.monotonic() - start < 30
 
 
 def test_a_wrong_address_is_named_with_the_way_out():
     with pytest.raises(EvaluationError, match=r"no Ray cluster at 127\.0\.0\.1:1 .*--engine inline"):
-        ray_engine(spec(), Policy(1), actor=WorkerActor, address="127.0.0.1:1")
+        ray_engine(spec(), Limits(1), actor=WorkerActor, address="127.0.0.1:1")
 
 
 def test_without_ray_the_error_says_what_does_without(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(EvaluationError, match=r"Ray cannot be imported .*--engine inline"):
-        ray_engine(spec(), Policy(1), actor=WorkerActor)
+        ray_engine(spec(), Limits(1), actor=WorkerActor)
 
 
 def test_it_works_in_a_thread_where_signals_cannot_be_set(tmp_path, reference):
@@ -200,7 +200,7 @@ def with_two_pretended_gpus(monkeypatch):
 
 
 def mirrored(workers: int, claim: Claim) -> list[tuple[int, list[str], dict[str, str]]]:
-    with ray_engine(spec(), Policy(workers), actor=Mirror, claim=claim) as engine:
+    with ray_engine(spec(), Limits(workers), actor=Mirror, claim=claim) as engine:
         answers = engine.evaluate(centre(random_parameters()), [TrainingChunk(1, chunk) for chunk in range(16)])
     return list({answer[0]: answer for answer in answers}.values())
 
@@ -224,4 +224,4 @@ def test_two_workers_share_one_gpu_and_its_memory(monkeypatch):
 
 def test_a_gpu_that_is_not_there_is_named():
     with pytest.raises(EvaluationError, match=r"Each needs 1 CPU and 1 GPU; the cluster has 1 CPU, 0 GPU in all"):
-        ray_engine(spec(), Policy(1), actor=WorkerActor, claim=Claim(gpus=1))
+        ray_engine(spec(), Limits(1), actor=WorkerActor, claim=Claim(gpus=1))
