@@ -28,13 +28,13 @@ class Tasks(Mapping[str, TaskSpec]):
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is none of ours, ConfigError for another that cannot be had."""
-        return replace(_described(name) if ":" in name else environments.TASKS[name], no_vectors=_no_vectors())
+        return replace(_described(name) if ":" in name else environments.SHIPPED[name], no_vectors=_no_vectors())
 
     def __iter__(self) -> Iterator[str]:
-        return iter(environments.TASKS)
+        return iter(environments.SHIPPED)
 
     def __len__(self) -> int:
-        return len(environments.TASKS)
+        return len(environments.SHIPPED)
 
 
 TASKS = Tasks()

@@ -21,7 +21,7 @@ from jax import lax
 
 from es_service.noise import NORMAL_STD, Domain, normal_integers, stream_keys
 from es_service.protocol import PolicyShape, WorkerSpec
-from workers.environments import TASKS, Environment, describe_environment, make_environment
+from workers.environments import SHIPPED, Environment, describe_environment, make_environment
 from workers.policy import initial_parameters
 from workers.rollout import make_training_rollout
 from workers.simd import rollout as simd_rollout
@@ -56,7 +56,7 @@ def measure(
         steps_per_second, compile_seconds (without that of resets, where there is no policy), peak_mib; or the problem,
         where simd cannot compile the task or run here.
     """
-    size = TASKS[task] if task in TASKS else describe_environment(task)
+    size = SHIPPED[task] if task in SHIPPED else describe_environment(task)
     environment = make_environment(task, options)
     shape = PolicyShape((size.observation_size, *hidden, size.action_size))
     states = None if policy else _after_reset(environment, batch)

@@ -26,7 +26,7 @@ import pandas as pd
 from es_service import open_run
 from es_service.platform_info import cpu_kind
 from es_service.run_view import Run
-from workers.environments import TASKS
+from workers.environments import SHIPPED
 
 POINTS = 60
 """Of a curve."""
@@ -117,7 +117,7 @@ def draw(runs: dict[str, Run], path: Path) -> None:
     for axes in all_axes.ravel()[len(runs) :]:
         axes.axis("off")
     for axes, (name, run) in zip(all_axes.ravel(), runs.items(), strict=False):
-        history, task = run.history, TASKS[run.config["task"]["environment"]]
+        history, task = run.history, SHIPPED[run.config["task"]["environment"]]
         order = history.env_steps / 1e6
         shown = axes.scatter(history.centre_x, history.centre_y, c=order, s=3, cmap="viridis_r", linewidths=0)
         for (x0, y0), (x1, y1) in task.walls or ():

@@ -49,14 +49,14 @@ def facts_of(task: str) -> dict:
     import jax
     import jax.numpy as jnp
 
-    from workers.environments import TASKS, describe_environment, make_environment
+    from workers.environments import SHIPPED, describe_environment, make_environment
     from workers.simd.graph import Graph
     from workers.simd.kernel import compile_kernel
     from workers.simd.schedule import Region, schedule
     from workers.simd.trace import trace_jaxpr
 
     environment = make_environment(task, {})
-    size = TASKS[task] if task in TASKS else describe_environment(task)
+    size = SHIPPED[task] if task in SHIPPED else describe_environment(task)
 
     def step(state, action):
         after, reward, done = environment.step(state, action)

@@ -18,7 +18,7 @@ import numpy as np
 
 from es_service.noise import Domain, stream_keys
 from es_service.protocol import PolicyShape
-from workers.environments import TASKS, ant_maze, ant_trap, make_environment
+from workers.environments import SHIPPED, ant_maze, ant_trap, make_environment
 from workers.environments.walls import WALL_RADIUS
 from workers.policy import act, split_layers
 
@@ -28,7 +28,7 @@ POLICIES, STEPS = 8, 600
 
 def ways(name: str) -> np.ndarray:
     """Torso positions of one episode of each of some random policies, [policies, steps + 1, 2]; NaN after the end."""
-    task, environment = TASKS[name], make_environment(name, {})
+    task, environment = SHIPPED[name], make_environment(name, {})
     shape = PolicyShape((task.observation_size, 32, task.action_size))
     parameters = np.random.default_rng(0).normal(size=(POLICIES, shape.parameters)).astype(np.float32) * 0.6
 

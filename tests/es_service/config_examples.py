@@ -11,7 +11,7 @@ from es_service.config.loading import load_config
 from es_service.config.model import RunConfig
 from workers import environments
 
-POINT_MAZE = environments.TASKS["point_maze"]
+POINT_MAZE = environments.SHIPPED["point_maze"]
 TASKS = {"point_maze": POINT_MAZE}
 MINIMAL = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 3}}
 MINIMAL_TEXT = "task: {environment: point_maze}\nsearch: {algorithm: es}\nbudget: {generations: 3}\n"

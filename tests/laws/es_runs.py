@@ -9,7 +9,7 @@ from es_service.protocol import (
 )
 from es_service.statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
-from workers.environments import TASKS
+from workers.environments import SHIPPED
 from workers.policy import initial_parameters
 
 SHAPE = PolicyShape((2, 8, 8, 2))
@@ -27,13 +27,13 @@ def small_config(**changes):
 
 
 def run_in_memory(config, evaluator=None):
-    evaluator = evaluator or DirectEvaluator(worker_spec(config, TASKS["point_maze"]))
+    evaluator = evaluator or DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
     first = initial_parameters(SHAPE, config.policy.init, config.seed)
     search = driver.Search(
         config,
         ALGORITHMS["es"](config),
         lambda: ([first], no_observations(2)),
-        TASKS["point_maze"],
+        SHIPPED["point_maze"],
     )
     store = MemoryStore()
     state, reason = driver.run(search, evaluator, store, None, lambda row: None)

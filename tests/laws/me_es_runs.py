@@ -12,7 +12,7 @@ from es_service.protocol import EvaluationChunk, PolicyShape
 from es_service.statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
 from tests.twins.behaviour_map import cell_number
-from workers.environments import TASKS
+from workers.environments import SHIPPED
 from workers.policy import initial_parameters
 
 SHAPE = PolicyShape((2, 8, 8, 2))
@@ -50,7 +50,7 @@ def config_of(preset="literature", generations=30, seed=0, neighbours=3, **searc
 
 @cache
 def compiled(preset):
-    return DirectEvaluator(worker_spec(config_of(preset), TASKS["point_maze"]))
+    return DirectEvaluator(worker_spec(config_of(preset), SHIPPED["point_maze"]))
 
 
 class Sharing(DirectEvaluator):
@@ -84,7 +84,7 @@ def run_in_memory(config, evaluator=None, store=None):
     evaluator, store = evaluator or Sharing(config.search.preset), store or Remembering()
     first = initial_parameters(SHAPE, config.policy.init, config.seed, 0)
     search = driver.Search(
-        config, ALGORITHMS["me_es"](config), lambda: ([first], no_observations(2)), TASKS["point_maze"]
+        config, ALGORITHMS["me_es"](config), lambda: ([first], no_observations(2)), SHIPPED["point_maze"]
     )
     state, _ = driver.run(search, evaluator, store, driver.stored_state(store, search.task), lambda row: None)
     return state, store, evaluator

@@ -25,7 +25,7 @@ from es_service.statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
 from tests.laws.es_runs import SHAPE, run_in_memory, small_config
 from tests.twins import es as twin
-from workers.environments import TASKS
+from workers.environments import SHIPPED
 from workers.policy import initial_parameters
 from workers.simd import episodes, target
 from workers.simd import rollout as simd_rollout
@@ -168,7 +168,7 @@ def test_invalid_members_rank_last_are_counted_and_do_not_stop_the_run():
         return result
 
     config = small_config()
-    state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config, TASKS["point_maze"]), spoil))
+    state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config, SHIPPED["point_maze"]), spoil))
     assert [row.get("invalid_members") for row in store.rows[1:]] == [2] * 20
     assert np.isfinite(state.search.members[0].centre_D).all()
     assert all(np.isfinite(row["population_fitness_min"]) for row in store.rows[1:])
@@ -184,14 +184,16 @@ def test_too_many_invalid_members_stop_the_run_with_a_named_error():
     with pytest.raises(
         EvaluationError, match=r"generation 3: 54 of 96 members .* search.max_invalid_fraction \(0.25\)"
     ):
-        run_in_memory(config, Tampering(worker_spec(config, TASKS["point_maze"]), spoil))
+        run_in_memory(config, Tampering(worker_spec(config, SHIPPED["point_maze"]), spoil))
 
 
 def test_a_centre_that_is_not_finite_stops_the_run_before_it_is_kept():
     config = small_config(learning_rate=1e300)
-    evaluator, store = DirectEvaluator(worker_spec(config, TASKS["point_maze"])), MemoryStore()
+    evaluator, store = DirectEvaluator(worker_spec(config, SHIPPED["point_maze"])), MemoryStore()
     first = initial_parameters(SHAPE, config.policy.init, config.seed)
-    search = driver.Search(config, ALGORITHMS["es"](config), lambda: ([first], no_observations(2)), TASKS["point_maze"])
+    search = driver.Search(
+        config, ALGORITHMS["es"](config), lambda: ([first], no_observations(2)), SHIPPED["point_maze"]
+    )
     with pytest.raises(EvaluationError, match=r"generation 1: the centre is not finite.*learning_rate \(1e\+300 now\)"):
         driver.run(search, evaluator, store, None, lambda row: None)
     assert store.generation == 0
@@ -204,7 +206,7 @@ def test_an_invalid_centre_is_never_the_best():
         return result
 
     config = small_config()
-    state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config, TASKS["point_maze"]), spoil))
+    state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config, SHIPPED["point_maze"]), spoil))
     assert state.best.generation == 4
     assert store.rows[3]["best_fitness"] == -np.inf
 
@@ -238,7 +240,9 @@ def test_the_driver_holds_no_population_times_parameters_array():
     config = load_config(mapping | {"budget": {"generations": 3}})
     shape = PolicyShape((2, 64, 64, 2))
     first = initial_parameters(shape, "unit_columns", 0)
-    search = driver.Search(config, ALGORITHMS["es"](config), lambda: ([first], no_observations(2)), TASKS["point_maze"])
+    search = driver.Search(
+        config, ALGORITHMS["es"](config), lambda: ([first], no_observations(2)), SHIPPED["point_maze"]
+    )
     evaluator = Inventing(shape.parameters)
     tracemalloc.start()
     driver.run(search, evaluator, MemoryStore(), None, lambda row: None)

@@ -27,7 +27,7 @@ from tests.laws.me_es_runs import (
 )
 from tests.twins import me_es as twin
 from tests.twins.behaviour_map import GridMap, coverage, qd_score
-from workers.environments import TASKS
+from workers.environments import SHIPPED
 from workers.policy import initial_parameters
 
 
@@ -230,6 +230,6 @@ def test_a_search_put_together_again_inside_a_block_equals_an_uninterrupted_one(
     assert store.parts.keys() == straight.parts.keys()
     for name, part in straight.parts.items():
         assert encode_part(store.parts[name]) == encode_part(part)
-    columns = [c.name for c in history_columns(TASKS["point_maze"], True) if c.deterministic]
+    columns = [c.name for c in history_columns(SHIPPED["point_maze"], True) if c.deterministic]
     kept = [[[row[name] for name in columns] for row in s.rows] for s in (store, straight)]
     np.testing.assert_array_equal(np.array(kept[0], float), np.array(kept[1], float))

@@ -24,7 +24,7 @@ from es_service.run_state import state_from_parts
 from es_service.statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
 from tests.twins import novelty_search as twin
-from workers.environments import TASKS
+from workers.environments import SHIPPED
 from workers.policy import initial_parameters
 
 SHAPE = PolicyShape((2, 8, 8, 2))
@@ -54,13 +54,13 @@ def config_of(algorithm, distance="euclidean", **search):
 
 
 def run_in_memory(config, evaluator=None, store=None):
-    evaluator = evaluator or DirectEvaluator(worker_spec(config, TASKS["point_maze"]))
+    evaluator = evaluator or DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
     centres = [initial_parameters(SHAPE, config.policy.init, config.seed, m) for m in range(config.search.members)]
     search = driver.Search(
         config,
         ALGORITHMS[config.search.algorithm](config),
         lambda: (centres, no_observations(2)),
-        TASKS["point_maze"],
+        SHIPPED["point_maze"],
     )
     store = store or MemoryStore()
     state, _ = driver.run(search, evaluator, store, driver.stored_state(store, search.task), lambda row: None)
@@ -286,7 +286,7 @@ class Spoiling(DirectEvaluator):
 
 def test_an_invalid_centre_never_enters_the_archive():
     config = config_of("nsra_es")
-    state, store, _ = run_in_memory(config, Spoiling(worker_spec(config, TASKS["point_maze"])))
+    state, store, _ = run_in_memory(config, Spoiling(worker_spec(config, SHIPPED["point_maze"])))
     assert [row["archive_size"] for row in store.rows[:6]] == [0, 1, 2, 2, 3, 4]
     assert np.isnan(store.rows[3]["centre_novelty"])
     assert 3 not in state.search.archive.generation_N

@@ -15,7 +15,7 @@ from es_service.shaping import centred_ranks, pair_weights
 from tests.helpers import DirectEvaluator, centre
 from tests.laws.es_runs import SHAPE, small_config
 from tests.twins import es as twin
-from workers.environments import TASKS
+from workers.environments import SHIPPED
 
 fitness_arrays = hnp.arrays(
     np.float64, st.tuples(st.integers(1, 12), st.just(2)), elements=st.integers(-5, 5).map(float) | st.floats(-1e6, 1e6)
@@ -44,7 +44,7 @@ def test_an_increasing_map_of_the_fitness_changes_nothing(fitness):
 
 def test_swapping_signs_negates_the_gradient_estimate_exactly():
     config = small_config()
-    evaluator = DirectEvaluator(worker_spec(config, TASKS["point_maze"]))
+    evaluator = DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
     fitness = np.random.default_rng(0).normal(size=(48, 2))
     point = centre(np.zeros(SHAPE.parameters))
     estimates = [
@@ -63,7 +63,7 @@ def test_gradient_by_hand_three_pairs():
     )
     weights = np.float32([1.0, -0.5, 0.25])
     found = estimate_gradient(
-        DirectEvaluator(worker_spec(config, TASKS["point_maze"])), centre(np.zeros(SHAPE.parameters)), weights, 2
+        DirectEvaluator(worker_spec(config, SHIPPED["point_maze"])), centre(np.zeros(SHAPE.parameters)), weights, 2
     )
     noise = [normals(key, SHAPE.parameters) for key in stream_keys(0, Domain.PARAMETER_NOISE, 1, np.arange(3))]
     np.testing.assert_allclose(found, (noise[0] - 0.5 * noise[1] + 0.25 * noise[2]) / 3, rtol=1e-5, atol=1e-6)

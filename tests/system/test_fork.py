@@ -24,7 +24,7 @@ from es_service.store import reader
 from es_service.store.reader import read_generation
 from tests.system.command_line import digest, es
 from tests.system.session import ROOT, SMALL, finish
-from workers.environments import TASKS
+from workers.environments import SHIPPED
 
 
 def run(folder: Path, *overrides: str, config=SMALL):
@@ -72,16 +72,16 @@ def test_a_state_that_does_not_fit_is_refused(parent, override, change):
 
 def test_another_descriptor_is_refused(tmp_path, monkeypatch):
     """One of as many dimensions: a novelty archive of both would mean nothing."""
-    bounds = TASKS["point_maze"].descriptor_bounds
+    bounds = SHIPPED["point_maze"].descriptor_bounds
     told = replace(
-        TASKS["point_maze"],
+        SHIPPED["point_maze"],
         options={"descriptor": ("place", "speed", "height")},
         descriptors={
             "place": (("x", "y"), bounds), "speed": (("u", "v"), bounds), "height": (("h",), bounds[:1])
         },
     )  # fmt: skip
     for module in (configs, tasks):
-        monkeypatch.setattr(module, "TASKS", {"point_maze": told})
+        monkeypatch.setattr(module, "SHIPPED", {"point_maze": told})
     monkeypatch.setattr(api, "work", lambda *arguments: None)  # as workers know of no such option
     api.run(SMALL, tmp_path / "run")
     assert (
@@ -91,16 +91,18 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
         with pytest.raises(ConfigError, match=rf"task\.options\.descriptor: place -> {other}\n[^$]*search\.init_from="):
             lineage.fork_config(tmp_path / "run", [f"task.options.descriptor={other}"])
     for module in (configs, tasks):
-        monkeypatch.setattr(module, "TASKS", {"point_maze": replace(told, descriptors={"place": (("a", "b"), bounds)})})
+        monkeypatch.setattr(
+            module, "SHIPPED", {"point_maze": replace(told, descriptors={"place": (("a", "b"), bounds)})}
+        )
     with pytest.raises(ConfigError, match=r"the descriptor of point_maze: \[x, y\] -> \[a, b\]\n.*search\.init_from="):
         lineage.fork_config(tmp_path / "run")
 
 
 def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkeypatch):
     """A user's own, edited: the same parameters would mean another network."""
-    other = replace(TASKS["point_maze"], action_size=3)
+    other = replace(SHIPPED["point_maze"], action_size=3)
     for module in (configs, tasks):
-        monkeypatch.setattr(module, "TASKS", {"point_maze": other})
+        monkeypatch.setattr(module, "SHIPPED", {"point_maze": other})
     with pytest.raises(ConfigError, match=r"point_maze is not what it was \(action_size: 2 -> 3\)"):
         api.resume(parent.folder, ["budget.generations=7"])
     with pytest.raises(ConfigError, match=r"the network's layers: \[2, 8, 2\] -> \[2, 8, 3\]\n.*search\.init_from="):
@@ -116,7 +118,7 @@ def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkey
 )
 def test_a_task_with_other_columns_is_no_other_version(parent, monkeypatch, change, told):
     for module in (configs, tasks):
-        monkeypatch.setattr(module, "TASKS", {"point_maze": replace(TASKS["point_maze"], **change)})
+        monkeypatch.setattr(module, "SHIPPED", {"point_maze": replace(SHIPPED["point_maze"], **change)})
     with pytest.raises(ConfigError, match=rf"the task point_maze is not what it was \({told}\)"):
         api.resume(parent.folder, ["budget.generations=7"])
 

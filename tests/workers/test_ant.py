@@ -13,7 +13,7 @@ from es_service.noise import NORMAL_STD, Domain, normals, stream_keys
 from es_service.protocol import SIGNS, PolicyShape
 from tests.helpers import SPEC
 from workers import rollout as xla
-from workers.environments import TASKS, make_environment
+from workers.environments import SHIPPED, make_environment
 from workers.environments.ant import STEP_S, Ant, contact_forces, expand, load_system, make_ant, observe, physics_step
 from workers.environments.brax_parts import pipeline
 from workers.policy import act, initial_parameters, split_layers
@@ -221,4 +221,4 @@ def test_reward_of_the_trap_by_hand():
     control = 0.5 * float((np.clip(action, -1, 1) ** 2).sum())
     contact = 5e-4 * float((np.clip(np.asarray(contact_forces(new)), -1, 1) ** 2).sum())
     assert float(reward) == pytest.approx(speed + 1.0 - control - contact, rel=1e-4)
-    assert TASKS["ant_trap"].observation_size == environment.observe(state).shape[0] == 113
+    assert SHIPPED["ant_trap"].observation_size == environment.observe(state).shape[0] == 113

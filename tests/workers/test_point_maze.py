@@ -10,7 +10,7 @@ import pytest
 
 from es_service.noise import Domain, stream_keys
 from tests.twins import point_maze as twin
-from workers.environments import TASKS, make_environment
+from workers.environments import SHIPPED, make_environment
 
 ENVIRONMENT = make_environment("point_maze", {})
 step = jax.jit(ENVIRONMENT.step)
@@ -83,10 +83,10 @@ def test_reset_covers_its_rectangle_and_corner_is_fixed():
     np.testing.assert_array_equal(jax.vmap(corner.reset)(keys[:3]), np.float32([[0.9, -0.9]] * 3))
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", SHIPPED)
 def test_task_table_tells_the_truth(name):
     """The driver plans with the table and never sees the module; a wrong size would only show in a worker."""
-    task = TASKS[name]
+    task = SHIPPED[name]
     takes = inspect.signature(importlib.import_module(f"workers.environments.{name}").make).parameters
     assert {option: values[0] for option, values in task.options.items()} == {x.name: x.default for x in takes.values()}
     environment = make_environment(name, {option: values[0] for option, values in task.options.items()})

@@ -17,7 +17,7 @@ class TaskError(Exception):
 ANT_CLEARANCE = 0.65
 """Half a wall and the torso's radius, less the tenth of a metre that a wall may give way."""
 
-TASKS: Mapping[str, TaskSpec] = {
+SHIPPED: Mapping[str, TaskSpec] = {
     "point_maze": TaskSpec(
         name="point_maze",
         observation_size=2,
@@ -95,7 +95,7 @@ def make_environment(name: str, options: Mapping[str, str]) -> Environment:
     """The functions of a named task; imports its module, and with it JAX and any physics engine it needs.
 
     Args:
-        name: one of TASKS, `brax:NAME`, or `package.module:Class`. Raises TaskError if that cannot be had.
+        name: one of SHIPPED, `brax:NAME`, or `package.module:Class`. Raises TaskError if that cannot be had.
     """
     kind, colon, rest = name.partition(":")
     if not colon:

@@ -10,11 +10,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from workers.environments import TASKS, Environment
+from workers.environments import SHIPPED, Environment
 from workers.environments.ant import AntState, make_ant, observe
 
-WALLS = TASKS["ant_maze"].walls or ()
-LOW, HIGH = TASKS["ant_maze"].descriptor_bounds[0]
+WALLS = SHIPPED["ant_maze"].walls or ()
+LOW, HIGH = SHIPPED["ant_maze"].descriptor_bounds[0]
 """Of x and of y: the arena is a square."""
 START = (-25.0, -25.0)
 GOAL = (35.0, -25.0)

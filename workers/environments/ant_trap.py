@@ -10,11 +10,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from workers.environments import TASKS, Environment
+from workers.environments import SHIPPED, Environment
 from workers.environments.ant import STEP_S, AntState, contact_forces, make_ant, observe
 
-WALLS = TASKS["ant_trap"].walls or ()
-DESCRIPTOR_BOUNDS = TASKS["ant_trap"].descriptor_bounds
+WALLS = SHIPPED["ant_trap"].walls or ()
+DESCRIPTOR_BOUNDS = SHIPPED["ant_trap"].descriptor_bounds
 START = (0.0, 0.0)
 HEALTHY_Z = (0.2, 1.0)
 SURVIVAL_REWARD = 1.0

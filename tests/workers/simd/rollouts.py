@@ -10,7 +10,7 @@ import workers.rollout
 from es_service.noise import NORMAL_STD, Domain, stream_keys
 from es_service.protocol import PolicyShape, WorkerSpec
 from tests.helpers import spec
-from workers.environments import TASKS, make_environment
+from workers.environments import SHIPPED, make_environment
 from workers.episode import Episodes
 from workers.policy import initial_parameters
 from workers.simd import rollout
@@ -34,7 +34,7 @@ def kinds() -> list[str]:
 
 
 def task_spec(task: str, **changes: Any) -> WorkerSpec:
-    size = TASKS[task]
+    size = SHIPPED[task]
     hidden = (64, 64) if task == "point_maze" else (256, 256)
     shape = PolicyShape((size.observation_size, *hidden, size.action_size))
     return spec(environment=task, policy=shape, episode_steps=size.episode_steps, **changes)

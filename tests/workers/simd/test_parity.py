@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from es_service.noise import Domain, stream_keys
-from workers.environments import TASKS, Environment, ant_maze, ant_trap, describe_environment, make_environment
+from workers.environments import SHIPPED, Environment, ant_maze, ant_trap, describe_environment, make_environment
 from workers.environments.ant import expand, make_ant, physics_step
 from workers.simd.kernel import compile_kernel
 
@@ -53,7 +53,7 @@ NAMES = ("ant_maze", "ant_trap", "point_maze", "brax:ant", "brax:halfcheetah", "
 def random_states(name: str, step: Step) -> tuple[Any, np.ndarray]:
     """(states [STATES, ...], actions, some of them beyond their limits); `step` is the control step of many."""
     environment = make_environment(name, {})
-    size = (TASKS[name] if name in TASKS else describe_environment(name)).action_size
+    size = (SHIPPED[name] if name in SHIPPED else describe_environment(name)).action_size
     rng = np.random.default_rng(0)
     state = jax.jit(jax.vmap(environment.reset))(stream_keys(7, Domain.TRAINING_RESET, 0, np.arange(STATES)))
     if name in WALLS:

@@ -14,7 +14,7 @@ import workers.simd.episodes
 from es_service.noise import Domain, normal_integers, stream_keys
 from es_service.protocol import EvaluationChunk, PolicyShape, TrainingChunk
 from tests.helpers import centre, random_parameters, spec
-from workers.environments import TASKS, describe_environment, make_environment
+from workers.environments import SHIPPED, describe_environment, make_environment
 from workers.simd import noise, rollout
 from workers.simd.episodes import compile_episodes
 from workers.simd.primitives import UnsupportedError
@@ -41,7 +41,7 @@ def test_a_step_that_makes_other_arrays_than_a_reset_is_refused():
 
 
 def test_why_a_task_cannot_have_it():
-    assert rollout.why_not(TASKS["point_maze"]) == ""
+    assert rollout.why_not(SHIPPED["point_maze"]) == ""
     sorting = describe_environment("tests.examples.sorting:Sorting")
     assert "the primitive sort, from" in rollout.why_not(sorting)
 
@@ -84,4 +84,4 @@ def test_a_step_without_a_text_of_its_own_is_refused_beforehand(monkeypatch: pyt
         raise ValueError("<function at 0x7f>")
 
     monkeypatch.setattr(workers.simd.episodes, "jaxpr_digest", nameless)
-    assert rollout.why_not(TASKS["point_maze"]) == "ValueError: <function at 0x7f>"
+    assert rollout.why_not(SHIPPED["point_maze"]) == "ValueError: <function at 0x7f>"
