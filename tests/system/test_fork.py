@@ -81,7 +81,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
         },
     )  # fmt: skip
     for module in (configs, tasks):
-        monkeypatch.setattr(module, "SHIPPED", {"point_maze": told})
+        monkeypatch.setattr(module, "TASKS", {"point_maze": told})
     monkeypatch.setattr(api, "work", lambda *arguments: None)  # as workers know of no such option
     api.run(SMALL, tmp_path / "run")
     assert (
@@ -91,9 +91,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
         with pytest.raises(ConfigError, match=rf"task\.options\.descriptor: place -> {other}\n[^$]*search\.init_from="):
             lineage.fork_config(tmp_path / "run", [f"task.options.descriptor={other}"])
     for module in (configs, tasks):
-        monkeypatch.setattr(
-            module, "SHIPPED", {"point_maze": replace(told, descriptors={"place": (("a", "b"), bounds)})}
-        )
+        monkeypatch.setattr(module, "TASKS", {"point_maze": replace(told, descriptors={"place": (("a", "b"), bounds)})})
     with pytest.raises(ConfigError, match=r"the descriptor of point_maze: \[x, y\] -> \[a, b\]\n.*search\.init_from="):
         lineage.fork_config(tmp_path / "run")
 
@@ -102,7 +100,7 @@ def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkey
     """A user's own, edited: the same parameters would mean another network."""
     other = replace(SHIPPED["point_maze"], action_size=3)
     for module in (configs, tasks):
-        monkeypatch.setattr(module, "SHIPPED", {"point_maze": other})
+        monkeypatch.setattr(module, "TASKS", {"point_maze": other})
     with pytest.raises(ConfigError, match=r"point_maze is not what it was \(action_size: 2 -> 3\)"):
         api.resume(parent.folder, ["budget.generations=7"])
     with pytest.raises(ConfigError, match=r"the network's layers: \[2, 8, 2\] -> \[2, 8, 3\]\n.*search\.init_from="):
@@ -118,7 +116,7 @@ def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkey
 )
 def test_a_task_with_other_columns_is_no_other_version(parent, monkeypatch, change, told):
     for module in (configs, tasks):
-        monkeypatch.setattr(module, "SHIPPED", {"point_maze": replace(SHIPPED["point_maze"], **change)})
+        monkeypatch.setattr(module, "TASKS", {"point_maze": replace(SHIPPED["point_maze"], **change)})
     with pytest.raises(ConfigError, match=rf"the task point_maze is not what it was \({told}\)"):
         api.resume(parent.folder, ["budget.generations=7"])
 
