@@ -81,8 +81,13 @@ def test_the_fork_that_a_refused_resume_names_goes_on(tmp_path):
         assert words_after(str(refused.value), "fork") == [str(folder), *settings]
     (folder / "config.yaml").unlink()
     with pytest.raises(ConfigError) as refused:
-        api.run_or_resume(SMALL | {"budget": {"env_steps": 10**6}, "seed": 1}, folder)
-    assert words_after(str(refused.value), "fork") == [str(folder), "--set", "seed=1"]
+        api.run_or_resume(SMALL | {"budget": {"env_steps": 5000}, "seed": 1}, folder)
+    wanted = ["seed=1", "budget.generations=null", "budget.env_steps=5000"]
+    assert words_after(str(refused.value), "fork") == [
+        str(folder),
+        *(word for key in wanted for word in ("--set", key)),
+    ]
+    assert (api.fork(folder, wanted, out=tmp_path / "fork").run.generation or 0) > 2
 
 
 def test_commands_start_what_is_there(tmp_path, monkeypatch):
