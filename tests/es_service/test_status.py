@@ -82,11 +82,6 @@ def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, cap
         assert (going_on.run.generation or 0) > before
 
 
-def test_the_way_out_of_a_refused_change_keeps_the_budget_that_was_wanted(run):
-    with pytest.raises(ConfigError, match=r" --set search\.sigma=0\.05 --set budget\.generations=50$"):
-        api.resume(run.folder, ["search.sigma=0.05", "budget.generations=50"])
-
-
 def test_budgets_are_shown_beside_what_is_reached(run, console, capsys):
     api.resume(run.folder, ["budget.env_steps=1_000_000", "budget.target_fitness=-1.5", "budget.wall_clock_s=600"])
     print_status(console, run)
