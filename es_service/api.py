@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import count
@@ -13,17 +13,17 @@ from typing import Any
 from uuid import uuid4
 
 from es_service.budget import REACHED, limits_of, raised
-from es_service.commands import command
-from es_service.config.changes import changed_constants, describe_changes
+from es_service.config.changes import changed_constants, refused_changes
+from es_service.config.keys import Overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
 from es_service.config.yaml_text import show
 from es_service.configs import changed_config, load_config
-from es_service.errors import ConfigError, StoreError
+from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.history import history_columns
 from es_service.lineage import fork_config, forked, started
 from es_service.protocol import TaskSpec
-from es_service.report.standing import Standing, look, way_on
+from es_service.report.standing import Standing, look
 from es_service.run_view import open_run
 from es_service.session import OnGeneration, OnNotice, Outcome, work
 from es_service.store.beginning import Beginning
@@ -75,7 +75,7 @@ def run(
 
 def resume(
     folder: str | os.PathLike[str],
-    overrides: Iterable[str] = (),
+    overrides: Overrides = (),
     *,
     on_generation: OnGeneration = _ignore,
     on_notice: OnNotice = _warn,
@@ -134,17 +134,22 @@ def _go_on(
         config = make_config(store)
         if changes := changed_constants(store.meta.constants, config.constants()):
             besides = _budget_of_a_fork(config, look(open_run(folder)))
-            raise ConfigError(f"{folder}: {describe_changes(changes, str(folder), besides)}")
+            raise refused_changes(folder, changes, besides)
         task = task_of(config)
         if other := _other_task(store.meta.task, task):
             raise ConfigError(
                 f"{folder}: the task {config.task.environment} is not what it was ({other}), so what the run has kept "
-                "does not fit it; undo that, or start a new run"
+                "does not fit it; undo that, or start a new run",
+                field="task.environment",
+                value=config.task.environment,
+                run=folder,
             )
         if store.meta.columns != history_columns(task, config.map.enabled):
             raise StoreError(
                 f"{folder} was written by a version of es-service with other history columns; continue it with that "
-                f"version, or go on from its state in a new run: {command('fork', folder)}"
+                "version",
+                run=folder,
+                ways_out=[WayOut("fork", "go on from its state in a new run", str(folder))],
             )
         try:
             write_config(folder, config.resolved_yaml())
@@ -171,7 +176,7 @@ def _other_task(recorded: Mapping[str, Any], task: TaskSpec) -> str:
 
 def fork(
     parent: str | os.PathLike[str],
-    overrides: Iterable[str] = (),
+    overrides: Overrides = (),
     *,
     generation: int | None = None,
     out: str | os.PathLike[str] | None = None,
@@ -196,8 +201,8 @@ def fork(
     outcome = _create_and_work(config, out, lineage, beginning, on_generation, on_notice, hook)
     if outcome.run.generation == (begun := lineage["generation"]):
         on_notice(
-            f"nothing was run: {outcome.reason} at generation {begun} already, where this fork begins; with a larger "
-            f"budget: {way_on(look(outcome.run))}"
+            f"nothing was run: {outcome.reason} at generation {begun} already, where this fork begins; resume it with "
+            "a larger budget"
         )
     return outcome
 
@@ -226,7 +231,7 @@ def _create_and_work(
             RUNS_FOLDER.mkdir(exist_ok=True)
         except OSError as error:
             raise StoreError(
-                f"cannot create the folder {RUNS_FOLDER} in {Path.cwd()}: {error.strerror}; choose another --out"
+                f"cannot create the folder {RUNS_FOLDER} in {Path.cwd()}: {error.strerror}; choose another folder"
             ) from error
     task = task_of(config)
     meta = RunMeta(

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
 
-from es_service.config.yaml_text import did_you_mean, one_of
+from es_service.config.problems import did_you_mean, one_of
 from es_service.cores import cores
 from es_service.errors import ConfigError, EvaluationError
 from es_service.process_environment import child_environment

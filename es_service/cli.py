@@ -36,7 +36,7 @@ from es_service.cli_options import (
 )
 from es_service.commands import command
 from es_service.config.resolution import config_warnings
-from es_service.errors import ConfigError, EvaluationError, Interrupted, NotInRunError, ServiceError
+from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError
 from es_service.platform_info import VERSION
 from es_service.report.catalogue import print_catalogue
 from es_service.report.overview import print_overview
@@ -226,10 +226,10 @@ def main() -> None:
     except Interrupted:
         raise
     except (ConfigError, NotInRunError) as error:
-        print_error(str(error))
+        print_error(error)
         sys.exit(2)
     except ServiceError as error:
-        print_error(str(error))
+        print_error(error)
         sys.exit(1)
     except MemoryError as error:
         print_error(f"not enough memory: {error}. A smaller policy.hidden or search.pairs needs less.")
@@ -259,9 +259,6 @@ def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
             print_note(f"interrupted; every finished generation is saved. Go on with: {command('resume', folder)}")
         else:
             print_note("interrupted before the run began; nothing was written")
-        raise
-    except EvaluationError:
-        print_note(f"every finished generation is saved. Once the cause is gone: {command('resume', folder)}")
         raise
     with contextlib.suppress(SystemExit):
         print_summary(console, outcome.run, outcome.reason)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from es_service.config.yaml_text import one_of
+from es_service.config.problems import one_of
 from es_service.errors import ConfigError
 
 bench = typer.Typer(help="Measure this machine.", no_args_is_help=True)

@@ -9,7 +9,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from es_service.commands import assignments, error_message
 from es_service.config.compute import ENGINE_IMPLIES
+from es_service.errors import ServiceError
 
 console = Console()
 errors = Console(stderr=True)
@@ -41,11 +43,12 @@ def overrides(
     So what a file, or a run's record, says of a cluster is moot, and a `--set` that contradicts the options is refused.
     """
     if address is not None:  # a cluster to join is a Ray cluster
-        implied = [*ENGINE_IMPLIES["ray"], *([] if engine else ["compute.engine=ray"])]
+        implied = ENGINE_IMPLIES["ray"] | ({} if engine else {"compute.engine": "ray"})
     else:
-        implied = list(ENGINE_IMPLIES.get(engine or "", ()))
+        implied = ENGINE_IMPLIES.get(engine or "", {})
     named = {"seed": seed, "compute.workers": workers, "compute.engine": engine, "compute.address": address}
-    return [*implied, *(set_ or []), *(f"{key}={value}" for key, value in named.items() if value is not None)]
+    options = {key: value for key, value in named.items() if value is not None}
+    return [*assignments(implied), *(set_ or []), *assignments(options)]
 
 
 def print_note(message: str, style: str | None = None) -> None:
@@ -54,6 +57,7 @@ def print_note(message: str, style: str | None = None) -> None:
         errors.print(message, style=style, highlight=False, markup=False, soft_wrap=True)
 
 
-def print_error(message: str) -> None:
+def print_error(error: ServiceError | str) -> None:
     """What has gone wrong, and what to do."""
+    message = error_message(error) if isinstance(error, ServiceError) else error
     print_note(f"error: {message}", style="red")

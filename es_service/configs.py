@@ -5,16 +5,15 @@ Nothing is made of a config that its search refuses: no folder, no worker.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from es_service.algorithms import ALGORITHMS
 from es_service.config import loading
+from es_service.config.keys import Overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
 from es_service.tasks import TASKS
 
 
-def load_config(source: Source, overrides: Iterable[str] = (), *, new: bool = True) -> RunConfig:
+def load_config(source: Source, overrides: Overrides = (), *, new: bool = True) -> RunConfig:
     """Read a YAML file (or a mapping like one), apply overrides such as "search.sigma=0.05", resolve and check it all.
 
     Args:
@@ -26,7 +25,7 @@ def load_config(source: Source, overrides: Iterable[str] = (), *, new: bool = Tr
     return _accepted(loading.load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, new=new))
 
 
-def changed_config(source: Source, overrides: Iterable[str] = ()) -> RunConfig:
+def changed_config(source: Source, overrides: Overrides = ()) -> RunConfig:
     """The config of a run that exists, with some keys changed; see `loading.changed_config`.
 
     Raises:

@@ -18,8 +18,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from es_service import platform_info
-from es_service.commands import command
-from es_service.errors import StoreError
+from es_service.errors import StoreError, WayOut
 from es_service.maps.behaviour_map import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.store.codec import decode_part, row_bytes
 from es_service.store.folder import DATABASE
@@ -69,8 +68,9 @@ def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
     with reading(folder) as (connection, meta):
         if problems := verify(connection, folder / DATABASE).problems:
             raise StoreError(
-                f"{folder} is damaged: {'; '.join(problems)}. `{command('resume', folder)}` goes on from the newest "
-                "generation that is sound."
+                f"{folder} is damaged: {'; '.join(problems)}",
+                run=folder,
+                ways_out=[WayOut("resume", "go on from the newest generation that is sound", str(folder))],
             )
         return _parts(folder, connection, meta), _is_mixed(connection)
 
@@ -84,7 +84,8 @@ def _parts(folder: Path, connection: Connection, meta: RunMeta, until: int = NEW
     try:
         return {**_state(connection, until), "history": _history(connection, meta, until)}
     except ValueError as error:
-        raise StoreError(f"{folder} holds what cannot be read: {error}; resume it to repair what can be") from error
+        ways_out = [WayOut("resume", "repair what can be repaired", str(folder))]
+        raise StoreError(f"{folder} holds what cannot be read: {error}", run=folder, ways_out=ways_out) from error
 
 
 def _state(connection: Connection, until: int) -> dict[str, str]:

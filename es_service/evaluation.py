@@ -1,4 +1,4 @@
-"""`es-service evaluate`: fresh episodes for policies that a run has kept, beside what the run believed of them.
+"""Fresh episodes for policies that a run has kept, beside what the run believed of them.
 
 An elite, or a best centre, is the highest of many noisy means: part of its fitness is luck. Episodes that selection has
 never seen tell how much. Every policy gets the same fresh episodes, and the same command again gets them too;
@@ -14,12 +14,11 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.commands import command
 from es_service.config.compute import ENGINE_IMPLIES
 from es_service.config.model import worker_spec
 from es_service.configs import changed_config
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.errors import NotInRunError
+from es_service.errors import NotInRunError, WayOut
 from es_service.generation import evaluate_centre
 from es_service.protocol import Centre, Evaluator, FloatArray
 from es_service.run_state import best_from_arrays
@@ -86,7 +85,8 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
     generation.
     """
     if run.generation is None:
-        raise NotInRunError(f"{run.folder} has no generation yet; `{command('resume', run.folder)}` continues it")
+        way_out = WayOut("resume", "continue it", str(run.folder))
+        raise NotInRunError(f"{run.folder} has no generation yet", run=run.folder, ways_out=[way_out])
     found = []
     if best:
         kept = best_from_arrays(run.parts(wanted=lambda part: part == "best")[1]["best"])
@@ -100,7 +100,7 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
     wanted = None if every else [run.cell(place) for place in cells]
     map_, elites = run.elites(wanted)
     if not elites:
-        raise NotInRunError(f"the map of {run.folder} is empty")
+        raise NotInRunError(f"the map of {run.folder} is empty", run=run.folder)
     for cell in map_.cell_N.tolist() if wanted is None else wanted:
         row, elite = map_.row_of(cell), elites[cell]
         assert row is not None
@@ -120,7 +120,7 @@ def evaluate(
 
     Raises EvaluationError where rollouts cannot go on; Interrupted when asked to stop.
     """
-    overrides = ["compute.engine=inline", *ENGINE_IMPLIES["inline"], f"compute.workers={workers or 'auto'}"]
+    overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": workers or "auto"}
     config = changed_config(run.present_config, overrides)
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     with (

@@ -1,4 +1,4 @@
-"""`es-service export`: a run as tables (csv, parquet), as arrays that NumPy alone opens, or as a pyribs archive."""
+"""A run as tables (csv, parquet), as arrays that NumPy alone opens, or as a pyribs archive."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from es_service.commands import command, install_command
-from es_service.config.yaml_text import did_you_mean, one_of
-from es_service.errors import ConfigError, NotInRunError, StoreError
+from es_service.config.problems import did_you_mean, nearest, one_of
+from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
 from es_service.maps.behaviour_map import ELITE_PREFIX, BehaviourMap, Elite
 from es_service.maps.geometry import Grid
 from es_service.run_view import Run, map_places
@@ -37,14 +36,21 @@ def export(run: Run, to: str, folder: Path) -> list[Path]:
             one of. StoreError: the folder cannot be written.
     """
     if to not in FORMATS:
-        raise ConfigError(f"--to {to}: no known format; must be {one_of(FORMATS)}{did_you_mean(to, FORMATS)}")
+        raise ConfigError(
+            f"{to} is no known format; must be {one_of(FORMATS)}{did_you_mean(to, FORMATS)}",
+            field="to",
+            value=to,
+            allowed=one_of(FORMATS),
+            suggestion=nearest(to, FORMATS),
+        )
     if run.generation is None:
-        raise NotInRunError(f"{run.folder} has no generation yet; `{command('resume', run.folder)}` continues it")
+        way_out = WayOut("resume", "continue it", str(run.folder))
+        raise NotInRunError(f"{run.folder} has no generation yet", run=run.folder, ways_out=[way_out])
     try:
         folder.mkdir(parents=True, exist_ok=True)
         return FORMATS[to](run, folder)
     except OSError as error:
-        raise StoreError(f"cannot write into {folder}: {error.strerror or error}; choose another --out") from error
+        raise StoreError(f"cannot write into {folder}: {error.strerror or error}; choose another folder") from error
 
 
 @dataclass(frozen=True)
@@ -114,12 +120,16 @@ def ribs_archive(run: Run) -> Any:
     try:
         from ribs.archives import GridArchive
     except ImportError as error:
-        raise ConfigError(f"--to ribs needs pyribs; {install_command('ribs')}") from error
+        raise ConfigError(
+            "a pyribs archive needs pyribs", field="to", value="ribs", ways_out=[_install("ribs")]
+        ) from error
     map_, elites = run.elites()
     if not isinstance(map_.geometry, Grid):
-        raise NotInRunError(f"the map of {run.folder} is a cvt and no grid, as a GridArchive is; --to npz has it all")
+        raise NotInRunError(
+            f"the map of {run.folder} is a cvt and no grid, as a GridArchive is; npz has it all", run=run.folder
+        )
     if not map_.size:
-        raise NotInRunError(f"the map of {run.folder} is empty")
+        raise NotInRunError(f"the map of {run.folder} is empty", run=run.folder)
     columns = _map_arrays(run, map_, elites)
     size = columns["mean"].shape[1]
     archive = GridArchive(
@@ -147,7 +157,8 @@ def ribs_archive(run: Run) -> Any:
     if archive.stats.num_elites != map_.size:
         raise NotInRunError(
             f"pyribs puts the {map_.size} elites of {run.folder} into {archive.stats.num_elites} of its cells, too "
-            "small for its arithmetic; --to npz has them all"
+            "small for its arithmetic; npz has them all",
+            run=run.folder,
         )
     return archive
 
@@ -185,8 +196,13 @@ def _parquet(run: Run, folder: Path) -> list[Path]:
         try:
             table.to_parquet(written[-1], index=False)
         except ImportError as error:
-            raise ConfigError(f"--to parquet needs pyarrow; {install_command('parquet')}") from error
+            ways_out = [_install("parquet")]
+            raise ConfigError("parquet needs pyarrow", field="to", value="parquet", ways_out=ways_out) from error
     return written
+
+
+def _install(extra: str) -> WayOut:
+    return WayOut("install", "install it", extra=extra)
 
 
 def _npz(run: Run, folder: Path) -> list[Path]:

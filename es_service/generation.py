@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.algorithms.base import Judgement
-from es_service.errors import EvaluationError
+from es_service.errors import EvaluationError, WayOut
 from es_service.protocol import (
     EVALUATION_EPISODES_PER_CHUNK,
     Centre,
@@ -92,7 +92,9 @@ def invalidate(population: EpisodesResult, max_invalid_fraction: float, generati
         raise EvaluationError(
             f"generation {generation}: {invalid} of {valid_P_S.size} members returned a fitness or descriptor that is "
             f"not finite, more than search.max_invalid_fraction ({max_invalid_fraction}) allows. Everything up to "
-            f"generation {generation - 1} is saved; a smaller search.sigma or search.learning_rate may help (fork)."
+            f"generation {generation - 1} is saved; a smaller search.sigma or search.learning_rate may help.",
+            field="search.max_invalid_fraction",
+            value=max_invalid_fraction,
         )
     fitness_P_S = np.where(valid_P_S, population.fitness, np.float32(np.nan))
     return replace(population, fitness=fitness_P_S), invalid
@@ -103,8 +105,16 @@ def require_finite(centre_D: FloatArray, learning_rate: float, generation: int) 
     if not np.isfinite(centre_D).all():
         raise EvaluationError(
             f"generation {generation}: the centre is not finite after its update, so it is not kept. Everything up to "
-            f"generation {generation - 1} is saved; go on from there with a smaller search.learning_rate "
-            f"({learning_rate:g} now): es-service fork RUN --set search.learning_rate=..."
+            f"generation {generation - 1} is saved.",
+            field="search.learning_rate",
+            value=learning_rate,
+            ways_out=[
+                WayOut(
+                    "fork",
+                    "go on from there with a smaller learning rate",
+                    settings={"search.learning_rate": learning_rate / 10},
+                )
+            ],
         )
 
 

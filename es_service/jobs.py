@@ -19,9 +19,8 @@ from typing import Any
 from urllib.parse import urlsplit
 from uuid import uuid4
 
-from es_service.commands import install_command
 from es_service.config.model import RunConfig
-from es_service.errors import ConfigError, EvaluationError, ServiceError
+from es_service.errors import ConfigError, EvaluationError, ServiceError, WayOut
 
 FOLDER = "es_service_run"
 """Key of a job's metadata: the run folder."""
@@ -56,7 +55,13 @@ def submit(config: RunConfig, address: str, out: str) -> str:
         ConfigError: `out` is relative. EvaluationError: no cluster answers, or it refuses us.
     """
     if not out.startswith("/"):
-        raise ConfigError(f"--out {out}: must be absolute, since a job's own directory is deleted; such as /runs/{out}")
+        raise ConfigError(
+            f"the run folder {out} must be absolute, since a job's own directory is deleted; such as /runs/{out}",
+            field="out",
+            value=out,
+            allowed="an absolute path",
+            suggestion=f"/runs/{out}",
+        )
     client = _client(address)
     name = f"es-{uuid4().hex[:8]}"
     command = ["es-service", "run", "config.yaml", "--or-resume", "--out", out]
@@ -130,16 +135,24 @@ def stop(job: str, address: str) -> str:
 def _client(address: str) -> Any:
     """Ray's client for jobs."""
     if not address.startswith(("http://", "https://")):
+        url = f"http://{_host(address)}:8265"
         raise ConfigError(
-            f"--address {address}: must be the URL of the cluster's dashboard, such as http://{_host(address)}:8265"
+            f"the address {address} must be the URL of the cluster's dashboard, such as {url}",
+            field="address",
+            value=address,
+            allowed="a URL",
+            suggestion=url,
         )
     try:
         import aiohttp  # noqa: F401  what Ray's client lacks without the extra
         from ray.job_submission import JobSubmissionClient
     except ImportError as error:
         raise EvaluationError(
-            f"jobs need the extra `cluster` ({error}); {install_command('cluster')}. "
-            "`es-service run CONFIG --address HOST:PORT` does without"
+            f"jobs need the extra `cluster` ({error})",
+            ways_out=[
+                WayOut("install", "install it", extra="cluster"),
+                WayOut("run", "run on the cluster without a job", settings={"compute.address": "HOST:PORT"}),
+            ],
         ) from error
     for name in ("ray.dashboard.modules.dashboard_sdk", "ray._private.runtime_env.packaging"):
         logging.getLogger(name).setLevel(logging.WARNING)  # they would tell of each upload
@@ -168,9 +181,7 @@ def _explained(address: str, job: str | None = None) -> Iterator[None]:
     except Exception as error:  # RuntimeError and ConnectionError, mostly
         text = str(error).strip()
         if job is not None and "does not exist" in text:
-            raise EvaluationError(
-                f"there is no job {job} on {address}; `es-service jobs --address {address}` lists them"
-            ) from error
+            raise EvaluationError(f"there is no job {job} on {address}", field="job", value=job) from error
         first = text.partition("\n")[0]
         raise EvaluationError(
             f"the cluster at {address} did not do it: {first}. Check the address, that its dashboard runs there, and "

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from es_service.config.changes import START_KEYS, STATE_KEYS, changed_constants, start_afresh
-from es_service.config.keys import parse_overrides
+from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.model import RunConfig, policy_shape
 from es_service.config.yaml_text import show
 from es_service.configs import changed_config
 from es_service.digest import digest_at
-from es_service.errors import ConfigError
+from es_service.errors import ConfigError, Problem
 from es_service.maps.behaviour_map import ELITE_PREFIX
 from es_service.protocol import Moments
 from es_service.run_state import moments_from_arrays, moments_to_arrays, without_fitness, without_scores
@@ -34,40 +34,48 @@ ROWS_AT_ONCE = 4096
 """Of a history, in memory."""
 
 
-def fork_config(parent: str | os.PathLike[str], overrides: Iterable[str] = ()) -> RunConfig:
+def fork_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> RunConfig:
     """The config of a fork: the one that the parent would go on with, with overrides.
 
     Raises:
         ConfigError: as `load_config`, the parent's state does not fit the changes, or a key would change nothing.
     """
     origin = open_run(parent)
-    overrides = [overrides] if isinstance(overrides, str) else list(overrides)
+    if not isinstance(overrides, str | Mapping):
+        overrides = list(overrides)  # it is gone through twice
     wanted = parse_overrides(overrides)[0]
-    if idle := [f"  {key}" for key in START_KEYS if key in wanted]:
-        listed = "\n".join(idle)
-        raise ConfigError(
-            f"{origin.folder}: a fork has its state and all its settings, so these would change nothing:\n{listed}\n"
-            f"instead of a preset, set the keys that it stands for (`es-service list` shows them); "
-            f"{start_afresh(str(origin.folder))}"
+    if idle := [key for key in START_KEYS if key in wanted]:
+        raise _refused(
+            origin,
+            "a fork has its state and all its settings, so these would change nothing",
+            [Problem(key, key, wanted[key]) for key in idle],
+            "instead of a preset, set the keys that it stands for",
         )
     present = origin.present_config
     mapping = present | {"search": present["search"] | {"init_from": None}}  # it has the parent's state instead
     config = changed_config(mapping, overrides)
     changes = changed_constants(origin.constants, config.constants())
-    unfit = [f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes if name in STATE_KEYS]
+    unfit = [_unfit(name, old, new, name) for name, old, new in changes if name in STATE_KEYS]
     names = task_of(config).descriptor_names
     if not unfit and list(names) != origin.descriptor_names:  # a task of the user's that is not what it was
-        unfit = [
-            f"  the descriptor of {config.task.environment}: {show(origin.descriptor_names)} -> {show(list(names))}"
-        ]
+        what = f"the descriptor of {config.task.environment}"
+        unfit = [_unfit(what, origin.descriptor_names, list(names), "task.environment")]
     if not unfit and origin.policy_shape != (shape := policy_shape(config, task_of(config))):
-        unfit = [f"  the network's layers: {show(list(origin.policy_shape.widths))} -> {show(list(shape.widths))}"]
+        old, new = list(origin.policy_shape.widths), list(shape.widths)
+        unfit = [_unfit("the network's layers", old, new, "policy.hidden")]
     if unfit:
-        listed = "\n".join(unfit)
-        raise ConfigError(
-            f"{origin.folder}: its state does not fit these changes:\n{listed}\n{start_afresh(str(origin.folder))}"
-        )
+        raise _refused(origin, "its state does not fit these changes", unfit)
     return config
+
+
+def _unfit(what: str, old: Any, new: Any, field: str) -> Problem:
+    return Problem(f"{what}: {show(old)} -> {show(new)}", field, new, show(old), old)
+
+
+def _refused(origin: Run, why: str, problems: Sequence[Problem], note: str = "") -> ConfigError:
+    """The error for a fork that cannot be made with some settings; a new run could be, from the origin's centre."""
+    ways_out = [start_afresh(origin.folder)]
+    return ConfigError.listing(f"{origin.folder}: {why}:", problems, note, run=origin.folder, ways_out=ways_out)
 
 
 def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict[str, Any], Beginning]:
@@ -115,7 +123,10 @@ def started(config: RunConfig, folder: str, tell: Callable[[str], None]) -> tupl
     if origin.policy_shape != shape:
         raise ConfigError(
             f"search.init_from: the policy of {origin.folder} has layers {list(origin.policy_shape.widths)}, "
-            f"this run's has {list(shape.widths)}; use the same task and policy.hidden"
+            f"this run's has {list(shape.widths)}; use the same task and policy.hidden",
+            field="search.init_from",
+            value=folder,
+            run=origin.folder,
         )
     at, parts = origin.parts(wanted=lambda part: not part.startswith(ELITE_PREFIX))
     member, moments = origin.newest_member(at, parts), moments_from_arrays(parts["observations"])

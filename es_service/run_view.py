@@ -175,7 +175,10 @@ class Run:
             near = ",".join(map(str, map_places(map_)[0])) if map_.size else "none yet"
             raise NotInRunError(
                 f"cell {shown} is not in the map of {self.folder}: a cell has {dimensions} numbers there, "
-                f"such as {near}, the first that was filled"
+                f"such as {near}, the first that was filled",
+                field="cell",
+                value=place,
+                run=self.folder,
             )
         cell = map_.geometry.cell_at(place)
         if cell is not None and map_.row_of(cell) is not None:
@@ -184,8 +187,10 @@ class Run:
         hint = f"; the nearest filled cell is {','.join(map(str, near))}" if near else "; the map is empty"
         if cell is None:
             sizes = " and ".join(f"0 to {n - 1}" for n in map_.geometry.shape)
-            raise NotInRunError(f"cell {shown} is not in the map of {self.folder}, whose cells are {sizes}{hint}")
-        raise NotInRunError(f"cell {shown} of {self.folder} is empty{hint}")
+            why = f"cell {shown} is not in the map of {self.folder}, whose cells are {sizes}"
+        else:
+            why = f"cell {shown} of {self.folder} is empty"
+        raise NotInRunError(f"{why}{hint}", field="cell", value=place, suggestion=near, run=self.folder)
 
     def elite(self, place: int | Sequence[int]) -> Elite:
         """What is kept of a cell's elite: parameters, statistics, trace. Raises as `cell`."""
@@ -210,7 +215,7 @@ class Run:
     def _map(self, parts: Mapping[str, Mapping[str, np.ndarray]]) -> BehaviourMap:
         map_ = map_from_parts(parts)
         if map_ is None:
-            raise NotInRunError(f"{self.folder} keeps no map; it was started with map.enabled = false")
+            raise NotInRunError(f"{self.folder} keeps no map; it was started with map.enabled = false", run=self.folder)
         return map_
 
     @property

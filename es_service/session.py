@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from es_service import driver
@@ -14,6 +16,7 @@ from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.messages import Limits
+from es_service.errors import EvaluationError, WayOut
 from es_service.platform_info import computed_on, is_mixed, platform_info
 from es_service.protocol import FloatArray, Moments
 from es_service.run_state import Arrays, moments_from_arrays
@@ -70,6 +73,7 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
         task=task,
     )
     with (
+        _blaming(store.folder),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
         stop_on_signals() as should_stop,
         _engine(config, should_stop, log) as engine,
@@ -109,6 +113,19 @@ class _OnPlatforms:
                 )
             self._workers = workers
         self._store.commit(generation, parts, history)
+
+
+@contextmanager
+def _blaming(folder: Path) -> Iterator[None]:
+    """Add to an error of the rollouts which run it ended, and that this run can be resumed."""
+    try:
+        yield
+    except EvaluationError as error:
+        run = str(folder)
+        resume = WayOut("resume", "go on once the cause is gone; every finished generation is saved", run)
+        ways_out = [replace(way, run=way.run or run) for way in error.ways_out]
+        error.run, error.ways_out = run, (*ways_out, resume)
+        raise
 
 
 def dispatch_limits(config: RunConfig) -> Limits:

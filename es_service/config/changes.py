@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from es_service.commands import command, settings
 from es_service.config.fields import OPTIONS
 from es_service.config.yaml_text import show
+from es_service.errors import ConfigError, Problem, WayOut
 
 STATE_KEYS = (
     "task.environment",
@@ -58,29 +58,32 @@ def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tu
     ]
 
 
-def describe_changes(
-    changes: Sequence[tuple[str, Any, Any]], run: str = "RUN", besides: Mapping[str, Any] = MappingProxyType({})
-) -> str:
-    """What to tell someone whose resume would change constants of the run: all of them, and the way out.
+def refused_changes(
+    run: object, changes: Sequence[tuple[str, Any, Any]], besides: Mapping[str, Any] = MappingProxyType({})
+) -> ConfigError:
+    """The error for a resume that would change constants of the run: all of them, and the ways out.
 
     Args:
+        run: folder of the run.
         besides: keys that a fork has to set as well, and their values.
     """
-    forkable = {name: new for name, _, new in changes if name not in (*STATE_KEYS, *START_KEYS) and new != ABSENT}
     fixed = [name for name, _, _ in changes if name in (*STATE_KEYS, *START_KEYS)]
-    lines = [
-        "a run keeps its task, policy, search, novelty, map, seed and chunk shapes for life; this would change:",
-        *(f"  {name}: {show(old)} -> {show(new)}" for name, old, new in changes),
-    ]
+    forkable = {name: new for name, _, new in changes if name not in fixed and new != ABSENT}
+    problems = [Problem(f"{name}: {show(old)} -> {show(new)}", name, new, show(old), old) for name, old, new in changes]
+    heading = (
+        f"{run}: a run keeps its task, policy, search, novelty, map, seed and chunk shapes for life; this would change:"
+    )
+    ways = []
     if forkable:
-        way = command("fork", run, *settings({**forkable, **besides}))
-        lines.append(f"to go on from its state with other settings: {way}")
+        ways.append(
+            WayOut("fork", "go on from its state with other settings", str(run), settings={**forkable, **besides})
+        )
     if fixed:
-        lines.append(f"a fork has to keep {', '.join(fixed)}; {start_afresh(run)}")
-    return "\n".join(lines)
+        ways.append(start_afresh(run))
+    note = f"a fork has to keep {', '.join(fixed)}" if fixed else ""
+    return ConfigError.listing(heading, problems, note, run=run, ways_out=ways)
 
 
-def start_afresh(run: str) -> str:
+def start_afresh(run: object) -> WayOut:
     """The way out where the state of a run is of no use with the settings that are wanted."""
-    way = command("run", "CONFIG", *settings({"search.init_from": run}))
-    return f"to start anew from its centre (same task and network): {way}"
+    return WayOut("run", "start anew from its centre (same task and network)", settings={"search.init_from": str(run)})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -80,8 +80,8 @@ class ComputeConfig(Section):
 
 COMPUTE_CONSTANTS = ("rollout", "chunk_pairs", "rollout_block_pairs", "gradient_block_pairs")
 """Keys of `compute` that fix floating-point results, and therefore the run."""
-ENGINE_IMPLIES = {
-    "inline": ("compute.address=null", "compute.worker_resources.cpu=1", "compute.worker_resources.gpu=0"),
-    "ray": ("compute.inline_workers=processes",),
+ENGINE_IMPLIES: dict[str, dict[str, Any]] = {
+    "inline": {"compute.address": None, "compute.worker_resources.cpu": 1, "compute.worker_resources.gpu": 0},
+    "ray": {"compute.inline_workers": "processes"},
 }
 """Engine -> settings that belong to the other one, as it needs them."""

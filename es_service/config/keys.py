@@ -1,9 +1,9 @@
-"""The keys of a config: which there are, what a file or `--set` says of each, and the message for one that is none."""
+"""The keys of a config: which there are, what a file or an override says of each, what is wrong with any other."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from difflib import get_close_matches
+from dataclasses import replace
 from typing import Any
 
 from pydantic import BaseModel
@@ -11,7 +11,9 @@ from pydantic import BaseModel
 from es_service.config.compute import WorkerResources
 from es_service.config.fields import OPTIONS, RESOURCES
 from es_service.config.model import RunConfig
-from es_service.config.yaml_text import parse_value, show
+from es_service.config.problems import nearest, unfit
+from es_service.config.yaml_text import in_line, parse_value, show
+from es_service.errors import Problem
 
 SECTIONS = {
     name: field.annotation
@@ -39,16 +41,16 @@ BUDGET = [name for name in FIELDS if name.startswith("budget.")]
 """Keys of which one must be set."""
 
 
-def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, Any], set[str], list[str]]:
+def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, Any], set[str], list[Problem]]:
     """Flat values of the known keys, the groups that are no mapping, and the problems of both other kinds of key."""
     values: dict[str, Any] = {}
     unusable: set[str] = set()
-    problems: list[str] = []
+    problems: list[Problem] = []
     for key, value in mapping.items():
         name = f"{group}{key}"
         if "." in str(key):
             section, leaf = name.rsplit(".", 1)
-            problems.append(f"{name}: no dots in a file (they are for --set); write {leaf} inside {section}:")
+            problems.append(unfit(name, value, f"no dots in a file; write {leaf} inside {section}:"))
         elif name in GROUPS and isinstance(value, Mapping):
             below = sort_keys(value, f"{name}.")
             values |= below[0]
@@ -56,40 +58,46 @@ def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, An
             problems += below[2]
         elif name in GROUPS:
             unusable.add(name)
-            problems.append(
-                f"{name}: {show(value)} where keys belong; indent them below `{_leaf(name)}:`, "
-                "or delete the line for the defaults"
-            )
+            hint = f"indent them below `{_leaf(name)}:`, or delete the line for the defaults"
+            problems.append(unfit(name, value, f"{show(value)} where keys belong; {hint}"))
         elif name in FIELDS or group == OPTIONS:
             values[name] = value
         else:
-            problems.append(_unknown_key(name, (*GROUPS, *FIELDS) if isinstance(value, Mapping) else FIELDS))
+            problems.append(_unknown_key(name, (*GROUPS, *FIELDS) if isinstance(value, Mapping) else FIELDS, value))
     return values, unusable, problems
 
 
-def parse_overrides(overrides: Iterable[str]) -> tuple[dict[str, Any], list[str]]:
+Overrides = Iterable[str] | Mapping[str, Any]
+"""Changes of a config: "search.sigma=0.05" and the like, values in YAML, later ones winning; or values by key."""
+
+
+def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]]:
     """Values by dotted key, and a problem for each override that has none to give."""
     values: dict[str, Any] = {}
-    problems: list[str] = []
+    problems: list[Problem] = []
+    if isinstance(overrides, Mapping):
+        overrides = [f"{name}={in_line(value)}" for name, value in overrides.items()]
     for override in [overrides] if isinstance(overrides, str) else overrides:
         name, equals, text = (part.strip() for part in override.partition("="))
         where = f"override {override}"
         if not equals or not name or not text:
             hint = "write null for no value" if name and equals else "write a.b=c, such as search.sigma=0.05"
-            problems.append(f"{where}: {hint}")
+            problems.append(Problem(f"{where}: {hint}"))
         elif name in GROUPS:
             keys = [key for key in FIELDS if key.startswith(f"{name}.")] or [f"{OPTIONS}start"]
-            problems.append(f"{where}: {name} is a section; set its keys one by one, such as {keys[0]}=...")
+            what = f"{where}: {name} is a section; set its keys one by one, such as {keys[0]}=..."
+            problems.append(Problem(what, name, text, suggestion=keys[0]))
         elif name in FIELDS or _is_option(name):
             try:
                 value = parse_value(text)
             except ValueError as error:
-                problems.append(f"{where}: {error}")
+                problems.append(Problem(f"{where}: {error}", name, text))
                 continue
             is_word = _is_option(name) and isinstance(value, bool | int | float)  # such as off, or 10
             values[name] = text if is_word else value
         else:
-            problems.append(f"{where}: {_unknown_key(name, FIELDS)}")
+            problem = _unknown_key(name, FIELDS, text)
+            problems.append(replace(problem, sentence=f"{where}: {problem.sentence}"))
     return values, problems
 
 
@@ -99,8 +107,8 @@ def _is_option(name: str) -> bool:
     return option not in ("", name) and "." not in option
 
 
-def _unknown_key(name: str, candidates: Iterable[str]) -> str:
-    """The message for a key that is none: the same key elsewhere, else the nearest one, else what there is.
+def _unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:
+    """The problem of a key that is none: the same key elsewhere, else the nearest one, else what there is.
 
     Args:
         candidates: what may have been meant.
@@ -110,11 +118,11 @@ def _unknown_key(name: str, candidates: Iterable[str]) -> str:
     near_by = {leaf: key for leaf, key in everywhere.items() if key.rpartition(".")[0] == section}
     exactly = everywhere | ALIASES
     for keys in ({leaf: exactly[leaf]} if leaf in exactly else {}, near_by, everywhere):
-        if near := get_close_matches(leaf, keys, n=1):
-            return f"{name}: unknown key; did you mean {keys[near[0]]}?"
+        if near := nearest(leaf, keys):
+            return unfit(name, value, f"unknown key; did you mean {keys[near]}?", suggestion=keys[near])
     if siblings := [_leaf(key) for key in (*GROUPS, *FIELDS) if key.rpartition(".")[0] == section]:
-        return f"{name}: unknown key; {section or 'the top level'} has {', '.join(siblings)}"
-    return f"{name}: unknown key; the sections are {', '.join(SECTIONS)}"
+        return unfit(name, value, f"unknown key; {section or 'the top level'} has {', '.join(siblings)}")
+    return unfit(name, value, f"unknown key; the sections are {', '.join(SECTIONS)}")
 
 
 def _leaf(name: str) -> str:

@@ -15,10 +15,11 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import ValidationError
 
 from es_service.config.changes import without_followers
-from es_service.config.keys import BUDGET, FIELDS, SECTIONS, parse_overrides, sort_keys
+from es_service.config.keys import BUDGET, FIELDS, SECTIONS, Overrides, parse_overrides, sort_keys
 from es_service.config.map_rules import map_problems
 from es_service.config.model import RunConfig
 from es_service.config.presets import PRESETS, preset_values
+from es_service.config.problems import nearest, not_allowed, one_of, unfit
 from es_service.config.resolution import (
     LEFT_OPEN,
     engine_problems,
@@ -30,8 +31,8 @@ from es_service.config.resolution import (
     shape_problems,
     task_problems,
 )
-from es_service.config.yaml_text import config_error, did_you_mean, one_of, parse_value, read_yaml_file, show
-from es_service.errors import ConfigError
+from es_service.config.yaml_text import parse_value, read_yaml_file, show
+from es_service.errors import ConfigError, Problem
 from es_service.protocol import TaskSpec
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
@@ -40,7 +41,7 @@ Source = str | os.PathLike[str] | Mapping[str, Any]
 
 def load_config(
     source: Source,
-    overrides: Iterable[str] = (),
+    overrides: Overrides = (),
     *,
     tasks: Mapping[str, TaskSpec],
     algorithms: Mapping[str, object],
@@ -50,7 +51,7 @@ def load_config(
 
     Args:
         source: a YAML file, or a nested mapping like one.
-        overrides: "search.sigma=0.05" and the like, values in YAML; a later one wins.
+        overrides: "search.sigma=0.05" and the like, values in YAML, of which a later one wins; or values by key.
         tasks: what `task.environment` may name.
         algorithms: what `search.algorithm` may name.
         new: whether the run that it starts from, if any, must be there.
@@ -62,7 +63,7 @@ def load_config(
 
 
 def changed_config(
-    source: Source, overrides: Iterable[str] = (), *, tasks: Mapping[str, TaskSpec], algorithms: Mapping[str, object]
+    source: Source, overrides: Overrides = (), *, tasks: Mapping[str, TaskSpec], algorithms: Mapping[str, object]
 ) -> RunConfig:
     """The config of a run that exists, with some keys changed; what follows from those, by a preset or from the task,
     is resolved anew. Whether the run can change so is for the caller to say.
@@ -78,7 +79,7 @@ def changed_config(
 
 def _load(
     source: Source,
-    overrides: Iterable[str],
+    overrides: Overrides,
     tasks: Mapping[str, TaskSpec],
     algorithms: Mapping[str, object],
     *,
@@ -113,14 +114,14 @@ def _load(
         try:
             found[key] = known[chosen] if chosen is not None else None
         except KeyError:
-            problems.append(
-                f"{key}: {show(chosen)} is no known {what}; must be {one_of(known)}, or {besides}"
-                f"{did_you_mean(chosen, known)}"
-            )
+            allowed, meant = f"{one_of(known)}, or {besides}", nearest(chosen, known)
+            hint = f"; did you mean {meant}?" if meant else ""
+            sentence = f"{key}: {show(chosen)} is no known {what}; must be {allowed}{hint}"
+            problems.append(Problem(sentence, key, chosen, allowed, meant))
         except ConfigError as error:
-            problems.append(f"{key}: {error}")
+            problems.append(Problem(f"{key}: {error}", key, chosen))
         if chosen is None and key not in bad and key.split(".")[0] not in unusable:
-            problems.append(f"{key}: missing; must be {one_of(known)}")
+            problems.append(unfit(key, None, f"missing; must be {one_of(known)}", allowed=one_of(known)))
     task: TaskSpec | None = found.get("task.environment")
     values = resolve(values, left_open, task)
     if task is not None:
@@ -129,9 +130,10 @@ def _load(
     problems += member_problems(values) + shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):
-        problems.append(f"budget: nothing ends this run; set at least one of {one_of(BUDGET)}")
+        problems.append(unfit("budget", None, f"nothing ends this run; set at least one of {one_of(BUDGET)}"))
     if problems:
-        raise config_error(name, problems)
+        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+        raise ConfigError.listing(f"{name}: {count}", problems)
     return RunConfig.model_validate(_nested(values))
 
 
@@ -163,8 +165,8 @@ def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
     return nested
 
 
-def _value_problems(values: Mapping[str, Any]) -> dict[str, str]:
-    """Keys whose value is wrong by itself -> message. What is absent is no problem here."""
+def _value_problems(values: Mapping[str, Any]) -> dict[str, Problem]:
+    """Keys whose value is wrong by itself -> what is wrong. What is absent is no problem here."""
     try:
         RunConfig.model_validate(_nested(values))
     except ValidationError as error:
@@ -176,24 +178,24 @@ def _value_problems(values: Mapping[str, Any]) -> dict[str, str]:
     return {name: _bad_value(name, value) for name, value in values.items() if name in names}
 
 
-def _bad_value(name: str, value: object) -> str:
+def _bad_value(name: str, value: object) -> Problem:
     """Name, value, what is allowed, and how to write what was probably meant."""
     if name not in FIELDS:
-        return f"{name}: {show(value)} is not allowed; must be text, so write it in quotes"
+        return not_allowed(name, value, "text, so write it in quotes")
     field = FIELDS[name]
     allowed = _allowed(field.annotation, field.metadata)
     if name in LEFT_OPEN:
         allowed = f"{show(LEFT_OPEN[name])} or {allowed}"
-    hint = ""
+    hint, meant = "", None
     if value is None:
         hint = "; leave the key out for its default"
     elif isinstance(value, str) and "number" in allowed and _is_number(value):
-        hint = f"; remove the quotes around {value}"
+        hint, meant = f"; remove the quotes around {value}", parse_value(value)
     elif isinstance(value, float) and "whole number" in allowed and value.is_integer() and 1 <= value < 2**53:
-        hint = f"; write {int(value)}"
+        hint, meant = f"; write {int(value)}", int(value)
     elif isinstance(value, str) and get_origin(field.annotation) is Literal:
-        hint = did_you_mean(value, get_args(field.annotation))
-    return f"{name}: {show(value)} is not allowed; must be {allowed}{hint}"
+        meant = nearest(value, get_args(field.annotation))
+    return not_allowed(name, value, allowed, hint=hint, suggestion=meant)
 
 
 def _is_number(text: str) -> bool:

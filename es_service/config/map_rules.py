@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from es_service.config.fields import OPTIONS
+from es_service.config.problems import not_allowed, unfit
 from es_service.config.yaml_text import show
+from es_service.errors import Problem
 from es_service.protocol import TaskSpec, with_options
 
 MOST_AUTO_CELLS = 10_000
@@ -42,29 +44,34 @@ def default_qd_offset(values: Mapping[str, Any], task: TaskSpec) -> float:
     return task.least_reward * counted
 
 
-def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
+def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     """Where the map does not fit the descriptor, or the algorithm needs one."""
     problems = []
     if values.get("search.algorithm") == "me_es" and values.get("map.enabled", True) is False:
-        problems.append(
-            "map.enabled: false is not allowed for me_es, which draws its parents from the map; must be true"
-        )
+        why = " for me_es, which draws its parents from the map"
+        problems.append(not_allowed("map.enabled", False, "true", why=why))
     names = with_options(task, options_of(values)).descriptor_names
     bounds, cells, kind = values.get("map.bounds"), values.get("map.cells"), values.get("map.kind")
     qd_offset = values.get("map.qd_offset", 0.0)
     for key, numbers in (("map.bounds", [x for pair in bounds or () for x in pair]), ("map.qd_offset", [qd_offset])):
         if any(abs(number) > LARGEST for number in numbers):
-            problems.append(f"{key}: {show(values[key])} is not allowed; must be within {LARGEST:g} of 0")
+            problems.append(not_allowed(key, values[key], f"within {LARGEST:g} of 0"))
     if bounds is not None:
         if len(bounds) != len(names):
-            problems.append(
-                f"map.bounds: {show(bounds)} has {len(bounds)} pairs; the descriptor has {len(names)} dimensions "
-                f"({', '.join(names)}), so must be a list of {len(names)} pairs [low, high], or auto"
-            )
+            allowed = f"a list of {len(names)} pairs [low, high], or auto"
+            what = f"{show(bounds)} has {len(bounds)} pairs; the descriptor has {len(names)} dimensions"
+            problem = f"{what} ({', '.join(names)}), so must be {allowed}"
+            problems.append(unfit("map.bounds", bounds, problem, allowed=allowed))
         else:
             problems += [
-                f"map.bounds: {show(pair)} for {name} is not allowed; must be [low, high] with low below high"
-                + (f"; did you mean {show(pair[::-1])}?" if pair[0] > pair[1] else "")
+                Problem(
+                    f"map.bounds: {show(pair)} for {name} is not allowed; must be [low, high] with low below high"
+                    + (f"; did you mean {show(pair[::-1])}?" if pair[0] > pair[1] else ""),
+                    "map.bounds",
+                    pair,
+                    "[low, high] with low below high",
+                    pair[::-1] if pair[0] > pair[1] else None,
+                )
                 for name, pair in zip(names, bounds, strict=True)
                 if not pair[0] < pair[1]
             ]
@@ -72,12 +79,14 @@ def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
         wanted = 1 if kind == "cvt" else len(names)
         if len(cells) != wanted:
             what = "one number for a cvt" if kind == "cvt" else f"{wanted} numbers, one for each of {', '.join(names)}"
-            problems.append(f"map.cells: {show(cells)} has {len(cells)} numbers; must be {what}, or auto")
+            allowed = f"{what}, or auto"
+            problem = f"{show(cells)} has {len(cells)} numbers; must be {allowed}"
+            problems.append(unfit("map.cells", cells, problem, allowed=allowed))
         elif math.prod(cells) > (most := MOST_CVT_CELLS if kind == "cvt" else MOST_CELLS):
-            problems.append(
-                f"map.cells: {show(cells)} makes {math.prod(cells):,} cells; must be at most {most:,}"
-                + (" for a cvt" if kind == "cvt" else "; with many dimensions use map.kind = cvt")
-            )
+            allowed = f"at most {most:,}"
+            hint = " for a cvt" if kind == "cvt" else "; with many dimensions use map.kind = cvt"
+            problem = f"{show(cells)} makes {math.prod(cells):,} cells; must be {allowed}{hint}"
+            problems.append(unfit("map.cells", cells, problem, allowed=allowed))
     return problems
 
 

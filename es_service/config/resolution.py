@@ -17,7 +17,9 @@ from es_service.config.fields import OPTIONS, RESOURCES
 from es_service.config.keys import FIELDS
 from es_service.config.map_rules import default_cells, default_kind, default_qd_offset, options_of
 from es_service.config.model import RunConfig
-from es_service.config.yaml_text import did_you_mean, one_of, show
+from es_service.config.problems import nearest, not_allowed, one_of, unfit
+from es_service.config.yaml_text import show
+from es_service.errors import Problem
 from es_service.protocol import PolicyShape, TaskSpec, with_options
 
 LEFT_OPEN: dict[str, str | None] = {
@@ -132,54 +134,52 @@ def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpe
     return values
 
 
-def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
+def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     """Where the config asks of the task what it cannot do."""
     problems = []
     if values.get("task.fitness") == "final" and not task.final_fitness:
-        problems.append(
-            f"task.fitness: final is not allowed for {task.name}, whose last reward says little about the episode; "
-            "must be sum"
-        )
+        why = f" for {task.name}, whose last reward says little about the episode"
+        problems.append(not_allowed("task.fitness", "final", "sum", why=why))
     for key in values:
         option = key.removeprefix(OPTIONS)
         if not key.startswith(OPTIONS):
             continue
         if option not in task.options:
             known = f"{task.name} has {one_of(task.options)}" if task.options else f"{task.name} has none"
-            problems.append(f"{key}: unknown option; {known}{did_you_mean(option, task.options)}")
+            meant = nearest(option, task.options)
+            hint = f"; did you mean {meant}?" if meant else ""
+            problems.append(unfit(key, values[key], f"unknown option; {known}{hint}", suggestion=meant))
         elif values[key] not in task.options[option]:
             allowed = task.options[option]
-            problems.append(
-                f"{key}: {show(values[key])} is not allowed; must be {one_of(allowed)}"
-                f"{did_you_mean(values[key], allowed)}"
-            )
+            meant = nearest(values[key], allowed)
+            problems.append(not_allowed(key, values[key], one_of(allowed), suggestion=meant))
     return problems
 
 
-def policy_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
+def policy_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     """Where the network is larger than a run can keep."""
     shape = _policy_shape(values, task)
     if shape.parameters <= MOST_PARAMETERS:
         return []
-    return [
-        f"policy.hidden: {show(list(shape.widths[1:-1]))} makes more than {MOST_PARAMETERS:,} parameters for "
-        f"{task.name}, the most that the run store takes; must be narrower"
-    ]
+    hidden = list(shape.widths[1:-1])
+    what = f"{show(hidden)} makes more than {MOST_PARAMETERS:,} parameters for {task.name}"
+    problem = f"{what}, the most that the run store takes; must be narrower"
+    return [unfit("policy.hidden", hidden, problem, allowed="narrower")]
 
 
 def _policy_shape(values: Mapping[str, Any], task: TaskSpec) -> PolicyShape:
     return PolicyShape((task.observation_size, *_value(values, "policy.hidden"), task.action_size))
 
 
-def member_problems(values: Mapping[str, Any]) -> list[str]:
+def member_problems(values: Mapping[str, Any]) -> list[Problem]:
     """Where the algorithm cannot have as many members."""
     algorithm, members = values.get("search.algorithm"), values.get("search.members")
     if algorithm not in SINGLE_MEMBER or members in (None, 1):
         return []
-    return [f"search.members: {members} is not allowed for {algorithm}, which has one centre; must be 1 or auto"]
+    return [not_allowed("search.members", members, "1 or auto", why=f" for {algorithm}, which has one centre")]
 
 
-def shape_problems(values: Mapping[str, Any]) -> list[str]:
+def shape_problems(values: Mapping[str, Any]) -> list[Problem]:
     """Where pairs, chunks and blocks do not divide each other."""
     problems = []
     pairs, chunk = values.get("search.pairs"), values.get("compute.chunk_pairs")
@@ -187,42 +187,44 @@ def shape_problems(values: Mapping[str, Any]) -> list[str]:
     if pairs is not None and chunk is not None and pairs % chunk:
         below = pairs // chunk * chunk
         fits = f"{below + chunk} (or {below})" if below else f"{chunk}"
-        problems.append(
-            f"search.pairs: {pairs} is not a multiple of compute.chunk_pairs ({chunk}); try pairs = {fits}, "
-            "or compute.chunk_pairs = auto"
-        )
+        hint = f"try pairs = {fits}, or compute.chunk_pairs = auto"
+        what = f"{pairs} is not a multiple of compute.chunk_pairs ({chunk}); {hint}"
+        problems.append(unfit("search.pairs", pairs, what, suggestion=below + chunk))
     if chunk is not None and rollout is not None and chunk % rollout:
         divisors = [size for size in range(1, MOST_CHUNK_PAIRS + 1) if chunk % size == 0]
         near = sorted(sorted(divisors, key=lambda size: abs(size - rollout))[:2])
-        problems.append(
-            f"compute.rollout_block_pairs: {rollout} does not divide compute.chunk_pairs ({chunk}); "
-            f"try {' or '.join(map(str, near))}, or auto"
-        )
+        what = f"{rollout} does not divide compute.chunk_pairs ({chunk}); try {' or '.join(map(str, near))}, or auto"
+        problems.append(unfit("compute.rollout_block_pairs", rollout, what, suggestion=near[0]))
     if pairs is not None and gradient is not None and gradient > pairs:
-        problems.append(
-            f"compute.gradient_block_pairs: {gradient} is more than search.pairs ({pairs}); try {pairs}, or auto"
-        )
+        what = f"{gradient} is more than search.pairs ({pairs}); try {pairs}, or auto"
+        problems.append(unfit("compute.gradient_block_pairs", gradient, what, suggestion=pairs))
     return problems
 
 
-def engine_problems(values: Mapping[str, Any]) -> list[str]:
+def engine_problems(values: Mapping[str, Any]) -> list[Problem]:
     """Where the config asks for a cluster or a GPU without Ray, or for a share of a GPU that Ray cannot give."""
     problems = []
     if _value(values, "compute.engine") != "ray":
         problems = [
-            f"{name}: {show(values[name])} needs compute.engine = ray, which is {values['compute.engine']}"
+            unfit(
+                name,
+                values[name],
+                f"{show(values[name])} needs compute.engine = ray, which is {values['compute.engine']}",
+                suggestion=FIELDS[name].default,
+            )
             for name in ("compute.address", f"{RESOURCES}cpu", f"{RESOURCES}gpu")
             if _value(values, name) != FIELDS[name].default
         ]
     inline, threads = values.get("compute.engine") == "inline", values.get("compute.inline_workers") == "threads"
     if threads and not (inline and values.get("compute.rollout", "simd") == "simd"):
-        problems.append(
-            "compute.inline_workers: threads needs compute.engine = inline and compute.rollout = simd, in whose code "
-            "threads do not wait for each other; must be processes"
+        what = (
+            "threads needs compute.engine = inline and compute.rollout = simd, in whose code threads do not wait for "
+            "each other; must be processes"
         )
+        problems.append(unfit("compute.inline_workers", "threads", what, allowed="processes"))
     gpus = _value(values, f"{RESOURCES}gpu")
     if gpus > 1 and gpus != int(gpus):
-        problems.append(f"{RESOURCES}gpu: {show(gpus)} is not allowed; must be a whole number or a fraction below 1")
+        problems.append(not_allowed(f"{RESOURCES}gpu", gpus, "a whole number or a fraction below 1"))
     return problems
 
 
@@ -240,18 +242,20 @@ def _why_no_simd(values: Mapping[str, Any], task: TaskSpec) -> str:
     return task.no_simd or (task.no_vectors if values.get("compute.address") is None else "")
 
 
-def rollout_problems(values: Mapping[str, Any], task: TaskSpec) -> list[str]:
+def rollout_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     """Where simd is asked for and cannot be had."""
     if values.get("compute.rollout") != "simd":
         return []
     if _on_gpu(values):
-        return [f"compute.rollout: simd runs on CPUs, and {RESOURCES}gpu is not 0; must be auto or xla"]
-    if task.no_simd:
-        return [f"compute.rollout: simd cannot run {task.name}: {task.no_simd}; must be auto or xla"]
-    return []
+        why = f"simd runs on CPUs, and {RESOURCES}gpu is not 0"
+    elif task.no_simd:
+        why = f"simd cannot run {task.name}: {task.no_simd}"
+    else:
+        return []
+    return [unfit("compute.rollout", "simd", f"{why}; must be auto or xla", allowed="auto or xla")]
 
 
-def folder_problems(values: Mapping[str, Any]) -> list[str]:
+def folder_problems(values: Mapping[str, Any]) -> list[Problem]:
     """Where the config names a run that is not there."""
     folder = values.get("search.init_from")
     if folder is None:
@@ -264,7 +268,8 @@ def folder_problems(values: Mapping[str, Any]) -> list[str]:
         what = f"cannot be looked at ({getattr(error, 'strerror', error)})"
     else:
         what = "" if stat.S_ISDIR(found.st_mode) else "is a file"
-    return [f"search.init_from: {folder} {what}; must be the folder of another run, or null"] if what else []
+    allowed = "the folder of another run, or null"
+    return [unfit("search.init_from", folder, f"{folder} {what}; must be {allowed}", allowed=allowed)] if what else []
 
 
 def config_warnings(config: RunConfig, task: TaskSpec) -> list[str]:

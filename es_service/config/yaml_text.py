@@ -8,13 +8,12 @@ types of the config then reject) and a repeated key is a problem that names both
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
-from difflib import get_close_matches
+from collections.abc import Mapping
 from pathlib import Path
 
 import yaml
 
-from es_service.errors import ConfigError
+from es_service.errors import ConfigError, Problem
 
 _DECIMAL = re.compile(r"[-+]?[0-9]+(_[0-9]+)*")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9][0-9_]*(\.[0-9_]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
@@ -57,34 +56,38 @@ for _class in (_Loader, _Dumper):
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_decimal)
 
 
-def read_yaml_file(path: str | Path) -> tuple[Mapping[object, object], list[str]]:
+def read_yaml_file(path: str | Path) -> tuple[Mapping[object, object], list[Problem]]:
     """Read a config file.
 
     Returns:
-        The top-level mapping, and a line for every repeated key (of which the last one counts).
+        The top-level mapping, and a problem for every repeated key (of which the last one counts).
 
     Raises:
         ConfigError: there is nothing to go on with: no such file, not text, not YAML, empty, not a mapping.
     """
     path = Path(path)
+
+    def refused(problem: str) -> ConfigError:
+        return ConfigError.listing(f"{path}: 1 problem", [Problem(problem)])
+
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:
-        raise config_error(path, ["no such file"]) from None
+        raise refused("no such file") from None
     except IsADirectoryError:
-        raise config_error(path, ["this is a directory; name a YAML file"]) from None
+        raise refused("this is a directory; name a YAML file") from None
     except UnicodeDecodeError as error:
-        raise config_error(path, [f"not a text file: byte {error.start} is not UTF-8"]) from None
+        raise refused(f"not a text file: byte {error.start} is not UTF-8") from None
     except OSError as error:
-        raise config_error(path, [f"cannot be read: {error.strerror}"]) from None
+        raise refused(f"cannot be read: {error.strerror}") from None
     try:
         value, problems = _parse(text)
     except ValueError as error:
-        raise config_error(path, [str(error)]) from None
+        raise refused(str(error)) from None
     if value is None:
-        raise config_error(path, ["the file is empty; it needs at least task.environment, search.algorithm, a budget"])
+        raise refused("the file is empty; it needs at least task.environment, search.algorithm, a budget")
     if not isinstance(value, Mapping):
-        raise config_error(path, [f"the top level is {show(value)}; write sections such as `task:` and `search:`"])
+        raise refused(f"the top level is {show(value)}; write sections such as `task:` and `search:`")
     return value, problems
 
 
@@ -96,7 +99,7 @@ def parse_value(text: str) -> object:
     """
     value, problems = _parse(text)
     if problems:
-        raise ValueError(problems[0])
+        raise ValueError(problems[0].sentence)
     return value
 
 
@@ -105,35 +108,22 @@ def dump_yaml(value: object) -> str:
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=120)
 
 
-def show(value: object) -> str:
-    """A value as one would type it in a config, on one line, shortened to about 60 characters."""
+def in_line(value: object) -> str:
+    """A value as one would type it in a config, on one line."""
     try:
         text = yaml.dump(value, Dumper=_Dumper, default_flow_style=True, width=1_000_000)
     except (yaml.YAMLError, RecursionError):  # from a Python mapping, or a list that contains itself
         text = repr(value)
-    text = " ".join(text.removesuffix("...\n").split())
+    return " ".join(text.removesuffix("...\n").split())
+
+
+def show(value: object) -> str:
+    """`in_line`, shortened to about 60 characters."""
+    text = in_line(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def did_you_mean(name: object, candidates: Collection[str]) -> str:
-    """A hint to append to a message: "; did you mean X?", or nothing where no candidate is near."""
-    near = get_close_matches(str(name), candidates, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
-
-
-def one_of(names: Collection[str]) -> str:
-    """Names in a sentence: "a", "a or b", "a, b or c"."""
-    *first, last = map(str, names)
-    return f"{', '.join(first)} or {last}" if first else last
-
-
-def config_error(name: object, problems: list[str]) -> ConfigError:
-    """The error that lists every problem of one config under its name."""
-    count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-    return ConfigError("\n".join([f"{name}: {count}", *(f"  {problem}" for problem in problems)]))
-
-
-def _parse(text: str) -> tuple[object, list[str]]:
+def _parse(text: str) -> tuple[object, list[Problem]]:
     """Value and repeated keys of one document; ValueError with one readable line where it is not YAML."""
     try:
         loader = _Loader(text)
@@ -164,12 +154,12 @@ def _explain(error: yaml.MarkedYAMLError, text: str) -> str:
     return f"line {mark.line + 1}, column {mark.column + 1}: not YAML: {reason}{since}: {offending}"
 
 
-def _repeated_keys(node: yaml.Node, prefix: str, seen: set[int]) -> list[str]:
-    """A line for each key that its mapping already has; `seen` ends the walk where an alias contains itself."""
+def _repeated_keys(node: yaml.Node, prefix: str, seen: set[int]) -> list[Problem]:
+    """A problem for each key that its mapping already has; `seen` ends the walk where an alias contains itself."""
     if id(node) in seen:
         return []
     seen.add(id(node))
-    problems: list[str] = []
+    problems: list[Problem] = []
     if isinstance(node, yaml.SequenceNode):
         for item in node.value:
             problems += _repeated_keys(item, prefix, seen)
@@ -178,7 +168,9 @@ def _repeated_keys(node: yaml.Node, prefix: str, seen: set[int]) -> list[str]:
         for key, value in node.value:
             name, line = f"{prefix}{key.value}", key.start_mark.line + 1
             if name in first_line:
-                problems.append(f"{name}: written twice, on lines {first_line[name]} and {line}; keep one")
+                problems.append(
+                    Problem(f"{name}: written twice, on lines {first_line[name]} and {line}; keep one", name)
+                )
             first_line.setdefault(name, line)
             problems += _repeated_keys(value, f"{name}.", seen)
     return problems

@@ -21,7 +21,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from es_service.errors import EvaluationError, Interrupted
+from es_service.config.compute import ENGINE_IMPLIES
+from es_service.errors import EvaluationError, Interrupted, WayOut
 
 OBJECT_STORE_BYTES = 200 * 2**20
 """Shared memory of a local Ray: a few centres and gradient blocks. Ray would take a third of the machine's."""
@@ -44,6 +45,9 @@ LOCAL_SETTINGS = {
     "RAY_enable_metrics_collection": "0",
 }
 """Further ones for a Ray of our own; without them its own bookkeeping takes a tenth of a small generation."""
+WITHOUT_RAY = WayOut(
+    "resume", "go on on this machine without Ray", settings={"compute.engine": "inline", **ENGINE_IMPLIES["inline"]}
+)
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
         EvaluationError: Ray is missing, in use by this process already, does not start, or no cluster takes us in.
         Interrupted: SIGTERM arrived meanwhile.
     """
-    without = "`--engine inline` runs on this machine without Ray"
+    ways_out = [WITHOUT_RAY]
     options: dict[str, Any] = {"address": address}
     settings = dict(SETTINGS)
     if address is None:
@@ -95,9 +99,9 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
         try:
             import ray
         except ImportError as error:
-            raise EvaluationError(f"Ray cannot be imported ({error}); install it, or: {without}") from error
+            raise EvaluationError(f"Ray cannot be imported ({error}); install it", ways_out=ways_out) from error
         if ray.is_initialized():
-            raise EvaluationError(f"this process uses Ray already; call ray.shutdown() first, or: {without}")
+            raise EvaluationError("this process uses Ray already; call ray.shutdown() first", ways_out=ways_out)
         try:
             if address not in (None, "auto"):
                 _knock(address)
@@ -109,11 +113,14 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
             raise Interrupted(signal.SIGTERM) from stop
         except Exception as error:  # Ray raises many kinds: ConnectionError, RuntimeError, ValueError, TimeoutError ...
             if address is None:
-                raise EvaluationError(f"Ray does not start on this machine: {error}. {without}") from error
+                raise EvaluationError(f"Ray does not start on this machine: {error}", ways_out=ways_out) from error
             raise EvaluationError(
                 f"no Ray cluster at {address} took us in: {error}. Check the address, that RAY_AUTH_TOKEN is the "
                 f"cluster's (with RAY_AUTH_MODE=token), and that it has this Ray ({ray.__version__}) and this Python "
-                f"({platform.python_version()}); {without}"
+                f"({platform.python_version()})",
+                field="compute.address",
+                value=address,
+                ways_out=ways_out,
             ) from error
     _let_print(ray, False)
     return ray
@@ -173,7 +180,8 @@ class Watch:
         if silent_s > SILENCE_S:
             raise EvaluationError(
                 f"the Ray cluster has not answered for {silent_s:.0f} s: its head node is gone or out of reach. "
-                "Start a cluster again and resume there, or resume on this machine alone with --engine inline"
+                "Start a cluster again and resume there, or on this machine alone",
+                ways_out=[WITHOUT_RAY],
             )
         return self._latest
 

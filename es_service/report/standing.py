@@ -9,9 +9,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from es_service.budget import REACHED, limits_of, raised, spent
-from es_service.commands import command, settings
 from es_service.config.model import BudgetConfig
-from es_service.errors import ConfigError
+from es_service.errors import ConfigError, WayOut
 from es_service.report.progress import Row
 from es_service.run_view import Run
 from es_service.store.folder import CONFIG
@@ -66,16 +65,16 @@ def state(standing: Standing) -> str:
     return "stopped before its budget is spent"
 
 
-def way_on(standing: Standing) -> str:
-    """The command that goes on with a run that is not running."""
-    return command("resume", standing.run.folder, *more(standing))
+def way_on(standing: Standing) -> WayOut:
+    """How to go on with a run that is not running."""
+    return WayOut("resume", "go on", str(standing.run.folder), more(standing))
 
 
-def more(standing: Standing) -> list[str]:
-    """Options with which a run that is over goes on."""
+def more(standing: Standing) -> dict[str, float | None]:
+    """Settings with which a run that is over goes on; none if it is not over."""
     if standing.row is None:
-        return []
-    return settings({f"budget.{key}": value for key, value in raised(standing.limits, standing.row).items()})
+        return {}
+    return {f"budget.{key}": value for key, value in raised(standing.limits, standing.row).items()}
 
 
 def to_go(standing: Standing) -> str:

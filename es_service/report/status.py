@@ -6,7 +6,7 @@ import time
 
 from rich.console import Console
 
-from es_service.commands import command
+from es_service.commands import command, settings, way_command
 from es_service.report.progress import plain_line
 from es_service.report.standing import Standing, look, more, state, way_on
 from es_service.run_view import Run
@@ -26,7 +26,9 @@ def print_status(console: Console, run: Run) -> None:
     }
     if parent:
         fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
-    fields["state"] = state(standing) if standing.driver else f"{state(standing)}; go on with: {way_on(standing)}"
+    fields["state"] = (
+        state(standing) if standing.driver else f"{state(standing)}; go on with: {way_command(way_on(standing))}"
+    )
     _print_fields(console, fields | _progress(standing))
 
 
@@ -39,7 +41,8 @@ def follow_status(console: Console, run: Run) -> None:
             next_generation = standing.row["generation"] + 1
             console.print(plain_line(standing.row), highlight=False, soft_wrap=True)
         if not standing.driver:
-            _print_line(console, f"no driver is running: {state(standing)}; go on with: {way_on(standing)}")
+            way = way_command(way_on(standing))
+            _print_line(console, f"no driver is running: {state(standing)}; go on with: {way}")
             return
         time.sleep(FOLLOW_INTERVAL_S)
 
@@ -47,6 +50,7 @@ def follow_status(console: Console, run: Run) -> None:
 def print_summary(console: Console, run: Run, reason: str) -> None:
     """What a session ends with: the result, the folder, the next commands."""
     standing, folder = look(run), run.folder
+    doubled = {"search.sigma": float(f"{run.constants['search.sigma'] * 2:g}")}
     _print_line(console, f"\nDone: {reason}.")
     _print_fields(console, _progress(standing))
     _print_line(console, f"\nThe run is in {folder}. Next:")
@@ -54,8 +58,8 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
         ("status", folder),
         ("evaluate", folder),
         ("digest", folder),
-        ("resume", folder, *more(standing)),
-        ("fork", folder, "--set", f"search.sigma={run.constants['search.sigma'] * 2:g}", *more(standing)),
+        ("resume", folder, *settings(more(standing))),
+        ("fork", folder, *settings(doubled | more(standing))),
     ):
         _print_line(console, f"  {command(*words)}")
 

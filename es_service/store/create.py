@@ -8,8 +8,7 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-from es_service.commands import command
-from es_service.errors import StoreError
+from es_service.errors import StoreError, WayOut
 from es_service.store.beginning import Beginning, store_beginning
 from es_service.store.folder import (
     CONFIG,
@@ -40,14 +39,16 @@ def create_run_folder(folder: Path, config_yaml: str, meta: RunMeta, beginning: 
     try:
         return _create(folder, config_yaml, meta, beginning)
     except (sqlite3.Error, OSError) as error:
-        raise explained(error, folder, "creating the run", "give the same command again") from error
+        raise explained(error, folder, "creating the run", "try again") from error
 
 
 def _create(folder: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -> RunLock:
     _refuse_taken(folder)
     parent = folder.absolute().parent
     if not parent.is_dir():
-        raise StoreError(f"cannot create {folder}: its parent folder {parent} does not exist; create it first")
+        raise StoreError(
+            f"cannot create {folder}: its parent folder {parent} does not exist; create it first", run=folder
+        )
     # A folder that exists may be a mount point or somebody's working directory, which cannot be renamed over.
     beside = not folder.is_dir()
     place = parent / f".{folder.name}.creating" if beside else folder
@@ -57,7 +58,7 @@ def _create(folder: Path, config_yaml: str, meta: RunMeta, beginning: Beginning)
         if is_disk_full(error, parent):
             raise
         raise StoreError(
-            f"cannot create {folder}: {error.strerror} in {parent}; make that folder writable or choose another --out"
+            f"cannot create {folder}: {error.strerror} in {parent}; make that folder writable or choose another folder"
         ) from error
     lock = acquire_lock(place)
     try:
@@ -92,7 +93,7 @@ def _move(place: Path, folder: Path) -> None:
         os.rename(place, folder)
     except OSError as error:
         if folder.exists():
-            raise StoreError(f"{folder} appeared while this run was being created; choose another --out") from error
+            raise StoreError(f"{folder} appeared while this run was being created; choose another folder") from error
         raise
     sync_folder(folder.absolute().parent)
 
@@ -115,11 +116,12 @@ def _refuse_taken(folder: Path) -> None:
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise StoreError(f"cannot create a run in {folder}: it is a file; choose another --out")
+        raise StoreError(f"cannot create a run in {folder}: it is a file; choose another folder")
     names = {path.name for path in folder.iterdir()}
     if names & {DATABASE, COPY}:
-        raise StoreError(f"{folder} already holds a run; continue it with `{command('resume', folder)}`")
+        way_out = WayOut("resume", "continue it", str(folder))
+        raise StoreError(f"{folder} already holds a run", run=folder, ways_out=[way_out])
     others = sorted(names - _LEFT_BEHIND)
     if others:
         shown = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
-        raise StoreError(f"{folder} is not empty and holds no run ({shown}); choose another --out")
+        raise StoreError(f"{folder} is not empty and holds no run ({shown}); choose another folder")

@@ -9,8 +9,7 @@ import shutil
 import sqlite3
 from pathlib import Path
 
-from es_service.commands import command
-from es_service.errors import StoreError
+from es_service.errors import StoreError, WayOut
 
 CONFIG = "config.yaml"
 DATABASE = "run.db"
@@ -102,7 +101,7 @@ def holds_run(folder: Path) -> bool:
     try:
         return (folder / DATABASE).exists() or (folder / COPY).exists()
     except OSError as error:
-        raise explained(error, folder, "looking for a run", "give the same command again") from error
+        raise explained(error, folder, "looking for a run", "try again") from error
 
 
 def require_run_folder(folder: Path) -> None:
@@ -110,12 +109,15 @@ def require_run_folder(folder: Path) -> None:
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
         raise StoreError(
-            f"{folder} is not a run folder: it {what}. `{command('run', 'CONFIG', '--out', folder)}` starts one."
+            f"{folder} is not a run folder: it {what}",
+            run=folder,
+            ways_out=[WayOut("run", "start a run there", out=str(folder))],
         )
     if not holds_run(folder):
         raise StoreError(
-            f"{folder} is not a run folder: it holds no {DATABASE}. If `es-service run` was stopped while creating "
-            f"it, nothing was lost: give the same command again."
+            f"{folder} is not a run folder: it holds no {DATABASE}. If its creation was stopped, nothing was lost: "
+            f"start it again.",
+            run=folder,
         )
 
 
@@ -138,10 +140,13 @@ def explained(error: sqlite3.Error | OSError, folder: Path, doing: str, then: st
 
     `then` is what to do after the cause is gone; resuming if None.
     """
-    then = then or f"`{command('resume', folder)}`"
+    ways_out = [] if then else [WayOut("resume", "go on, once the cause is gone", str(folder))]
+    ending = f", then {then}." if then else "."
     if is_disk_full(error, folder):
         return StoreError(
-            f"{folder}: disk full while {doing} ({error}). Everything stored before is safe; free space, then {then}."
+            f"{folder}: disk full while {doing} ({error}). Everything stored before is safe; free space{ending}",
+            run=folder,
+            ways_out=ways_out,
         )
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
@@ -150,4 +155,4 @@ def explained(error: sqlite3.Error | OSError, folder: Path, doing: str, then: st
         hint = "Check that the folder and its files exist and may be read and written"
     else:
         hint = "Everything stored before is safe; check the disk"
-    return StoreError(f"{folder}: error while {doing}: {error}. {hint}, then {then}.")
+    return StoreError(f"{folder}: error while {doing}: {error}. {hint}{ending}", run=folder, ways_out=ways_out)

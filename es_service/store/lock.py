@@ -18,8 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from es_service.commands import command
-from es_service.errors import RunLockedError, StoreError
+from es_service.errors import RunLockedError, StoreError, WayOut
 from es_service.store.folder import LOCK, explained
 
 _PATIENCE_S = 0.5
@@ -60,7 +59,8 @@ def acquire_lock(folder: Path) -> RunLock:
         if error.errno in _NO_LOCKS:
             raise StoreError(
                 f"{folder / LOCK}: this file system does not support file locks ({error}), so two writers could not "
-                f"be kept apart. Mount it with locks enabled (`flock`), or choose another --out."
+                f"be kept apart. Mount it with locks enabled (`flock`), or choose another folder.",
+                run=folder,
             ) from error
         raise explained(error, folder, f"locking {LOCK}") from error
 
@@ -139,8 +139,9 @@ def _locked(folder: Path) -> RunLockedError:
     holder = lock_holder(folder) or _identity(b"")
     return RunLockedError(
         f"{folder} is being written by process {holder['pid'] or '(unknown)'} on host {holder['host'] or '(unknown)'} "
-        f"since {holder['since'] or '(unknown)'}. Watch it with `{command('status', folder, '--follow')}`, "
-        f"or stop that process first."
+        f"since {holder['since'] or '(unknown)'}; stop that process first, or leave it at work.",
+        run=folder,
+        ways_out=[WayOut("watch", "watch it", str(folder))],
     )
 
 

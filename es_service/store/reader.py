@@ -14,8 +14,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from es_service.commands import command
-from es_service.errors import StoreError
+from es_service.errors import StoreError, WayOut
 from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict
 from es_service.store.folder import COPY, DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.lock import lock_holder
@@ -47,7 +46,8 @@ def reading(folder: Path) -> Iterator[tuple[sqlite3.Connection, RunMeta]]:
 def _connected(folder: Path) -> tuple[sqlite3.Connection, RunMeta]:
     require_run_folder(folder)
     if not (folder / DATABASE).exists():
-        raise StoreError(f"{folder / DATABASE} is missing; `{command('resume', folder)}` restores it from {COPY}")
+        way_out = WayOut("resume", f"restore it from {COPY}", str(folder))
+        raise StoreError(f"{folder / DATABASE} is missing", run=folder, ways_out=[way_out])
     if not is_network_filesystem(folder) or not (folder / COPY).exists():
         return _connected_to(folder / DATABASE)
     # There the database of a writer at work is left alone.
@@ -72,11 +72,12 @@ def _connected_to(file: Path) -> tuple[sqlite3.Connection, RunMeta]:
 
 def _unreadable(folder: Path, error: sqlite3.Error | Damaged | OSError) -> StoreError:
     if not isinstance(error, Damaged) and is_no_damage(error, folder):
-        return explained(error, folder, "reading it", "give the same command again, or give it a copy of the folder")
+        return explained(error, folder, "reading it", "try again, or with a copy of the folder")
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     is_database = code != sqlite3.SQLITE_NOTADB and "no such table: meta" not in str(error)
     what = "cannot be read" if is_database else "is not a run folder"
-    return StoreError(f"{folder} {what}: {error}. If it is a run, `{command('resume', folder)}` repairs what can be.")
+    way_out = WayOut("resume", "repair what can be repaired, if it is a run", str(folder))
+    return StoreError(f"{folder} {what}: {error}", run=folder, ways_out=[way_out])
 
 
 def read_meta(folder: Path) -> RunMeta:
@@ -153,14 +154,20 @@ def read_parts(
     with reading(folder) as (connection, _):
         kept, states, whole = _kept(connection)
         if not states:
-            raise StoreError(f"{folder} has no generation yet; `{command('resume', folder)}` continues it")
+            way_out = WayOut("resume", "continue it", str(folder))
+            raise StoreError(f"{folder} has no generation yet", run=folder, ways_out=[way_out])
         asked = max(states) if generation is None else generation
         if asked not in whole:
             if asked in states and asked == max(states):
                 raise Damaged(f"the state of generation {asked} is damaged")
             raise StoreError(
                 f"{folder} does not keep the state of generation {asked}; it keeps that of {whole}, "
-                f"the history reaches generation {max(states)}"
+                f"the history reaches generation {max(states)}",
+                field="generation",
+                value=asked,
+                allowed=str(whole),
+                suggestion=max(whole, default=None),
+                run=folder,
             )
         parts: dict[str, dict[str, NDArray[Any]]] = {}
         for part, (at, sha256) in sorted(rows_in_force(kept, asked).items()):

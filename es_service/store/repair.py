@@ -87,7 +87,8 @@ def _restore_copy(folder: Path, damage: str, notices: list[str]) -> None:
     if not copy.exists():
         raise StoreError(
             f"{file} cannot be trusted, and there is no {COPY} to turn to: {damage}. If {folder} is not a run folder, "
-            f"name another; if it is, put back a backup of {DATABASE}, or start again in another --out."
+            f"name another; if it is, put back a backup of {DATABASE}, or start again in another folder.",
+            run=folder,
         )
     remove_database(restored)
     shutil.copyfile(copy, restored)
@@ -97,7 +98,8 @@ def _restore_copy(folder: Path, damage: str, notices: list[str]) -> None:
         remove_database(restored)
         raise StoreError(
             f"Nothing in {folder} can be trusted. {DATABASE}: {damage}. {COPY}: {error}. "
-            f"Put back a backup of {DATABASE}, or start again in another --out."
+            f"Put back a backup of {DATABASE}, or start again in another folder.",
+            run=folder,
         ) from error
     with closing(connection):
         # One file, so that the rename below moves all of it.

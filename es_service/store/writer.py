@@ -18,8 +18,7 @@ from typing import Any, Self
 
 from numpy.typing import NDArray
 
-from es_service.commands import command
-from es_service.errors import StoreError
+from es_service.errors import StoreError, WayOut
 from es_service.store.beginning import Beginning, load_start
 from es_service.store.codec import (
     Part,
@@ -146,8 +145,9 @@ class RunStore:
             ).fetchone()
             if row is None or part_sha256(name, at, row[0]) != self._kept[name][at]:
                 raise StoreError(
-                    f"{self.folder / DATABASE}: state of {name!r} at generation {at} was damaged since it was "
-                    f"opened; `{command('resume', self.folder)}` falls back to what is sound"
+                    f"{self.folder / DATABASE}: state of {name!r} at generation {at} was damaged since it was opened",
+                    run=self.folder,
+                    ways_out=[WayOut("resume", "fall back to what is sound", str(self.folder))],
                 )
             return decode_part(row[0])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from es_service.algorithms import ALGORITHMS
-from es_service.config.changes import changed_constants, describe_changes
+from es_service.config.changes import changed_constants, refused_changes
 from es_service.config.loading import changed_config
 from es_service.config.model import RunConfig
 from es_service.config.yaml_text import parse_value
@@ -33,15 +33,21 @@ def test_changed_constants_lists_both_values_and_absent_ones():
     assert changed_constants(old, new) == [("b", 2, 5), ("c", 3, "(absent)"), ("d", "(absent)", 4)]
 
 
-def test_describe_changes_shows_all_and_the_commands_that_make_them():
+def test_refused_changes_shows_all_and_the_ways_to_make_them():
     changes = [("search.sigma", 0.02, 0.05), ("policy.hidden", [64, 64], [8, 8]), ("task.options.start", "a b", "c d")]
-    lines = describe_changes(changes, run="runs/a").splitlines()
+    error = refused_changes("runs/a", changes, besides={"budget.generations": 9})
+    assert [(problem.field, problem.suggestion, problem.value) for problem in error.problems] == changes
+    assert (error.field, error.value, error.run) == ("search.sigma", 0.05, "runs/a")
+    fork, afresh = error.ways_out
+    assert (error.way_out, fork.action, fork.run) == (fork, "fork", "runs/a")
+    assert fork.settings == {"search.sigma": 0.05, "task.options.start": "c d", "budget.generations": 9}
+    assert (afresh.action, afresh.settings) == ("run", {"search.init_from": "runs/a"})
+    *_, kept, in_python, _ = lines = str(error).splitlines()
     assert {"  search.sigma: 0.02 -> 0.05", "  policy.hidden: [64, 64] -> [8, 8]"} < set(lines)
-    assert lines[-2].endswith(": es-service fork runs/a --set search.sigma=0.05 --set 'task.options.start=c d'")
-    assert lines[-1].startswith("a fork has to keep policy.hidden; to start anew from its centre")
-    assert lines[-1].endswith(": es-service run CONFIG --set search.init_from=runs/a")
+    assert kept == "a fork has to keep policy.hidden"
+    assert in_python.endswith(f": fork('runs/a', {fork.settings!r})")
     for key in ("search.members", "search.preset", "map.cells", "task.environment", "task.options.descriptor"):
-        assert "es-service fork" not in describe_changes([(key, "a", "b")])
+        assert [way.action for way in refused_changes("runs/a", [(key, "a", "b")]).ways_out] == ["run"]
 
 
 def changed(*overrides: str, config: RunConfig | None = None) -> RunConfig:

@@ -163,7 +163,7 @@ def test_a_cluster_or_a_gpu_without_ray_is_refused():
         (MINIMAL_TEXT + "policy:\n", "policy: null where keys belong; indent them below `policy:`, or delete"),
         (MINIMAL_TEXT + "compute: 3\n", "compute: 3 where keys belong"),
         (MINIMAL_TEXT + "seed: 1\nseed: 2\n", "seed: written twice, on lines 4 and 5; keep one"),
-        (MINIMAL_TEXT + "policy.hidden: [3]\n", "policy.hidden: no dots in a file (they are for --set); write hidden"),
+        (MINIMAL_TEXT + "policy.hidden: [3]\n", "policy.hidden: no dots in a file; write hidden"),
         (MINIMAL_TEXT.replace("algorithm: es", "preset: uber"), "search.algorithm: missing; must be es"),
         (MINIMAL_TEXT.replace("es}", "es, sigma: 1, sigma: 2}"), "search.sigma: written twice, on lines 2 and 2"),
         (MINIMAL_TEXT.replace("maze}", "maze, options: }"), "task.options: null where keys belong"),

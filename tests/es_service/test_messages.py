@@ -13,6 +13,7 @@ CHUNKS = (
     protocol.EvaluationChunk(1, 0),
     protocol.GradientChunk(1, 0, np.linspace(-1, 1, 8, dtype=np.float32)),
 )
+ERRORS = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, errors.ServiceError)]
 
 
 @pytest.mark.parametrize("chunk", CHUNKS, ids=lambda chunk: type(chunk).__name__)
@@ -28,10 +29,14 @@ def test_messages_survive_pickling_and_are_small(chunk):
         assert isinstance(value, np.ndarray | protocol.Moments | None), name
 
 
-@pytest.mark.parametrize("kind", [k for k in vars(errors).values() if isinstance(k, type)], ids=lambda k: k.__name__)
+@pytest.mark.parametrize("kind", ERRORS, ids=lambda k: k.__name__)
 def test_errors_survive_pickling(kind):
-    error = kind(15) if kind is errors.Interrupted else kind("what is wrong; what to do")
+    if kind is errors.Interrupted:
+        error = kind(15)
+    else:
+        way_out = errors.WayOut("fork", "go on", "runs/a", {"search.sigma": 0.1})
+        error = kind("what is wrong", field="search.sigma", value=7, run="runs/a", ways_out=[way_out])
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is kind
-    assert again.args == error.args
+    assert (again.args, vars(again), str(again)) == (error.args, vars(error), str(error))
     assert isinstance(again, errors.ServiceError)

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from es_service.errors import RunLockedError, StoreError
+from es_service.errors import RunLockedError, StoreError, WayOut
 from es_service.store import lock as run_lock
 from es_service.store.lock import acquire_lock, lock_holder
 from es_service.store.writer import RunStore
@@ -22,7 +22,7 @@ def test_a_second_writer_is_told_who_writes_and_how_to_watch(tmp_path):
             RunLockedError, match=f"process {os.getpid()} on host {socket.gethostname()} since 20"
         ) as info:
             RunStore.open(folder)
-        assert f"status {folder} --follow" in str(info.value)
+        assert info.value.way_out == WayOut("watch", "watch it", str(folder))
         store.commit(1, {}, dict.fromkeys(("env_steps", "centre_fitness_mean", "goal_distance", "seconds_rollout"), 1))
     RunStore.open(folder).close()
 

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from es_service import api
 from es_service.cli import app
+from es_service.commands import settings
 from es_service.errors import ConfigError
 from es_service.report.overview import print_overview
 from es_service.report.standing import Standing, look, more, state
@@ -60,7 +61,7 @@ def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, cap
     print_summary(console, run, "")
     print_status(console, run)
     printed = capsys.readouterr().out
-    suggested = more(look(run))
+    suggested = settings(more(look(run)))
     assert f"state              finished: the {'target' if 'reached' in spent else 'budget'}" in printed
     assert spent in printed
     assert printed.count(f"resume {run.folder} {' '.join(suggested)}") == 2
@@ -68,14 +69,16 @@ def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, cap
     assert options is None or set(suggested[1::2]) == options
     before = run.generation or 0
     with pytest.raises(ConfigError, match="to go on from its state") as refused:
-        api.resume(run.folder, ["search.sigma=0.05"])
-    [way] = [line for line in str(refused.value).splitlines() if " fork " in line]
-    assert way.endswith(f" fork {run.folder} {' '.join(['--set', 'search.sigma=0.05', *suggested])}")
-    with pytest.warns(RuntimeWarning, match="nothing was run") as told:
+        api.resume(run.folder, {"search.sigma": 0.05})
+    way = refused.value.way_out
+    assert way is not None
+    assert (way.action, way.run) == ("fork", str(run.folder))
+    assert way.settings == {"search.sigma": 0.05, **more(look(run))}
+    with pytest.warns(RuntimeWarning, match="nothing was run"):
         empty = api.fork(run.folder, ["search.sigma=0.05"], out=tmp_path / "empty").run
-    assert str(told[0].message).endswith(f" resume {empty.folder} {' '.join(suggested)}")
+    assert more(look(empty)) == more(look(run))
     for going_on in (
-        api.fork(run.folder, ["search.sigma=0.05", *suggested[1::2]], out=tmp_path / "fork"),
+        api.fork(way.run, way.settings, out=tmp_path / "fork"),
         api.resume(empty.folder, suggested[1::2]),
         api.resume(run.folder, suggested[1::2]),
     ):

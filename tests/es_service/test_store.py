@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from es_service.errors import StoreError
+from es_service.errors import StoreError, WayOut
 from es_service.history import Column
 from es_service.store import create as store_create
 from es_service.store import upkeep as store_upkeep
@@ -65,14 +65,15 @@ def test_an_existing_empty_folder_is_fine(tmp_path):
 
 def test_a_folder_with_a_run_says_resume(tmp_path):
     folder = finished(tmp_path / "run", 2)
-    with pytest.raises(StoreError, match=f"already holds a run; continue it with `es-service resume {folder}`"):
+    with pytest.raises(StoreError, match=f"{folder} already holds a run") as error:
         create(folder)
+    assert error.value.way_out == WayOut("resume", "continue it", str(folder))
     assert read_generation(folder) == 1
 
 
 def test_a_folder_with_something_else_is_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("years")
-    with pytest.raises(StoreError, match=r"not empty and holds no run \(thesis.tex\); choose another --out"):
+    with pytest.raises(StoreError, match=r"not empty and holds no run \(thesis.tex\); choose another folder"):
         create(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     with pytest.raises(StoreError, match="it is a file"):
@@ -98,7 +99,7 @@ def test_a_failed_creation_leaves_nothing_and_says_why(tmp_path, monkeypatch):
             patch.setattr(store_create, "write_config", full)
             if folder.name == "existing":
                 folder.mkdir()
-            with pytest.raises(StoreError, match=r"disk full .* free space, then give the same command again"):
+            with pytest.raises(StoreError, match=r"disk full .* free space, then try again"):
                 create(folder)
         assert [path.name for path in tmp_path.rglob("*")] == (["existing"] if folder.name == "existing" else [])
         finished(folder, 1)

@@ -32,9 +32,7 @@ def test_a_full_database_stops_the_commit_and_keeps_the_rest(tmp_path):
         pages = connection.execute("PRAGMA page_count").fetchone()[0]
         connection.execute(f"PRAGMA max_page_count = {pages}")
         big = {"member_0": {"centre_D": np.zeros(100_000, np.float32)}}
-        with pytest.raises(
-            StoreError, match=r"disk full while storing generation 3 .* free space, then `es-service resume"
-        ):
+        with pytest.raises(StoreError, match=r"disk full while storing generation 3 .* free space\.\n.* resume\("):
             run.commit(3, big, history_row(3))
         assert run.generation == 2
         assert_same_state(run.load(), state_at(2))
@@ -98,6 +96,6 @@ def test_no_space_for_what_sqlite_needs_beside_the_log_of_a_killed_run_is_no_dam
 
 def test_creating_a_run_on_a_full_disk_says_so(small_disk):
     fill(small_disk)
-    with pytest.raises(StoreError, match=r"disk full while .* free space, then give the same command again"):
+    with pytest.raises(StoreError, match=r"disk full while .* free space, then try again"):
         create(small_disk / "run")
     assert [path.name for path in small_disk.iterdir()] == ["ballast"]

@@ -113,7 +113,7 @@ def test_a_folder_where_no_runs_folder_can_be_made(config, tmp_path):
     (tmp_path / "runs").write_text("in the way")
     code, printed = es("run", config, cwd=tmp_path)
     assert code == 1
-    assert "choose another --out" in printed
+    assert "choose another folder" in printed
 
 
 def test_unwritable_home_does_not_matter(config, tmp_path):

@@ -88,7 +88,8 @@ def test_a_disk_that_fills_up_stops_the_run_and_resume_goes_on(config, small_dis
     code, printed = es("run", config, "--out", folder, *wide)
     assert code == 1
     assert f"disk full while storing generation {read_generation(folder) + 1}" in printed
-    assert f"free space, then `es-service resume {folder}`" in printed
+    assert "Everything stored before is safe; free space." in printed
+    assert f": es-service resume {folder}" in printed
     subprocess.run(["mount", "-o", "remount,size=50m", str(small_disk)], check=True)
     assert es("resume", folder)[0] == 0
     assert es("run", config, "--out", tmp_path / "whole", *wide)[0] == 0

@@ -15,7 +15,8 @@ import pytest
 from rich.console import Console
 
 from es_service import api, commands
-from es_service.config.changes import describe_changes
+from es_service.commands import error_message
+from es_service.config.changes import refused_changes
 from es_service.errors import ConfigError, NotInRunError, StoreError
 from es_service.evaluation import candidates
 from es_service.report.status import follow_status, print_summary
@@ -47,27 +48,28 @@ def test_a_folder_with_spaces_is_one_word_of_every_command(tmp_path, capsys):
         [verb, str(folder)] for verb in ("status", "evaluate", "digest", "resume", "fork")
     ]
     assert words_after(printed.splitlines()[-1], "resume") == [str(folder), "--set", "budget.generations=2"]
-    assert words_after(describe_changes([("seed", 0, 1)], str(folder)), "fork") == [str(folder), "--set", "seed=1"]
+    refused = error_message(refused_changes(folder, [("seed", 0, 1)]))
+    assert words_after(refused, "fork") == [str(folder), "--set", "seed=1"]
     lock = acquire_lock(folder)
     with pytest.raises(StoreError) as locked:
         RunStore.open(folder)
     lock.release()
-    assert words_after(str(locked.value), "status") == [str(folder), "--follow"]
+    assert words_after(error_message(locked.value), "status") == [str(folder), "--follow"]
     with pytest.raises(StoreError) as taken:
         api.run(SMALL, folder)
-    assert words_after(str(taken.value), "resume") == [str(folder)]
+    assert words_after(error_message(taken.value), "resume") == [str(folder)]
     (folder / "run.db").rename(folder / "run.db.copy")
     with pytest.raises(StoreError) as missing:
         api.open_run(folder)
-    assert words_after(str(missing.value), "resume") == [str(folder)]
+    assert words_after(error_message(missing.value), "resume") == [str(folder)]
     with pytest.raises(StoreError) as none:
         api.open_run(folder / "none")
-    assert words_after(str(none.value), "run") == ["CONFIG", "--out", str(folder / "none")]
+    assert words_after(error_message(none.value), "run") == ["CONFIG", "--out", str(folder / "none")]
     with pytest.raises(NotInRunError) as empty:
         candidates(
             api.open_run(finished(tmp_path / "no generation", 0)), best=True, centre=False, cells=(), every=False
         )
-    assert words_after(str(empty.value), "resume") == [str(tmp_path / "no generation")]
+    assert words_after(error_message(empty.value), "resume") == [str(tmp_path / "no generation")]
 
 
 def test_the_fork_that_a_refused_resume_names_goes_on(tmp_path):
@@ -78,16 +80,19 @@ def test_the_fork_that_a_refused_resume_names_goes_on(tmp_path):
         with pytest.raises(ConfigError) as refused:
             api.resume(folder, ["search.sigma=0.3", *wanted])
         settings = ["--set", "search.sigma=0.3", "--set", f"budget.generations={budget}"]
-        assert words_after(str(refused.value), "fork") == [str(folder), *settings]
+        assert words_after(error_message(refused.value), "fork") == [str(folder), *settings]
     (folder / "config.yaml").unlink()
     with pytest.raises(ConfigError) as refused:
         api.run_or_resume(SMALL | {"budget": {"env_steps": 5000}, "seed": 1}, folder)
     wanted = ["seed=1", "budget.generations=null", "budget.env_steps=5000"]
-    assert words_after(str(refused.value), "fork") == [
+    assert words_after(error_message(refused.value), "fork") == [
         str(folder),
         *(word for key in wanted for word in ("--set", key)),
     ]
-    assert (api.fork(folder, wanted, out=tmp_path / "fork").run.generation or 0) > 2
+    way = refused.value.way_out
+    assert way is not None
+    assert way.run == str(folder)
+    assert (api.fork(way.run, way.settings, out=tmp_path / "fork").run.generation or 0) > 2
 
 
 def test_commands_start_what_is_there(tmp_path, monkeypatch):

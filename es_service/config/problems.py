@@ -1,0 +1,49 @@
+"""What is wrong with a config, as data and as a line for the user: field, value, what is allowed, what was meant."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from difflib import get_close_matches
+from typing import Any
+
+from es_service.config.yaml_text import show
+from es_service.errors import Problem
+
+
+def nearest(name: object, candidates: Collection[str]) -> str | None:
+    """The candidate that was probably meant, if one is near."""
+    near = get_close_matches(str(name), candidates, n=1)
+    return near[0] if near else None
+
+
+def did_you_mean(name: object, candidates: Collection[str]) -> str:
+    """A hint to append to a message: "; did you mean X?", or nothing where no candidate is near."""
+    near = nearest(name, candidates)
+    return f"; did you mean {near}?" if near else ""
+
+
+def one_of(names: Collection[str]) -> str:
+    """Names in a sentence: "a", "a or b", "a, b or c"."""
+    *first, last = map(str, names)
+    return f"{', '.join(first)} or {last}" if first else last
+
+
+def not_allowed(
+    field: str, value: Any, allowed: str, *, why: str = "", hint: str = "", suggestion: Any = None
+) -> Problem:
+    """The problem of a value that cannot be: "search.pairs: 0 is not allowed; must be a whole number, at least 1".
+
+    Args:
+        why: words after "is not allowed", with the space before them.
+        hint: the end of the line, instead of "; did you mean `suggestion`?".
+    """
+    ending = hint or (f"; did you mean {suggestion if isinstance(suggestion, str) else show(suggestion)}?"
+                      if suggestion is not None else "")  # fmt: skip
+    return Problem(
+        f"{field}: {show(value)} is not allowed{why}; must be {allowed}{ending}", field, value, allowed, suggestion
+    )
+
+
+def unfit(field: str, value: Any, what: str, *, suggestion: Any = None, allowed: str | None = None) -> Problem:
+    """The problem of a value that does not go with another one; `what` is all that follows "field: "."""
+    return Problem(f"{field}: {what}", field, value, allowed, suggestion)
