@@ -11,7 +11,7 @@ import signal
 import sys
 
 from es_service.errors import Interrupted
-from es_service.signals import interrupt
+from es_service.runs.signals import interrupt
 
 
 def main() -> None:
@@ -19,7 +19,7 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, interrupt)
     try:
-        from es_service.cli import main as run_command
+        from es_service.cli.main import main as run_command
 
         run_command()
     except Interrupted as stop:

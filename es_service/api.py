@@ -12,25 +12,25 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from es_service.budget import REACHED, limits_of, raised
 from es_service.config.changes import changed_constants, refused_changes
 from es_service.config.keys import Overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
+from es_service.config.tasks import task_of
 from es_service.config.yaml_text import show
-from es_service.configs import changed_config, load_config
 from es_service.errors import ConfigError, StoreError, WayOut
-from es_service.history import history_columns
-from es_service.lineage import fork_config, forked, started
-from es_service.protocol import TaskSpec
-from es_service.report.standing import Standing, look
-from es_service.run_view import open_run
-from es_service.session import OnGeneration, OnNotice, Outcome, work
+from es_service.loop.budget import REACHED, limits_of, raised
+from es_service.loop.history import history_columns
+from es_service.protocol.messages import TaskSpec
+from es_service.runs.checked_config import changed_config, load_config
+from es_service.runs.lineage import fork_config, forked, started
+from es_service.runs.session import OnGeneration, OnNotice, Outcome, work
+from es_service.runs.standing import Standing, look
+from es_service.runs.view import open_run
 from es_service.store.beginning import Beginning
 from es_service.store.folder import CONFIG, explained, holds_run, write_config
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook
-from es_service.tasks import task_of
 
 RUNS_FOLDER = Path("runs")
 """Where runs go unless told otherwise, relative to the current folder."""

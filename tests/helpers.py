@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts, PolicyShape, WorkerSpec
+from es_service.protocol.messages import Centre, Chunk, ChunkResult, DispatchCounts, PolicyShape, WorkerSpec
 from workers.worker import make_worker
 
 SPEC = WorkerSpec(

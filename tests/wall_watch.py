@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from es_service.protocol import Segment
+from es_service.protocol.messages import Segment
 from workers.environments import ant_maze, ant_trap
 from workers.environments.ant import LEG_LENGTH, LEG_RADIUS, LOWER_LEGS, TORSO_RADIUS, AntState, expand
 from workers.environments.brax_parts import Transform

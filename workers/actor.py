@@ -11,9 +11,9 @@ import socket
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from es_service.platform_info import platform_info, platform_text
-from es_service.process_environment import worker_environment
-from es_service.protocol import Centre, Chunk, ChunkResult, WorkerPlace
+from es_service.protocol.machine import platform_info, platform_text
+from es_service.protocol.messages import Centre, Chunk, ChunkResult, WorkerPlace
+from es_service.protocol.process_environment import worker_environment
 
 
 class WorkerActor:

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from es_service.noise import NORMAL_STD, normal_integers
-from es_service.protocol import TRACE_POINTS, WorkerSpec
+from es_service.protocol.messages import TRACE_POINTS, WorkerSpec
+from es_service.protocol.noise import NORMAL_STD, normal_integers
 from workers.environments import Environment
 from workers.policy import normalise
 

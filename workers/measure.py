@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from es_service.noise import NORMAL_STD, Domain, normal_integers, stream_keys
-from es_service.protocol import PolicyShape, WorkerSpec
+from es_service.protocol.messages import PolicyShape, WorkerSpec
+from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, stream_keys
 from workers.environments import SHIPPED, Environment, describe_environment, make_environment
 from workers.policy import initial_parameters
 from workers.rollout import make_training_rollout

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from es_service.noise import Domain, normals, stream_keys
-from es_service.protocol import FloatArray, PolicyShape
+from es_service.protocol.messages import FloatArray, PolicyShape
+from es_service.protocol.noise import Domain, normals, stream_keys
 
 INITIAL_COLUMN_NORMS = {"unit_columns": (1.0, 0.01), "small_columns": (0.01, 0.01)}
 """`policy.init` -> (column norm of hidden layers, of the output layer).

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from es_service.wire import framed, receive
+from es_service.protocol.wire import framed, receive
 
 PR_SET_PDEATHSIG = 1
 

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from es_service.noise import NORMAL_STD, normal_integers
-from es_service.protocol import SIGNS, WorkerSpec
+from es_service.protocol.messages import SIGNS, WorkerSpec
+from es_service.protocol.noise import NORMAL_STD, normal_integers
 from workers.environments import Environment
 from workers.episode import Carry, Episodes, episode_steps
 from workers.policy import act, split_layers

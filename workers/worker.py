@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from es_service.noise import NORMAL_STD, Domain, Keys, stream_keys
-from es_service.protocol import (
+from es_service.protocol.messages import (
     EVALUATION_EPISODES_PER_CHUNK,
     Centre,
     Chunk,
@@ -24,6 +23,7 @@ from es_service.protocol import (
     TrainingChunk,
     WorkerSpec,
 )
+from es_service.protocol.noise import NORMAL_STD, Domain, Keys, stream_keys
 from workers.environments import make_environment
 from workers.episode import Episodes
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from es_service.protocol import Bounds
+from es_service.protocol.messages import Bounds
 
 OPTIONS = "task.options."
 RESOURCES = "compute.worker_resources."

@@ -33,7 +33,7 @@ from es_service.config.resolution import (
 )
 from es_service.config.yaml_text import parse_value, read_yaml_file, show
 from es_service.errors import ConfigError, Problem
-from es_service.protocol import TaskSpec
+from es_service.protocol.messages import TaskSpec
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
 """Where a config comes from: the path of a YAML file, or what such a file would contain."""

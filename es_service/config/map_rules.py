@@ -10,7 +10,7 @@ from es_service.config.fields import OPTIONS
 from es_service.config.problems import not_allowed, unfit
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
-from es_service.protocol import TaskSpec, with_options
+from es_service.protocol.messages import TaskSpec, with_options
 
 MOST_AUTO_CELLS = 10_000
 MOST_CELLS = 10_000_000

@@ -27,7 +27,7 @@ from es_service.config.fields import (
     Widths,
 )
 from es_service.config.yaml_text import dump_yaml
-from es_service.protocol import PolicyShape, TaskSpec, WorkerSpec
+from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
 
 
 class TaskConfig(Section):
@@ -124,7 +124,7 @@ class SearchConfig(Section):
     )
     cell_sampling: Literal["top", "score"] = Field(
         description="me_es: how a cell is drawn, as QDax (top) or the released code (score) has it; "
-        "es_service/algorithms/me_es.py says how. Set by the preset."
+        "es_service/search/algorithms/me_es.py says how. Set by the preset."
     )
     parent_statistics: Literal["global", "elite"] = Field(
         "global",

@@ -20,7 +20,7 @@ from es_service.config.model import RunConfig
 from es_service.config.problems import nearest, not_allowed, one_of, unfit
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
-from es_service.protocol import PolicyShape, TaskSpec, with_options
+from es_service.protocol.messages import PolicyShape, TaskSpec, with_options
 
 LEFT_OPEN: dict[str, str | None] = {
     "task.episode_steps": None,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from es_service.dispatch.messages import Assign, Command
+from es_service.dispatch.events import Assign, Command
 from es_service.dispatch.scheduler_state import SchedulerState, Slot, Worker, usual_chunk_s
 
 

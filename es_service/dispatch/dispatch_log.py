@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from es_service.dispatch.messages import Command, Event, Task
+from es_service.dispatch.events import Command, Event, Task
 from es_service.store.folder import explained
 
 FILE = "dispatch.jsonl"

@@ -12,12 +12,12 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, Self, TypeVar
 
-from es_service.dispatch import messages
+from es_service.dispatch import events as messages
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, told_last_words, usual_chunk_s
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts, TaskKey
+from es_service.protocol.messages import Centre, Chunk, ChunkResult, DispatchCounts, TaskKey
 
 POLL_S = 0.1
 """Longest wait before a request to stop is noticed."""

@@ -23,11 +23,11 @@ from typing import IO
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.messages import Failure, Limits, WorkerLost, WorkerUp, with_last_words
+from es_service.dispatch.events import Failure, Limits, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
-from es_service.process_environment import child_environment
-from es_service.protocol import Centre, Chunk, WorkerSpec
-from es_service.wire import BUFFER_BYTES, Channel, framed
+from es_service.protocol.messages import Centre, Chunk, WorkerSpec
+from es_service.protocol.process_environment import child_environment
+from es_service.protocol.wire import BUFFER_BYTES, Channel, framed
 
 PIECE_S = 0.1
 """Longest wait for the next piece of a message that has begun to come."""

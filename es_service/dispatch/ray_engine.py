@@ -21,10 +21,10 @@ from typing import Any
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.messages import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
+from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import ONE_CORE, Claim, Watch, connect, demand, disconnect, look
 from es_service.errors import EvaluationError
-from es_service.protocol import Centre, Chunk, WorkerPlace, WorkerSpec
+from es_service.protocol.messages import Centre, Chunk, WorkerPlace, WorkerSpec
 
 IN_CALL_BYTES = 64 * 2**10
 """A centre up to this size travels with every call; a larger one is stored once and fetched once per node."""

@@ -27,7 +27,7 @@ from collections import deque
 from collections.abc import Hashable
 
 from es_service.dispatch.assignment import assign, begin_first_slot
-from es_service.dispatch.messages import (
+from es_service.dispatch.events import (
     Command,
     Deliver,
     Drain,
@@ -45,14 +45,7 @@ from es_service.dispatch.messages import (
     WorkerLost,
     WorkerUp,
 )
-from es_service.dispatch.scheduler_state import (
-    SchedulerState,
-    Waiting,
-    Worker,
-    find_slot,
-    holds,
-    next_deadline,
-)
+from es_service.dispatch.scheduler_state import SchedulerState, Waiting, Worker, find_slot, holds, next_deadline
 
 RECENT_DURATIONS = 31
 """Durations per kind of task that the running median is taken over."""

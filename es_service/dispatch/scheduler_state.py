@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Hashable
 from typing import NamedTuple
 
-from es_service.dispatch.messages import Limits, Task, with_last_words
+from es_service.dispatch.events import Limits, Task, with_last_words
 
 
 class Waiting(NamedTuple):

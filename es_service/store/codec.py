@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
-from es_service.history import Column
+from es_service.loop.history import Column
 
 Part = Mapping[str, NDArray[Any]]
 """One piece of the search state that changes as a whole: arrays by name, e.g. {"centre_D": ..., "step": int64[]}."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from es_service.errors import StoreError
-from es_service.history import Column
+from es_service.loop.history import Column
 from es_service.store.codec import text_sha256
 
 SCHEMA_VERSION = 3

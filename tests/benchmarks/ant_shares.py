@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from es_service.noise import Domain, stream_keys
+from es_service.protocol.noise import Domain, stream_keys
 from workers.environments import ant_maze, ant_trap
 from workers.environments.ant import make_ant
 from workers.environments.brax_parts import Motion, collisions

@@ -20,8 +20,9 @@ from typing import Any
 
 import pandas as pd
 
-from es_service import api, session
-from es_service.process_environment import worker_environment
+from es_service import api
+from es_service.protocol.process_environment import worker_environment
+from es_service.runs import session
 from tests.benchmarks.ants import summary
 from tests.benchmarks.science import CONFIGS, in_this_process
 

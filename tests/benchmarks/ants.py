@@ -24,8 +24,8 @@ import numpy as np
 import pandas as pd
 
 from es_service import open_run
-from es_service.platform_info import cpu_kind
-from es_service.run_view import Run
+from es_service.protocol.machine import cpu_kind
+from es_service.runs.view import Run
 from workers.environments import SHIPPED
 
 POINTS = 60

@@ -22,9 +22,9 @@ from scipy.stats import ks_2samp
 
 from es_service import api
 from es_service.config.model import RunConfig, worker_spec
-from es_service.platform_info import cpu_kind
-from es_service.protocol import Centre, EpisodesResult, TrainingChunk, WorkerSpec
-from es_service.tasks import task_of
+from es_service.config.tasks import task_of
+from es_service.protocol.machine import cpu_kind
+from es_service.protocol.messages import Centre, EpisodesResult, TrainingChunk, WorkerSpec
 
 RESULTS = Path(__file__).parent / "results" / "episode_parity.csv"
 TASKS = ("ant_maze", "ant_trap")

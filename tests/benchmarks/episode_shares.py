@@ -22,9 +22,9 @@ import numpy as np
 
 from es_service import api
 from es_service.config.model import worker_spec
-from es_service.noise import KEY_WORDS, NORMAL_STD, Domain, stream_keys
-from es_service.protocol import WorkerSpec
-from es_service.tasks import task_of
+from es_service.config.tasks import task_of
+from es_service.protocol.messages import WorkerSpec
+from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, Domain, stream_keys
 from tests.benchmarks.simd_physics import peak
 from workers.environments import make_environment
 from workers.episode import episode_steps

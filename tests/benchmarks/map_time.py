@@ -20,19 +20,20 @@ from typing import Any
 
 import numpy as np
 
-from es_service import api, driver
-from es_service.algorithms import ALGORITHMS
+from es_service import api
 from es_service.config.model import policy_shape
-from es_service.history import history_columns
-from es_service.maps.behaviour_map import Elite, cell_part, elite_part, elite_to_arrays
-from es_service.protocol import DispatchCounts, EpisodesResult, GradientChunk, GradientResult, TrainingChunk
-from es_service.run_state import Arrays
-from es_service.statistics import no_observations
+from es_service.config.tasks import task_of
+from es_service.loop import driver
+from es_service.loop.history import history_columns
+from es_service.loop.state import Arrays
+from es_service.protocol.messages import DispatchCounts, EpisodesResult, GradientChunk, GradientResult, TrainingChunk
+from es_service.search.algorithms import ALGORITHMS
+from es_service.search.maps.behaviour_map import Elite, cell_part, elite_part, elite_to_arrays
+from es_service.search.observation_statistics import no_observations
 from es_service.store.beginning import Beginning
 from es_service.store.folder import DATABASE
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
-from es_service.tasks import task_of
 from tests.helpers import MemoryStore
 
 CELLS = (50, 50)

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from es_service.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys
+from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys
 from workers.rollout import make_gradient_sum
 from workers.simd import rollout as simd
 

@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 
-from es_service.novelty import TREE_STEP, NoveltyArchive, extended, novelty
+from es_service.search.novelty import TREE_STEP, NoveltyArchive, extended, novelty
 
 QUERIES = 1024
 MEMBERS = 5

@@ -22,10 +22,10 @@ from typing import Any
 
 from es_service import api
 from es_service.config.model import worker_spec
+from es_service.config.tasks import task_of
+from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.messages import Limits
-from es_service.protocol import EpisodesResult, Evaluator, TrainingChunk
-from es_service.tasks import task_of
+from es_service.protocol.messages import EpisodesResult, Evaluator, TrainingChunk
 from tests.helpers import centre
 from workers.policy import initial_parameters
 

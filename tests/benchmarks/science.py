@@ -29,14 +29,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from es_service import api, session
+from es_service import api
 from es_service.config.model import RunConfig, worker_spec
+from es_service.config.tasks import task_of
 from es_service.errors import Interrupted
-from es_service.platform_info import cpu_kind
-from es_service.process_environment import worker_environment
-from es_service.protocol import Centre, Chunk, ChunkResult, DispatchCounts
-from es_service.run_view import Policy, Run
-from es_service.tasks import task_of
+from es_service.protocol.machine import cpu_kind
+from es_service.protocol.messages import Centre, Chunk, ChunkResult, DispatchCounts
+from es_service.protocol.process_environment import worker_environment
+from es_service.runs import session
+from es_service.runs.view import Policy, Run
 from tests.benchmarks import science_picture
 
 RESULTS = Path(__file__).parent / "results"
@@ -73,7 +74,7 @@ def episodes(policy: Policy, seed: int, count: int) -> tuple[np.ndarray, np.ndar
     """(returns [count], positions of the first one [T + 1, 2]) of noise-free episodes of a policy."""
     import jax
 
-    from es_service.noise import Domain, stream_keys
+    from es_service.protocol.noise import Domain, stream_keys
     from workers.environments import make_environment
 
     environment = make_environment("point_maze", {})

@@ -23,8 +23,8 @@ from unittest import mock
 
 import numpy as np
 
-from es_service.bench import ANT_HIDDEN
-from es_service.process_environment import worker_environment
+from es_service.cli.bench_rollouts import ANT_HIDDEN
+from es_service.protocol.process_environment import worker_environment
 
 TASKS = ("ant_maze", "ant_trap", "point_maze", "brax:ant")
 OTHERS = ("brax:halfcheetah", "brax:hopper", "brax:walker2d", "brax:humanoid", "brax:reacher", "brax:pusher")

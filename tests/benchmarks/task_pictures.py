@@ -16,8 +16,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from es_service.noise import Domain, stream_keys
-from es_service.protocol import PolicyShape
+from es_service.protocol.messages import PolicyShape
+from es_service.protocol.noise import Domain, stream_keys
 from workers.environments import SHIPPED, ant_maze, ant_trap, make_environment
 from workers.environments.walls import WALL_RADIUS
 from workers.policy import act, split_layers

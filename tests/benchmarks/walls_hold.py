@@ -29,7 +29,7 @@ def watch(name: str, drive: str, seed: int) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
 
-    from es_service.noise import Domain, stream_keys
+    from es_service.protocol.noise import Domain, stream_keys
     from tests.wall_watch import WALLS, colliders, crosses, depth, places_beside_walls
     from workers.environments import ant_maze
     from workers.environments.ant import make_ant

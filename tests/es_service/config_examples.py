@@ -6,9 +6,9 @@ import string
 
 from hypothesis import strategies as st
 
-from es_service.algorithms import ALGORITHMS
 from es_service.config.loading import load_config
 from es_service.config.model import RunConfig
+from es_service.search.algorithms import ALGORITHMS
 from workers import environments
 
 POINT_MAZE = environments.SHIPPED["point_maze"]

@@ -1,9 +1,7 @@
 """Maps of a plane."""
 
 from es_service.api import load_config
-from es_service.maps.geometry import (
-    Grid,
-)
+from es_service.search.maps.geometry import Grid
 
 SQUARE, OBLONG = ((-1.0, 1.0), (-1.0, 1.0)), ((0.0, 30.0), (-8.0, 8.0))
 

@@ -4,16 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from es_service.dispatch.messages import (
-    Command,
-    Event,
-    Limits,
-    StartWorker,
-    Submit,
-    Task,
-    Tick,
-    WorkerUp,
-)
+from es_service.dispatch.events import Command, Event, Limits, StartWorker, Submit, Task, Tick, WorkerUp
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import SchedulerState, initial_state
 

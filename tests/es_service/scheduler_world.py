@@ -9,7 +9,7 @@ import math
 from collections import Counter, deque
 from random import Random
 
-from es_service.dispatch.messages import (
+from es_service.dispatch.events import (
     Assign,
     Deliver,
     Drain,

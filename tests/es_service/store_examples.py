@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from es_service.history import Column
+from es_service.loop.history import Column
 from es_service.store import upkeep as store_upkeep
 from es_service.store.folder import DATABASE
 from es_service.store.reader import read_history, read_parts, reading

@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from es_service import bench
+from es_service.cli import bench_rollouts as bench
 from es_service.errors import EvaluationError, Interrupted
 
 FAILS, HANGS = "raise SystemExit('no such task')", "import time; time.sleep(60)"

@@ -10,7 +10,6 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from es_service.algorithms import ALGORITHMS
 from es_service.config.changes import changed_constants
 from es_service.config.loading import load_config
 from es_service.config.model import RunConfig, worker_spec
@@ -23,6 +22,7 @@ from es_service.config.resolution import (
 )
 from es_service.config.yaml_text import dump_yaml, parse_value
 from es_service.errors import ConfigError
+from es_service.search.algorithms import ALGORITHMS
 from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS, load
 
 # What a config resolves to

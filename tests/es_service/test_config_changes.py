@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from es_service.algorithms import ALGORITHMS
 from es_service.config.changes import changed_constants, refused_changes
 from es_service.config.loading import changed_config
 from es_service.config.model import RunConfig
 from es_service.config.yaml_text import parse_value
 from es_service.errors import ConfigError
+from es_service.search.algorithms import ALGORITHMS
 from tests.es_service.config_examples import MINIMAL, TASKS, load
 
 

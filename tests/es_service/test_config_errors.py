@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from es_service.config.loading import load_config
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
-from es_service.protocol import TaskSpec
+from es_service.protocol.messages import TaskSpec
 from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS
 from tests.es_service.store_examples import without_root_rights
 

@@ -6,8 +6,11 @@ import os
 
 import pytest
 
-from es_service import bench, cores, doctor, session
 from es_service.api import load_config
+from es_service.cli import bench_rollouts as bench
+from es_service.cli import doctor
+from es_service.dispatch import cores
+from es_service.runs import session
 
 SMALLEST = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
 

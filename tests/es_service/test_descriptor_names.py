@@ -6,8 +6,8 @@ import pytest
 from rich.console import Console
 
 from es_service import api
-from es_service.evaluation import candidates, evaluate
-from es_service.report.evaluations import print_evaluations
+from es_service.cli.tables.evaluations import print_evaluations
+from es_service.runs.evaluation import candidates, evaluate
 from tests.examples.sorting import Sorting
 from workers.environments import TaskError, user_task
 

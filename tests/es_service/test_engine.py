@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 from es_service.dispatch import engine as engine_module
 from es_service.dispatch.engine import POLL_S, Answer, Engine, task_sizes
-from es_service.dispatch.messages import Failure, Limits, WorkerLost, WorkerUp
+from es_service.dispatch.events import Failure, Limits, WorkerLost, WorkerUp
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol import TrainingChunk
+from es_service.protocol.messages import TrainingChunk
 from tests.helpers import centre, random_parameters
 
 FIRST, SECOND = centre(random_parameters(0)), centre(random_parameters(1))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from es_service import api, session
-from es_service.export import arrays, tables
+from es_service import api
+from es_service.runs import session
+from es_service.runs.export import arrays, tables
 from es_service.store import reader
 from tests.benchmarks.science import in_this_process
 

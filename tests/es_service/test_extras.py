@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import pandas as pd
 import pytest
 
-from es_service import export
-from es_service.commands import error_message, install_command
+from es_service.cli.commands import error_message, install_command
 from es_service.errors import ConfigError, WayOut
+from es_service.runs import export
 
 ROOT = Path(__file__).parents[2]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]

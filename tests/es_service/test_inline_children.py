@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from es_service.dispatch.events import Limits, StartWorker
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.messages import Limits, StartWorker
 from es_service.errors import EvaluationError
-from es_service.protocol import EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
 from tests.helpers import SPEC, centre, random_parameters, spec
 
 FIRST = centre(random_parameters(0))

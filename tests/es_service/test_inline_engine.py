@@ -18,11 +18,11 @@ import pytest
 
 from es_service.dispatch import inline_engine as inline_module
 from es_service.dispatch.engine import Answer
+from es_service.dispatch.events import Limits, WorkerLost, WorkerUp
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.messages import Limits, WorkerLost, WorkerUp
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol import TrainingChunk
-from es_service.wire import framed
+from es_service.protocol.messages import TrainingChunk
+from es_service.protocol.wire import framed
 from tests.helpers import SPEC, centre, random_parameters, spec
 
 FIRST = centre(random_parameters(0))

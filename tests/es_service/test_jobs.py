@@ -9,12 +9,13 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
-from es_service import cli_jobs, jobs
 from es_service.api import load_config
-from es_service.cli import app
-from es_service.commands import error_message
+from es_service.cli import jobs as cli_jobs
+from es_service.cli.commands import error_message
+from es_service.cli.main import app
 from es_service.config.yaml_text import dump_yaml
 from es_service.errors import ConfigError, EvaluationError
+from es_service.runs import jobs
 
 CONFIG = load_config(
     {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from es_service.maps.behaviour_map import (
+from es_service.search.maps.behaviour_map import (
     GEOMETRY_PART,
     BehaviourMap,
     Elite,

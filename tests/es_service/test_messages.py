@@ -5,7 +5,8 @@ import pickle
 import numpy as np
 import pytest
 
-from es_service import errors, protocol
+from es_service import errors
+from es_service.protocol import messages as protocol
 from tests.helpers import DirectEvaluator, centre, random_parameters, spec
 
 CHUNKS = (

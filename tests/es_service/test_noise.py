@@ -8,15 +8,7 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from es_service.noise import (
-    NORMAL_STD,
-    TEST_VECTORS,
-    Domain,
-    normal_integers,
-    normals,
-    stream_keys,
-    uniforms,
-)
+from es_service.protocol.noise import NORMAL_STD, TEST_VECTORS, Domain, normal_integers, normals, stream_keys, uniforms
 from tests.twins import noise as twin
 
 COORDINATES = np.arange(4482, dtype=np.uint32)

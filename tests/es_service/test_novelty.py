@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from es_service.novelty import (
+from es_service.search.novelty import (
     BLOCK_ENTRIES,
     COPIES,
     TREE_STEP,

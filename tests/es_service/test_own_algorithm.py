@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from es_service import api
-from es_service.algorithms import ALGORITHMS
-from es_service.algorithms.base import Judgement, Plan
-from es_service.algorithms.steps import archived, first_state
 from es_service.errors import ConfigError, StoreError
-from es_service.maps.behaviour_map import insert
-from es_service.novelty import NoveltyArchive
-from es_service.protocol import EpisodesResult
-from es_service.statistics import no_observations
+from es_service.protocol.messages import EpisodesResult
+from es_service.search.algorithms import ALGORITHMS
+from es_service.search.algorithms.base import Judgement, Plan
+from es_service.search.algorithms.steps import archived, first_state
+from es_service.search.maps.behaviour_map import insert
+from es_service.search.novelty import NoveltyArchive
+from es_service.search.observation_statistics import no_observations
 
 EXAMPLE = "tests.examples.minimal_criterion:minimal_criterion"
 CONFIG = {
@@ -61,7 +61,7 @@ def test_a_run_of_it_goes_on_where_it_was_with_the_same_bits(tmp_path):
         ("tests.examples.minimal_criterion:min", "has no function 'min'"),
         (f"{__name__}:NOT_CALLABLE", "has no function 'NOT_CALLABLE'"),
         (f"{__name__}:raises", r"raises raised KeyError: 'sigma'"),
-        (f"{__name__}:something_else", r"returned 3, which is no es_service\.algorithms\.base\.Algorithm"),
+        (f"{__name__}:something_else", r"returned 3, which is no es_service\.search\.algorithms\.base\.Algorithm"),
         (".:x", "cannot import"),
     ],
 )

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from es_service import api, session
-from es_service.digest import checked_parts
-from es_service.platform_info import VERSION, computed_on, is_mixed, platform_info, platform_text
+from es_service import api
+from es_service.protocol.machine import VERSION, computed_on, is_mixed, platform_info, platform_text
+from es_service.runs import session
+from es_service.store.digest import checked_parts
 from es_service.store.reader import read_platforms
 from tests.benchmarks.science import InThisProcess
 
@@ -89,4 +90,4 @@ def test_our_own_version_is_that_of_the_code_not_of_its_last_installation(monkey
     assert printed.stdout.strip() == VERSION
     described = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
     assert described["project"]["dynamic"] == ["version"]
-    assert described["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "es_service.platform_info.VERSION"}
+    assert described["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "es_service.protocol.machine.VERSION"}

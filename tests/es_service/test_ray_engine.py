@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 from es_service.dispatch.engine import Answer, Engine
-from es_service.dispatch.messages import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
+from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import ONE_CORE, Membership, look
 from es_service.dispatch.ray_engine import Actors
 from es_service.errors import EvaluationError
-from es_service.protocol import TrainingChunk
+from es_service.protocol.messages import TrainingChunk
 from tests.helpers import SPEC, centre, random_parameters
 
 FIRST = centre(random_parameters())

@@ -6,11 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from es_service.maps.geometry import (
-    Grid,
-    make_geometry,
-    reachable_cells,
-)
+from es_service.search.maps.geometry import Grid, make_geometry, reachable_cells
 from tests.es_service.map_examples import SQUARE, map_config
 from workers.environments import ANT_CLEARANCE, SHIPPED, ant_maze, point_maze
 from workers.environments.ant import TORSO_RADIUS

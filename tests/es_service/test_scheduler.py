@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from es_service.dispatch.messages import (
+from es_service.dispatch.events import (
     Assign,
     Deliver,
     Fail,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from es_service.dispatch.messages import (
+from es_service.dispatch.events import (
     Assign,
     Deliver,
     Drain,

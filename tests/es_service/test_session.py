@@ -6,10 +6,10 @@ import re
 
 from es_service.api import load_config
 from es_service.config.compute import ComputeConfig
-from es_service.dispatch.messages import Result, StopWorker, Submit, Task, Tick, WorkerUp
+from es_service.dispatch.events import Result, StopWorker, Submit, Task, Tick, WorkerUp
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state
-from es_service.session import LIMIT_NAMES, dispatch_limits
+from es_service.runs.session import LIMIT_NAMES, dispatch_limits
 
 CONFIG = {
     "task": {"environment": "point_maze"},

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from es_service.algorithms import ALGORITHMS
 from es_service.config.loading import load_config
 from es_service.config.model import worker_spec
 from es_service.config.presets import preset_values
 from es_service.config.resolution import config_warnings
-from es_service.tasks import TASKS
+from es_service.config.tasks import TASKS
+from es_service.search.algorithms import ALGORITHMS
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 EACH = pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)

@@ -10,14 +10,14 @@ import sys
 
 import pytest
 
-from es_service import signals
 from es_service.errors import Interrupted
+from es_service.runs import signals
 from tests.system.session import ROOT
 
 PROGRAM = """
 import os, signal, time
 from rich.live import Live
-from es_service import signals
+from es_service.runs import signals
 signals.REPEAT_S = 0.0
 with signals.stop_on_signals() as should_stop, Live("busy"):
     os.kill(os.getpid(), signal.SIGTERM)

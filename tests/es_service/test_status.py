@@ -9,12 +9,12 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from es_service import api
-from es_service.cli import app
-from es_service.commands import settings
+from es_service.cli.commands import settings
+from es_service.cli.main import app
+from es_service.cli.tables.overview import print_overview
+from es_service.cli.tables.status import follow_status, print_status, print_summary
 from es_service.errors import ConfigError
-from es_service.report.overview import print_overview
-from es_service.report.standing import Standing, look, more, state
-from es_service.report.status import follow_status, print_status, print_summary
+from es_service.runs.standing import Standing, look, more, state
 from es_service.store import reader
 from es_service.store.lock import acquire_lock
 from tests.system.session import SMALL

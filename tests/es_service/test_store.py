@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError, WayOut
-from es_service.history import Column
+from es_service.loop.history import Column
 from es_service.store import create as store_create
 from es_service.store import upkeep as store_upkeep
 from es_service.store.beginning import Beginning

@@ -9,9 +9,9 @@ import sqlite3
 import numpy as np
 import pytest
 
-from es_service.digest import digest, digest_parts
 from es_service.errors import StoreError
 from es_service.store.codec import encode_part
+from es_service.store.digest import digest, digest_parts
 from es_service.store.reader import read_generation, read_history, read_parts, read_platforms
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (

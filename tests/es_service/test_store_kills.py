@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from es_service.digest import digest
 from es_service.errors import StoreError
 from es_service.store import reader as store_reader
 from es_service.store import writer as store
+from es_service.store.digest import digest
 from es_service.store.reader import read_generation, read_history
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (

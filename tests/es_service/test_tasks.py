@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from es_service.bench import bench_rollouts
+from es_service.cli.bench_rollouts import bench_rollouts
+from es_service.config.tasks import TASKS
+from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.messages import Limits
 from es_service.errors import ConfigError
-from es_service.protocol import TrainingChunk
-from es_service.tasks import TASKS
+from es_service.protocol.messages import TrainingChunk
 from tests.helpers import SPEC, centre, random_parameters
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from es_service.wire import Channel, framed, receive
+from es_service.protocol.wire import Channel, framed, receive
 
 
 @pytest.fixture

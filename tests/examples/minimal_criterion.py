@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from es_service.algorithms.base import Algorithm, Plan, SearchState
-from es_service.algorithms.steps import novelty_search
 from es_service.config.model import RunConfig
-from es_service.novelty import novelty
-from es_service.protocol import EpisodesResult
-from es_service.shaping import centred_ranks, pair_weights
+from es_service.protocol.messages import EpisodesResult
+from es_service.search.algorithms.base import Algorithm, Plan, SearchState
+from es_service.search.algorithms.steps import novelty_search
+from es_service.search.novelty import novelty
+from es_service.search.shaping import centred_ranks, pair_weights
 
 
 def minimal_criterion(config: RunConfig) -> Algorithm:

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from es_service.noise import uniforms
+from es_service.protocol.noise import uniforms
 
 
 class Sorting:

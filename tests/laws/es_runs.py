@@ -1,13 +1,11 @@
 """Small ES runs in memory."""
 
-from es_service import driver
-from es_service.algorithms import ALGORITHMS
 from es_service.api import load_config
 from es_service.config.model import worker_spec
-from es_service.protocol import (
-    PolicyShape,
-)
-from es_service.statistics import no_observations
+from es_service.loop import driver
+from es_service.protocol.messages import PolicyShape
+from es_service.search.algorithms import ALGORITHMS
+from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
 from workers.environments import SHIPPED
 from workers.policy import initial_parameters

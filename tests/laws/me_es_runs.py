@@ -4,12 +4,12 @@ from functools import cache
 
 import numpy as np
 
-from es_service import driver
-from es_service.algorithms import ALGORITHMS
 from es_service.api import load_config
 from es_service.config.model import worker_spec
-from es_service.protocol import EvaluationChunk, PolicyShape
-from es_service.statistics import no_observations
+from es_service.loop import driver
+from es_service.protocol.messages import EvaluationChunk, PolicyShape
+from es_service.search.algorithms import ALGORITHMS
+from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
 from tests.twins.behaviour_map import cell_number
 from workers.environments import SHIPPED

@@ -1,4 +1,7 @@
-"""Who may import whom. The rules keep the driver light and the workers free of the driver."""
+"""Who may import whom: the rooms of es_service are the floors of a tower, and imports go down its stairs.
+
+The rules keep the driver light and the workers free of the driver.
+"""
 
 import ast
 import subprocess
@@ -8,22 +11,37 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-LEAVES = {f"es_service.{name}" for name in ("protocol", "noise", "wire", "platform_info", "process_environment")}
-JOINERS = {"api.py", "bench.py", "cli.py", "doctor.py", "run_view.py", "session.py", "tasks.py"}
-"""Files of es_service that know both sides: the Python interface and the command line. `run_view` is the interface's
-reading half (a policy runs in NumPy), `doctor` the command's."""
-RAY_USERS = {"ray_cluster.py", "jobs.py"}
-"""Files of es_service that import Ray, inside the functions that need it: all others are given the module."""
+ROOMS = ("cli", "api", "report", "runs", "dispatch", "store", "loop", "search", "config", "protocol", "errors")
+"""From what a person touches down to the ground. `report` is still to come."""
+GROUND = ("protocol", "errors")
+"""Rooms that import nothing of the project."""
+ENTRIES = {"es_service.__init__": "api", "es_service.__main__": "cli"}
+"""What stands at the door -> the highest room it may go to."""
+JOINERS = {
+    "es_service.runs.view",
+    "es_service.runs.session",
+    "es_service.config.tasks",
+    "es_service.cli.doctor",
+    "es_service.cli.bench_rollouts",
+}
+"""Modules of es_service that know both sides: they may import `workers`."""
+RAY_USERS = {"es_service.dispatch.ray_cluster", "es_service.runs.jobs"}
+"""Modules of es_service that import Ray, inside the functions that need it: all others are given the module."""
 
 
-def imports(path: Path) -> set[str]:
+def module_of(path: Path) -> str:
+    """Dotted name of a file; a package's own is `package.__init__`."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+
+def imports(source: str) -> set[str]:
     """Absolute names of the modules a file imports, `from x import y` as both x and x.y."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: write absolute imports"
+            assert node.level == 0, "write absolute imports"
             found |= {str(node.module)} | {f"{node.module}.{alias.name}" for alias in node.names}
     return found
 
@@ -32,34 +50,79 @@ def files(package: str) -> list[Path]:
     return sorted((ROOT / package).rglob("*.py"))
 
 
-def is_project_module(name: str) -> bool:
-    path = ROOT / name.replace(".", "/")
-    return path.with_suffix(".py").exists() or (path / "__init__.py").exists()
+def room_of(module: str) -> str:
+    """The room that a module of es_service is in; empty for the package itself."""
+    return module.split(".")[1] if "." in module else ""
 
 
-@pytest.mark.parametrize("path", files("workers"), ids=str)
-def test_workers_import_only_the_leaves_of_es_service(path):
-    used = {name for name in imports(path) if name.startswith("es_service") and is_project_module(name)}
-    assert used - {"es_service"} <= LEAVES
+def wrong_arrows(module: str, source: str) -> list[str]:
+    """A sentence for every import that the law forbids to a module of the project."""
+    found = []
+    used = {name for name in imports(source) if name.split(".")[0] in ("es_service", "workers", "jax", "brax", "ray")}
+    here = ENTRIES.get(module) or (room_of(module) if module.startswith("es_service.") else "workers")
+    for name in sorted(used):
+        package, there = name.split(".")[0], room_of(name)
+        if package == "es_service" and there in ROOMS:
+            if here == "workers":
+                if there != "protocol":
+                    found.append(f"{module} imports {name}: workers import of es_service only protocol")
+            elif here in GROUND:
+                if there != here:
+                    found.append(f"{module} imports {name}: {here} imports nothing of the project")
+            elif ROOMS.index(there) < ROOMS.index(here):
+                found.append(f"{module} imports {name}: {there} is above {here}; a room imports only those below it")
+        elif package == "workers" and here != "workers":
+            if here in GROUND:
+                found.append(f"{module} imports {name}: {here} imports nothing of the project")
+            elif module not in JOINERS:
+                found.append(f"{module} imports {name}: of es_service only {', '.join(sorted(JOINERS))} import workers")
+        elif package in ("jax", "brax") and here != "workers":
+            found.append(f"{module} imports {name}: the driver loads no JAX and no Brax")
+        elif package == "ray" and here != "workers" and module not in RAY_USERS:
+            found.append(f"{module} imports {name}: only {', '.join(sorted(RAY_USERS))} import Ray")
+    return found
 
 
-@pytest.mark.parametrize("leaf", sorted(LEAVES))
-def test_leaves_import_nothing_of_the_project(leaf):
-    used = imports(ROOT / f"{leaf.replace('.', '/')}.py")
-    assert not {name for name in used if name.split(".")[0] in ("es_service", "workers", "jax")}
+@pytest.mark.parametrize("path", [*files("es_service"), *files("workers")], ids=module_of)
+def test_imports_go_down(path):
+    assert wrong_arrows(module_of(path), path.read_text()) == []
 
 
-@pytest.mark.parametrize("path", files("es_service"), ids=str)
-def test_only_the_interfaces_join_both_sides(path):
-    used = {name.split(".")[0] for name in imports(path)}
-    assert not used & ({"brax", "jax"} if path.name in RAY_USERS else {"ray", "brax", "jax"})
-    if str(path.relative_to(ROOT / "es_service")) not in JOINERS:
-        assert "workers" not in used
+@pytest.mark.parametrize(
+    ("module", "source", "sentence"),
+    [
+        ("es_service.store.lock", "from es_service.cli.commands import command", "cli is above store"),
+        ("es_service.loop.driver", "from es_service.store import writer", "store is above loop"),
+        ("es_service.config.model", "import es_service.search.novelty", "search is above config"),
+        ("es_service.search.novelty", "def f():\n    from es_service.loop import clock", "loop is above search"),
+        ("es_service.protocol.wire", "from es_service.errors import StoreError", "protocol imports nothing"),
+        ("es_service.__main__", "from workers import worker", "import workers"),
+        ("es_service.api", "import workers", "import workers"),
+        ("workers.worker", "from es_service.config.model import RunConfig", "only protocol"),
+        ("es_service.runs.view", "import jax.numpy", "no JAX"),
+        ("es_service.runs.session", "import ray", "import Ray"),
+    ],
+)
+def test_a_wrong_arrow_is_named(module, source, sentence):
+    (arrow,) = {one.rpartition(": ")[2]: one for one in wrong_arrows(module, source)}.values()
+    assert arrow.startswith(f"{module} imports ")
+    assert sentence in arrow
+
+
+def test_every_file_of_es_service_is_in_a_room():
+    assert {path.name for path in (ROOT / "es_service").glob("*.py")} == {
+        "__init__.py",
+        "__main__.py",
+        "api.py",
+        "errors.py",
+    }
+    rooms = {path.name for path in (ROOT / "es_service").iterdir() if path.is_dir() and path.name != "__pycache__"}
+    assert rooms <= set(ROOMS)
 
 
 def test_a_driver_process_loads_no_jax():
     """Start-up time and memory of the driver depend on it, and so does independence of the caller's JAX."""
-    code = "import sys, es_service.api, es_service.cli; sys.exit(any(m in sys.modules for m in ('jax', 'ray', 'brax')))"
+    code = "import sys, es_service.api, es_service.cli.main; assert not {'jax', 'ray', 'brax'} & sys.modules.keys()"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

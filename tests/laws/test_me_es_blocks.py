@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from es_service.algorithms import ALGORITHMS
-from es_service.algorithms.base import NO_CELL, Judgement
-from es_service.algorithms.me_es import cell_shares, elite_novelty
-from es_service.algorithms.steps import archived, first_state, mapped
-from es_service.maps.behaviour_map import BehaviourMap
-from es_service.maps.geometry import Grid
-from es_service.novelty import empty_archive, extended
+from es_service.search.algorithms import ALGORITHMS
+from es_service.search.algorithms.base import NO_CELL, Judgement
+from es_service.search.algorithms.me_es import cell_shares, elite_novelty
+from es_service.search.algorithms.steps import archived, first_state, mapped
+from es_service.search.maps.behaviour_map import BehaviourMap
+from es_service.search.maps.geometry import Grid
+from es_service.search.novelty import empty_archive, extended
 from tests.laws.me_es_runs import BLOCK, config_of
 
 

@@ -3,11 +3,17 @@
 import numpy as np
 import pytest
 
-from es_service import driver
-from es_service.algorithms import ALGORITHMS
-from es_service.algorithms.base import FitnessWeight, Judgement
-from es_service.algorithms.nsra_es import adapted_weight
-from es_service.algorithms.steps import (
+from es_service.api import load_config
+from es_service.config.model import worker_spec
+from es_service.loop import driver
+from es_service.loop.generation import invalidate
+from es_service.loop.state import state_from_parts
+from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
+from es_service.search.algorithms import ALGORITHMS
+from es_service.search.algorithms.base import FitnessWeight, Judgement
+from es_service.search.algorithms.nsra_es import adapted_weight
+from es_service.search.algorithms.steps import (
     MEMBER_CHOICE,
     archived,
     choose_member,
@@ -15,13 +21,7 @@ from es_service.algorithms.steps import (
     member_novelty,
     mixed_utilities,
 )
-from es_service.api import load_config
-from es_service.config.model import worker_spec
-from es_service.generation import invalidate
-from es_service.noise import Domain, normals, stream_keys, uniforms
-from es_service.protocol import EpisodesResult, EvaluationChunk, PolicyShape, TrainingChunk
-from es_service.run_state import state_from_parts
-from es_service.statistics import no_observations
+from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
 from tests.twins import novelty_search as twin
 from workers.environments import SHIPPED

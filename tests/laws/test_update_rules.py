@@ -8,10 +8,10 @@ from hypothesis.extra import numpy as hnp
 
 from es_service.api import load_config
 from es_service.config.model import worker_spec
-from es_service.generation import estimate_gradient, tree_sum
-from es_service.noise import Domain, normals, stream_keys
-from es_service.optimizer import adam_ascent, fresh_adam
-from es_service.shaping import centred_ranks, pair_weights
+from es_service.loop.generation import estimate_gradient, tree_sum
+from es_service.protocol.noise import Domain, normals, stream_keys
+from es_service.search.optimizer import adam_ascent, fresh_adam
+from es_service.search.shaping import centred_ranks, pair_weights
 from tests.helpers import DirectEvaluator, centre
 from tests.laws.es_runs import SHAPE, small_config
 from tests.twins import es as twin

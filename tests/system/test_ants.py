@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from es_service import api
-from es_service.digest import digest_parts
+from es_service.store.digest import digest_parts
 from tests.benchmarks import ants
 from tests.system.processes import children
 

@@ -17,8 +17,8 @@ import pytest
 import yaml
 
 from es_service import api
-from es_service.digest import digest_parts
 from es_service.dispatch.dispatch_log import FILE
+from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation
 from tests.dispatch_checker import check_dispatch, read_dispatch_log
 from tests.system import cluster

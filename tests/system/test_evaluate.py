@@ -7,8 +7,8 @@ import csv
 import pandas as pd
 import pytest
 
+from es_service.cli.tables.evaluations import csv_file
 from es_service.errors import ConfigError, StoreError
-from es_service.report.evaluations import csv_file
 from tests.system.command_line import command
 from tests.system.me_es_runs import run
 

@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from es_service.export import ribs_archive
-from es_service.maps.geometry import Grid
-from es_service.run_view import map_places
+from es_service.runs.export import ribs_archive
+from es_service.runs.view import map_places
+from es_service.search.maps.geometry import Grid
 from tests.system.command_line import command
 
 

@@ -14,15 +14,18 @@ import numpy as np
 import pytest
 import yaml
 
-from es_service import api, configs, evaluation, lineage, open_run, tasks
-from es_service.commands import error_message
+from es_service import api, open_run
+from es_service.cli.commands import error_message
+from es_service.config import tasks
 from es_service.config.changes import START_KEYS, start_afresh
-from es_service.digest import digest_at
 from es_service.errors import ConfigError
-from es_service.maps.behaviour_map import CELL_PREFIX
-from es_service.report.standing import look, more
-from es_service.session import dispatch_limits
+from es_service.runs import checked_config as configs
+from es_service.runs import evaluation, lineage
+from es_service.runs.session import dispatch_limits
+from es_service.runs.standing import look, more
+from es_service.search.maps.behaviour_map import CELL_PREFIX
 from es_service.store import reader
+from es_service.store.digest import digest_at
 from es_service.store.reader import read_generation
 from tests.system.command_line import digest, es
 from tests.system.session import ROOT, SMALL, finish

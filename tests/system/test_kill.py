@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from es_service.digest import digest_parts
+from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation
 from tests.system.processes import committed, wait_until
 from tests.system.session import SMALL, finish, start

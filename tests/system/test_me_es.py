@@ -12,10 +12,10 @@ import pandas as pd
 import pytest
 
 from es_service import api
-from es_service.digest import digest_parts
 from es_service.errors import ConfigError, NotInRunError
-from es_service.export import arrays, ribs_archive
-from es_service.maps.geometry import Grid
+from es_service.runs.export import arrays, ribs_archive
+from es_service.search.maps.geometry import Grid
+from es_service.store.digest import digest_parts
 from tests.system.command_line import command
 from tests.system.me_es_runs import CONFIG, run
 from tests.system.processes import children

@@ -13,15 +13,15 @@ from pathlib import Path
 import pytest
 
 from es_service import api
-from es_service.commands import error_message
-from es_service.digest import digest_parts
+from es_service.cli.commands import error_message
 from es_service.dispatch import ray_engine as module
-from es_service.dispatch.messages import Limits
+from es_service.dispatch.events import Limits
 from es_service.dispatch.ray_cluster import Claim
 from es_service.dispatch.ray_engine import Actors, ray_engine
 from es_service.errors import EvaluationError
-from es_service.process_environment import worker_environment
-from es_service.protocol import TrainingChunk, WorkerPlace
+from es_service.protocol.messages import TrainingChunk, WorkerPlace
+from es_service.protocol.process_environment import worker_environment
+from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation
 from tests.dispatch_checker import check_dispatch
 from tests.helpers import centre, random_parameters, spec

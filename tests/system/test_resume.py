@@ -49,7 +49,7 @@ def test_resume_of_a_finished_run_does_nothing(finished, tmp_path):
 def test_columns_explained_in_other_words_are_the_same_columns(finished, tmp_path, monkeypatch):
     """So a version may explain them better and go on with the runs of those before it."""
     from es_service import api
-    from es_service.history import history_columns
+    from es_service.loop.history import history_columns
 
     shutil.copytree(finished[0], tmp_path / "run")
     monkeypatch.setattr(
@@ -60,7 +60,8 @@ def test_columns_explained_in_other_words_are_the_same_columns(finished, tmp_pat
 
 @pytest.mark.parametrize("budget", ["generations=30", "env_steps=100", "wall_clock_s=1e-3", "target_fitness=-1e9"])
 def test_a_spent_budget_starts_no_engine(finished, tmp_path, monkeypatch, budget):
-    from es_service import api, session
+    from es_service import api
+    from es_service.runs import session
 
     shutil.copytree(finished[0], tmp_path / "run")
     monkeypatch.delattr(session, "_engine")
@@ -74,7 +75,8 @@ def test_a_spent_budget_starts_no_engine(finished, tmp_path, monkeypatch, budget
 
 def test_a_state_is_read_once(finished, tmp_path, monkeypatch):
     """Its hash, and the tree of a long archive, take seconds."""
-    from es_service import api, driver
+    from es_service import api
+    from es_service.loop import driver
 
     shutil.copytree(finished[0], tmp_path / "run")
     read, inner = [], driver.state_from_parts
@@ -129,7 +131,8 @@ def test_damage_gives_the_same_digest_or_a_named_error(config, finished, tmp_pat
 
 
 def test_other_versions_on_resume_are_told_and_make_the_digest_mixed(config, tmp_path, monkeypatch):
-    from es_service import api, session
+    from es_service import api
+    from es_service.runs import session
 
     folder = tmp_path / "run"
     assert es("run", config, "--out", folder, "--set", "budget.generations=3")[0] == 0

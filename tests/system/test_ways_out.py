@@ -14,12 +14,13 @@ import time
 import pytest
 from rich.console import Console
 
-from es_service import api, commands
-from es_service.commands import error_message
+from es_service import api
+from es_service.cli import commands
+from es_service.cli.commands import error_message
+from es_service.cli.tables.status import follow_status, print_summary
 from es_service.config.changes import refused_changes
 from es_service.errors import ConfigError, NotInRunError, StoreError
-from es_service.evaluation import candidates
-from es_service.report.status import follow_status, print_summary
+from es_service.runs.evaluation import candidates
 from es_service.store.lock import acquire_lock
 from es_service.store.reader import read_generation
 from es_service.store.writer import RunStore

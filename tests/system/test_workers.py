@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 
 from es_service import api
-from es_service.digest import digest_parts
 from es_service.dispatch import inline_engine
 from es_service.dispatch.engine import Engine
 from es_service.errors import EvaluationError
-from es_service.process_environment import child_environment
-from es_service.protocol import TrainingChunk
+from es_service.protocol.messages import TrainingChunk
+from es_service.protocol.process_environment import child_environment
+from es_service.store.digest import digest_parts
 from tests.system.processes import children, committed, is_running, running, wait_for, wait_until
 
 CONFIG = {

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from es_service.noise import NORMAL_STD, Domain, normals, stream_keys
-from es_service.protocol import SIGNS, PolicyShape
+from es_service.protocol.messages import SIGNS, PolicyShape
+from es_service.protocol.noise import NORMAL_STD, Domain, normals, stream_keys
 from tests.helpers import SPEC
 from workers import rollout as xla
 from workers.environments import SHIPPED, make_environment

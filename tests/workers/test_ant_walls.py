@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from es_service.noise import Domain, stream_keys
+from es_service.protocol.noise import Domain, stream_keys
 from tests.wall_watch import WALLS, Walls, colliders, crosses, depth, inside_the_maze, places_beside_walls
 from workers.environments import ant_maze
 from workers.environments.ant import STEP_S, make_ant

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from es_service.config.tasks import TASKS
 from es_service.errors import ConfigError
-from es_service.noise import Domain, stream_keys
-from es_service.protocol import PolicyShape, with_options
-from es_service.tasks import TASKS
+from es_service.protocol.messages import PolicyShape, with_options
+from es_service.protocol.noise import Domain, stream_keys
 from tests.examples.ant_slalom import AntSlalom
 from tests.helpers import centre, random_parameters, spec
 from workers.environments import TaskError, brax_parts, brax_task, describe_environment, make_environment, user_task
@@ -163,7 +163,7 @@ def test_a_worker_runs_the_example():
         environment=EXAMPLE, environment_options={"walls": "first"}, policy=shape, episode_steps=20,
         chunk_pairs=2, rollout_block_pairs=2, gradient_block_pairs=2,
     )  # fmt: skip
-    from es_service.protocol import TrainingChunk
+    from es_service.protocol.messages import TrainingChunk
 
     point = centre(random_parameters(size=shape.parameters), observation_size=task.observation_size)
     result = make_worker(worker_spec)(point, TrainingChunk(1, 0))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import workers.worker
-from es_service.protocol import EpisodesResult, TrainingChunk
+from es_service.protocol.messages import EpisodesResult, TrainingChunk
 from tests.helpers import centre, random_parameters
 from workers.environments import Environment
 from workers.worker import episode_keys, make_worker

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from es_service.noise import Domain, stream_keys
+from es_service.protocol.noise import Domain, stream_keys
 from tests.twins import point_maze as twin
 from workers.environments import SHIPPED, make_environment
 

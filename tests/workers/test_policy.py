@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from es_service.protocol import (
-    PolicyShape,
-)
+from es_service.protocol.messages import PolicyShape
 from workers.policy import initial_parameters
 
 

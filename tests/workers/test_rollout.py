@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import workers.worker
-from es_service.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys
-from es_service.protocol import (
+from es_service.protocol.messages import (
     EpisodesResult,
     EvaluationChunk,
     GradientChunk,
@@ -17,7 +16,8 @@ from es_service.protocol import (
     PolicyShape,
     TrainingChunk,
 )
-from es_service.run_view import Policy
+from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys
+from es_service.runs.view import Policy
 from tests import helpers
 from tests.helpers import PARAMETERS, centre, random_parameters
 from tests.twins import noise as noise_twin

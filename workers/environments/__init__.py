@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from es_service.protocol import TaskSpec
+from es_service.protocol.messages import TaskSpec
 
 
 class TaskError(Exception):

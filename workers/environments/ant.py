@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from etils import epath
 
-from es_service.noise import uniforms
+from es_service.protocol.noise import uniforms
 from workers.environments.brax_parts import (
     Contact,
     Motion,

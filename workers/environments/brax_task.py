@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from es_service.protocol import Bounds, TaskSpec
+from es_service.protocol.messages import Bounds, TaskSpec
 from workers.environments import Environment, TaskError
 from workers.environments.brax_parts import Transform, brax_contact, quietly
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from es_service.noise import uniforms
+from es_service.protocol.noise import uniforms
 from workers.environments import Environment
 
 GOAL = (-0.5, 0.8)

@@ -17,8 +17,9 @@ went; `options = {"name": ("default", "other")}`, keywords of its constructor, w
 descriptor is a place in the plane, `walls`, a tuple of segments ((x, y), (x, y)), and `wall_clearance`, how near to one
 nothing comes, for the map's coverage of what can be reached; `least_reward`, from which QD-scores count; a docstring,
 whose first line `es-service` shows. All methods are pure functions that JAX can trace, of one state: they are batched
-and compiled for you. `es_service.noise.uniforms(key, counters)` makes random numbers. In training, actions leave
-[-1, 1] by up to 7.95 times `policy.action_noise`, which is added after the last tanh: a task that needs a bound clips.
+and compiled for you. `es_service.protocol.noise.uniforms(key, counters)` makes random numbers. In training, actions
+leave [-1, 1] by up to 7.95 times `policy.action_noise`, which is added after the last tanh: a task that needs a bound
+clips.
 Observations are summed in float32: in units in which they are not thousands of their standard deviations from 0.
 """
 
@@ -34,7 +35,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from es_service.protocol import TaskSpec
+from es_service.protocol.messages import TaskSpec
 from workers.environments import Environment, TaskError
 
 METHODS = ("reset", "observe", "step", "descriptor")

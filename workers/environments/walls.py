@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from es_service.protocol import Segment
+from es_service.protocol.messages import Segment
 
 WALL_RADIUS = 0.5
 TINY = 1e-9

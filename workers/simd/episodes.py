@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from es_service.noise import KEY_WORDS
-from es_service.protocol import WorkerSpec
+from es_service.protocol.messages import WorkerSpec
+from es_service.protocol.noise import KEY_WORDS
 from workers.environments import Environment
 from workers.episode import Carry, Episodes, EpisodeSteps, episode_steps
 from workers.simd.code import Code, Values, module

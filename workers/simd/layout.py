@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol import PolicyShape
+from es_service.protocol.messages import PolicyShape
 from workers.simd.words import aligned
 
 

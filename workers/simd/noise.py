@@ -1,4 +1,4 @@
-"""Code of the noise, at some three numbers a nanosecond: the generator of `es_service.noise`, word for word."""
+"""Code of the noise, at some three numbers a nanosecond: that of `es_service.protocol.noise`, word for word."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from es_service.noise import KEY_WORDS, NORMAL_STD, normal_integers
+from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, normal_integers
 from workers.simd.code import Code, Values, module
 from workers.simd.emit import inline
 from workers.simd.kernel import jaxpr_digest

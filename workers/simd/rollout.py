@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from es_service.noise import KEY_WORDS
-from es_service.protocol import PolicyShape, TaskSpec, WorkerSpec
+from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
+from es_service.protocol.noise import KEY_WORDS
 from workers.environments import Environment, make_environment
 from workers.episode import Episodes
 from workers.simd.episodes import EpisodeKernel, compile_episodes, write_episodes

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 import workers.rollout
-from es_service.noise import NORMAL_STD, Domain, stream_keys
-from es_service.protocol import PolicyShape, WorkerSpec
+from es_service.protocol.messages import PolicyShape, WorkerSpec
+from es_service.protocol.noise import NORMAL_STD, Domain, stream_keys
 from tests.helpers import spec
 from workers.environments import SHIPPED, make_environment
 from workers.episode import Episodes

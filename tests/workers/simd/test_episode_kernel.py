@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from es_service.noise import KEY_WORDS
+from es_service.protocol.noise import KEY_WORDS
 from tests.helpers import SPEC, random_parameters
 from workers.environments import make_environment
 from workers.simd.episodes import compile_episodes

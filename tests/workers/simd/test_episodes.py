@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import workers.rollout
-from es_service.noise import NORMAL_STD, TEST_VECTORS, Domain, normal_integers, stream_keys
-from es_service.protocol import PolicyShape
+from es_service.protocol.messages import PolicyShape
+from es_service.protocol.noise import NORMAL_STD, TEST_VECTORS, Domain, normal_integers, stream_keys
 from tests.helpers import random_parameters, spec
 from tests.workers.simd.rollouts import arguments, both, targets, task_spec
 from workers.environments import make_environment

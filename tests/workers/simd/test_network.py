@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from es_service.noise import NORMAL_STD, Domain, normals, stream_keys
-from es_service.protocol import PolicyShape
+from es_service.protocol.messages import PolicyShape
+from es_service.protocol.noise import NORMAL_STD, Domain, normals, stream_keys
 from tests.helpers import random_parameters
 from tests.workers.simd.rollouts import targets
 from workers.simd.code import Code, module

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from es_service.noise import Domain, stream_keys
+from es_service.protocol.noise import Domain, stream_keys
 from workers.environments import SHIPPED, Environment, ant_maze, ant_trap, describe_environment, make_environment
 from workers.environments.ant import expand, make_ant, physics_step
 from workers.simd.kernel import compile_kernel

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import workers.simd.episodes
-from es_service.noise import Domain, normal_integers, stream_keys
-from es_service.protocol import EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.protocol.noise import Domain, normal_integers, stream_keys
 from tests.helpers import centre, random_parameters, spec
 from workers.environments import SHIPPED, describe_environment, make_environment
 from workers.simd import noise, rollout

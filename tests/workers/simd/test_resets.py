@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from es_service.protocol import EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
 from tests.helpers import centre, random_parameters, spec
 from workers.environments import describe_environment
 from workers.simd import rollout

@@ -1,0 +1,123 @@
+"""`es-service bench rollouts`: how many environment steps a second this machine makes."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from typing import Any
+
+from es_service.config.problems import did_you_mean, one_of
+from es_service.config.tasks import TASKS
+from es_service.dispatch.cores import cores
+from es_service.errors import ConfigError, EvaluationError
+from es_service.protocol.process_environment import child_environment
+
+BATCHES = {"point_maze": (64,)}
+ANT_BATCHES = (8, 16, 64)
+PAPER = {"point_maze": 1_520_000, "ant_maze": 4_480, "ant_trap": 7_470}
+"""Steps a second on one CPU, without a policy (Chalumeau et al. 2022): other physics, another machine."""
+ROLLOUTS = ("xla", "simd")
+HIDDEN = {"point_maze": [64, 64]}
+ANT_HIDDEN = [256, 256]
+
+
+def bench_rollouts(
+    tasks: Sequence[str] = (),
+    *,
+    policies: Sequence[bool] = (False, True),
+    rollouts: Sequence[str] = ROLLOUTS,
+    batches: Sequence[int] = (),
+    seconds: float = 3.0,
+) -> Iterator[dict[str, Any]]:
+    """One row per task, with and without policy, rollout, batch, and on one core and on all: as each is measured.
+
+    The hidden layers are the paper's: 64x64 for PointMaze, else 256x256. Each core has a process like a worker's; rates
+    on several, measured side by side, are added. Where simd cannot compile a task, its rows are one {"task", "rollout",
+    "note"}, and xla is what there is.
+
+    Raises:
+        ConfigError: a task cannot be had. EvaluationError: it cannot be run, or not by simd, and nothing else was asked
+            for.
+    """
+    for task in tasks:
+        if task not in TASKS:
+            raise ConfigError(
+                f"--task {task}: no known task; must be {one_of(TASKS)}, or brax:NAME, or module:Class"
+                f"{did_you_mean(task, TASKS)}"
+            )
+    every = sorted({1, cores()})
+    for task in tasks or TASKS:
+        cannot: set[str] = set()
+        for policy, rollout in itertools.product(policies, rollouts):
+            if rollout in cannot:
+                continue
+            for batch, count in itertools.product(batches or BATCHES.get(task, ANT_BATCHES), every):
+                arguments = {
+                    "task": task,
+                    "options": {},
+                    "hidden": HIDDEN.get(task, ANT_HIDDEN),
+                    "policy": policy,
+                    "batch": batch,
+                    "seconds": seconds,
+                    "rollout": rollout,
+                }
+                row = _row(arguments, count)
+                if "note" in row and set(rollouts) == {"simd"}:
+                    raise EvaluationError(f"{task}: {row['note']}")
+                yield row
+                if "note" in row:
+                    cannot.add(rollout)
+                    break
+
+
+def _row(arguments: Mapping[str, Any], count: int) -> dict[str, Any]:
+    command = [sys.executable, "-m", "workers.measure", json.dumps(arguments)]
+    environment = child_environment()
+    found = []
+    with ExitStack() as ends:
+        started = []
+        for _ in range(count):
+            process = subprocess.Popen(
+                command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            )
+            ends.enter_context(process)  # waits for it
+            ends.callback(process.kill)  # should another fail, or a signal arrive
+            started.append(process)
+        for process in started:
+            printed, errors = process.communicate()
+            if process.returncode:
+                raise EvaluationError(f"{arguments['task']} cannot be measured:\n{errors.strip()}")
+            found.append(json.loads(printed.splitlines()[-1]))
+    named = {"task": arguments["task"], "rollout": arguments["rollout"]}
+    if "problem" in found[0]:
+        return named | {"note": f"simd cannot compile it: {found[0]['problem']}; it runs on xla"}
+    return named | {
+        "policy": "on" if arguments["policy"] else "off",
+        "batch": arguments["batch"],
+        "cores": count,
+        "steps_per_second": sum(one["steps_per_second"] for one in found),
+        "compile_seconds": max(one["compile_seconds"] for one in found),
+        "peak_mib": max(one["peak_mib"] for one in found),
+    }
+
+
+COLUMNS = {"task": -36, "policy": -8, "rollout": -9, "batch": 5, "cores": 7, "steps/s": 13, "compile s": 11,
+           "peak MiB": 10, "paper": 12}  # fmt: skip
+"""Title -> width; negative ones are flush left."""
+HEADER = "".join(f"{title:{'<' if width < 0 else '>'}{abs(width)}}" for title, width in COLUMNS.items())
+
+
+def line(row: Mapping[str, Any]) -> str:
+    """A row under HEADER, with the paper's rate where that is comparable."""
+    if "note" in row:
+        return f"{row['task']:<36}{row['note']}"
+    comparable = row["policy"] == "off" and row["cores"] == 1 and row["task"] in PAPER
+    paper = f"{PAPER[row['task']]:,}" if comparable else ""
+    shown = (row["task"], row["policy"], row["rollout"], row["batch"], row["cores"], f"{row['steps_per_second']:,}",
+             row["compile_seconds"], row["peak_mib"], paper)  # fmt: skip
+    widths = COLUMNS.values()
+    return "".join(f"{one!s:{'<' if width < 0 else '>'}{abs(width)}}" for one, width in zip(shown, widths, strict=True))

@@ -1,0 +1,141 @@
+"""`es-service doctor`: can this machine run, and what will its results depend on."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from es_service.api import load_config
+from es_service.config.model import worker_spec
+from es_service.config.tasks import TASKS
+from es_service.dispatch.cores import cores
+from es_service.dispatch.events import Limits
+from es_service.dispatch.inline_engine import inline_engine
+from es_service.errors import Interrupted, ServiceError
+from es_service.protocol.machine import platform_info
+from es_service.protocol.messages import Centre, EpisodesResult, TrainingChunk
+from es_service.protocol.noise import TEST_VECTORS, normal_integers, stream_keys
+from es_service.runs.signals import stop_on_signals
+from es_service.search.observation_statistics import no_observations, normalisation
+from es_service.store.folder import is_network_filesystem
+from workers.policy import initial_parameters
+from workers.simd.kernel import compile_kernel
+from workers.simd.target import NoVectorsError, host_target
+
+Finding = tuple[str, str]
+"""("ok" | "note" | "FAIL", text)."""
+MIN_FREE_BYTES = 1 << 30
+MIN_MEMORY_BYTES = 2 << 30
+
+
+def examine(console: Console) -> bool:
+    """Print every finding; whether nothing failed."""
+    healthy = True
+    for check in (_software, _ray, _machine, _vectors, _disk, _noise, _rollout):
+        for level, text in _guarded(check):
+            healthy &= level != "FAIL"
+            colour = {"ok": "green", "note": "yellow", "FAIL": "red"}[level]
+            console.print(f"[{colour}]{level:>4}[/]  ", end="")
+            console.print(text, highlight=False, markup=False, soft_wrap=True)
+    return healthy
+
+
+def _guarded(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    try:
+        yield from check()
+    except Interrupted:
+        raise
+    except (OSError, ServiceError) as error:
+        yield "FAIL", f"{check.__name__.strip('_')}: {error}"
+
+
+def _software() -> Iterator[Finding]:
+    versions = platform_info()
+    cpu = versions.pop("cpu")
+    yield "ok", ", ".join(f"{name} {version}" for name, version in versions.items())
+    yield "ok", f"processor {cpu}: results repeat bit for bit on this kind and these versions"
+    yield "ok", f"SQLite {sqlite3.sqlite_version}, {sys.platform}"
+
+
+def _ray() -> Iterator[Finding]:
+    try:
+        version = metadata.version("ray")
+    except metadata.PackageNotFoundError:
+        yield "note", "Ray is not installed: only --engine inline runs here"
+        return
+    jobs = "with" if find_spec("aiohttp") else "without"
+    yield "ok", f"ray {version}, {jobs} what `ray start` with a dashboard and `submit` need (the extra `cluster`)"
+
+
+def _machine() -> Iterator[Finding]:
+    usable, present = cores(), os.cpu_count() or 1
+    yield "ok", f"{usable} of {present} cores usable: that many workers by default"
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
+    yield ("ok" if memory >= MIN_MEMORY_BYTES else "note"), f"{memory / 2**30:.1f} GiB of memory free"
+
+
+def _vectors() -> Iterator[Finding]:
+    """The width of the vectors that steps can be compiled for, tried on a small one."""
+    try:
+        target = host_target()
+    except NoVectorsError as error:
+        yield "note", f"simd: {error}: rollouts run on xla"
+        return
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        kernel = compile_kernel(lambda x: x * x + 1.0, np.zeros((), np.float32), folder=Path(folder))
+    found = kernel(np.arange(100, dtype=np.float32))
+    if not np.array_equal(found, np.arange(100, dtype=np.float32) ** 2 + 1):
+        yield "FAIL", f"simd ({target.describe()}): a compiled kernel gives wrong numbers"
+        return
+    yield "ok", f"simd: {target.describe()}; a kernel compiles and runs in {time.perf_counter() - started:.2f} s"
+
+
+def _disk() -> Iterator[Finding]:
+    here = Path.cwd()
+    free = shutil.disk_usage(here).free
+    yield ("ok" if free >= MIN_FREE_BYTES else "note"), f"{free / 2**30:.1f} GiB free under {here}"
+    if not os.access(here, os.W_OK):
+        yield "FAIL", f"{here} is not writable; run elsewhere or name a folder with --out"
+    if is_network_filesystem(here):
+        yield "note", f"{here} is on a network file system: runs work there, with a slower journal"
+
+
+def _noise() -> Iterator[Finding]:
+    for (seed, domain, generation, ids), expected in TEST_VECTORS:
+        key = stream_keys(seed, domain, generation, *ids)
+        found = normal_integers(np, key, np.arange(len(expected), dtype=np.uint32))
+        if found.tolist() != list(expected):
+            yield "FAIL", f"noise of stream {(seed, domain, generation, *ids)} is {found.tolist()}, not {expected}"
+            return
+    yield "ok", f"noise equals its {len(TEST_VECTORS)} test vectors"
+
+
+def _rollout() -> Iterator[Finding]:
+    """Start one worker as a run would, and let it work for a moment."""
+    config = load_config(
+        {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
+    )
+    task = TASKS["point_maze"]
+    spec = worker_spec(config, task)
+    mean_O, std_O = normalisation(no_observations(task.observation_size), enabled=False)
+    centre = Centre(0, initial_parameters(spec.policy, config.policy.init, 0), config.search.sigma, mean_O, std_O)
+    started = time.perf_counter()
+    with stop_on_signals() as should_stop, inline_engine(spec, Limits(workers=1), should_stop) as engine:
+        engine.evaluate(centre, [TrainingChunk(0, 0)])
+        ready = time.perf_counter()
+        results = engine.evaluate(centre, [TrainingChunk(1, chunk) for chunk in range(8)])
+        seconds = time.perf_counter() - ready
+    steps = sum(int(result.steps.sum()) for result in results if isinstance(result, EpisodesResult))
+    yield "ok", f"a worker starts and compiles in {ready - started:.1f} s, then makes {steps / seconds:,.0f} steps/s"

@@ -1,0 +1,81 @@
+"""The command line's `es-service submit | jobs | logs | stop`: runs as jobs of a Ray cluster."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from es_service import api
+from es_service.cli.commands import command
+from es_service.cli.options import ConfigArgument, SeedOption, SetOption, WorkersOption, overrides, print_note
+from es_service.config.keys import parse_overrides
+from es_service.config.yaml_text import read_yaml_file
+from es_service.errors import ConfigError
+from es_service.runs import jobs
+
+job_commands = typer.Typer()
+of_jobs = partial(job_commands.command, rich_help_panel="Cluster jobs")
+"""What makes a command one of these, in `--help` too."""
+
+JobsOption = Annotated[
+    str, typer.Option("--address", help="The cluster's dashboard, such as http://127.0.0.1:8265.", show_default=False)
+]
+JobArgument = Annotated[str, typer.Argument(help="Id of a job, as `submit` printed it.", show_default=False)]
+
+
+@of_jobs()
+def submit(
+    config: ConfigArgument,
+    address: JobsOption,
+    out: Annotated[str, typer.Option("--out", help="Folder of the run on the cluster's head, or a disk it shares.")],
+    set_: SetOption = None,
+    seed: SeedOption = None,
+    workers: WorkersOption = None,
+) -> None:
+    """Send a run to a Ray cluster as a job. The same command again goes on with it, after whatever happened."""
+    wanted = overrides(set_, seed=seed, workers=workers, address="auto")
+    _require_absolute_start(config, wanted)
+    loaded = api.load_config(config, wanted, new=False)  # paths are those of the cluster's head, which checks them
+    job = jobs.submit(loaded, address, out)
+    print(job)
+    print_note(f"submitted; watch it with: {command('logs', job, '--address', address, '--follow')}")
+
+
+def _require_absolute_start(config: Path, wanted: list[str]) -> None:
+    """Raise a ConfigError for a `search.init_from` that would mean another folder here than on the cluster's head."""
+    in_file = read_yaml_file(config)[0].get("search")
+    named = {"search.init_from": in_file.get("init_from")} if isinstance(in_file, dict) else {}
+    start = (named | parse_overrides(wanted)[0]).get("search.init_from")
+    if isinstance(start, str) and not start.startswith("/"):
+        raise ConfigError(f"search.init_from: {start} must be absolute, a path as the cluster's head sees it")
+
+
+@of_jobs(name="jobs")
+def jobs_(address: JobsOption) -> None:
+    """List the jobs of a cluster, newest first: id, state, run folder."""
+    for job in jobs.list_jobs(address):
+        print(f"{job.id}  {job.state:<9}  {job.folder}")
+
+
+@of_jobs()
+def logs(
+    job: JobArgument,
+    address: JobsOption,
+    follow: Annotated[bool, typer.Option("--follow", help="Keep printing until the job ends.")] = False,
+) -> None:
+    """Print what a job of a cluster has printed."""
+    for text in jobs.logs(job, address, follow=follow):
+        print(text, end="", flush=True)
+    if follow:
+        state = jobs.state(job, address)
+        print_note(f"{job} {state.lower()}")
+        raise typer.Exit(0 if state == "SUCCEEDED" else 1)
+
+
+@of_jobs()
+def stop(job: JobArgument, address: JobsOption) -> None:
+    """Stop a job of a cluster; what is committed stays, and submitting it again goes on from there."""
+    print_note(f"{job} {jobs.stop(job, address).lower()}")

@@ -1,0 +1,274 @@
+"""The command line: `es-service run | resume | fork | status | digest | list | evaluate | export | submit | jobs | logs
+| stop | bench | doctor`.
+
+Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by SIGINT or SIGTERM.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from es_service import api
+from es_service.cli.bench import bench
+from es_service.cli.commands import command
+from es_service.cli.jobs import job_commands
+from es_service.cli.options import (
+    AddressOption,
+    ConfigArgument,
+    EngineOption,
+    OutOption,
+    RunArgument,
+    SeedOption,
+    SetOption,
+    WorkersOption,
+    console,
+    errors,
+    overrides,
+    print_error,
+    print_note,
+)
+from es_service.cli.tables.catalogue import print_catalogue
+from es_service.cli.tables.overview import print_overview
+from es_service.cli.tables.progress import show_progress
+from es_service.cli.tables.status import follow_status, print_status, print_summary
+from es_service.config.resolution import config_warnings
+from es_service.config.tasks import TASKS, task_of
+from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError
+from es_service.loop.history import Row
+from es_service.protocol.machine import VERSION
+from es_service.store import digest
+from es_service.store.folder import holds_run
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(VERSION)
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Evolution strategies for neuro-evolution on hard-exploration control tasks."""
+
+
+@app.command()
+def run(
+    config: ConfigArgument,
+    set_: SetOption = None,
+    out: OutOption = None,
+    seed: SeedOption = None,
+    workers: WorkersOption = None,
+    engine: EngineOption = None,
+    address: AddressOption = None,
+    or_resume: Annotated[
+        bool, typer.Option("--or-resume", help="Go on with the run if --out holds it already.")
+    ] = False,
+) -> None:
+    """Start a run from a config file."""
+    wanted = overrides(set_, seed=seed, workers=workers, engine=engine, address=address)
+    if or_resume and out is None:
+        raise ConfigError("--or-resume needs --out: without it every run has a folder of its own")
+    begun = or_resume and out is not None and holds_run(out)
+    loaded = api.load_config(config, wanted, new=not begun)
+    for warning in config_warnings(loaded, task_of(loaded)):
+        print_note(f"note: {warning}")
+    folder = out if out is not None else api.default_folder(loaded)
+    _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder))
+
+
+@app.command()
+def resume(
+    folder: RunArgument,
+    set_: SetOption = None,
+    workers: WorkersOption = None,
+    engine: EngineOption = None,
+    address: AddressOption = None,
+) -> None:
+    """Go on with a run; only budget, engine, workers and time limits may change."""
+    wanted = overrides(set_, workers=workers, engine=engine, address=address)
+    _session(folder, partial(api.resume, folder, wanted))
+
+
+@app.command()
+def fork(
+    parent: RunArgument,
+    generation: Annotated[
+        int | None, typer.Option("--generation", help="One of the last two; default: newest.")
+    ] = None,
+    set_: SetOption = None,
+    out: OutOption = None,
+    workers: WorkersOption = None,
+    engine: EngineOption = None,
+    address: AddressOption = None,
+) -> None:
+    """Start a new run from another run's state, with changed settings."""
+    wanted = overrides(set_, workers=workers, engine=engine, address=address)
+    folder = out if out is not None else api.default_folder(api.fork_config(parent, wanted))
+    _session(folder, partial(api.fork, parent, wanted, generation=generation, out=folder))
+
+
+@app.command()
+def status(
+    folders: Annotated[list[Path], typer.Argument(help="Folders of runs.", show_default=False)],
+    follow: Annotated[bool, typer.Option("--follow", help="Keep watching one run until its driver ends.")] = False,
+) -> None:
+    """Show where a run stands, also while it is being written; of several runs, a line each."""
+    if follow and len(folders) > 1:
+        raise ConfigError(f"--follow: watches one run, got {len(folders)} folders; name one, or leave --follow out")
+    if len(folders) > 1:
+        raise typer.Exit(0 if print_overview(console, folders) else 1)
+    run = api.open_run(folders[0])
+    if follow:
+        follow_status(console, run)
+    else:
+        print_status(console, run)
+
+
+@app.command(name="digest")
+def digest_(
+    folder: RunArgument,
+    parts: Annotated[bool, typer.Option("--parts", help="One line per part of the state.")] = False,
+) -> None:
+    """Print the SHA-256 over everything deterministic in a run, after checking all of it."""
+    found, mixed = digest.checked_parts(folder)
+    if parts:
+        for name, value in found.items():
+            print(f"{value}  {name}")
+    print(f"{digest.digest_of(found)}{'  mixed' if mixed else ''}")
+
+
+@app.command(name="list")
+def list_() -> None:
+    """Show tasks, algorithms and presets."""
+    print_catalogue(console, TASKS)
+
+
+@app.command()
+def evaluate(
+    folder: RunArgument,
+    best: Annotated[bool, typer.Option("--best", help="The best centre; so too if nothing is named.")] = False,
+    centre: Annotated[bool, typer.Option("--centre", help="The newest centre.")] = False,
+    cell: Annotated[
+        list[str] | None, typer.Option("--cell", metavar="I,J", help="A cell's elite; may be given several times.")
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="Every elite of the map.")] = False,
+    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Fresh episodes of each.")] = 100,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Which fresh episodes.")] = 0,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Also write the rows to this CSV file.")] = None,
+) -> None:
+    """Run fresh episodes of what a run has found, beside what it believed of it."""
+    from es_service.cli.tables.evaluations import csv_file, print_evaluations
+    from es_service.runs import evaluation
+
+    if every and cell:
+        raise ConfigError("--all has every cell already; give --all or --cell")
+    found = api.open_run(folder)
+    chosen = evaluation.candidates(
+        found,
+        best=best or not (centre or cell or every),
+        centre=centre,
+        cells=list(dict.fromkeys(_place(text) for text in cell or ())),
+        every=every,
+    )
+    with csv_file(out, print_note) as write:
+        results = evaluation.evaluate(found, chosen, episodes, workers, seed)
+        print_evaluations(console, found, results, write, every=every)
+
+
+@app.command()
+def export(
+    folder: RunArgument,
+    to: Annotated[str, typer.Option("--to", help="csv, parquet, npz or ribs.", show_default=False)],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write into; default: RUN/export.")] = None,
+) -> None:
+    """Write history, novelty archive and map as tables, or policies as arrays."""
+    from es_service.runs.export import export as write
+
+    for file in write(api.open_run(folder), to, out if out is not None else folder / "export"):
+        print(file)
+
+
+app.add_typer(job_commands)
+app.add_typer(bench, name="bench")
+
+
+@app.command()
+def doctor() -> None:
+    """Check that this machine can run, and show what results depend on."""
+    from es_service.cli.doctor import examine
+
+    raise typer.Exit(0 if examine(console) else 1)
+
+
+def main() -> None:
+    """Run the command; turn errors into one readable message and an exit code. `__main__` is the way in."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a ± is no reason to fail where there is only ASCII
+    try:
+        app()
+    except Interrupted:
+        raise
+    except (ConfigError, NotInRunError) as error:
+        print_error(error)
+        sys.exit(2)
+    except ServiceError as error:
+        print_error(error)
+        sys.exit(1)
+    except MemoryError as error:
+        print_error(f"not enough memory: {error}. A smaller policy.hidden or search.pairs needs less.")
+        sys.exit(1)
+
+
+def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
+    """Show a run while it works, and at its end what came of it. It goes on where nobody reads that any more."""
+    began = False
+
+    def tell(show: Callable[[Any], None], what: Row | str) -> None:
+        try:
+            show(what)
+        except SystemExit:  # what rich makes of a broken pipe; from then on it prints nothing
+            print_note(f"nobody reads the output any more; the run goes on: {command('status', folder, '--follow')}")
+
+    def tell_generation(show: Callable[[Row], None], row: Row) -> None:
+        nonlocal began
+        began = True  # whatever has become of the folder's name since
+        tell(show, row)
+
+    try:
+        with show_progress(console, errors, str(folder)) as (show, note):
+            outcome = work(on_generation=partial(tell_generation, show), on_notice=partial(tell, note))
+    except Interrupted:
+        if began or holds_run(folder):
+            print_note(f"interrupted; every finished generation is saved. Go on with: {command('resume', folder)}")
+        else:
+            print_note("interrupted before the run began; nothing was written")
+        raise
+    with contextlib.suppress(SystemExit):
+        print_summary(console, outcome.run, outcome.reason)
+
+
+def _place(text: str) -> tuple[int, ...]:
+    """A cell as it is typed: 3,17."""
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--cell {text}: must be whole numbers with commas between them, such as 3,17") from None

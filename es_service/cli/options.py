@@ -1,0 +1,63 @@
+"""What the commands of the command line share: options, what they stand for in a config, how notes are printed."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from es_service.cli.commands import assignments, error_message
+from es_service.config.compute import ENGINE_IMPLIES
+from es_service.errors import ServiceError
+
+console = Console()
+errors = Console(stderr=True)
+
+ConfigArgument = Annotated[Path, typer.Argument(help="YAML config; see configs/.", show_default=False)]
+RunArgument = Annotated[Path, typer.Argument(help="Folder of a run.", show_default=False)]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one key, e.g. search.sigma=0.05.")
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the new run; default: a name under runs/.")]
+SeedOption = Annotated[int | None, typer.Option("--seed", help="Seed of all random numbers.")]
+WorkersOption = Annotated[int | None, typer.Option("--workers", help="Worker processes; default: as configured.")]
+EngineOption = Annotated[str | None, typer.Option("--engine", help="What runs the workers: inline or ray.")]
+AddressOption = Annotated[
+    str | None, typer.Option("--address", help="Ray cluster to join: HOST:PORT, or auto. Implies --engine ray.")
+]
+
+
+def overrides(
+    set_: list[str] | None,
+    *,
+    seed: int | None = None,
+    workers: int | None = None,
+    engine: str | None = None,
+    address: str | None = None,
+) -> list[str]:
+    """What options imply, then `--set` values, then the keys that options stand for; later ones win.
+
+    So what a file, or a run's record, says of a cluster is moot, and a `--set` that contradicts the options is refused.
+    """
+    if address is not None:  # a cluster to join is a Ray cluster
+        implied = ENGINE_IMPLIES["ray"] | ({} if engine else {"compute.engine": "ray"})
+    else:
+        implied = ENGINE_IMPLIES.get(engine or "", {})
+    named = {"seed": seed, "compute.workers": workers, "compute.engine": engine, "compute.address": address}
+    options = {key: value for key, value in named.items() if value is not None}
+    return [*assignments(implied), *(set_ or []), *assignments(options)]
+
+
+def print_note(message: str, style: str | None = None) -> None:
+    """A line for the user that is no result; nothing where nobody reads it, of which rich makes an exit."""
+    with contextlib.suppress(SystemExit):
+        errors.print(message, style=style, highlight=False, markup=False, soft_wrap=True)
+
+
+def print_error(error: ServiceError | str) -> None:
+    """What has gone wrong, and what to do."""
+    message = error_message(error) if isinstance(error, ServiceError) else error
+    print_note(f"error: {message}", style="red")

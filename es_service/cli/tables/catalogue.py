@@ -1,0 +1,61 @@
+"""What there is to choose from: tasks, algorithms, presets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from es_service.config.presets import PRESETS, preset_table
+from es_service.config.yaml_text import show
+from es_service.protocol.messages import TaskSpec
+from es_service.search.algorithms import ALGORITHMS
+
+
+def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> None:
+    """Tables of tasks, algorithms, and of the keys on which presets differ."""
+    tasks = _table("tasks (task.environment)")
+    for task in known_tasks.values():
+        tasks.add_row(task.name, _about(task))
+    tasks.add_row("brax:NAME", "any environment of the installed Brax")
+    tasks.add_row("module:Class", "one of your own; the README says what it has to have")
+    console.print(tasks)
+
+    algorithms = _table("algorithms (search.algorithm)")
+    for name, factory in ALGORITHMS.items():
+        algorithms.add_row(name, (factory.__doc__ or "").strip().splitlines()[0])
+    algorithms.add_row("module:function", "One of your own; es_service/search/algorithms/own.py says what it gives.")
+    console.print(algorithms)
+
+    presets = Table(title="presets (search.preset): the keys on which they differ", title_justify="left")
+    presets.add_column("key")
+    for name in PRESETS:
+        presets.add_column(name)
+    for row in preset_table():
+        presets.add_row(row.key, *(_value(getattr(row, name)) for name in PRESETS))
+    console.print(presets)
+
+
+def _table(title: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    table.add_column("name", no_wrap=True)
+    table.add_column("what it is")
+    return table
+
+
+def _about(task: TaskSpec) -> str:
+    bounds = zip(task.descriptor_names, task.descriptor_bounds, strict=True)
+    lines = [
+        task.summary,
+        f"observation {task.observation_size}, action {task.action_size}, steps {task.episode_steps}",
+        "descriptor: " + ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in bounds),
+        *(f"option {name}: {' | '.join(values)}" for name, values in task.options.items()),
+    ]
+    return escape("\n".join(lines))
+
+
+def _value(value: object) -> str:
+    """As one would type it in a config."""
+    return f"{value:g}" if isinstance(value, float) else show(value)

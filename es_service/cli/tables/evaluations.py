@@ -1,0 +1,127 @@
+"""What `es-service evaluate` prints: stored and fresh values side by side."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from es_service.errors import ConfigError, StoreError
+from es_service.runs.evaluation import Fresh
+from es_service.runs.view import Run
+
+Write = Callable[[Mapping[str, Any]], None]
+
+
+@contextlib.contextmanager
+def csv_file(path: Path | None, note: Callable[[str], None]) -> Iterator[Write]:
+    """What to call with each row of a table, which is at `path` once all of them are there; None for none.
+
+    Until then they are in a file beside it, and what was at `path` stays. If something ends this early they are left
+    there, which `note` is told.
+
+    Raises ConfigError for a name without .csv, so that nothing else is ever overwritten, StoreError if it cannot be
+    written.
+    """
+    if path is None:
+        yield lambda row: None
+        return
+    if path.suffix != ".csv":
+        raise ConfigError(f"--out {path}: must end in .csv")
+    new, is_empty = path.with_name(f"{path.name}.new"), True
+    with _explained(path):
+        if path.is_dir():
+            raise ConfigError(f"--out {path}: is a folder; must be a file")
+        file = new.open("w", newline="")
+
+    def write(row: Mapping[str, Any]) -> None:
+        nonlocal is_empty
+        writer = csv.DictWriter(file, list(row), lineterminator="\n")
+        with _explained(path):
+            if is_empty:
+                writer.writeheader()
+            writer.writerow(row)
+            file.flush()
+        is_empty = False
+
+    try:
+        yield write
+        with _explained(path):
+            file.close()
+            os.replace(new, path)
+    except BaseException:
+        with contextlib.suppress(OSError):  # on a full disk there is still something to write
+            file.close()
+        if is_empty:
+            new.unlink(missing_ok=True)
+        else:
+            note(f"what was evaluated until then is in {new}")
+        raise
+
+
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(f"cannot write {path}: {error.strerror}; choose another --out") from error
+
+
+def print_evaluations(console: Console, run: Run, results: Iterable[Fresh], write: Write, *, every: bool) -> None:
+    """A line per policy as it comes, its row to `write`; then, if `every` elite was asked, what it says of the map."""
+    names = run.descriptor_names
+    found: list[Fresh] = []
+    _line(console, f"{'policy':<10} {'from':>7} {'stored':>10} {'fresh':>10} {'± s.e.':>8}  where (± spread)")
+    for fresh in results:
+        found.append(fresh)
+        row = _row(fresh, names)
+        write(row)
+        where = ", ".join(f"{name} {row[name]:.3g} ± {row[f'{name}_std']:.2g}" for name in names)
+        one = fresh.candidate
+        _line(
+            console,
+            f"{one.name:<10} {one.generation:>7} {one.stored_fitness:>10.2f} {fresh.mean:>10.2f} "
+            f"{fresh.standard_error:>8.2f}  {where}",
+        )
+    if every:
+        _line(console, _about_elites(run, [fresh for fresh in found if fresh.candidate.cell is not None]))
+
+
+def _row(fresh: Fresh, names: list[str]) -> dict[str, Any]:
+    one = fresh.candidate
+    return {
+        "policy": one.name,
+        "generation": one.generation,
+        "episodes": fresh.fitness_E.size,
+        "stored_fitness": one.stored_fitness,
+        "fresh_fitness": fresh.mean,
+        "fresh_standard_error": fresh.standard_error,
+        **{name: float(value) for name, value in zip(names, fresh.descriptor, strict=True)},
+        **{f"{name}_std": float(value) for name, value in zip(names, fresh.descriptor_std, strict=True)},
+    }
+
+
+def _about_elites(run: Run, elites: list[Fresh]) -> str:
+    """Stored and fresh QD-score, and how many elites still end in their cells."""
+    offset = run.constants["map.qd_offset"]
+    stayed = sum(fresh.cell == fresh.candidate.cell for fresh in elites)
+    best: dict[int, float] = {}
+    for fresh in elites:
+        if fresh.cell is not None and math.isfinite(fresh.mean):
+            best[fresh.cell] = max(best.get(fresh.cell, -math.inf), fresh.mean)
+    stored = math.fsum(fresh.candidate.stored_fitness - offset for fresh in elites)
+    again = math.fsum(fitness - offset for fitness in best.values())
+    return (
+        f"{len(elites)} elites: {stayed} still end in their cell on average; put into a new map by their fresh values "
+        f"they fill {len(best)} cells.\nQD-score (offset {offset:g}): {stored:,.0f} stored, {again:,.0f} fresh"
+    )
+
+
+def _line(console: Console, text: str) -> None:
+    console.print(text, highlight=False, markup=False, soft_wrap=True)

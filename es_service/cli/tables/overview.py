@@ -1,0 +1,52 @@
+"""Several runs side by side, a line each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from es_service.cli.tables.progress import short
+from es_service.errors import ServiceError
+from es_service.runs.standing import Standing, look, state
+from es_service.runs.view import open_run
+
+_COLUMNS = ("run", "algorithm", "task", "seed", "generation", "env steps", "best", "cells", "state")
+
+
+def print_overview(console: Console, folders: Sequence[Path]) -> bool:
+    """A line for each run; where one cannot be read, why. Whether all could be."""
+    rows, problems = [], 0
+    for folder in folders:
+        try:
+            rows.append(_row(look(open_run(folder))))
+        except ServiceError as error:
+            rows.append((str(folder), *["-"] * (len(_COLUMNS) - 2), f"error: {' '.join(str(error).split())}"))
+            problems += 1
+    widths = [max(map(len, column)) for column in zip(_COLUMNS, *rows, strict=True)]
+    for row in (_COLUMNS, *rows):
+        line = "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+        console.print(line, highlight=False, markup=False, soft_wrap=True)  # folders are there to be copied
+    return not problems
+
+
+def _row(standing: Standing) -> tuple[str, ...]:
+    constants, limits, row = standing.run.constants, standing.limits, standing.row
+    who = (
+        str(standing.run.folder),
+        constants["search.algorithm"],
+        constants["task.environment"],
+        str(constants["seed"]),
+    )
+    if row is None:
+        return (*who, *["-"] * (len(_COLUMNS) - len(who) - 1), state(standing))
+    generations, steps = limits.get("generations"), limits.get("env_steps")
+    return (
+        *who,
+        f"{row['generation']:,}" + (f" of {generations:,}" if generations else ""),
+        short(row["env_steps"]) + (f" of {short(steps)}" if steps else ""),
+        f"{row['best_fitness']:.2f}",
+        f"{row['map_cells']:,}" if "map_cells" in row else "-",
+        state(standing),
+    )

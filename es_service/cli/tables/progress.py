@@ -1,0 +1,113 @@
+"""What a run shows while it runs: a live table on a terminal, one plain line a second elsewhere (TERM=dumb, too)."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from es_service.loop.history import Row
+
+ShowRow = Callable[[Row], None]
+ShowNotice = Callable[[str], None]
+TABLE_ROWS = 12
+ROWS_AROUND = 9
+"""Lines of a screen that the table's own frame, its title and the line below need."""
+RATE_WINDOW = 20
+"""Generations over which steps per second are averaged for display."""
+_PARTS = ("rollout", "gradient", "evaluation", "driver", "store")
+
+
+@contextmanager
+def show_progress(console: Console, errors: Console, title: str) -> Iterator[tuple[ShowRow, ShowNotice]]:
+    """Yield two functions: one to call with every history row, one with every notice."""
+    if not console.is_terminal or console.is_dumb_terminal:  # which cannot move its cursor up a table
+        yield _plain_lines(console), partial(_print_notice, errors)
+        return
+    recent: deque[Row] = deque(maxlen=RATE_WINDOW)
+    with Live(Text(f"{title}: starting workers"), console=console, refresh_per_second=5) as live:
+
+        def show(row: Row) -> None:
+            recent.append(row)
+            live.update(live_table(title, recent, console.width, console.height))
+
+        yield show, partial(_print_notice, live.console)  # above the table
+
+
+def _print_notice(console: Console, notice: str) -> None:
+    console.print(f"note: {notice}", highlight=False, markup=False, soft_wrap=True)
+
+
+def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group:
+    """The last generations, and where their time went; fewer columns and rows on a small screen."""
+    columns: dict[str, Callable[[Row], str]] = {
+        "generation": lambda row: str(row["generation"]),
+        "centre fitness": lambda row: f"{row['centre_fitness_mean']:.2f} ± {row['centre_fitness_std']:.2f}",
+        "best so far": lambda row: f"{row['best_fitness']:.2f}",
+        "env steps": lambda row: short(row["env_steps"]),
+        "steps/s": lambda row: short(row["steps_per_second"]),
+        "population median": lambda row: _number(row["population_fitness_median"]),
+        "cells": lambda row: str(row.get("map_cells", "-")),
+        "invalid": lambda row: str(row["invalid_members"]),
+    }
+    shown = [name for name, least in zip(columns, (0, 0, 45, 60, 75, 100, 108, 118), strict=True) if width >= least]
+    table = Table(title=title, title_justify="left", header_style="bold")
+    for name in shown:
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in list(recent)[-max(1, min(TABLE_ROWS, height - ROWS_AROUND)) :]:
+        table.add_row(*(columns[name](row) for name in shown))
+    return Group(table, Text(time_by_part(recent)))
+
+
+def time_by_part(rows: deque[Row] | list[Row]) -> str:
+    """Shares of the time of some generations: "time: rollout 81 %, gradient 6 %, ..."; faults if there were any."""
+    seconds = {part: sum(row[f"seconds_{part}"] or 0.0 for row in rows) for part in _PARTS}
+    whole = sum(seconds.values()) or 1.0
+    per_generation = 1000.0 * whole / len(rows)
+    text = f"{per_generation:.1f} ms a generation: " + ", ".join(
+        f"{part} {100.0 * value / whole:.0f} %" for part, value in seconds.items()
+    )
+    lost = sum(row["lost_workers"] or 0 for row in rows)
+    return text + (f"; workers replaced: {lost}" if lost else "")
+
+
+def plain_line(row: Row) -> str:
+    """One generation as one line."""
+    return (
+        f"generation {row['generation']}  centre {row['centre_fitness_mean']:.2f}  best {row['best_fitness']:.2f}  "
+        f"env steps {row['env_steps']:,}  steps/s {row['steps_per_second']:,.0f}"
+    )
+
+
+def _plain_lines(console: Console) -> ShowRow:
+    last_s, lost = float("-inf"), 0
+
+    def show(row: Row) -> None:
+        nonlocal last_s, lost
+        lost += row["lost_workers"]
+        now = time.monotonic()
+        if now - last_s >= 1.0:
+            faults = f"  workers replaced {lost}" if lost else ""
+            console.print(plain_line(row) + faults, highlight=False, soft_wrap=True)
+            last_s, lost = now, 0
+
+    return show
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def short(value: float) -> str:
+    """A count with three digits: 850, 12.3 k, 4.56 M."""
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if value >= size:
+            return f"{value / size:.3g} {unit}"
+    return f"{value:.0f}"

@@ -1,0 +1,105 @@
+"""Where a run stands, and what to do with it next."""
+
+from __future__ import annotations
+
+import time
+
+from rich.console import Console
+
+from es_service.cli.commands import command, settings, way_command
+from es_service.cli.tables.progress import plain_line
+from es_service.runs.standing import Standing, look, more, state, way_on
+from es_service.runs.view import Run
+from es_service.store.reader import read_totals
+
+FOLLOW_INTERVAL_S = 1.0
+
+
+def print_status(console: Console, run: Run) -> None:
+    """Settings, progress, best result, whether it is running or over."""
+    standing = look(run)
+    constants, parent = run.constants, run.meta.parent
+    fields = {
+        "run": str(run.folder),
+        "task": f"{constants['task.environment']}, {constants['task.episode_steps']} steps an episode",
+        "search": f"{constants['search.algorithm']}, {constants['search.pairs']} pairs, seed {constants['seed']}",
+    }
+    if parent:
+        fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
+    fields["state"] = (
+        state(standing) if standing.driver else f"{state(standing)}; go on with: {way_command(way_on(standing))}"
+    )
+    _print_fields(console, fields | _progress(standing))
+
+
+def follow_status(console: Console, run: Run) -> None:
+    """Print a line for the newest generation, at most one a second, until no driver is running."""
+    next_generation = 0
+    while True:
+        standing = look(run)
+        if standing.row and standing.row["generation"] >= next_generation:
+            next_generation = standing.row["generation"] + 1
+            console.print(plain_line(standing.row), highlight=False, soft_wrap=True)
+        if not standing.driver:
+            way = way_command(way_on(standing))
+            _print_line(console, f"no driver is running: {state(standing)}; go on with: {way}")
+            return
+        time.sleep(FOLLOW_INTERVAL_S)
+
+
+def print_summary(console: Console, run: Run, reason: str) -> None:
+    """What a session ends with: the result, the folder, the next commands."""
+    standing, folder = look(run), run.folder
+    doubled = {"search.sigma": float(f"{run.constants['search.sigma'] * 2:g}")}
+    _print_line(console, f"\nDone: {reason}.")
+    _print_fields(console, _progress(standing))
+    _print_line(console, f"\nThe run is in {folder}. Next:")
+    for words in (
+        ("status", folder),
+        ("evaluate", folder),
+        ("digest", folder),
+        ("resume", folder, *settings(more(standing))),
+        ("fork", folder, *settings(doubled | more(standing))),
+    ):
+        _print_line(console, f"  {command(*words)}")
+
+
+def _progress(standing: Standing) -> dict[str, str]:
+    last, limits = standing.row, standing.limits
+    if last is None:
+        return {"generation": "none is finished yet"}
+    goal = {}
+    if "goal_distance" in last:
+        goal["goal distance"] = f"{last['goal_distance']:.3f} at the end, {last['goal_distance_min']:.3f} at its least"
+    filled = {}
+    if "map_cells" in last:
+        filled["map"] = f"{last['map_cells']:,} cells, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
+    rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
+    lost, retries = read_totals(standing.run.folder, ("lost_workers", "retries"))
+    faults = {}
+    if lost or retries:
+        faults["faults survived"] = f"{lost} workers replaced, {retries} chunks handed out again"
+    of = {key: f" of {limit:,}" for key, limit in limits.items()}
+    target = f" (target: {limits['target_fitness']:g})" if "target_fitness" in limits else ""
+    return {
+        "generation": f"{last['generation']:,}{of.get('generations', '')}",
+        "best fitness": f"{last['best_fitness']:.2f}{target}",
+        "centre fitness": f"{last['centre_fitness_mean']:.2f} ± {last['centre_fitness_std']:.2f}",
+        **goal,
+        **filled,
+        "novelty archive": f"{last['archive_size']:,} centres",
+        "weight of fitness": f"{last['fitness_weight']:g} (novelty: {1.0 - last['fitness_weight']:g})",
+        "environment steps": f"{last['env_steps']:,}{of.get('env_steps', '')} in {last['episodes']:,} episodes",
+        "time": f"{last['wall_clock_s']:.1f}{of.get('wall_clock_s', '')} s, {rate:,.0f} steps/s overall",
+        **faults,
+    }
+
+
+def _print_fields(console: Console, fields: dict[str, str]) -> None:
+    for name, value in fields.items():
+        _print_line(console, f"{name:<18} {value}")
+
+
+def _print_line(console: Console, text: str) -> None:
+    """As it is: folders and commands are there to be copied, so nothing is wrapped or cut."""
+    console.print(text, highlight=False, markup=False, soft_wrap=True)

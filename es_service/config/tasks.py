@@ -1,0 +1,98 @@
+"""Tasks by name, as the driver needs them: ours from a table, `brax:NAME` and `package.module:Class` by asking.
+
+Asking starts a process, since it imports JAX and Brax; each name is asked for once.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import cache
+
+from es_service.config.model import RunConfig
+from es_service.errors import ConfigError
+from es_service.protocol.messages import TaskSpec, with_options
+from es_service.protocol.process_environment import child_environment
+from workers import environments
+from workers.simd.target import NoVectorsError, host_target
+
+DESCRIBE_S = 120.0
+"""Longest wait for a description; the first import of Brax on a slow disk takes a while."""
+
+
+class Tasks(Mapping[str, TaskSpec]):
+    """Iterates over our own tasks; looks up any."""
+
+    def __getitem__(self, name: str) -> TaskSpec:
+        """Raises KeyError for a plain name that is none of ours, ConfigError for another that cannot be had."""
+        return replace(_described(name) if ":" in name else environments.SHIPPED[name], no_vectors=_no_vectors())
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(environments.SHIPPED)
+
+    def __len__(self) -> int:
+        return len(environments.SHIPPED)
+
+
+TASKS = Tasks()
+"""Of the command line and the Python interface; the workers' table has ours alone."""
+
+
+def task_of(config: RunConfig) -> TaskSpec:
+    """The task of a run, with the descriptor that its options choose."""
+    return with_options(TASKS[config.task.environment], config.task.options)
+
+
+@cache
+def _no_vectors() -> str:
+    """Why this processor cannot run code for vectors; empty if it can."""
+    try:
+        host_target()
+    except NoVectorsError as error:
+        return str(error)
+    return ""
+
+
+@cache
+def _described(name: str) -> TaskSpec:
+    try:
+        process = subprocess.run(
+            [sys.executable, "-m", "workers.describe", name],
+            env=child_environment(),
+            capture_output=True,
+            text=True,
+            timeout=DESCRIBE_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise ConfigError(f"{name} could not be described in {DESCRIBE_S:g} s") from None
+    lines = process.stdout.splitlines()
+    if process.returncode or not lines:
+        raise ConfigError(f"{name} raised while it was imported:\n{process.stderr.strip()}")
+    answer = json.loads(lines[-1])
+    if "problem" in answer:
+        raise ConfigError(answer["problem"])
+    return _task_spec(answer["task"])
+
+
+def _task_spec(fields: dict) -> TaskSpec:
+    """JSON has lists where a TaskSpec has tuples."""
+
+    def bounds(pairs: list) -> tuple[tuple[float, float], ...]:
+        return tuple((float(low), float(high)) for low, high in pairs)
+
+    return TaskSpec(
+        **fields
+        | {
+            "descriptor_names": tuple(fields["descriptor_names"]),
+            "descriptor_bounds": bounds(fields["descriptor_bounds"]),
+            "walls": None if fields["walls"] is None else tuple(bounds(wall) for wall in fields["walls"]),
+            "options": {name: tuple(values) for name, values in fields["options"].items()},
+            "descriptors": {
+                name: (tuple(names), bounds(pairs)) for name, (names, pairs) in fields["descriptors"].items()
+            },
+        }
+    )

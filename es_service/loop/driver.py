@@ -1,0 +1,322 @@
+"""The loop everybody reads: plan, roll out, weigh, step, evaluate, keep.
+
+It knows no Ray, no JAX and no files; its collaborators are arguments. Whatever happens, the store holds the last
+finished generation, and the next one depends only on (config, seed, state).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.config.model import BudgetConfig, RunConfig
+from es_service.loop import budget as budgets
+from es_service.loop.clock import Clock
+from es_service.loop.generation import (
+    estimate_gradient,
+    evaluate_centre,
+    evaluate_population,
+    invalidate,
+    judge,
+    require_finite,
+)
+from es_service.loop.history import (
+    HistoryRow,
+    evaluation_columns,
+    fault_columns,
+    population_columns,
+    search_columns,
+    step_columns,
+)
+from es_service.loop.state import Arrays, Best, RunState, state_from_parts, state_parts, statistics_in_force
+from es_service.protocol.messages import (
+    Centre,
+    DispatchCounts,
+    EpisodesResult,
+    Evaluator,
+    FloatArray,
+    Moments,
+    TaskSpec,
+)
+from es_service.search.algorithms.base import Algorithm, Judgement, Member, SearchState
+from es_service.search.algorithms.me_es import restarted
+from es_service.search.algorithms.steps import first_state
+from es_service.search.maps.behaviour_map import (
+    ELITE_PREFIX,
+    BehaviourMap,
+    Elite,
+    elite_from_arrays,
+    elite_part,
+    empty_map,
+    make_elite,
+    map_columns,
+)
+from es_service.search.maps.geometry import make_geometry, reachable_cells
+from es_service.search.novelty import novelty
+from es_service.search.observation_statistics import merge_moments
+
+Reachable = NDArray[np.bool_] | None
+"""Which cells of the map can be reached, [cells]; None where the task does not know."""
+
+
+class Stored(Protocol):
+    """What a run store has of earlier sessions."""
+
+    @property
+    def generation(self) -> int | None:
+        """Newest committed generation; None before the first."""
+        ...
+
+    def load(self, without: str | None = None) -> Mapping[str, Arrays]: ...
+    def last_history(self) -> Mapping[str, Any] | None: ...
+
+
+class Store(Protocol):
+    """What the loop needs of a run store."""
+
+    def part(self, name: str) -> Arrays: ...
+    def commit(self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow) -> None: ...
+
+
+@dataclass(frozen=True)
+class Search:
+    """What a run is about, apart from where it runs: task, settings, method, starting point."""
+
+    config: RunConfig
+    algorithm: Algorithm
+    initial: Callable[[], tuple[Sequence[FloatArray], Moments]]
+    """First centre of each member, and the observation statistics they come with (none counted unless they are
+    another run's)."""
+    task: TaskSpec
+
+
+def run(
+    search: Search,
+    evaluator: Evaluator,
+    store: Store,
+    state: RunState | None,
+    report: Callable[[HistoryRow], None],
+) -> tuple[RunState, str]:
+    """Run generations until the budget is spent.
+
+    Args:
+        state: the newest in `store`, to go on from; None to begin, with a store that has none.
+        report: called with each history row after it is safe in the store.
+
+    Returns:
+        The last state and the reason for ending, in words.
+
+    Raises:
+        EvaluationError, StoreError: nothing committed is lost. Interrupted: a signal asked to stop.
+    """
+    budget = search.config.budget
+    clock = Clock(0.0)
+    if state is None:
+        map_ = empty_map(make_geometry(search.config.map)) if search.config.map.enabled else None
+        reachable = _reachable(search, map_)
+        state = _keep(store, report, clock, None, *_first_generation(search, evaluator, clock, map_, reachable))
+    else:
+        reachable = _reachable(search, state.search.map)
+        clock = Clock(state.wall_clock_s)
+    while (reason := spent(budget, state)) is None:
+        state = _keep(store, report, clock, state, *_next_generation(search, evaluator, store, clock, state, reachable))
+    return state, reason
+
+
+def stored_state(store: Stored, task: TaskSpec) -> RunState | None:
+    """The newest state in the store, without the elites' policies; None before the first generation."""
+    if store.generation is None:
+        return None
+    seconds = float((store.last_history() or {}).get("wall_clock_s") or 0.0)
+    parts = store.load(without=ELITE_PREFIX)
+    return state_from_parts(parts, store.generation, seconds, len(task.descriptor_names))
+
+
+def spent(budget: BudgetConfig, state: RunState) -> str | None:
+    """Why the run is over, or None if it is not."""
+    reached = {
+        "generation": state.generation,
+        "env_steps": state.env_steps,
+        "wall_clock_s": state.wall_clock_s,
+        "best_fitness": state.best.fitness,
+    }
+    return next(iter(budgets.spent(budgets.limits_of(budget), reached).values()), None)
+
+
+def _first_generation(
+    search: Search, evaluator: Evaluator, clock: Clock, map_: BehaviourMap | None, reachable: Reachable
+) -> tuple[RunState, HistoryRow]:
+    """Generation 0: the initial centres, evaluated. The history shows the fittest of them."""
+    centres, observations = search.initial()
+    moved = first_state(centres, len(search.task.descriptor_names), search.algorithm.fitness_weight, map_)
+    points = [_centre(search, 0, centre_D, observations) for centre_D in centres]
+    episodes = search.config.search.evaluation_episodes
+    evaluations = [evaluate_centre(evaluator, point, episodes, index) for index, point in enumerate(points)]
+    clock.lap("seconds_evaluation")
+    fittest = 0
+    best = Best(0, -math.inf, centres[0], points[0].observation_mean_O, points[0].observation_std_O)
+    elites: dict[int, Elite] = {}
+    for member, (point, evaluation) in enumerate(zip(points, evaluations, strict=True)):
+        judgement = judge(0, member, evaluation)
+        moved = search.algorithm.absorb(moved, judgement)
+        elites |= _entered(moved, judgement, point, evaluation)
+        better = _better(best, point, judgement)
+        best, fittest = better, fittest if better is best else member
+    state = RunState(
+        generation=0,
+        search=moved,
+        observations=observations,
+        best=best,
+        env_steps=sum(map(_steps, evaluations)),
+        episodes=sum(evaluation.fitness.size for evaluation in evaluations),
+        wall_clock_s=clock.total(),
+        elites=elites,
+    )
+    row: HistoryRow = {
+        **search_columns(fittest, search.algorithm.fitness_weight, None, moved.archive.size),
+        **_map_columns(search, reachable, moved, 0, fittest, None),
+        **step_columns(None, centres[fittest]),
+        **population_columns(None, 0),
+        **evaluation_columns(evaluations[fittest], search.task),
+        **fault_columns(evaluator.counts, since=DispatchCounts()),
+    }
+    return state, row
+
+
+def _next_generation(
+    search: Search, evaluator: Evaluator, store: Store, clock: Clock, state: RunState, reachable: Reachable
+) -> tuple[RunState, HistoryRow]:
+    """One generation: a pure function of (search, state, elites in the store) but for its timings."""
+    settings, sizes, algorithm = search.config.search, search.config.compute, search.algorithm
+    generation = state.generation + 1
+    counts = evaluator.counts
+
+    begun = state.search
+    start_cell = algorithm.start_cell(begun, generation)
+    if start_cell is not None:
+        elite = elite_from_arrays(store.part(elite_part(start_cell)))
+        begun = restarted(begun, start_cell, elite, own_statistics=settings.parent_statistics == "elite")
+    plan = algorithm.plan(begun, generation)
+    centre = _centre(search, generation, plan.centre_D, state.observations, begun.members[plan.member])
+    clock.lap("seconds_driver")
+    population, observed = evaluate_population(evaluator, centre, pairs=settings.pairs, chunk_pairs=sizes.chunk_pairs)
+    clock.lap("seconds_rollout")
+    population, invalid = invalidate(population, settings.max_invalid_fraction, generation)
+    weights_P = algorithm.weights(begun, plan, population)
+    clock.lap("seconds_driver")
+    gradient_D = estimate_gradient(evaluator, centre, weights_P, sizes.gradient_block_pairs)
+    clock.lap("seconds_gradient")
+    moved = algorithm.step(begun, plan, gradient_D)
+    new_centre_D = moved.members[plan.member].centre_D
+    require_finite(new_centre_D, settings.learning_rate, generation)
+    clock.lap("seconds_driver")
+    new_centre = replace(centre, parameters_D=new_centre_D)  # evaluated with the statistics of the generation's start
+    evaluation = evaluate_centre(evaluator, new_centre, settings.evaluation_episodes)
+    clock.lap("seconds_evaluation")
+    judgement = judge(generation, plan.member, evaluation, population)
+    learned = algorithm.absorb(moved, judgement)
+    nearest = search.config.novelty
+    centre_novelty = novelty(
+        moved.archive, judgement.descriptor_B, neighbours=nearest.neighbours, distance=nearest.distance
+    )
+
+    row: HistoryRow = {
+        **search_columns(plan.member, plan.fitness_weight, float(centre_novelty), learned.archive.size),
+        **_map_columns(search, reachable, learned, generation, plan.member, start_cell),
+        **step_columns(plan.centre_D, new_centre_D),
+        **population_columns(population, invalid),
+        **evaluation_columns(evaluation, search.task),
+        **fault_columns(evaluator.counts, since=counts),
+    }
+    state = RunState(
+        generation=generation,
+        search=learned,
+        observations=merge_moments(state.observations, observed),
+        best=_better(state.best, new_centre, judgement),
+        env_steps=state.env_steps + _steps(population) + _steps(evaluation),
+        episodes=state.episodes
+        + population.fitness.size * search.config.task.episodes_per_member
+        + evaluation.fitness.size,
+        wall_clock_s=clock.total(),
+        elites=_entered(learned, judgement, new_centre, evaluation),
+    )
+    return state, row
+
+
+def _keep(
+    store: Store,
+    report: Callable[[HistoryRow], None],
+    clock: Clock,
+    before: RunState | None,
+    state: RunState,
+    row: HistoryRow,
+) -> RunState:
+    """Commit a finished generation, then show it."""
+    clock.lap("seconds_driver")
+    seconds, laps = clock.finish_generation()
+    steps = state.env_steps - (before.env_steps if before else 0)
+    row = {
+        "generation": state.generation,
+        "env_steps": state.env_steps,
+        "episodes": state.episodes,
+        "best_fitness": state.best.fitness,
+        **row,
+        "wall_clock_s": state.wall_clock_s,
+        "steps_per_second": steps / seconds,
+        **laps,
+    }
+    store.commit(state.generation, state_parts(state, before), row)
+    clock.lap("seconds_store")
+    report(row)
+    return state
+
+
+def _centre(
+    search: Search, generation: int, centre_D: FloatArray, observations: Moments, member: Member | None = None
+) -> Centre:
+    """The point to send out, with the statistics in force."""
+    enabled = search.config.policy.observation_normalization
+    mean_O, std_O = statistics_in_force(observations, member, enabled)
+    return Centre(generation, centre_D, search.config.search.sigma, mean_O, std_O)
+
+
+def _entered(state: SearchState, judged: Judgement, centre: Centre, evaluation: EpisodesResult) -> dict[int, Elite]:
+    """The centre just evaluated as an elite, by its cell, if it entered the map. The map says so, not its member: a
+    search of the user's need not keep `Member.cell`."""
+    if state.map is None or (cell := state.map.cell_of(judged.generation, judged.member)) is None:
+        return {}
+    assert evaluation.trace_T_B is not None, "an evaluation has a trace"
+    return {cell: make_elite(centre, evaluation.trace_T_B)}
+
+
+def _reachable(search: Search, map_: BehaviourMap | None) -> Reachable:
+    return None if map_ is None else reachable_cells(map_.geometry, search.task)
+
+
+def _map_columns(
+    search: Search, reachable: Reachable, after: SearchState, generation: int, member: int, start_cell: int | None
+) -> HistoryRow:
+    if after.map is None:
+        return {}
+    return {
+        "start_cell": start_cell,
+        "cell": after.map.cell_of(generation, member),
+        **map_columns(after.map, search.config.map.qd_offset, reachable),
+    }
+
+
+def _better(best: Best, centre: Centre, judgement: Judgement) -> Best:
+    """The better of the best so far and a centre just evaluated; an invalid centre (not finite) is no improvement."""
+    if not judgement.valid or judgement.fitness <= best.fitness:
+        return best
+    mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
+    return Best(centre.generation, judgement.fitness, centre.parameters_D, mean_O, std_O)
+
+
+def _steps(result: EpisodesResult) -> int:
+    return int(result.steps.sum(dtype=np.int64))

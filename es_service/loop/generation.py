@@ -1,0 +1,162 @@
+"""The pieces of one generation: what to ask the workers for, and how their answers become one.
+
+Order never comes from arrival: results are taken by chunk id, and partial gradients are added in one fixed binary tree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.errors import EvaluationError, WayOut
+from es_service.protocol.messages import (
+    EVALUATION_EPISODES_PER_CHUNK,
+    Centre,
+    EpisodesResult,
+    EvaluationChunk,
+    Evaluator,
+    FloatArray,
+    GradientChunk,
+    GradientResult,
+    Moments,
+    TrainingChunk,
+)
+from es_service.search.algorithms.base import Judgement
+
+Result = TypeVar("Result", EpisodesResult, GradientResult)
+
+
+def evaluate_population(
+    evaluator: Evaluator, centre: Centre, *, pairs: int, chunk_pairs: int
+) -> tuple[EpisodesResult, list[Moments]]:
+    """Roll out all pairs around the centre: results with axes [P, S], and each chunk's observations in chunk order."""
+    chunks = [TrainingChunk(centre.generation, chunk_id) for chunk_id in range(pairs // chunk_pairs)]
+    results = _all_of(EpisodesResult, evaluator.evaluate(centre, chunks))
+    return _concatenate(results, pairs), [result.moments for result in results if result.moments is not None]
+
+
+def evaluate_centre(evaluator: Evaluator, centre: Centre, episodes: int, index: int = 0) -> EpisodesResult:
+    """Roll out the unperturbed centre: results with axis [E]. Episodes past the wanted number are discarded.
+
+    Args:
+        index: of this centre among those evaluated in the same generation; each has resets of its own.
+    """
+    count = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
+    chunks = [EvaluationChunk(centre.generation, chunk_id) for chunk_id in range(index * count, (index + 1) * count)]
+    results = evaluator.evaluate(centre, chunks)
+    return _concatenate(_all_of(EpisodesResult, results), episodes)
+
+
+def estimate_gradient(evaluator: Evaluator, centre: Centre, weights_P: FloatArray, block_pairs: int) -> FloatArray:
+    """(1 / pairs) * sum over pairs of weight * noise, in standard normal units; workers sum blocks of pairs."""
+    chunks = []
+    for chunk_id, first in enumerate(range(0, weights_P.size, block_pairs)):
+        block_P = weights_P[first : first + block_pairs]
+        padded_P = np.pad(block_P, (0, block_pairs - block_P.size))
+        chunks.append(GradientChunk(centre.generation, chunk_id, padded_P))
+    results = _all_of(GradientResult, evaluator.evaluate(centre, chunks))
+    return tree_sum([result.sum_D for result in results]) * np.float32(1.0 / weights_P.size)
+
+
+def tree_sum(blocks: Sequence[FloatArray]) -> FloatArray:
+    """Sum by adding neighbours level by level: ((0 + 1) + (2 + 3)) + ...; an odd one out moves up unchanged.
+
+    The tree is fixed by the number of blocks alone, so any node of it may be computed anywhere.
+    """
+    level = list(blocks)
+    while len(level) > 1:
+        pairs = [level[i] + level[i + 1] for i in range(0, len(level) - 1, 2)]
+        level = pairs + level[len(pairs) * 2 :]
+    return level[0]
+
+
+def valid_members(result: EpisodesResult) -> NDArray[np.bool_]:
+    """Which members (or episodes) have a finite fitness and descriptor; leading axes only."""
+    return np.isfinite(result.fitness) & np.isfinite(result.descriptor).all(axis=-1)
+
+
+def invalidate(population: EpisodesResult, max_invalid_fraction: float, generation: int) -> tuple[EpisodesResult, int]:
+    """Give every invalid member the fitness NaN, which ranks last: (population, number of invalid members).
+
+    Raises:
+        EvaluationError: more than `max_invalid_fraction` of the members are invalid.
+    """
+    valid_P_S = valid_members(population)
+    invalid = int(np.count_nonzero(~valid_P_S))
+    if invalid > max_invalid_fraction * valid_P_S.size:
+        raise EvaluationError(
+            f"generation {generation}: {invalid} of {valid_P_S.size} members returned a fitness or descriptor that is "
+            f"not finite, more than search.max_invalid_fraction ({max_invalid_fraction}) allows. Everything up to "
+            f"generation {generation - 1} is saved; a smaller search.sigma or search.learning_rate may help.",
+            field="search.max_invalid_fraction",
+            value=max_invalid_fraction,
+        )
+    fitness_P_S = np.where(valid_P_S, population.fitness, np.float32(np.nan))
+    return replace(population, fitness=fitness_P_S), invalid
+
+
+def require_finite(centre_D: FloatArray, learning_rate: float, generation: int) -> None:
+    """Raise an EvaluationError for a centre that an update has made infinite."""
+    if not np.isfinite(centre_D).all():
+        raise EvaluationError(
+            f"generation {generation}: the centre is not finite after its update with search.learning_rate = "
+            f"{learning_rate:g}, so it is not kept. Everything up to generation {generation - 1} is saved.",
+            field="search.learning_rate",
+            value=learning_rate,
+            ways_out=[
+                WayOut(
+                    "fork",
+                    "go on from there with a smaller learning rate",
+                    settings={"search.learning_rate": learning_rate / 10},
+                )
+            ],
+        )
+
+
+def judge(
+    generation: int, member: int, evaluation: EpisodesResult, population: EpisodesResult | None = None
+) -> Judgement:
+    """What a centre's evaluation episodes say of it, and the population that led to it, invalid fitness being NaN."""
+    return Judgement(
+        generation,
+        member,
+        bool(valid_members(evaluation).all()),
+        float(np.mean(evaluation.fitness, dtype=np.float64)),
+        evaluation.descriptor.astype(np.float64).mean(axis=0),
+        _highest(population.fitness) if population is not None else math.nan,
+    )
+
+
+def _highest(fitness: FloatArray) -> float:
+    """Of the finite values; NaN where there is none."""
+    finite = fitness[np.isfinite(fitness)]
+    return float(finite.max()) if finite.size else math.nan
+
+
+def _all_of(kind: type[Result], results: Sequence[object]) -> list[Result]:
+    """The same results, known to be of one kind."""
+    checked = [result for result in results if isinstance(result, kind)]
+    assert len(checked) == len(results), f"an evaluator answered with something else than {kind.__name__}"
+    return checked
+
+
+def _concatenate(results: Sequence[EpisodesResult], count: int) -> EpisodesResult:
+    """Join along the first axis and keep the first `count`; observation moments are left to the caller."""
+
+    def join(name: str) -> np.ndarray:
+        return np.concatenate([getattr(result, name) for result in results])[:count]
+
+    return EpisodesResult(
+        fitness=join("fitness"),
+        returns=join("returns"),
+        descriptor=join("descriptor"),
+        steps=join("steps"),
+        goal_distance=join("goal_distance"),
+        moments=None,
+        trace_T_B=results[0].trace_T_B,
+    )

@@ -1,0 +1,159 @@
+"""The columns of a run's history: one row per generation. This table is their documentation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from es_service.protocol.messages import DispatchCounts, EpisodesResult, FloatArray, TaskSpec
+
+HistoryRow = dict[str, int | float | None]
+"""Values by name of the column, as the loop makes them."""
+Row = Mapping[str, Any]
+"""The same, to read; a value that is missing may be NaN."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of the history. Only deterministic columns enter the digest."""
+
+    name: str
+    type: Literal["INTEGER", "REAL"]
+    deterministic: bool
+    meaning: str = field(compare=False)
+    """Words for a reader: a run whose columns were explained in others is continued all the same."""
+
+
+_FITNESS = (
+    Column("generation", "INTEGER", True, "generations completed; 0 is the initial centre's evaluation"),
+    Column("env_steps", "INTEGER", True, "environment steps so far, evaluations counted, none after done"),
+    Column("episodes", "INTEGER", True, "episodes so far, evaluations counted"),
+    Column("centre_fitness_mean", "REAL", True, "mean fitness over the new centre's evaluation episodes"),
+    Column("centre_fitness_std", "REAL", True, "standard deviation of the same episodes (population formula)"),
+    Column("centre_return_mean", "REAL", True, "mean return; equals the fitness with `fitness: sum`"),
+    Column("centre_return_std", "REAL", True, "standard deviation of the return over the same episodes"),
+    Column("best_fitness", "REAL", True, "highest centre_fitness_mean so far"),
+    Column("population_fitness_min", "REAL", True, "lowest fitness of a valid member of this generation"),
+    Column("population_fitness_q25", "REAL", True, "first quartile of the valid members' fitness"),
+    Column("population_fitness_median", "REAL", True, "median of the valid members' fitness"),
+    Column("population_fitness_q75", "REAL", True, "third quartile of the valid members' fitness"),
+    Column("population_fitness_max", "REAL", True, "highest fitness of a member: a noisy single value, not the best"),
+    Column("population_return_min", "REAL", True, "the same for the valid members' returns"),
+    Column("population_return_q25", "REAL", True, "first quartile"),
+    Column("population_return_median", "REAL", True, "median"),
+    Column("population_return_q75", "REAL", True, "third quartile"),
+    Column("population_return_max", "REAL", True, "highest"),
+)
+_GOAL = (
+    Column("goal_distance", "REAL", True, "mean distance to the goal at the end of the evaluation episodes"),
+    Column("goal_distance_min", "REAL", True, "least distance to the goal along any evaluation episode"),
+)
+_CELL = (
+    "cell of the map that the new centre entered; none if it did not. A number: those of a grid run along its last "
+    "dimension first, so that of 20 by 20 cells 90 is 4,10; the map's table has both"
+)
+_MAP = (
+    Column("start_cell", "INTEGER", True, "me_es: cell whose elite this generation began with; none inside a block"),
+    Column("cell", "INTEGER", True, _CELL),
+    Column("map_cells", "INTEGER", True, "filled cells of the map after this generation"),
+    Column("coverage", "REAL", True, "filled cells as a fraction of all"),
+    Column("coverage_reachable", "REAL", True, "the same of the cells that can be reached, where the task knows them"),
+    Column("map_fitness_max", "REAL", True, "highest fitness of an elite, as it was when it entered"),
+    Column("qd_score", "REAL", True, "sum over elites of fitness less map.qd_offset"),
+)
+_SEARCH_AND_TIMES = (
+    Column("member", "INTEGER", True, "member whose centre this row is about; of the initial ones, the fittest"),
+    Column("fitness_weight", "REAL", True, "weight of fitness beside novelty in this generation's utilities"),
+    Column("centre_novelty", "REAL", True, "novelty of the mean descriptor in the archive before it entered"),
+    Column("archive_size", "INTEGER", True, "entries of the novelty archive after this generation"),
+    Column("update_norm", "REAL", True, "Euclidean norm of the step from the old centre to the new one"),
+    Column("parameter_norm", "REAL", True, "Euclidean norm of the new centre"),
+    Column("invalid_members", "INTEGER", True, "members with a non-finite fitness or descriptor"),
+    Column("retries", "INTEGER", False, "chunks handed out again in this generation"),
+    Column("lost_workers", "INTEGER", False, "workers that died, hung or were replaced in this generation"),
+    Column("workers", "INTEGER", False, "workers the evaluator was asked to keep"),
+    Column("wall_clock_s", "REAL", False, "seconds spent in this run so far, all sessions together"),
+    Column("steps_per_second", "REAL", False, "environment steps of this generation over its seconds"),
+    Column("seconds_rollout", "REAL", False, "waiting for training chunks"),
+    Column("seconds_gradient", "REAL", False, "waiting for gradient chunks and adding them up"),
+    Column("seconds_evaluation", "REAL", False, "waiting for the new centre's evaluation"),
+    Column("seconds_driver", "REAL", False, "everything else on the driver but the store"),
+    Column("seconds_store", "REAL", False, "committing the generation before this one"),
+)
+
+
+def history_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
+    """All columns of a run: `centre_<name>` per descriptor dimension, distances if the task has a goal, the map's."""
+    descriptor = tuple(
+        column
+        for name in task.descriptor_names
+        for column in (
+            Column(f"centre_{name}", "REAL", True, f"mean descriptor of the evaluation episodes: {name}"),
+            Column(f"centre_{name}_std", "REAL", True, f"standard deviation of {name} over the same episodes"),
+        )
+    )
+    return (*_FITNESS, *descriptor, *(_GOAL if task.has_goal else ()), *(_MAP if has_map else ()), *_SEARCH_AND_TIMES)
+
+
+def search_columns(member: int, fitness_weight: float, centre_novelty: float | None, archive_size: int) -> HistoryRow:
+    """What the search did; no novelty in generation 0."""
+    return {
+        "member": member,
+        "fitness_weight": fitness_weight,
+        "centre_novelty": centre_novelty,
+        "archive_size": archive_size,
+    }
+
+
+def step_columns(old_D: FloatArray | None, new_D: FloatArray) -> HistoryRow:
+    """How far the centre went, and where to; None for generation 0, whose centres came from nowhere."""
+    return {"update_norm": None if old_D is None else _norm(new_D - old_D), "parameter_norm": _norm(new_D)}
+
+
+def population_columns(population: EpisodesResult | None, invalid_members: int) -> HistoryRow:
+    """Quartiles of the valid members' fitness and return; None for generation 0, which has no population."""
+    columns: HistoryRow = {"invalid_members": invalid_members}
+    for quantity in ("fitness", "return"):
+        names = [f"population_{quantity}_{name}" for name in ("min", "q25", "median", "q75", "max")]
+        if population is None:
+            columns |= dict.fromkeys(names)
+            continue
+        values = population.fitness if quantity == "fitness" else population.returns
+        values = values[np.isfinite(population.fitness) & np.isfinite(values)].astype(np.float64)
+        quartiles = np.quantile(values, [0.0, 0.25, 0.5, 0.75, 1.0]) if values.size else np.full(5, np.nan)
+        columns |= dict(zip(names, quartiles.tolist(), strict=True))
+    return columns
+
+
+def evaluation_columns(evaluation: EpisodesResult, task: TaskSpec) -> HistoryRow:
+    """What the new centre's evaluation episodes say: fitness, return, where they end, how near the goal."""
+    mean_B = evaluation.descriptor.mean(axis=0, dtype=np.float64).tolist()
+    std_B = evaluation.descriptor.std(axis=0, dtype=np.float64).tolist()
+    columns: HistoryRow = {
+        "centre_fitness_mean": float(evaluation.fitness.mean(dtype=np.float64)),
+        "centre_fitness_std": float(evaluation.fitness.std(dtype=np.float64)),
+        "centre_return_mean": float(evaluation.returns.mean(dtype=np.float64)),
+        "centre_return_std": float(evaluation.returns.std(dtype=np.float64)),
+        **{f"centre_{name}": value for name, value in zip(task.descriptor_names, mean_B, strict=True)},
+        **{f"centre_{name}_std": value for name, value in zip(task.descriptor_names, std_B, strict=True)},
+    }
+    if task.has_goal:
+        columns["goal_distance"] = float(evaluation.goal_distance[:, 0].mean(dtype=np.float64))
+        columns["goal_distance_min"] = float(evaluation.goal_distance[:, 1].min())
+    return columns
+
+
+def fault_columns(now: DispatchCounts, *, since: DispatchCounts) -> HistoryRow:
+    """Faults survived since, and the workers at present."""
+    return {
+        "retries": now.retries - since.retries,
+        "lost_workers": now.lost_workers - since.lost_workers,
+        "workers": now.workers,
+    }
+
+
+def _norm(x_D: FloatArray) -> float:
+    return float(np.sqrt(np.sum(np.square(x_D, dtype=np.float64))))

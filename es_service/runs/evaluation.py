@@ -1,0 +1,143 @@
+"""Fresh episodes for policies that a run has kept, beside what the run believed of them.
+
+An elite, or a best centre, is the highest of many noisy means: part of its fitness is luck. Episodes that selection has
+never seen tell how much. Every policy gets the same fresh episodes, and the same command again gets them too;
+another seed makes others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.config.compute import ENGINE_IMPLIES
+from es_service.config.model import worker_spec
+from es_service.runs.checked_config import changed_config
+from es_service.dispatch.inline_engine import inline_engine
+from es_service.errors import NotInRunError, WayOut
+from es_service.loop.generation import evaluate_centre
+from es_service.protocol.messages import Centre, Evaluator, FloatArray
+from es_service.loop.state import best_from_arrays
+from es_service.runs.view import Policy, Run
+from es_service.runs.session import dispatch_limits
+from es_service.runs.signals import stop_on_signals
+from es_service.config.tasks import task_of
+
+FRESH_GENERATION = 2**40
+"""Of the resets of fresh episodes with seed 0; no run counts so far."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A policy of a run, and what the run says of it."""
+
+    name: str
+    """best, centre, or the place of its cell."""
+    policy: Policy
+    generation: int
+    """In which it was evaluated."""
+    stored_fitness: float
+    cell: int | None = None
+
+
+@dataclass(frozen=True)
+class Fresh:
+    """What fresh episodes say of a candidate."""
+
+    candidate: Candidate
+    fitness_E: FloatArray
+    descriptor_E_B: FloatArray
+    cell: int | None
+    """Where its mean descriptor lies now; None without a map."""
+
+    @property
+    def mean(self) -> float:
+        """Mean fitness."""
+        return float(self.fitness_E.mean(dtype=np.float64))
+
+    @property
+    def standard_error(self) -> float:
+        """Of the mean: standard deviation (n - 1) over the square root of n; NaN for one episode."""
+        count = self.fitness_E.size
+        return float(self.fitness_E.std(dtype=np.float64, ddof=1) / sqrt(count)) if count > 1 else float("nan")
+
+    @property
+    def descriptor(self) -> NDArray[np.float64]:
+        """Its mean over the episodes, [B]."""
+        return self.descriptor_E_B.mean(axis=0, dtype=np.float64)
+
+    @property
+    def descriptor_std(self) -> NDArray[np.float64]:
+        """Its standard deviation over the episodes, [B]."""
+        return self.descriptor_E_B.std(axis=0, dtype=np.float64)
+
+
+def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[int]], every: bool) -> list[Candidate]:
+    """What is to be evaluated, in this order; cells as often as they are named, every elite in the order of discovery.
+
+    Each is read as of one generation, also while a driver is writing.
+
+    Raises NotInRunError for a cell that is not there or empty, for `every` of an empty map, and for a run without any
+    generation.
+    """
+    if run.generation is None:
+        way_out = WayOut("resume", "continue it", str(run.folder))
+        raise NotInRunError(f"{run.folder} has no generation yet", run=run.folder, ways_out=[way_out])
+    found = []
+    if best:
+        kept = best_from_arrays(run.parts(wanted=lambda part: part == "best")[1]["best"])
+        policy = run.policy_of(kept.centre_D, kept.observation_mean_O, kept.observation_std_O)
+        found.append(Candidate("best", policy, kept.generation, kept.fitness))
+    if centre:
+        at, policy = run.newest_policy()
+        found.append(Candidate("centre", policy, at, run.history_rows(at)[0]["centre_fitness_mean"]))
+    if not cells and not every:
+        return found
+    wanted = None if every else [run.cell(place) for place in cells]
+    map_, elites = run.elites(wanted)
+    if not elites:
+        raise NotInRunError(f"the map of {run.folder} is empty", run=run.folder)
+    for cell in map_.cell_N.tolist() if wanted is None else wanted:
+        row, elite = map_.row_of(cell), elites[cell]
+        assert row is not None
+        policy = run.policy_of(elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
+        name = ",".join(map(str, map_.geometry.index_of(cell)))
+        found.append(Candidate(name, policy, int(map_.generation_N[row]), float(map_.fitness_N[row]), cell))
+    return found
+
+
+def evaluate(
+    run: Run, chosen: Sequence[Candidate], episodes: int, workers: int | None = None, seed: int = 0
+) -> Iterator[Fresh]:
+    """Fresh episodes without noise for each candidate, on this machine: results one by one, in order.
+
+    Args:
+        seed: which fresh episodes, as wide as a run's.
+
+    Raises EvaluationError where rollouts cannot go on; Interrupted when asked to stop.
+    """
+    overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": workers or "auto"}
+    config = changed_config(run.present_config, overrides)
+    geometry = run.behaviour_map.geometry if config.map.enabled else None
+    with (
+        stop_on_signals() as should_stop,
+        inline_engine(worker_spec(config, task_of(config)), dispatch_limits(config), should_stop) as engine,
+    ):
+        for candidate in chosen:
+            fitness_E, descriptor_E_B = _episodes(engine, candidate.policy, config.search.sigma, episodes, seed)
+            mean_B = descriptor_E_B.mean(axis=0, dtype=np.float64)
+            cell = None
+            if geometry is not None and np.isfinite(mean_B).all():
+                cell = int(geometry.cells_of(mean_B[None])[0])
+            yield Fresh(candidate, fitness_E, descriptor_E_B, cell)
+
+
+def _episodes(engine: Evaluator, policy: Policy, sigma: float, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    mean_O, std_O = policy.observation_mean_O, policy.observation_std_O
+    centre = Centre(FRESH_GENERATION + seed, policy.parameters_D, sigma, mean_O, std_O)
+    result = evaluate_centre(engine, centre, count)
+    return result.fitness, result.descriptor

@@ -1,0 +1,228 @@
+"""A run as tables (csv, parquet), as arrays that NumPy alone opens, or as a pyribs archive."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from es_service.config.problems import did_you_mean, nearest, one_of
+from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
+from es_service.search.maps.behaviour_map import ELITE_PREFIX, BehaviourMap, Elite
+from es_service.search.maps.geometry import Grid
+from es_service.runs.view import Run, map_places
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+RIBS_MARGIN = 2e-6
+"""pyribs adds a millionth to a measure before it looks for its cell."""
+
+
+def export(run: Run, to: str, folder: Path) -> list[Path]:
+    """Write a run into `folder`, which is made if need be: the files written, older ones of these names replaced.
+
+    Args:
+        to: a key of FORMATS.
+
+    Raises:
+        ConfigError: no such format, or a package it needs is not installed. NotInRunError: the run has no map to make
+            one of. StoreError: the folder cannot be written.
+    """
+    if to not in FORMATS:
+        raise ConfigError(
+            f"{to} is no known format; must be {one_of(FORMATS)}{did_you_mean(to, FORMATS)}",
+            field="to",
+            value=to,
+            allowed=one_of(FORMATS),
+            suggestion=nearest(to, FORMATS),
+        )
+    if run.generation is None:
+        way_out = WayOut("resume", "continue it", str(run.folder))
+        raise NotInRunError(f"{run.folder} has no generation yet", run=run.folder, ways_out=[way_out])
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return FORMATS[to](run, folder)
+    except OSError as error:
+        raise StoreError(f"cannot write into {folder}: {error.strerror or error}; choose another folder") from error
+
+
+@dataclass(frozen=True)
+class _Moment(Run):
+    """A run as it was after one generation, whatever its driver has stored since."""
+
+    at: int
+    state: dict[str, dict[str, np.ndarray]]
+
+    @property
+    def generation(self) -> int:
+        return self.at
+
+    def history_rows(self, since_generation: int | None = None) -> list[dict[str, Any]]:
+        return [row for row in super().history_rows(since_generation) if row["generation"] <= self.at]
+
+    def parts(
+        self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
+    ) -> tuple[int, dict[str, dict[str, np.ndarray]]]:
+        return self.at, {part: arrays for part, arrays in self.state.items() if wanted(part)}
+
+
+def tables(run: Run) -> dict[str, pd.DataFrame]:
+    """History, novelty archive and, where there is one, the map, as of one generation."""
+    run = _Moment(run.folder, *run.parts(wanted=lambda part: not part.startswith(ELITE_PREFIX)))
+    found = {"history": run.history.reset_index(), "novelty": run.novelty}
+    return found | ({"map": run.map} if run.constants["map.enabled"] else {})
+
+
+def arrays(run: Run) -> dict[str, np.ndarray]:
+    """All policies of a run after one generation, with what each needs to act: the best centre, the newest one, every
+    elite of the map.
+
+    Names: `widths` of the layers, `observation_clip` (NaN: none); for the best and the newest centre `best_parameters`
+    [D], `best_mean` [O], `best_std` [O], `centre_parameters`, ...; for N elites `cell` [N, dimensions of the map],
+    `fitness` [N], `descriptor` [N, B], `generation` [N], `parameters` [N, D], `mean` [N, O], `std` [N, O], `trace`
+    [N, T, B]. A layer's weights [inputs, outputs] come before its biases, layer after layer.
+    """
+    run = _Moment(run.folder, *run.parts())
+    clip = run.constants["policy.observation_clip"]
+    found: dict[str, Any] = {
+        "widths": np.array(run.policy_shape.widths),
+        "observation_clip": np.array(math.nan if clip is None else clip),
+    }
+    for which in ("best", "centre"):
+        policy = run.policy(which)
+        found |= {
+            f"{which}_parameters": policy.parameters_D,
+            f"{which}_mean": policy.observation_mean_O,
+            f"{which}_std": policy.observation_std_O,
+        }
+    if run.constants["map.enabled"]:
+        map_, elites = run.elites()
+        found |= _map_arrays(run, map_, elites)
+    return found
+
+
+def ribs_archive(run: Run) -> Any:
+    """The map as a `ribs.archives.GridArchive`: solutions are parameters, measures descriptors, objectives fitness.
+
+    Fields besides: `generation`, `observation_mean`, `observation_std`. Its arithmetic of cells is another one, so
+    descriptors within two millionths of an edge, and those outside the bounds, are moved that far into their cell.
+
+    Raises:
+        ConfigError: pyribs is not installed. NotInRunError: the run has no map, an empty one, or one that is no grid.
+    """
+    try:
+        from ribs.archives import GridArchive
+    except ImportError as error:
+        raise ConfigError(
+            "a pyribs archive needs pyribs", field="to", value="ribs", ways_out=[_install("ribs")]
+        ) from error
+    map_, elites = run.elites()
+    if not isinstance(map_.geometry, Grid):
+        raise NotInRunError(
+            f"the map of {run.folder} is a cvt and no grid, as a GridArchive is; npz has it all", run=run.folder
+        )
+    if not map_.size:
+        raise NotInRunError(f"the map of {run.folder} is empty", run=run.folder)
+    columns = _map_arrays(run, map_, elites)
+    size = columns["mean"].shape[1]
+    archive = GridArchive(
+        solution_dim=columns["parameters"].shape[1],
+        dims=map_.geometry.shape,
+        ranges=map_.geometry.bounds,
+        qd_score_offset=run.constants["map.qd_offset"],
+        extra_fields={
+            "generation": ((), np.int64),
+            "observation_mean": ((size,), np.float32),
+            "observation_std": ((size,), np.float32),
+        },
+    )
+    edges = list(zip(map_.geometry.edges, columns["cell"].T, strict=True))
+    low_N_B, high_N_B = (np.stack([of[cell + up] for of, cell in edges], axis=1) for up in (0, 1))
+    margin_N_B = np.minimum(RIBS_MARGIN, (high_N_B - low_N_B) / 4)
+    archive.add(
+        solution=columns["parameters"],
+        objective=columns["fitness"],
+        measures=np.clip(columns["descriptor"], low_N_B + margin_N_B, high_N_B - margin_N_B),
+        generation=columns["generation"],
+        observation_mean=columns["mean"],
+        observation_std=columns["std"],
+    )
+    if archive.stats.num_elites != map_.size:
+        raise NotInRunError(
+            f"pyribs puts the {map_.size} elites of {run.folder} into {archive.stats.num_elites} of its cells, too "
+            "small for its arithmetic; npz has them all",
+            run=run.folder,
+        )
+    return archive
+
+
+def _map_arrays(run: Run, map_: BehaviourMap, elites: dict[int, Elite]) -> dict[str, np.ndarray]:
+    fields = {"parameters": "centre_D", "mean": "observation_mean_O", "std": "observation_std_O", "trace": "trace_T_B"}
+    sizes = {"parameters": (run.policy_shape.parameters,), "trace": (0, len(map_.geometry.bounds))}
+    none = run.policy_shape.widths[:1]
+    return {
+        "cell": map_places(map_),
+        "fitness": map_.fitness_N,
+        "descriptor": map_.descriptor_N_B,
+        "generation": map_.generation_N,
+        **{
+            name: np.array([getattr(elite, field) for elite in elites.values()], np.float32)
+            if elites
+            else np.zeros((0, *sizes.get(name, none)), np.float32)
+            for name, field in fields.items()
+        },
+    }
+
+
+def _csv(run: Run, folder: Path) -> list[Path]:
+    written = []
+    for name, table in tables(run).items():
+        written.append(folder / f"{name}.csv")
+        table.to_csv(written[-1], index=False, lineterminator="\n")
+    return written
+
+
+def _parquet(run: Run, folder: Path) -> list[Path]:
+    written = []
+    for name, table in tables(run).items():
+        written.append(folder / f"{name}.parquet")
+        try:
+            table.to_parquet(written[-1], index=False)
+        except ImportError as error:
+            ways_out = [_install("parquet")]
+            raise ConfigError("parquet needs pyarrow", field="to", value="parquet", ways_out=ways_out) from error
+    return written
+
+
+def _install(extra: str) -> WayOut:
+    return WayOut("install", "install it", extra=extra)
+
+
+def _npz(run: Run, folder: Path) -> list[Path]:
+    file = folder / "policies.npz"
+    np.savez(file, allow_pickle=False, **arrays(run))
+    return [file]
+
+
+def _ribs(run: Run, folder: Path) -> list[Path]:
+    file = folder / "archive.pickle"
+    archive = ribs_archive(run)
+    with file.open("wb") as stream:
+        pickle.dump(archive, stream)
+    return [file]
+
+
+FORMATS: dict[str, Callable[[Run, Path], list[Path]]] = {
+    "csv": _csv,
+    "parquet": _parquet,
+    "npz": _npz,
+    "ribs": _ribs,
+}
+"""How a run can be written."""

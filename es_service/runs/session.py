@@ -1,0 +1,179 @@
+"""One sitting of a run: its engine starts, the loop works until the budget is spent or somebody stops it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from es_service.loop import driver
+from es_service.search.algorithms import ALGORITHMS
+from es_service.config.model import RunConfig, policy_shape, worker_spec
+from es_service.dispatch.cores import cores
+from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log
+from es_service.dispatch.engine import Engine
+from es_service.dispatch.inline_engine import inline_engine
+from es_service.dispatch.events import Limits
+from es_service.errors import EvaluationError, WayOut
+from es_service.protocol.machine import computed_on, is_mixed, platform_info
+from es_service.protocol.messages import FloatArray, Moments
+from es_service.loop.state import Arrays, moments_from_arrays
+from es_service.runs.view import Run, open_run
+from es_service.runs.signals import stop_on_signals
+from es_service.search.observation_statistics import no_observations
+from es_service.store.writer import RunStore
+from es_service.config.tasks import task_of
+from workers.actor import WorkerActor
+from workers.policy import initial_parameters
+
+LIMIT_NAMES = {
+    "start_deadline_s": "half of compute.no_worker_timeout_s",
+    "first_deadline_s": "compute.compile_timeout_s",
+    "min_deadline_s": "at least compute.chunk_timeout_s",
+    "no_worker_timeout_s": "compute.no_worker_timeout_s",
+}
+"""What sets how patient the engine is, as its messages say it."""
+
+OnGeneration = Callable[[Mapping[str, Any]], None]
+"""Called with each history row once it is safe."""
+OnNotice = Callable[[str], None]
+"""Called with what had to be repaired, or what the user should know, as soon as it is known."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a session of a run ended."""
+
+    run: Run
+    reason: str
+    """Which budget was spent, in words."""
+
+
+def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_notice: OnNotice) -> Outcome:
+    """Run the loop until the budget is spent."""
+    task = task_of(config)
+    told = 0
+
+    def tell_notices() -> None:
+        nonlocal told
+        for notice in store.notices[told:]:
+            on_notice(notice)
+        told = len(store.notices)
+
+    tell_notices()
+    state = driver.stored_state(store, task)
+    if state is not None and (reason := driver.spent(config.budget, state)) is not None:
+        return Outcome(open_run(store.folder), reason)  # no engine need start to find that out
+    search = driver.Search(
+        config=config,
+        algorithm=ALGORITHMS[config.search.algorithm](config),
+        initial=lambda: _initial(config, store),
+        task=task,
+    )
+    with (
+        _blaming(store.folder),
+        dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
+        stop_on_signals() as should_stop,
+        _engine(config, should_stop, log) as engine,
+    ):
+
+        def after_generation(row: Mapping[str, Any]) -> None:
+            log(Committed(row["generation"]))
+            tell_notices()
+            if lost := row["lost_workers"]:
+                who = "a worker" if lost == 1 else f"{lost} workers"
+                on_notice(f"generation {row['generation']}: lost {who}; {engine.last_loss}")
+            on_generation(row)
+
+        _, reason = driver.run(search, engine, _OnPlatforms(store, engine, on_notice), state, after_generation)
+    return Outcome(open_run(store.folder), reason)
+
+
+class _OnPlatforms:
+    """The run's store for the loop: what a generation was computed on is recorded before the generation is."""
+
+    def __init__(self, store: RunStore, engine: Engine[Any], on_notice: OnNotice) -> None:
+        self._store, self._engine, self._on_notice = store, engine, on_notice
+        self._driver = platform_info()
+        self._workers: frozenset[str] | None = None
+        self.part = store.part
+
+    def commit(self, generation: int, parts: Mapping[str, Arrays], history: driver.HistoryRow) -> None:
+        """Record the platform if it is not the one in force, and say so if it is not the first; then commit."""
+        workers = self._engine.platforms
+        if workers != self._workers:
+            platform = computed_on(self._driver, workers)
+            is_other = self._store.record_platform(generation, platform)
+            if is_other and (generation or is_mixed([platform])):
+                self._on_notice(
+                    f"from generation {generation} on this run has another platform, or workers of several: "
+                    f"{platform}. Its digest now says `mixed`."
+                )
+            self._workers = workers
+        self._store.commit(generation, parts, history)
+
+
+@contextmanager
+def _blaming(folder: Path) -> Iterator[None]:
+    """Add to an error of the rollouts which run it ended, and that this run can be resumed."""
+    try:
+        yield
+    except EvaluationError as error:
+        run = str(folder)
+        resume = WayOut("resume", "go on once the cause is gone; every finished generation is saved", run)
+        ways_out = [replace(way, run=way.run or run) for way in error.ways_out]
+        error.run, error.ways_out = run, (*ways_out, resume)
+        raise
+
+
+def dispatch_limits(config: RunConfig) -> Limits:
+    """How patient the engine is, and with how many workers."""
+    compute = config.compute
+    return Limits(
+        workers=worker_count(config),
+        max_attempts=compute.max_attempts,
+        start_deadline_s=compute.no_worker_timeout_s / 2,  # two tries fit in
+        first_deadline_s=compute.compile_timeout_s,
+        min_deadline_s=compute.chunk_timeout_s,
+        no_worker_timeout_s=compute.no_worker_timeout_s,
+        names=LIMIT_NAMES,
+    )
+
+
+def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) -> Engine[Any]:
+    """What runs the workers, as configured; they are starting."""
+    spec, compute, limits = worker_spec(config, task_of(config)), config.compute, dispatch_limits(config)
+    if compute.engine == "inline":
+        return inline_engine(spec, limits, should_stop, threads=compute.inline_workers == "threads", log=log)
+    from es_service.dispatch.ray_cluster import Claim
+    from es_service.dispatch.ray_engine import ray_engine
+
+    return ray_engine(
+        spec,
+        limits,
+        should_stop,
+        actor=WorkerActor,
+        address=compute.address,
+        claim=Claim(compute.worker_resources.cpu, compute.worker_resources.gpu),
+        elastic=compute.workers == "auto",
+        log=log,
+    )
+
+
+def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Moments]:
+    """Each member's first centre, and the observation statistics: random ones with none, or all of them the one that
+    the run was created with."""
+    task, members = task_of(config), range(config.search.members)
+    if store.start is not None:
+        return [store.start["centre_D"] for _ in members], moments_from_arrays(store.start)
+    shape = policy_shape(config, task)
+    centres = [initial_parameters(shape, config.policy.init, config.seed, member) for member in members]
+    return centres, no_observations(task.observation_size)
+
+
+def worker_count(config: RunConfig) -> int:
+    """Workers to start: as configured, or one per core this process may use."""
+    workers = config.compute.workers
+    return cores() if workers == "auto" else workers

@@ -1,0 +1,96 @@
+"""Where a run stands: its newest generation, its budget, whether it is running, finished, or was stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import ValidationError
+
+from es_service.loop.budget import REACHED, limits_of, raised, spent
+from es_service.config.model import BudgetConfig
+from es_service.errors import ConfigError, WayOut
+from es_service.loop.history import Row
+from es_service.runs.view import Run
+from es_service.store.folder import CONFIG
+from es_service.store.lock import lock_holder
+from es_service.store.reader import read_newest
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A run as it was when it was looked at."""
+
+    run: Run
+    driver: Mapping[str, Any] | None
+    """Who is writing, as `lock_holder` has it; None if nobody is."""
+    row: Row | None
+    """The newest generation's; None before the first."""
+    limits: Mapping[str, float]
+    """Of the budget that the run would go on with, by key; none if that is not known."""
+    problem: str = ""
+    """Why the budget is not known."""
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Why the run is over, by key of the budget; nothing if it is not."""
+        return spent(self.limits, self.row) if self.row else {}
+
+
+def look(run: Run) -> Standing:
+    """Where a run stands now. Raises StoreError if it cannot be read."""
+    driver = lock_holder(run.folder)  # asked before reading, so that the last row is not missed
+    row = read_newest(run.folder)
+    try:
+        return Standing(run, driver, row, limits_of(BudgetConfig.model_validate(run.present_config["budget"])))
+    except ConfigError as error:
+        return Standing(run, driver, row, {}, " ".join(str(error).split()))
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, ("budget", *first["loc"])))
+        return Standing(run, driver, row, {}, f"{run.folder / CONFIG}: {key}: {first['msg']}")
+
+
+def state(standing: Standing) -> str:
+    """running, finished or stopped, and some words on it."""
+    if standing.driver:
+        left = to_go(standing)
+        who = f"running on {standing.driver['host']}, pid {standing.driver['pid']}"
+        return f"{who}; {left} to go" if left else who
+    if standing.problem:
+        return f"stopped, and its budget cannot be read: {standing.problem}"
+    if standing.reasons:
+        return f"finished: {next(iter(standing.reasons.values()))}"
+    return "stopped before its budget is spent"
+
+
+def way_on(standing: Standing) -> WayOut:
+    """How to go on with a run that is not running."""
+    return WayOut("resume", "go on", str(standing.run.folder), more(standing))
+
+
+def more(standing: Standing) -> dict[str, float | None]:
+    """Settings with which a run that is over goes on; none if it is not over."""
+    if standing.row is None:
+        return {}
+    return {f"budget.{key}": value for key, value in raised(standing.limits, standing.row).items()}
+
+
+def to_go(standing: Standing) -> str:
+    """About how long a run takes that goes on as it did so far; empty where that cannot be said."""
+    row = standing.row
+    if row is None:
+        return ""
+    fractions = [
+        limit / row[REACHED[key]]
+        for key, limit in standing.limits.items()
+        if key != "target_fitness" and row[REACHED[key]] > 0
+    ]
+    if not fractions:
+        return ""
+    seconds = row["wall_clock_s"] * max(0.0, min(fractions) - 1.0)
+    for unit, size in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * size:
+            return f"about {seconds / size:.0f} {unit}"
+    return f"about {seconds:.0f} s"

@@ -1,0 +1,149 @@
+"""What every search algorithm is made of: its state, its plan, its functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.messages import EpisodesResult, FloatArray
+from es_service.search.maps.behaviour_map import BehaviourMap
+from es_service.search.novelty import NoveltyArchive
+from es_service.search.optimizer import Adam
+
+NO_ENTRY = -1
+"""`Member.entry` of a member none of whose centres was valid so far."""
+NO_CELL = -1
+"""`Member.cell` of a member whose centre is no elite."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """One centre with its optimiser. A meta-population has several, plain ES one."""
+
+    centre_D: FloatArray
+    adam: Adam
+    entry: int = NO_ENTRY
+    """Index of its newest entry in the novelty archive."""
+    cell: int = NO_CELL
+    """Cell of the map whose elite its centre is."""
+    own_mean_O: FloatArray | None = None
+    own_std_O: FloatArray | None = None
+    """Observation statistics that its centres run with instead of the whole run's; None if they do not."""
+
+
+@dataclass(frozen=True)
+class FitnessWeight:
+    """How much fitness counts beside novelty, from 0 to 1, and what an adaptive rule remembers to change it."""
+
+    value: float
+    record: float = -np.inf
+    """The fitness to beat: mean evaluation fitness of the centre that last counted as an improvement."""
+    stagnant: int = 0
+    """Generations since then, or since the weight was last lowered."""
+
+
+@dataclass(frozen=True)
+class SearchState:
+    """All that a search remembers between generations.
+
+    The store writes what a generation has changed, so a search of one's own may replace members (never add or drop
+    one), extend the archive (`novelty.extended`; never take entries out: compare with the newest, if those alone are to
+    count) and insert into the map (`behaviour_map.insert`; never empty a cell). Anything else ends the run with a
+    StoreError.
+    """
+
+    members: tuple[Member, ...]
+    archive: NoveltyArchive
+    weight: FitnessWeight
+    map: BehaviourMap | None = None
+    """None where the config switches it off."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to evaluate in this generation: the population around one member's centre."""
+
+    member: int
+    centre_D: FloatArray
+    fitness_weight: float
+    """How much fitness counts beside novelty in this generation, from 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the evaluation episodes say of a centre."""
+
+    generation: int
+    """0 for an initial centre."""
+    member: int
+    valid: bool
+    """Whether fitness and descriptor of every episode are finite."""
+    fitness: float
+    """Mean over the episodes."""
+    descriptor_B: NDArray[np.float64]
+    """Mean over the episodes."""
+    population_max: float = np.nan
+    """Highest fitness of a valid member of the population that led to it; NaN for an initial centre."""
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """The functions of one method. All are pure."""
+
+    plan: Callable[[SearchState, int], Plan]
+    """(state, generation) -> what to evaluate in that generation."""
+    weights: Callable[[SearchState, Plan, EpisodesResult], NDArray[np.float32]]
+    """(state, plan, the whole population's results with axes P, S) -> weight of each pair's noise [P]."""
+    step: Callable[[SearchState, Plan, FloatArray], SearchState]
+    """(state, plan, gradient estimate [D]) -> state with the planned member moved."""
+    absorb: Callable[[SearchState, Judgement], SearchState]
+    """(state, a centre's evaluation) -> state that has learned from it; initial centres come first, in order."""
+    fitness_weight: float
+    """What the state's `weight` starts with."""
+    start_cell: Callable[[SearchState, int], int | None] = lambda state, generation: None
+    """(state, generation) -> cell of the map whose elite takes the place of member 0 before that generation; None to go
+    on from where it is."""
+
+
+def member_part(index: int | str) -> str:
+    """Name of a member's part in the run store; of "", how all such names begin."""
+    return f"member_{index}"
+
+
+def member_to_arrays(member: Member) -> dict[str, np.ndarray]:
+    """A member as the store keeps it."""
+    adam = member.adam
+    own = {"own_mean_O": member.own_mean_O, "own_std_O": member.own_std_O}
+    return {
+        **{name: values for name, values in own.items() if values is not None},
+        "centre_D": member.centre_D,
+        "adam_m_D": adam.m_D,
+        "adam_v_D": adam.v_D,
+        "adam_step": np.asarray(adam.step, np.int64),
+        "entry": np.asarray(member.entry, np.int64),
+        "cell": np.asarray(member.cell, np.int64),
+    }
+
+
+def member_from_arrays(arrays: Mapping[str, np.ndarray]) -> Member:
+    """Inverse of `member_to_arrays`."""
+    adam = Adam(arrays["adam_m_D"], arrays["adam_v_D"], int(arrays["adam_step"]))
+    own_mean_O, own_std_O = arrays.get("own_mean_O"), arrays.get("own_std_O")
+    return Member(arrays["centre_D"], adam, int(arrays["entry"]), int(arrays["cell"]), own_mean_O, own_std_O)
+
+
+def weight_to_arrays(weight: FitnessWeight) -> dict[str, np.ndarray]:
+    """The fitness weight as the store keeps it."""
+    return {
+        "value": np.asarray(weight.value, np.float64),
+        "record": np.asarray(weight.record, np.float64),
+        "stagnant": np.asarray(weight.stagnant, np.int64),
+    }
+
+
+def weight_from_arrays(arrays: Mapping[str, np.ndarray]) -> FitnessWeight:
+    """Inverse of `weight_to_arrays`."""
+    return FitnessWeight(float(arrays["value"]), float(arrays["record"]), int(arrays["stagnant"]))

@@ -1,0 +1,12 @@
+"""NSR-ES: the ES that climbs novelty and fitness in equal parts. Conti et al. 2018 (arXiv:1712.06560)."""
+
+from __future__ import annotations
+
+from es_service.config.model import RunConfig
+from es_service.search.algorithms.base import Algorithm
+from es_service.search.algorithms.steps import novelty_search
+
+
+def nsr_es(config: RunConfig) -> Algorithm:
+    """Novelty search with reward: mean of rank of novelty and rank of fitness."""
+    return novelty_search(config, fitness_weight=0.5)

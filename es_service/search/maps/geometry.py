@@ -1,0 +1,194 @@
+"""How the space of descriptors is cut into cells: a regular grid, or the Voronoi cells of spread-out centroids.
+
+Descriptors outside the bounds belong to the nearest cell of the border. Everything is float64 and written so that equal
+descriptors fall into equal cells on every machine. Where the centroids of a cvt come to lie may depend on it, so they
+are stored with the run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from es_service.protocol.messages import Bounds, TaskSpec
+from es_service.protocol.noise import Domain, stream_keys, uniforms
+
+if TYPE_CHECKING:
+    from es_service.config.model import MapConfig
+
+LATTICE_PER_CELL = 8
+"""Places along each side of a cell that are looked at to find out whether it can be reached."""
+MOST_LATTICE_POINTS = 2_000_000
+OUTER_LATTICE = 100
+SAMPLES_PER_CENTROID = 50
+LLOYD_STEPS = 20
+CENTROID_STREAM = 2**32
+"""Last id of the stream of Domain.INITIALISATION that places centroids; no member has it."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A regular grid. Cells are numbered with the last descriptor dimension running fastest."""
+
+    bounds: Bounds
+    shape: tuple[int, ...]
+    """Cells along each dimension."""
+
+    @property
+    def size(self) -> int:
+        """Number of cells."""
+        return math.prod(self.shape)
+
+    @cached_property
+    def edges(self) -> tuple[NDArray[np.float64], ...]:
+        """Per dimension: edge i is low + i * (high - low) / cells, the last exactly high."""
+        return tuple(
+            np.array([*(low + i * (high - low) / cells for i in range(cells)), high])
+            for (low, high), cells in zip(self.bounds, self.shape, strict=True)
+        )
+
+    def cells_of(self, descriptor_N_B: ArrayLike) -> NDArray[np.int64]:
+        """Cell of each finite descriptor. Cell i reaches from edge i (included) to edge i + 1 (excluded); the last one
+        includes its upper edge. Outside the bounds: the border cell."""
+        descriptor_N_B = np.asarray(descriptor_N_B, np.float64)
+        cell_N = np.zeros(len(descriptor_N_B), np.int64)
+        for b, (edges, cells) in enumerate(zip(self.edges, self.shape, strict=True)):
+            cell_N = cell_N * cells + np.searchsorted(edges[1:-1], descriptor_N_B[:, b], side="right")
+        return cell_N
+
+    def index_of(self, cell: int) -> tuple[int, ...]:
+        """The cell's place along each dimension, as users name it: `--cell 3,17`."""
+        return tuple(int(i) for i in np.unravel_index(cell, self.shape))
+
+    def cell_at(self, index: tuple[int, ...]) -> int | None:
+        """Inverse of `index_of`; None if there is no such cell."""
+        if len(index) != len(self.shape) or not all(0 <= i < n for i, n in zip(index, self.shape, strict=True)):
+            return None
+        return int(np.ravel_multi_index(index, self.shape))
+
+
+@dataclass(frozen=True)
+class Cvt:
+    """Cells around centroids that are spread evenly: a centroidal Voronoi tessellation (Vassiliades et al. 2018).
+
+    Distances are measured with the bounds of each dimension as its unit, so that metres and fractions count alike.
+    """
+
+    bounds: Bounds
+    centroid_C_B: NDArray[np.float64]
+
+    @property
+    def size(self) -> int:
+        """Number of cells."""
+        return len(self.centroid_C_B)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """As of a grid with one dimension."""
+        return (self.size,)
+
+    def cells_of(self, descriptor_N_B: ArrayLike) -> NDArray[np.int64]:
+        """Index of the nearest centroid; of equally near ones the first."""
+        descriptor_N_B = np.asarray(descriptor_N_B, np.float64)
+        cell_N = np.zeros(len(descriptor_N_B), np.int64)
+        block = max(1, 2**20 // self.size)
+        for start in range(0, len(descriptor_N_B), block):
+            rows = slice(start, start + block)
+            squared = np.zeros((len(descriptor_N_B[rows]), self.size))
+            for b in range(self.centroid_C_B.shape[1]):
+                low, high = self.bounds[b]
+                difference = (descriptor_N_B[rows, None, b] - self.centroid_C_B[None, :, b]) / (high - low)
+                squared += difference * difference
+            cell_N[rows] = squared.argmin(axis=1)
+        return cell_N
+
+    def index_of(self, cell: int) -> tuple[int, ...]:
+        """The cell's number, alone."""
+        return (cell,)
+
+    def cell_at(self, index: tuple[int, ...]) -> int | None:
+        """Inverse of `index_of`; None if there is no such cell."""
+        return index[0] if len(index) == 1 and 0 <= index[0] < self.size else None
+
+
+Geometry = Grid | Cvt
+
+
+def make_geometry(config: MapConfig) -> Geometry:
+    """The cells that a config asks for; the same for every seed, so that runs can be compared cell by cell."""
+    if config.kind == "grid":
+        return Grid(config.bounds, config.cells)
+    return Cvt(config.bounds, _centroids(config.bounds, config.cells[0]))
+
+
+def geometry_to_arrays(geometry: Geometry) -> dict[str, np.ndarray]:
+    """The cells as the store keeps them: centroids too, since other versions of SciPy might place them otherwise."""
+    bounds = {"bounds_B_2": np.array(geometry.bounds, np.float64)}
+    if isinstance(geometry, Grid):
+        return bounds | {"shape_B": np.array(geometry.shape, np.int64)}
+    return bounds | {"centroid_C_B": geometry.centroid_C_B}
+
+
+def geometry_from_arrays(arrays: Mapping[str, np.ndarray]) -> Geometry:
+    """Inverse of `geometry_to_arrays`."""
+    bounds = tuple((float(low), float(high)) for low, high in arrays["bounds_B_2"])
+    if "shape_B" in arrays:
+        return Grid(bounds, tuple(int(n) for n in arrays["shape_B"]))
+    return Cvt(bounds, arrays["centroid_C_B"])
+
+
+def reachable_cells(geometry: Geometry, task: TaskSpec) -> NDArray[np.bool_] | None:
+    """Whether each cell holds a place where an episode can end, [cells]; None where the task does not know its walls.
+
+    Out of reach is what is nearer than `task.wall_clearance` to the middle of a wall, and what is outside the task's
+    own bounds. None, too, for more than two million cells.
+    """
+    if task.walls is None or len(geometry.bounds) != 2 or geometry.size > MOST_LATTICE_POINTS:
+        return None
+    per_cell = min(LATTICE_PER_CELL, int(math.sqrt(MOST_LATTICE_POINTS / geometry.size)))
+    shape = geometry.shape if isinstance(geometry, Grid) else (math.isqrt(geometry.size) + 1,) * 2
+    # The same number of places in each cell of a grid, so that none is missed; what lies outside the map's bounds
+    # belongs to its border cells.
+    place_N_2 = np.concatenate(
+        [
+            _lattice(geometry.bounds, (per_cell * shape[0], per_cell * shape[1])),
+            _lattice(task.descriptor_bounds, (OUTER_LATTICE, OUTER_LATTICE)),
+        ]
+    )
+    low_2, high_2 = np.array(task.descriptor_bounds).T
+    free_N = ((place_N_2 >= low_2) & (place_N_2 <= high_2)).all(axis=1)
+    for start, end in task.walls:
+        start_2, way_2 = np.array(start), np.array(end) - np.array(start)
+        along_N = np.clip((place_N_2 - start_2) @ way_2 / (way_2 @ way_2), 0.0, 1.0)
+        gap_N_2 = place_N_2 - start_2 - along_N[:, None] * way_2
+        free_N &= (gap_N_2**2).sum(axis=1) >= task.wall_clearance**2
+    reachable = np.zeros(geometry.size, bool)
+    reachable[geometry.cells_of(place_N_2[free_N])] = True
+    return reachable if reachable.any() else None
+
+
+def _lattice(bounds: Bounds, counts: tuple[int, int]) -> NDArray[np.float64]:
+    """The middles of equal rectangles that fill a plane region, [counts[0] * counts[1], 2]."""
+    axes = [
+        low + (np.arange(count) + 0.5) / count * (high - low) for count, (low, high) in zip(counts, bounds, strict=True)
+    ]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _centroids(bounds: Bounds, count: int) -> NDArray[np.float64]:
+    """Lloyd's algorithm on random points, from the first of them."""
+    from scipy.cluster.vq import kmeans2  # a tenth of a second that most runs need not spend
+
+    low_B, high_B = np.array(bounds, np.float64).T
+    samples = SAMPLES_PER_CENTROID * count
+    key = stream_keys(0, Domain.INITIALISATION, 0, CENTROID_STREAM)
+    share: Any = uniforms(key, np.arange(samples * len(bounds), dtype=np.uint32))
+    place_N_B = share.astype(np.float64).reshape(samples, len(bounds))
+    centroid_C_B, _ = kmeans2(place_N_B, place_N_B[:count], iter=LLOYD_STEPS, minit="matrix")
+    return low_B + centroid_C_B * (high_B - low_B)

@@ -1,0 +1,44 @@
+"""Running statistics of observations, merged on the driver in chunk order and in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from es_service.protocol.messages import FloatArray, Moments
+
+STD_FLOOR = 0.1
+"""Least standard deviation used for normalising; source: released code of the ES papers, sqrt(max(var, 0.01))."""
+
+
+def no_observations(size: int) -> Moments:
+    """Statistics before the first generation: nothing counted."""
+    return Moments(0.0, np.zeros(size), np.zeros(size))
+
+
+def merge_moments(total: Moments, parts: Iterable[Moments]) -> Moments:
+    """`total` and `parts`, one after another in the order given (the order decides the last bits).
+
+    Source: pairwise update of Chan, Golub and LeVeque 1983.
+    """
+    for part in parts:
+        if part.count == 0.0:
+            continue
+        count = total.count + part.count
+        delta_O = part.mean_O - total.mean_O
+        total = Moments(
+            count,
+            total.mean_O + delta_O * (part.count / count),
+            total.m2_O + part.m2_O + np.square(delta_O) * (total.count * part.count / count),
+        )
+    return total
+
+
+def normalisation(moments: Moments, enabled: bool) -> tuple[FloatArray, FloatArray]:
+    """(mean, standard deviation) to normalise with; 0 and 1 if off or nothing is counted, never below STD_FLOOR."""
+    if not enabled or moments.count == 0.0:
+        size = moments.mean_O.shape[0]
+        return np.zeros(size, np.float32), np.ones(size, np.float32)
+    std_O = np.sqrt(np.maximum(moments.m2_O / moments.count, STD_FLOOR**2))
+    return moments.mean_O.astype(np.float32), std_O.astype(np.float32)

@@ -1,0 +1,55 @@
+"""Adam as the evolution-strategies papers' code has it, in NumPy float32.
+
+Not optax's: here epsilon is added to sqrt(v) *before* the bias correction.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from es_service.protocol.messages import FloatArray
+
+BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
+
+
+@dataclass(frozen=True)
+class Adam:
+    """Optimiser state of one centre. D: policy parameters."""
+
+    m_D: FloatArray
+    v_D: FloatArray
+    step: int
+    """Updates made."""
+
+
+def fresh_adam(parameters: int) -> Adam:
+    """Moments zero, no update made."""
+    return Adam(np.zeros(parameters, np.float32), np.zeros(parameters, np.float32), 0)
+
+
+def adam_ascent(
+    adam: Adam, centre_D: FloatArray, gradient_D: FloatArray, *, learning_rate: float, l2: float
+) -> tuple[Adam, FloatArray]:
+    """One step up the gradient estimate: (new optimiser state, new centre).
+
+    The weight penalty goes through Adam: what it minimises is -gradient + l2 * centre.
+    Step: learning_rate * sqrt(1 - b2^t) / (1 - b1^t) * m / (sqrt(v) + eps), t counted from 1.
+
+    Source: released code of deep-neuroevolution and ME-ES (optimizers.py); constants 0.9, 0.999, 1e-8.
+    """
+    step = adam.step + 1
+    with np.errstate(over="ignore", invalid="ignore"):  # the driver says so if the centre is not finite
+        descent_D = centre_D * np.float32(l2) - gradient_D
+        m_D = adam.m_D * np.float32(BETA_1) + descent_D * np.float32(1.0 - BETA_1)
+        v_D = adam.v_D * np.float32(BETA_2) + np.square(descent_D) * np.float32(1.0 - BETA_2)
+        rate = np.float32(learning_rate * math.sqrt(1.0 - BETA_2**step) / (1.0 - BETA_1**step))
+        new_centre_D = centre_D - m_D * rate / (np.sqrt(v_D) + np.float32(EPSILON))
+    return Adam(_float32(m_D), _float32(v_D), step), _float32(new_centre_D)
+
+
+def _float32(x: np.ndarray) -> FloatArray:
+    """The same array: everything above is float32 already, which NumPy's type stubs do not see."""
+    return x.astype(np.float32, copy=False)
