@@ -10,12 +10,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from es_service.api import fork, load_config, open_run, resume, run
 
-__all__ = ["fork", "load_config", "open_run", "resume", "run"]
+    __version__: str
+
+__all__ = ["__version__", "fork", "load_config", "open_run", "resume", "run"]
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "__version__":
+        from es_service.protocol.machine import VERSION
+
+        return VERSION
     from es_service import api
 
     return getattr(api, name)

@@ -40,7 +40,7 @@ from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.progress import show_progress
 from es_service.cli.tables.status import follow_status, print_status, print_summary
 from es_service.config.resolution import config_warnings
-from es_service.config.tasks import TASKS, task_of
+from es_service.config.tasks import TASKS, no_vectors, task_of
 from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError
 from es_service.loop.history import Row
 from es_service.protocol.machine import VERSION
@@ -88,7 +88,7 @@ def run(
         raise ConfigError("--or-resume needs --out: without it every run has a folder of its own")
     begun = or_resume and out is not None and holds_run(out)
     loaded = api.load_config(config, wanted, new=not begun)
-    for warning in config_warnings(loaded, task_of(loaded)):
+    for warning in config_warnings(loaded, task_of(loaded), no_vectors()):
         print_note(f"note: {warning}")
     folder = out if out is not None else api.default_folder(loaded)
     _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder))

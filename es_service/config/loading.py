@@ -45,6 +45,7 @@ def load_config(
     *,
     tasks: Mapping[str, TaskSpec],
     algorithms: Mapping[str, object],
+    no_vectors: str = "",
     new: bool = True,
 ) -> RunConfig:
     """The config of a new run.
@@ -54,16 +55,22 @@ def load_config(
         overrides: "search.sigma=0.05" and the like, values in YAML, of which a later one wins; or values by key.
         tasks: what `task.environment` may name.
         algorithms: what `search.algorithm` may name.
+        no_vectors: why this machine's processor cannot run what simd compiles; empty where it can.
         new: whether the run that it starts from, if any, must be there.
 
     Raises:
         ConfigError: names the file, then lists every problem on a line of its own.
     """
-    return _load(source, overrides, tasks, algorithms, new=new, resolved=False)
+    return _load(source, overrides, tasks, algorithms, no_vectors, new=new, resolved=False)
 
 
 def changed_config(
-    source: Source, overrides: Overrides = (), *, tasks: Mapping[str, TaskSpec], algorithms: Mapping[str, object]
+    source: Source,
+    overrides: Overrides = (),
+    *,
+    tasks: Mapping[str, TaskSpec],
+    algorithms: Mapping[str, object],
+    no_vectors: str = "",
 ) -> RunConfig:
     """The config of a run that exists, with some keys changed; what follows from those, by a preset or from the task,
     is resolved anew. Whether the run can change so is for the caller to say.
@@ -74,7 +81,7 @@ def changed_config(
     Raises:
         ConfigError: as for `load_config`.
     """
-    return _load(source, overrides, tasks, algorithms, new=False, resolved=True)
+    return _load(source, overrides, tasks, algorithms, no_vectors, new=False, resolved=True)
 
 
 def _load(
@@ -82,6 +89,7 @@ def _load(
     overrides: Overrides,
     tasks: Mapping[str, TaskSpec],
     algorithms: Mapping[str, object],
+    no_vectors: str,
     *,
     new: bool,
     resolved: bool,
@@ -123,7 +131,7 @@ def _load(
         if chosen is None and key not in bad and key.split(".")[0] not in unusable:
             problems.append(unfit(key, None, f"missing; must be {one_of(known)}", allowed=one_of(known)))
     task: TaskSpec | None = found.get("task.environment")
-    values = resolve(values, left_open, task)
+    values = resolve(values, left_open, task, no_vectors)
     if task is not None:
         problems += task_problems(values, task) + policy_problems(values, task)
         problems += map_problems(values, task) + rollout_problems(values, task)

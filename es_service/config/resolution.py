@@ -89,13 +89,16 @@ def default_gradient_block_pairs(pairs: int, chunk_pairs: int, parameters: int) 
     return min(pairs, chunk_pairs * max(worth, -(-chunks // MOST_GRADIENT_BLOCKS)))
 
 
-def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpec | None) -> dict[str, Any]:
+def resolve(
+    values: Mapping[str, Any], left_open: Collection[str], task: TaskSpec | None, no_vectors: str
+) -> dict[str, Any]:
     """Fill in what was left open, as far as the values it follows from are there.
 
     Args:
         values: valid values of the config.
         left_open: keys of LEFT_OPEN that the config leaves to us.
         task: the task that `task.environment` names, or None where that is invalid.
+        no_vectors: why this machine's processor cannot run what simd compiles; empty where it can.
     """
     values = dict(values)
     if task is not None:
@@ -117,7 +120,7 @@ def resolve(values: Mapping[str, Any], left_open: Collection[str], task: TaskSpe
         algorithm = values["search.algorithm"]
         values["search.members"] = 1 if algorithm in SINGLE_MEMBER or ":" in algorithm else MEMBERS
     if "compute.rollout" in left_open and task is not None:
-        values["compute.rollout"] = "xla" if _on_gpu(values) or _why_no_simd(values, task) else "simd"
+        values["compute.rollout"] = "xla" if _on_gpu(values) or _why_no_simd(values, task, no_vectors) else "simd"
     pairs = values.get("search.pairs")
     if pairs is not None and "compute.chunk_pairs" in left_open:
         values["compute.chunk_pairs"] = default_chunk_pairs(pairs)
@@ -237,9 +240,9 @@ def _value(values: Mapping[str, Any], key: str) -> Any:
     return values.get(key, FIELDS[key].default)
 
 
-def _why_no_simd(values: Mapping[str, Any], task: TaskSpec) -> str:
+def _why_no_simd(values: Mapping[str, Any], task: TaskSpec, no_vectors: str) -> str:
     """Why a new run cannot have simd; in a cluster this machine's processor says nothing."""
-    return task.no_simd or (task.no_vectors if values.get("compute.address") is None else "")
+    return task.no_simd or (no_vectors if values.get("compute.address") is None else "")
 
 
 def rollout_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
@@ -272,11 +275,15 @@ def folder_problems(values: Mapping[str, Any]) -> list[Problem]:
     return [unfit("search.init_from", folder, f"{folder} {what}; must be {allowed}", allowed=allowed)] if what else []
 
 
-def config_warnings(config: RunConfig, task: TaskSpec) -> list[str]:
-    """What is legal and probably not meant; one line each, for the command line to print before the run starts."""
+def config_warnings(config: RunConfig, task: TaskSpec, no_vectors: str = "") -> list[str]:
+    """What is legal and probably not meant; one line each, for the command line to print before the run starts.
+
+    Args:
+        no_vectors: as for `resolve`.
+    """
     warnings = []
     values = {"compute.address": config.compute.address}
-    if config.compute.rollout == "xla" and (why := _why_no_simd(values, task)):
+    if config.compute.rollout == "xla" and (why := _why_no_simd(values, task, no_vectors)):
         warnings.append(f"compute.rollout: xla, since simd cannot run {task.name}: {why}")
     pairs, chunk = config.search.pairs, config.compute.chunk_pairs
     if chunk < FEW_CHUNK_PAIRS and pairs > MOST_CHUNK_PAIRS:

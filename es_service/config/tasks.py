@@ -9,7 +9,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import cache
 
 from es_service.config.model import RunConfig
@@ -28,7 +27,7 @@ class Tasks(Mapping[str, TaskSpec]):
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is none of ours, ConfigError for another that cannot be had."""
-        return replace(_described(name) if ":" in name else environments.SHIPPED[name], no_vectors=_no_vectors())
+        return _described(name) if ":" in name else environments.SHIPPED[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(environments.SHIPPED)
@@ -47,8 +46,8 @@ def task_of(config: RunConfig) -> TaskSpec:
 
 
 @cache
-def _no_vectors() -> str:
-    """Why this processor cannot run code for vectors; empty if it can."""
+def no_vectors() -> str:
+    """Why this machine's processor cannot run what simd compiles; empty where it can. For `compute.rollout: auto`."""
     try:
         host_target()
     except NoVectorsError as error:

@@ -1,7 +1,7 @@
 """The loop everybody reads: plan, roll out, weigh, step, evaluate, keep.
 
-It knows no Ray, no JAX and no files; its collaborators are arguments. Whatever happens, the store holds the last
-finished generation, and the next one depends only on (config, seed, state).
+It knows no Ray, no JAX, no files and no method by name; its collaborators are arguments. Whatever happens, the store
+holds the last finished generation, and the next one depends only on (config, seed, state).
 """
 
 from __future__ import annotations
@@ -18,44 +18,32 @@ from es_service.config.model import BudgetConfig, RunConfig
 from es_service.loop import budget as budgets
 from es_service.loop.clock import Clock
 from es_service.loop.generation import (
+    better,
+    entered,
     estimate_gradient,
     evaluate_centre,
     evaluate_population,
     invalidate,
     judge,
+    make_centre,
     require_finite,
+    steps_of,
 )
 from es_service.loop.history import (
     HistoryRow,
     evaluation_columns,
     fault_columns,
+    map_columns,
     population_columns,
     search_columns,
     step_columns,
 )
-from es_service.loop.state import Arrays, Best, RunState, state_from_parts, state_parts, statistics_in_force
-from es_service.protocol.messages import (
-    Centre,
-    DispatchCounts,
-    EpisodesResult,
-    Evaluator,
-    FloatArray,
-    Moments,
-    TaskSpec,
-)
-from es_service.search.algorithms.base import Algorithm, Judgement, Member, SearchState
-from es_service.search.algorithms.me_es import restarted
+from es_service.loop.parts import ELITE_PREFIX, Arrays, elite_from_arrays, elite_part, state_from_parts, state_parts
+from es_service.loop.state import Best, RunState
+from es_service.protocol.messages import DispatchCounts, Evaluator, FloatArray, Moments, TaskSpec
+from es_service.search.algorithms.base import Algorithm
 from es_service.search.algorithms.steps import first_state
-from es_service.search.maps.behaviour_map import (
-    ELITE_PREFIX,
-    BehaviourMap,
-    Elite,
-    elite_from_arrays,
-    elite_part,
-    empty_map,
-    make_elite,
-    map_columns,
-)
+from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map
 from es_service.search.maps.geometry import make_geometry, reachable_cells
 from es_service.search.novelty import novelty
 from es_service.search.observation_statistics import merge_moments
@@ -152,10 +140,11 @@ def _first_generation(
     search: Search, evaluator: Evaluator, clock: Clock, map_: BehaviourMap | None, reachable: Reachable
 ) -> tuple[RunState, HistoryRow]:
     """Generation 0: the initial centres, evaluated. The history shows the fittest of them."""
+    config, algorithm = search.config, search.algorithm
     centres, observations = search.initial()
-    moved = first_state(centres, len(search.task.descriptor_names), search.algorithm.fitness_weight, map_)
-    points = [_centre(search, 0, centre_D, observations) for centre_D in centres]
-    episodes = search.config.search.evaluation_episodes
+    learned = first_state(centres, len(search.task.descriptor_names), algorithm.fitness_weight, map_)
+    points = [make_centre(config, 0, centre_D, observations) for centre_D in centres]
+    episodes = config.search.evaluation_episodes
     evaluations = [evaluate_centre(evaluator, point, episodes, index) for index, point in enumerate(points)]
     clock.lap("seconds_evaluation")
     fittest = 0
@@ -163,23 +152,23 @@ def _first_generation(
     elites: dict[int, Elite] = {}
     for member, (point, evaluation) in enumerate(zip(points, evaluations, strict=True)):
         judgement = judge(0, member, evaluation)
-        moved = search.algorithm.absorb(moved, judgement)
-        elites |= _entered(moved, judgement, point, evaluation)
-        better = _better(best, point, judgement)
-        best, fittest = better, fittest if better is best else member
+        learned = algorithm.absorb(learned, judgement)
+        elites |= entered(learned, judgement, point, evaluation)
+        best_now = better(best, point, judgement)
+        best, fittest = best_now, fittest if best_now is best else member
     state = RunState(
         generation=0,
-        search=moved,
+        search=learned,
         observations=observations,
         best=best,
-        env_steps=sum(map(_steps, evaluations)),
+        env_steps=sum(map(steps_of, evaluations)),
         episodes=sum(evaluation.fitness.size for evaluation in evaluations),
         wall_clock_s=clock.total(),
         elites=elites,
     )
     row: HistoryRow = {
-        **search_columns(fittest, search.algorithm.fitness_weight, None, moved.archive.size),
-        **_map_columns(search, reachable, moved, 0, fittest, None),
+        **search_columns(fittest, algorithm.fitness_weight, None, learned.archive.size),
+        **map_columns(learned.map, config.map.qd_offset, reachable, generation=0, member=fittest, start_cell=None),
         **step_columns(None, centres[fittest]),
         **population_columns(None, 0),
         **evaluation_columns(evaluations[fittest], search.task),
@@ -192,17 +181,17 @@ def _next_generation(
     search: Search, evaluator: Evaluator, store: Store, clock: Clock, state: RunState, reachable: Reachable
 ) -> tuple[RunState, HistoryRow]:
     """One generation: a pure function of (search, state, elites in the store) but for its timings."""
-    settings, sizes, algorithm = search.config.search, search.config.compute, search.algorithm
+    config, algorithm = search.config, search.algorithm
+    settings, sizes = config.search, config.compute
     generation = state.generation + 1
     counts = evaluator.counts
 
     begun = state.search
     start_cell = algorithm.start_cell(begun, generation)
     if start_cell is not None:
-        elite = elite_from_arrays(store.part(elite_part(start_cell)))
-        begun = restarted(begun, start_cell, elite, own_statistics=settings.parent_statistics == "elite")
+        begun = algorithm.restart(begun, start_cell, elite_from_arrays(store.part(elite_part(start_cell))))
     plan = algorithm.plan(begun, generation)
-    centre = _centre(search, generation, plan.centre_D, state.observations, begun.members[plan.member])
+    centre = make_centre(config, generation, plan.centre_D, state.observations, begun.members[plan.member])
     clock.lap("seconds_driver")
     population, observed = evaluate_population(evaluator, centre, pairs=settings.pairs, chunk_pairs=sizes.chunk_pairs)
     clock.lap("seconds_rollout")
@@ -220,30 +209,36 @@ def _next_generation(
     clock.lap("seconds_evaluation")
     judgement = judge(generation, plan.member, evaluation, population)
     learned = algorithm.absorb(moved, judgement)
-    nearest = search.config.novelty
+    nearest = config.novelty
     centre_novelty = novelty(
         moved.archive, judgement.descriptor_B, neighbours=nearest.neighbours, distance=nearest.distance
     )
 
     row: HistoryRow = {
         **search_columns(plan.member, plan.fitness_weight, float(centre_novelty), learned.archive.size),
-        **_map_columns(search, reachable, learned, generation, plan.member, start_cell),
+        **map_columns(
+            learned.map,
+            config.map.qd_offset,
+            reachable,
+            generation=generation,
+            member=plan.member,
+            start_cell=start_cell,
+        ),
         **step_columns(plan.centre_D, new_centre_D),
         **population_columns(population, invalid),
         **evaluation_columns(evaluation, search.task),
         **fault_columns(evaluator.counts, since=counts),
     }
+    trained = population.fitness.size * config.task.episodes_per_member
     state = RunState(
         generation=generation,
         search=learned,
         observations=merge_moments(state.observations, observed),
-        best=_better(state.best, new_centre, judgement),
-        env_steps=state.env_steps + _steps(population) + _steps(evaluation),
-        episodes=state.episodes
-        + population.fitness.size * search.config.task.episodes_per_member
-        + evaluation.fitness.size,
+        best=better(state.best, new_centre, judgement),
+        env_steps=state.env_steps + steps_of(population) + steps_of(evaluation),
+        episodes=state.episodes + trained + evaluation.fitness.size,
         wall_clock_s=clock.total(),
-        elites=_entered(learned, judgement, new_centre, evaluation),
+        elites=entered(learned, judgement, new_centre, evaluation),
     )
     return state, row
 
@@ -276,47 +271,5 @@ def _keep(
     return state
 
 
-def _centre(
-    search: Search, generation: int, centre_D: FloatArray, observations: Moments, member: Member | None = None
-) -> Centre:
-    """The point to send out, with the statistics in force."""
-    enabled = search.config.policy.observation_normalization
-    mean_O, std_O = statistics_in_force(observations, member, enabled)
-    return Centre(generation, centre_D, search.config.search.sigma, mean_O, std_O)
-
-
-def _entered(state: SearchState, judged: Judgement, centre: Centre, evaluation: EpisodesResult) -> dict[int, Elite]:
-    """The centre just evaluated as an elite, by its cell, if it entered the map. The map says so, not its member: a
-    search of the user's need not keep `Member.cell`."""
-    if state.map is None or (cell := state.map.cell_of(judged.generation, judged.member)) is None:
-        return {}
-    assert evaluation.trace_T_B is not None, "an evaluation has a trace"
-    return {cell: make_elite(centre, evaluation.trace_T_B)}
-
-
 def _reachable(search: Search, map_: BehaviourMap | None) -> Reachable:
     return None if map_ is None else reachable_cells(map_.geometry, search.task)
-
-
-def _map_columns(
-    search: Search, reachable: Reachable, after: SearchState, generation: int, member: int, start_cell: int | None
-) -> HistoryRow:
-    if after.map is None:
-        return {}
-    return {
-        "start_cell": start_cell,
-        "cell": after.map.cell_of(generation, member),
-        **map_columns(after.map, search.config.map.qd_offset, reachable),
-    }
-
-
-def _better(best: Best, centre: Centre, judgement: Judgement) -> Best:
-    """The better of the best so far and a centre just evaluated; an invalid centre (not finite) is no improvement."""
-    if not judgement.valid or judgement.fitness <= best.fitness:
-        return best
-    mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
-    return Best(centre.generation, judgement.fitness, centre.parameters_D, mean_O, std_O)
-
-
-def _steps(result: EpisodesResult) -> int:
-    return int(result.steps.sum(dtype=np.int64))

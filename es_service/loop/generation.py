@@ -13,7 +13,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.config.model import RunConfig
 from es_service.errors import EvaluationError, WayOut
+from es_service.loop.state import Best, statistics_in_force
 from es_service.protocol.messages import (
     EVALUATION_EPISODES_PER_CHUNK,
     Centre,
@@ -26,9 +28,18 @@ from es_service.protocol.messages import (
     Moments,
     TrainingChunk,
 )
-from es_service.search.algorithms.base import Judgement
+from es_service.search.algorithms.base import Judgement, Member, SearchState
+from es_service.search.maps.behaviour_map import Elite, make_elite
 
 Result = TypeVar("Result", EpisodesResult, GradientResult)
+
+
+def make_centre(
+    config: RunConfig, generation: int, centre_D: FloatArray, observations: Moments, member: Member | None = None
+) -> Centre:
+    """What is sent to the workers of a centre: its parameters, and the statistics in force."""
+    mean_O, std_O = statistics_in_force(observations, member, config.policy.observation_normalization)
+    return Centre(generation, centre_D, config.search.sigma, mean_O, std_O)
 
 
 def evaluate_population(
@@ -130,6 +141,28 @@ def judge(
         evaluation.descriptor.astype(np.float64).mean(axis=0),
         _highest(population.fitness) if population is not None else math.nan,
     )
+
+
+def entered(state: SearchState, judged: Judgement, centre: Centre, evaluation: EpisodesResult) -> dict[int, Elite]:
+    """The centre just evaluated as an elite, by its cell, if it entered the map. The map says so, not its member: a
+    search of the user's need not keep `Member.cell`."""
+    if state.map is None or (cell := state.map.cell_of(judged.generation, judged.member)) is None:
+        return {}
+    assert evaluation.trace_T_B is not None, "an evaluation has a trace"
+    return {cell: make_elite(centre, evaluation.trace_T_B)}
+
+
+def better(best: Best, centre: Centre, judgement: Judgement) -> Best:
+    """The better of the best so far and a centre just evaluated; an invalid centre (not finite) is no improvement."""
+    if not judgement.valid or judgement.fitness <= best.fitness:
+        return best
+    mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
+    return Best(centre.generation, judgement.fitness, centre.parameters_D, mean_O, std_O)
+
+
+def steps_of(result: EpisodesResult) -> int:
+    """Environment steps of some episodes."""
+    return int(result.steps.sum(dtype=np.int64))
 
 
 def _highest(fitness: FloatArray) -> float:

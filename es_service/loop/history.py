@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from es_service.protocol.messages import DispatchCounts, EpisodesResult, FloatArray, TaskSpec
+from es_service.search.maps.behaviour_map import BehaviourMap, map_statistics
 
 HistoryRow = dict[str, int | float | None]
 """Values by name of the column, as the loop makes them."""
@@ -144,6 +146,22 @@ def evaluation_columns(evaluation: EpisodesResult, task: TaskSpec) -> HistoryRow
         columns["goal_distance"] = float(evaluation.goal_distance[:, 0].mean(dtype=np.float64))
         columns["goal_distance_min"] = float(evaluation.goal_distance[:, 1].min())
     return columns
+
+
+def map_columns(
+    map_: BehaviourMap | None,
+    qd_offset: float,
+    reachable: NDArray[np.bool_] | None,
+    *,
+    generation: int,
+    member: int,
+    start_cell: int | None,
+) -> HistoryRow:
+    """What became of the map, and the cells that a generation began with and entered; nothing where there is no map."""
+    if map_ is None:
+        return {}
+    cell = map_.cell_of(generation, member)
+    return {"start_cell": start_cell, "cell": cell, **map_statistics(map_, qd_offset, reachable)}
 
 
 def fault_columns(now: DispatchCounts, *, since: DispatchCounts) -> HistoryRow:

@@ -55,8 +55,6 @@ class TaskSpec:
     episodes of AntTrap can be below. None where nobody says."""
     no_simd: str = ""
     """Why simd cannot compile its episodes; empty where it can."""
-    no_vectors: str = ""
-    """Why this machine's processor cannot run what simd compiles; empty where it can."""
 
 
 def with_options(task: TaskSpec, options: Mapping[str, str]) -> TaskSpec:

@@ -5,12 +5,12 @@ Nothing is made of a config that its search refuses: no folder, no worker.
 
 from __future__ import annotations
 
-from es_service.search.algorithms import ALGORITHMS
 from es_service.config import loading
 from es_service.config.keys import Overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
-from es_service.config.tasks import TASKS
+from es_service.config.tasks import TASKS, no_vectors
+from es_service.search.algorithms import ALGORITHMS
 
 
 def load_config(source: Source, overrides: Overrides = (), *, new: bool = True) -> RunConfig:
@@ -22,7 +22,9 @@ def load_config(source: Source, overrides: Overrides = (), *, new: bool = True) 
     Raises:
         ConfigError: lists every problem found.
     """
-    return _accepted(loading.load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, new=new))
+    return _accepted(
+        loading.load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, no_vectors=no_vectors(), new=new)
+    )
 
 
 def changed_config(source: Source, overrides: Overrides = ()) -> RunConfig:
@@ -31,7 +33,9 @@ def changed_config(source: Source, overrides: Overrides = ()) -> RunConfig:
     Raises:
         ConfigError: lists every problem found.
     """
-    return _accepted(loading.changed_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS))
+    return _accepted(
+        loading.changed_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, no_vectors=no_vectors())
+    )
 
 
 def _accepted(config: RunConfig) -> RunConfig:

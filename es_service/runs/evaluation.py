@@ -16,16 +16,17 @@ from numpy.typing import NDArray
 
 from es_service.config.compute import ENGINE_IMPLIES
 from es_service.config.model import worker_spec
-from es_service.runs.checked_config import changed_config
+from es_service.config.tasks import task_of
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop.generation import evaluate_centre
+from es_service.loop.parts import BEST
 from es_service.protocol.messages import Centre, Evaluator, FloatArray
-from es_service.loop.state import best_from_arrays
-from es_service.runs.view import Policy, Run
+from es_service.runs.checked_config import changed_config
+from es_service.runs.moment import Policy, make_policy
 from es_service.runs.session import dispatch_limits
 from es_service.runs.signals import stop_on_signals
-from es_service.config.tasks import task_of
+from es_service.runs.view import Run, is_no_elite
 
 FRESH_GENERATION = 2**40
 """Of the resets of fresh episodes with seed 0; no run counts so far."""
@@ -89,12 +90,12 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
         raise NotInRunError(f"{run.folder} has no generation yet", run=run.folder, ways_out=[way_out])
     found = []
     if best:
-        kept = best_from_arrays(run.parts(wanted=lambda part: part == "best")[1]["best"])
-        policy = run.policy_of(kept.centre_D, kept.observation_mean_O, kept.observation_std_O)
-        found.append(Candidate("best", policy, kept.generation, kept.fitness))
+        moment = run.at(wanted=lambda part: part == BEST)
+        found.append(Candidate("best", moment.policy("best"), moment.best.generation, moment.best.fitness))
     if centre:
-        at, policy = run.newest_policy()
-        found.append(Candidate("centre", policy, at, run.history_rows(at)[0]["centre_fitness_mean"]))
+        moment = run.at(wanted=is_no_elite)
+        fitness = run.history_rows(moment.generation)[0]["centre_fitness_mean"]
+        found.append(Candidate("centre", moment.policy("centre"), moment.generation, fitness))
     if not cells and not every:
         return found
     wanted = None if every else [run.cell(place) for place in cells]
@@ -104,7 +105,7 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
     for cell in map_.cell_N.tolist() if wanted is None else wanted:
         row, elite = map_.row_of(cell), elites[cell]
         assert row is not None
-        policy = run.policy_of(elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
+        policy = make_policy(run.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
         name = ",".join(map(str, map_.geometry.index_of(cell)))
         found.append(Candidate(name, policy, int(map_.generation_N[row]), float(map_.fitness_N[row]), cell))
     return found

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +12,10 @@ import numpy as np
 
 from es_service.config.problems import did_you_mean, nearest, one_of
 from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
-from es_service.search.maps.behaviour_map import ELITE_PREFIX, BehaviourMap, Elite
+from es_service.runs.moment import map_places
+from es_service.runs.view import Run, is_no_elite
+from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.maps.geometry import Grid
-from es_service.runs.view import Run, map_places
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -53,31 +53,11 @@ def export(run: Run, to: str, folder: Path) -> list[Path]:
         raise StoreError(f"cannot write into {folder}: {error.strerror or error}; choose another folder") from error
 
 
-@dataclass(frozen=True)
-class _Moment(Run):
-    """A run as it was after one generation, whatever its driver has stored since."""
-
-    at: int
-    state: dict[str, dict[str, np.ndarray]]
-
-    @property
-    def generation(self) -> int:
-        return self.at
-
-    def history_rows(self, since_generation: int | None = None) -> list[dict[str, Any]]:
-        return [row for row in super().history_rows(since_generation) if row["generation"] <= self.at]
-
-    def parts(
-        self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
-    ) -> tuple[int, dict[str, dict[str, np.ndarray]]]:
-        return self.at, {part: arrays for part, arrays in self.state.items() if wanted(part)}
-
-
 def tables(run: Run) -> dict[str, pd.DataFrame]:
     """History, novelty archive and, where there is one, the map, as of one generation."""
-    run = _Moment(run.folder, *run.parts(wanted=lambda part: not part.startswith(ELITE_PREFIX)))
-    found = {"history": run.history.reset_index(), "novelty": run.novelty}
-    return found | ({"map": run.map} if run.constants["map.enabled"] else {})
+    moment = run.at(wanted=is_no_elite)
+    found = {"history": run.history_until(moment.generation).reset_index(), "novelty": moment.novelty}
+    return found | ({"map": moment.map} if run.constants["map.enabled"] else {})
 
 
 def arrays(run: Run) -> dict[str, np.ndarray]:
@@ -89,21 +69,21 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
     `fitness` [N], `descriptor` [N, B], `generation` [N], `parameters` [N, D], `mean` [N, O], `std` [N, O], `trace`
     [N, T, B]. A layer's weights [inputs, outputs] come before its biases, layer after layer.
     """
-    run = _Moment(run.folder, *run.parts())
+    moment = run.at()
     clip = run.constants["policy.observation_clip"]
     found: dict[str, Any] = {
         "widths": np.array(run.policy_shape.widths),
         "observation_clip": np.array(math.nan if clip is None else clip),
     }
     for which in ("best", "centre"):
-        policy = run.policy(which)
+        policy = moment.policy(which)
         found |= {
             f"{which}_parameters": policy.parameters_D,
             f"{which}_mean": policy.observation_mean_O,
             f"{which}_std": policy.observation_std_O,
         }
     if run.constants["map.enabled"]:
-        map_, elites = run.elites()
+        map_, elites = moment.elites()
         found |= _map_arrays(run, map_, elites)
     return found
 

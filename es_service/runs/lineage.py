@@ -11,19 +11,32 @@ import numpy as np
 from es_service.config.changes import START_KEYS, STATE_KEYS, changed_constants, start_afresh
 from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.model import RunConfig, policy_shape
+from es_service.config.tasks import task_of
 from es_service.config.yaml_text import show
-from es_service.runs.checked_config import changed_config
-from es_service.store.digest import digest_at
 from es_service.errors import ConfigError, Problem
-from es_service.search.maps.behaviour_map import ELITE_PREFIX
+from es_service.loop.parts import (
+    BEST,
+    CELL_PREFIX,
+    ELITE_PREFIX,
+    MEMBER_PREFIX,
+    OBSERVATIONS,
+    WEIGHT,
+    Arrays,
+    Parts,
+    moments_from_arrays,
+    moments_to_arrays,
+    weight_from_arrays,
+    weight_to_arrays,
+)
 from es_service.protocol.messages import Moments
-from es_service.loop.state import moments_from_arrays, moments_to_arrays, without_fitness, without_scores
-from es_service.runs.view import Run, open_run
+from es_service.runs.checked_config import changed_config
+from es_service.runs.view import Run, is_no_elite, open_run
+from es_service.search.algorithms.base import NO_CELL, FitnessWeight
 from es_service.search.observation_statistics import no_observations
 from es_service.store import reader
 from es_service.store.beginning import Beginning
 from es_service.store.codec import Part
-from es_service.config.tasks import task_of
+from es_service.store.digest import digest_at
 
 NORMALISED = "policy.observation_normalization"
 OBSERVED = ("policy.observation_clip", NORMALISED)
@@ -87,9 +100,9 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
     at, parts = origin.parts(generation)
     changed = {name for name, _, _ in changed_constants(origin.constants, config.constants())}
     if any(name in OBSERVED or name.startswith("task.") for name in changed.difference(LUCK)):
-        parts = without_fitness(parts)
+        parts = _without_fitness(parts)
     elif changed.intersection(LUCK):
-        parts = without_scores(parts)
+        parts = _without_scores(parts)
     if "search.parent_statistics" in changed and config.search.parent_statistics == "global":
         parts = _without_own_statistics(parts)
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
@@ -101,6 +114,24 @@ def _history(origin: Run, newest: int) -> Iterator[dict[str, int | float]]:
     end its log while it is being read."""
     for first in range(0, newest + 1, ROWS_AT_ONCE):
         yield from reader.read_history(origin.folder, first, min(ROWS_AT_ONCE, newest + 1 - first))
+
+
+def _without_fitness(parts: Parts) -> dict[str, Arrays]:
+    """The parts of a state in which no fitness seen so far counts: no best centre, an empty map, no record to beat."""
+    kept = {name: dict(part) for name, part in parts.items() if not name.startswith((CELL_PREFIX, ELITE_PREFIX))}
+    for name, part in kept.items():
+        if name.startswith(MEMBER_PREFIX):
+            part["cell"] = np.asarray(NO_CELL, np.int64)
+    kept[BEST]["fitness"] = np.asarray(-np.inf)
+    kept[WEIGHT] = weight_to_arrays(FitnessWeight(weight_from_arrays(parts[WEIGHT]).value))
+    return kept
+
+
+def _without_scores(parts: Parts) -> dict[str, Arrays]:
+    """The parts of a state in which no elite has a score: the luckiest of a population of another size, or whose
+    fitness came about otherwise, is none to compare with."""
+    nothing = {"score": np.asarray(np.nan)}
+    return {name: {**part, **nothing} if name.startswith(CELL_PREFIX) else dict(part) for name, part in parts.items()}
 
 
 def _without_own_statistics(parts: Mapping[str, Part]) -> dict[str, Part]:
@@ -128,8 +159,8 @@ def started(config: RunConfig, folder: str, tell: Callable[[str], None]) -> tupl
             value=folder,
             run=origin.folder,
         )
-    at, parts = origin.parts(wanted=lambda part: not part.startswith(ELITE_PREFIX))
-    member, moments = origin.newest_member(at, parts), moments_from_arrays(parts["observations"])
+    moment = origin.at(wanted=is_no_elite)
+    member, moments = moment.newest_member, moments_from_arrays(moment.parts[OBSERVATIONS])
     if not origin.constants[NORMALISED]:
         moments = no_observations(shape.widths[0])  # its policy was never given any, though they were gathered
     elif member.own_mean_O is not None and member.own_std_O is not None:
@@ -142,7 +173,7 @@ def started(config: RunConfig, folder: str, tell: Callable[[str], None]) -> tupl
             f"({other}), so it may act otherwise from generation 0 on"
         )
     start = {"centre_D": member.centre_D, **moments_to_arrays(moments)}
-    return _lineage(origin, at), Beginning(start=start)
+    return _lineage(origin, moment.generation), Beginning(start=start)
 
 
 def _seen_otherwise(origin: Run, config: RunConfig) -> str:

@@ -8,23 +8,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from es_service.loop import driver
-from es_service.search.algorithms import ALGORITHMS
 from es_service.config.model import RunConfig, policy_shape, worker_spec
+from es_service.config.tasks import task_of
 from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log
 from es_service.dispatch.engine import Engine
-from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.events import Limits
+from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError, WayOut
+from es_service.loop import driver
+from es_service.loop.parts import Arrays, moments_from_arrays
 from es_service.protocol.machine import computed_on, is_mixed, platform_info
 from es_service.protocol.messages import FloatArray, Moments
-from es_service.loop.state import Arrays, moments_from_arrays
-from es_service.runs.view import Run, open_run
 from es_service.runs.signals import stop_on_signals
+from es_service.runs.view import Run, open_run
+from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
 from es_service.store.writer import RunStore
-from es_service.config.tasks import task_of
 from workers.actor import WorkerActor
 from workers.policy import initial_parameters
 

@@ -8,9 +8,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from es_service.loop.budget import REACHED, limits_of, raised, spent
 from es_service.config.model import BudgetConfig
 from es_service.errors import ConfigError, WayOut
+from es_service.loop.budget import REACHED, limits_of, raised, spent
 from es_service.loop.history import Row
 from es_service.runs.view import Run
 from es_service.store.folder import CONFIG

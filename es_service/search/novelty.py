@@ -6,7 +6,6 @@ where the archive is large; what counts is always computed by one float64 expres
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -29,9 +28,6 @@ SPARE_CANDIDATES = 6
 """Neighbours asked of the tree beyond those wanted, so that rounding inside it can be noticed."""
 TREE_ROUNDING = 1e-9
 """Relative bound, generous, on how much the tree's distances differ from ours."""
-BLOCK_PREFIX = "novelty_"
-BLOCK_ENTRIES = 256
-"""Entries in one part of the run store: a generation rewrites the last part and no other."""
 
 
 @dataclass
@@ -83,6 +79,13 @@ class NoveltyArchive:
 def empty_archive(dimensions: int) -> NoveltyArchive:
     """An archive without entries: nothing is near anything, so every novelty is 0."""
     return NoveltyArchive(np.zeros((0, dimensions)), np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+def archive_of(
+    descriptor_N_B: NDArray[np.float64], generation_N: NDArray[np.int64], member_N: NDArray[np.int64]
+) -> NoveltyArchive:
+    """An archive of entries that were made before, in their order."""
+    return _with_tree(_Room(descriptor_N_B, generation_N, member_N, generation_N.size), None)
 
 
 def extended(archive: NoveltyArchive, descriptor_B: ArrayLike, generation: int, member: int) -> NoveltyArchive:
@@ -139,37 +142,6 @@ def novelty(
     novelty_Q = np.full(len(query_Q_B), np.nan)
     novelty_Q[finite_Q] = _mean_nearest(archive, query_Q_B[finite_Q], excluded_Q[finite_Q], neighbours, distance)
     return novelty_Q.reshape(shape)
-
-
-def block_part(block: int) -> str:
-    """Name of a block of entries in the run store."""
-    return f"{BLOCK_PREFIX}{block:05d}"
-
-
-def archive_to_parts(archive: NoveltyArchive, stored: int) -> dict[str, dict[str, np.ndarray]]:
-    """The blocks that differ from those of the archive's first `stored` entries, as the store keeps them."""
-    parts = {}
-    for block in range(stored // BLOCK_ENTRIES, -(-archive.size // BLOCK_ENTRIES)):
-        entries = slice(block * BLOCK_ENTRIES, (block + 1) * BLOCK_ENTRIES)
-        parts[block_part(block)] = {
-            "descriptor_N_B": archive.descriptor_N_B[entries],
-            "generation_N": archive.generation_N[entries],
-            "member_N": archive.member_N[entries],
-        }
-    return parts
-
-
-def archive_from_parts(parts: Mapping[str, Mapping[str, np.ndarray]], dimensions: int) -> NoveltyArchive:
-    """Inverse of `archive_to_parts(archive, 0)`, among any other parts."""
-    blocks = []
-    while block_part(len(blocks)) in parts:
-        blocks.append(parts[block_part(len(blocks))])
-    if not blocks:
-        return empty_archive(dimensions)
-    descriptor_N_B, generation_N, member_N = (
-        np.concatenate([block[name] for block in blocks]) for name in ("descriptor_N_B", "generation_N", "member_N")
-    )
-    return _with_tree(_Room(descriptor_N_B, generation_N, member_N, generation_N.size), None)
 
 
 def _address(archive: NoveltyArchive) -> int:

@@ -18,8 +18,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
+from es_service.loop.parts import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.protocol import machine as platform_info
-from es_service.search.maps.behaviour_map import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.store.codec import decode_part, row_bytes
 from es_service.store.folder import DATABASE
 from es_service.store.reader import kept_states, platforms, reading, state_payload

@@ -109,6 +109,16 @@ def test_awkward_populations_load_with_a_warning():
     assert "target_fitness (-25.0)" in warning
 
 
+def test_auto_chooses_simd_by_this_machine_unless_a_cluster_runs_the_workers():
+    why, of = "the processor (i486) has no AVX2", {"tasks": {"point_maze": POINT_MAZE}, "algorithms": ALGORITHMS}
+    here = load_config(MINIMAL, no_vectors=why, **of)
+    assert here.compute.rollout == "xla"
+    (warning,) = config_warnings(here, POINT_MAZE, why)
+    assert warning == f"compute.rollout: xla, since simd cannot run point_maze: {why}"
+    there = load_config(MINIMAL, {"compute.address": "auto", "compute.engine": "ray"}, no_vectors=why, **of)
+    assert (there.compute.rollout, config_warnings(there, POINT_MAZE, why)) == ("simd", [])
+
+
 def test_simd_is_what_auto_chooses_where_it_can_be_had():
     assert load().compute.rollout == "simd"
     assert load(MINIMAL, "compute.worker_resources.gpu=1").compute.rollout == "xla"

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from es_service.search.maps.geometry import Cvt, Grid, geometry_from_arrays, geometry_to_arrays, make_geometry
+from es_service.loop.parts import geometry_from_arrays, geometry_to_arrays
+from es_service.search.maps.geometry import Cvt, Grid, make_geometry
 from tests.es_service.map_examples import OBLONG, PLANE, SQUARE, map_config
 from tests.twins import behaviour_map as twin
 

@@ -8,21 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from es_service.search.maps.behaviour_map import (
+from es_service.loop.parts import (
     GEOMETRY_PART,
-    BehaviourMap,
-    Elite,
     cell_part,
     elite_from_arrays,
     elite_part,
     elite_to_arrays,
-    empty_map,
-    insert,
-    map_columns,
     map_from_parts,
     map_to_parts,
-    with_score,
 )
+from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map, insert, map_statistics, with_score
 from tests.es_service.map_examples import PLANE
 from tests.twins import behaviour_map as twin
 
@@ -109,7 +104,7 @@ def test_any_offers_give_the_twin_s_map_and_never_a_worse_one(offers):
     assert [PLANE.index_of(cell) for cell in map_.cell_N] == list(other.elites)
     assert map_.fitness_N.tolist() == [elite.fitness for elite in other.elites.values()]
     assert map_.generation_N.tolist() == [elite.generation for elite in other.elites.values()]
-    columns = map_columns(map_, -2.0, None)
+    columns = map_statistics(map_, -2.0, None)
     assert columns["coverage"] == twin.coverage(other.elites, 12)
     assert columns["qd_score"] == twin.qd_score(other.elites, -2.0)
 
@@ -121,7 +116,7 @@ def test_metrics_by_hand():
     map_ = filled(((1.0, 0.1), -5.0), ((5.0, 1.9), -1.5), ((3.0, 0.0), -20.0))
     reachable = np.ones(12, bool)
     reachable[[0, 2, 3]] = False  # of 9 reachable cells 2 are filled; the first is out of reach
-    assert map_columns(map_, -100.0, reachable) == {
+    assert map_statistics(map_, -100.0, reachable) == {
         "map_cells": 3,
         "coverage": 0.25,
         "coverage_reachable": pytest.approx(2 / 9),
@@ -131,7 +126,7 @@ def test_metrics_by_hand():
 
 
 def test_metrics_of_an_empty_map():
-    assert map_columns(empty_map(PLANE), -100.0, None) == {
+    assert map_statistics(empty_map(PLANE), -100.0, None) == {
         "map_cells": 0,
         "coverage": 0.0,
         "coverage_reachable": None,
@@ -142,7 +137,7 @@ def test_metrics_of_an_empty_map():
 
 def test_the_qd_score_does_not_depend_on_the_order_of_its_terms():
     offers = [((1.0, 0.1), 1e16), ((5.0, 1.9), 1.0), ((3.0, 0.0), -1e16), ((3.0, 1.9), 1.0)]
-    scores = {map_columns(filled(*order), 0.0, None)["qd_score"] for order in (offers, offers[::-1])}
+    scores = {map_statistics(filled(*order), 0.0, None)["qd_score"] for order in (offers, offers[::-1])}
     assert scores == {2.0}
 
 

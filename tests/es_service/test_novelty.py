@@ -7,18 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from es_service.search.novelty import (
-    BLOCK_ENTRIES,
-    COPIES,
-    TREE_STEP,
-    NoveltyArchive,
-    archive_from_parts,
-    archive_to_parts,
-    block_part,
-    empty_archive,
-    extended,
-    novelty,
-)
+from es_service.loop.parts import BLOCK_ENTRIES, archive_from_parts, archive_to_parts, block_part
+from es_service.search.novelty import COPIES, TREE_STEP, NoveltyArchive, empty_archive, extended, novelty
 from tests.twins import novelty_search as twin
 
 coordinates = st.integers(-3, 3).map(float) | st.floats(-1e3, 1e3, allow_subnormal=False)

@@ -18,11 +18,10 @@ GROUND = ("protocol", "errors")
 ENTRIES = {"es_service.__init__": "api", "es_service.__main__": "cli"}
 """What stands at the door -> the highest room it may go to."""
 JOINERS = {
-    "es_service.runs.view",
+    "es_service.runs.moment",
     "es_service.runs.session",
     "es_service.config.tasks",
     "es_service.cli.doctor",
-    "es_service.cli.bench_rollouts",
 }
 """Modules of es_service that know both sides: they may import `workers`."""
 RAY_USERS = {"es_service.dispatch.ray_cluster", "es_service.runs.jobs"}

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 
 from es_service.loop.history import history_columns
-from es_service.loop.state import moments_from_arrays
+from es_service.loop.parts import cell_part, elite_part, map_from_parts, moments_from_arrays
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms.base import NO_CELL
 from es_service.search.algorithms.me_es import CELL_CHOICE, block_mode
-from es_service.search.maps.behaviour_map import cell_part, elite_part, map_from_parts
 from es_service.search.observation_statistics import normalisation
 from es_service.store.codec import decode_part, encode_part
 from tests.laws.me_es_runs import (

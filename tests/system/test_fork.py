@@ -19,11 +19,11 @@ from es_service.cli.commands import error_message
 from es_service.config import tasks
 from es_service.config.changes import START_KEYS, start_afresh
 from es_service.errors import ConfigError
+from es_service.loop.parts import CELL_PREFIX
 from es_service.runs import checked_config as configs
 from es_service.runs import evaluation, lineage
 from es_service.runs.session import dispatch_limits
 from es_service.runs.standing import look, more
-from es_service.search.maps.behaviour_map import CELL_PREFIX
 from es_service.store import reader
 from es_service.store.digest import digest_at
 from es_service.store.reader import read_generation

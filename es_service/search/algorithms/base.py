@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.messages import EpisodesResult, FloatArray
-from es_service.search.maps.behaviour_map import BehaviourMap
+from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.novelty import NoveltyArchive
-from es_service.search.optimizer import Adam
+from es_service.search.optimizer import Adam, fresh_adam
 
 NO_ENTRY = -1
 """`Member.entry` of a member none of whose centres was valid so far."""
@@ -62,6 +62,20 @@ class SearchState:
     """None where the config switches it off."""
 
 
+def from_elite(state: SearchState, cell: int, elite: Elite, *, own_statistics: bool = False) -> SearchState:
+    """The state with an elite in the place of member 0: its parameters, a fresh optimiser and, if wanted, the
+    observation statistics it came with, which its centres then run with."""
+    member = Member(
+        elite.centre_D,
+        fresh_adam(elite.centre_D.size),
+        state.members[0].entry,
+        cell,
+        elite.observation_mean_O if own_statistics else None,
+        elite.observation_std_O if own_statistics else None,
+    )
+    return replace(state, members=(member, *state.members[1:]))
+
+
 @dataclass(frozen=True)
 class Plan:
     """What to evaluate in this generation: the population around one member's centre."""
@@ -104,46 +118,6 @@ class Algorithm:
     fitness_weight: float
     """What the state's `weight` starts with."""
     start_cell: Callable[[SearchState, int], int | None] = lambda state, generation: None
-    """(state, generation) -> cell of the map whose elite takes the place of member 0 before that generation; None to go
-    on from where it is."""
-
-
-def member_part(index: int | str) -> str:
-    """Name of a member's part in the run store; of "", how all such names begin."""
-    return f"member_{index}"
-
-
-def member_to_arrays(member: Member) -> dict[str, np.ndarray]:
-    """A member as the store keeps it."""
-    adam = member.adam
-    own = {"own_mean_O": member.own_mean_O, "own_std_O": member.own_std_O}
-    return {
-        **{name: values for name, values in own.items() if values is not None},
-        "centre_D": member.centre_D,
-        "adam_m_D": adam.m_D,
-        "adam_v_D": adam.v_D,
-        "adam_step": np.asarray(adam.step, np.int64),
-        "entry": np.asarray(member.entry, np.int64),
-        "cell": np.asarray(member.cell, np.int64),
-    }
-
-
-def member_from_arrays(arrays: Mapping[str, np.ndarray]) -> Member:
-    """Inverse of `member_to_arrays`."""
-    adam = Adam(arrays["adam_m_D"], arrays["adam_v_D"], int(arrays["adam_step"]))
-    own_mean_O, own_std_O = arrays.get("own_mean_O"), arrays.get("own_std_O")
-    return Member(arrays["centre_D"], adam, int(arrays["entry"]), int(arrays["cell"]), own_mean_O, own_std_O)
-
-
-def weight_to_arrays(weight: FitnessWeight) -> dict[str, np.ndarray]:
-    """The fitness weight as the store keeps it."""
-    return {
-        "value": np.asarray(weight.value, np.float64),
-        "record": np.asarray(weight.record, np.float64),
-        "stagnant": np.asarray(weight.stagnant, np.int64),
-    }
-
-
-def weight_from_arrays(arrays: Mapping[str, np.ndarray]) -> FitnessWeight:
-    """Inverse of `weight_to_arrays`."""
-    return FitnessWeight(float(arrays["value"]), float(arrays["record"]), int(arrays["stagnant"]))
+    """(state, generation) -> cell whose elite that generation starts from; None to go on from where it is."""
+    restart: Callable[[SearchState, int, Elite], SearchState] = from_elite
+    """(state, start cell, its elite) -> state that the generation starts from."""

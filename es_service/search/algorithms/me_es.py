@@ -20,6 +20,7 @@ has been valid or after a fork that emptied it, the search goes on from where it
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -27,11 +28,10 @@ from numpy.typing import NDArray
 
 from es_service.config.model import NoveltyConfig, RunConfig, SearchConfig
 from es_service.protocol.noise import Domain, stream_keys, uniforms
-from es_service.search.algorithms.base import Algorithm, Member, Plan, SearchState
+from es_service.search.algorithms.base import Algorithm, Plan, SearchState, from_elite
 from es_service.search.algorithms.steps import novelty_search
-from es_service.search.maps.behaviour_map import BehaviourMap, Elite
+from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.novelty import NoveltyArchive, novelty
-from es_service.search.optimizer import fresh_adam
 
 MODE_CHOICE, CELL_CHOICE = 1, 2
 """Last ids of the streams of Domain.SELECTION: what a block does, where it starts."""
@@ -59,7 +59,8 @@ def me_es(config: RunConfig) -> Algorithm:
     def plan(state: SearchState, generation: int) -> Plan:
         return Plan(0, state.members[0].centre_D, _weight(block_mode(search, config.seed, generation)))
 
-    return replace(shared, plan=plan, start_cell=start_cell)
+    restart = partial(from_elite, own_statistics=search.parent_statistics == "elite")
+    return replace(shared, plan=plan, start_cell=start_cell, restart=restart)
 
 
 def block_mode(search: SearchConfig, seed: int, generation: int) -> Mode:
@@ -133,20 +134,6 @@ def _own_entries(map_: BehaviourMap, archive: NoveltyArchive) -> NDArray[np.int6
     found_N = np.searchsorted(entry_N, elite_N)
     is_there_N = np.append(entry_N, -1)[found_N] == elite_N
     return np.where(is_there_N, found_N, -1)
-
-
-def restarted(state: SearchState, cell: int, elite: Elite, own_statistics: bool) -> SearchState:
-    """The state with an elite in the place of member 0: its parameters, a fresh optimiser and, if wanted, the
-    observation statistics it came with, which its block then runs with."""
-    member = Member(
-        elite.centre_D,
-        fresh_adam(elite.centre_D.size),
-        state.members[0].entry,
-        cell,
-        elite.observation_mean_O if own_statistics else None,
-        elite.observation_std_O if own_statistics else None,
-    )
-    return replace(state, members=(member, *state.members[1:]))
 
 
 def _weight(mode: Mode) -> float:

@@ -8,18 +8,13 @@ it enters and read again when it is wanted. N: filled cells, in the order of the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.messages import Centre, FloatArray
-from es_service.search.maps.geometry import Geometry, geometry_from_arrays, geometry_to_arrays
-
-GEOMETRY_PART = "map"
-"""Name of the cells' own part in the run store."""
-CELL_PREFIX, ELITE_PREFIX = "cell_", "elite_"
+from es_service.search.maps.geometry import Geometry
 
 
 @dataclass(frozen=True)
@@ -120,9 +115,11 @@ def with_score(map_: BehaviourMap, cell: int, member: int, score: float) -> Beha
     return replace(map_, score_N=_with(map_.score_N, row, score))
 
 
-def map_columns(map_: BehaviourMap, qd_offset: float, reachable: NDArray[np.bool_] | None) -> dict[str, float | None]:
-    """What the history says of a map. QD-score: sum over elites of fitness - qd_offset, exact before its last rounding,
-    so that the order of the cells does not matter."""
+def map_statistics(
+    map_: BehaviourMap, qd_offset: float, reachable: NDArray[np.bool_] | None
+) -> dict[str, float | None]:
+    """Coverage, best fitness and QD-score of a map: the sum over elites of fitness - qd_offset, exact before its last
+    rounding, so that the order of the cells does not matter."""
     filled = map_.size
     return {
         "map_cells": filled,
@@ -133,69 +130,9 @@ def map_columns(map_: BehaviourMap, qd_offset: float, reachable: NDArray[np.bool
     }
 
 
-def cell_part(cell: int) -> str:
-    """Name of a cell's light part in the run store."""
-    return f"{CELL_PREFIX}{cell:08d}"
-
-
-def elite_part(cell: int) -> str:
-    """Name of a cell's heavy part in the run store."""
-    return f"{ELITE_PREFIX}{cell:08d}"
-
-
-def map_to_parts(map_: BehaviourMap, before: BehaviourMap | None) -> dict[str, dict[str, np.ndarray]]:
-    """The light parts that differ from an earlier map, as the store keeps them; of None, all and the cells' own."""
-    parts = {GEOMETRY_PART: geometry_to_arrays(map_.geometry)} if before is None else {}
-    same_N = np.zeros(map_.size, bool)
-    if before is not None:
-        known = slice(before.size)
-        same_score_N = np.isclose(map_.score_N[known], before.score_N, rtol=0, atol=0, equal_nan=True)
-        same_N[known] = (map_.generation_N[known] == before.generation_N) & same_score_N
-    for row in np.flatnonzero(~same_N):
-        parts[cell_part(int(map_.cell_N[row]))] = {
-            "order": np.asarray(row, np.int64),
-            "fitness": map_.fitness_N[row],
-            "descriptor_B": map_.descriptor_N_B[row],
-            "generation": map_.generation_N[row],
-            "member": map_.member_N[row],
-            "score": map_.score_N[row],
-        }
-    return parts
-
-
-def map_from_parts(parts: Mapping[str, Mapping[str, np.ndarray]]) -> BehaviourMap | None:
-    """Inverse of `map_to_parts(map, None)`, among any other parts; None where there is no map."""
-    if GEOMETRY_PART not in parts:
-        return None
-    empty = empty_map(geometry_from_arrays(parts[GEOMETRY_PART]))
-    found = {int(name.removeprefix(CELL_PREFIX)): part for name, part in parts.items() if name.startswith(CELL_PREFIX)}
-    if not found:
-        return empty
-    cells = sorted(found, key=lambda cell: int(found[cell]["order"]))
-    return BehaviourMap(
-        empty.geometry,
-        np.array(cells, np.int64),
-        np.array([found[cell]["fitness"] for cell in cells], np.float64),
-        np.array([found[cell]["descriptor_B"] for cell in cells], np.float64),
-        np.array([found[cell]["generation"] for cell in cells], np.int64),
-        np.array([found[cell]["member"] for cell in cells], np.int64),
-        np.array([found[cell]["score"] for cell in cells], np.float64),
-    )
-
-
 def make_elite(centre: Centre, trace_T_B: FloatArray) -> Elite:
     """What is kept of a centre that has become an elite."""
     return Elite(centre.parameters_D, centre.observation_mean_O, centre.observation_std_O, trace_T_B)
-
-
-def elite_to_arrays(elite: Elite) -> dict[str, np.ndarray]:
-    """An elite as the store keeps it."""
-    return {name: getattr(elite, name) for name in Elite.__dataclass_fields__}
-
-
-def elite_from_arrays(arrays: Mapping[str, np.ndarray]) -> Elite:
-    """Inverse of `elite_to_arrays`."""
-    return Elite(**{name: arrays[name] for name in Elite.__dataclass_fields__})
 
 
 def _with(values: np.ndarray, row: int, value: object) -> np.ndarray:

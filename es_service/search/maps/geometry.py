@@ -8,7 +8,6 @@ are stored with the run.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -125,22 +124,6 @@ def make_geometry(config: MapConfig) -> Geometry:
     if config.kind == "grid":
         return Grid(config.bounds, config.cells)
     return Cvt(config.bounds, _centroids(config.bounds, config.cells[0]))
-
-
-def geometry_to_arrays(geometry: Geometry) -> dict[str, np.ndarray]:
-    """The cells as the store keeps them: centroids too, since other versions of SciPy might place them otherwise."""
-    bounds = {"bounds_B_2": np.array(geometry.bounds, np.float64)}
-    if isinstance(geometry, Grid):
-        return bounds | {"shape_B": np.array(geometry.shape, np.int64)}
-    return bounds | {"centroid_C_B": geometry.centroid_C_B}
-
-
-def geometry_from_arrays(arrays: Mapping[str, np.ndarray]) -> Geometry:
-    """Inverse of `geometry_to_arrays`."""
-    bounds = tuple((float(low), float(high)) for low, high in arrays["bounds_B_2"])
-    if "shape_B" in arrays:
-        return Grid(bounds, tuple(int(n) for n in arrays["shape_B"]))
-    return Cvt(bounds, arrays["centroid_C_B"])
 
 
 def reachable_cells(geometry: Geometry, task: TaskSpec) -> NDArray[np.bool_] | None:

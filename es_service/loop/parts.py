@@ -1,0 +1,264 @@
+"""The state as the run store keeps it: parts by name, each a few arrays. Every pair of functions stands side by side.
+
+`state_parts` gives the parts that a generation has changed, `state_from_parts` puts a state together again. What a part
+is made of is here and nowhere else; the searches and the maps know nothing of it. Elites are written when they enter
+the map and read one at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from es_service.loop.state import Best, RunState, require_successor
+from es_service.protocol.messages import Moments
+from es_service.search.algorithms.base import FitnessWeight, Member, SearchState
+from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map
+from es_service.search.maps.geometry import Cvt, Geometry, Grid
+from es_service.search.novelty import NoveltyArchive, archive_of, empty_archive
+from es_service.search.optimizer import Adam
+
+Arrays = dict[str, np.ndarray]
+Parts = Mapping[str, Mapping[str, np.ndarray]]
+"""Arrays by name, by the name of their part."""
+
+OBSERVATIONS, COUNTERS, WEIGHT, BEST, GEOMETRY_PART = "observations", "counters", "weight", "best", "map"
+MEMBER_PREFIX, CELL_PREFIX, ELITE_PREFIX, BLOCK_PREFIX = "member_", "cell_", "elite_", "novelty_"
+"""How the names of parts begin that have a number."""
+BLOCK_ENTRIES = 256
+"""Entries of the novelty archive in one part: a generation rewrites the last part and no other."""
+
+
+def member_part(index: int) -> str:
+    """Name of a member's part."""
+    return f"{MEMBER_PREFIX}{index}"
+
+
+def cell_part(cell: int) -> str:
+    """Name of the part with what is known of a cell's elite."""
+    return f"{CELL_PREFIX}{cell:08d}"
+
+
+def elite_part(cell: int) -> str:
+    """Name of the part with what a cell's elite is made of."""
+    return f"{ELITE_PREFIX}{cell:08d}"
+
+
+def block_part(block: int) -> str:
+    """Name of a block of entries of the novelty archive."""
+    return f"{BLOCK_PREFIX}{block:05d}"
+
+
+def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
+    """The parts of `state` that differ from `before`, all of them for None.
+
+    Raises:
+        StoreError: the search's state is none that can follow `before`; see `SearchState`.
+    """
+    require_successor(before, state)
+    search, earlier = state.search, before.search if before is not None else None
+    parts = {OBSERVATIONS: moments_to_arrays(state.observations), COUNTERS: _counters_to_arrays(state)}
+    for index, member in enumerate(search.members):
+        if earlier is None or member is not earlier.members[index]:
+            parts[member_part(index)] = member_to_arrays(member)
+    if earlier is None or search.weight != earlier.weight:
+        parts[WEIGHT] = weight_to_arrays(search.weight)
+    if earlier is None or search.archive is not earlier.archive:
+        parts |= archive_to_parts(search.archive, earlier.archive.size if earlier is not None else 0)
+    if search.map is not None:
+        parts |= map_to_parts(search.map, earlier.map if earlier is not None else None)
+        parts |= {elite_part(cell): elite_to_arrays(elite) for cell, elite in state.elites.items()}
+    if before is None or state.best is not before.best:
+        parts[BEST] = best_to_arrays(state.best)
+    return parts
+
+
+def state_from_parts(parts: Parts, generation: int, wall_clock_s: float, dimensions: int) -> RunState:
+    """Inverse of `state_parts(state, None)`; elites are not needed.
+
+    Args:
+        dimensions: of a descriptor, as long as the archive has no entry.
+    """
+    members = []
+    while member_part(len(members)) in parts:
+        members.append(member_from_arrays(parts[member_part(len(members))]))
+    counters = parts[COUNTERS]
+    return RunState(
+        generation=generation,
+        search=SearchState(
+            tuple(members),
+            archive_from_parts(parts, dimensions),
+            weight_from_arrays(parts[WEIGHT]),
+            map_from_parts(parts),
+        ),
+        observations=moments_from_arrays(parts[OBSERVATIONS]),
+        best=best_from_arrays(parts[BEST]),
+        env_steps=int(counters["env_steps"]),
+        episodes=int(counters["episodes"]),
+        wall_clock_s=wall_clock_s,
+    )
+
+
+def _counters_to_arrays(state: RunState) -> Arrays:
+    return {"env_steps": np.asarray(state.env_steps, np.int64), "episodes": np.asarray(state.episodes, np.int64)}
+
+
+def moments_to_arrays(moments: Moments) -> Arrays:
+    """Observation statistics."""
+    return {"count": np.asarray(moments.count, np.float64), "mean_O": moments.mean_O, "m2_O": moments.m2_O}
+
+
+def moments_from_arrays(arrays: Mapping[str, np.ndarray]) -> Moments:
+    """Inverse of `moments_to_arrays`."""
+    return Moments(float(arrays["count"]), arrays["mean_O"], arrays["m2_O"])
+
+
+def member_to_arrays(member: Member) -> Arrays:
+    """A member: its centre, its optimiser, what it knows of itself."""
+    adam = member.adam
+    own = {"own_mean_O": member.own_mean_O, "own_std_O": member.own_std_O}
+    return {
+        **{name: values for name, values in own.items() if values is not None},
+        "centre_D": member.centre_D,
+        "adam_m_D": adam.m_D,
+        "adam_v_D": adam.v_D,
+        "adam_step": np.asarray(adam.step, np.int64),
+        "entry": np.asarray(member.entry, np.int64),
+        "cell": np.asarray(member.cell, np.int64),
+    }
+
+
+def member_from_arrays(arrays: Mapping[str, np.ndarray]) -> Member:
+    """Inverse of `member_to_arrays`."""
+    adam = Adam(arrays["adam_m_D"], arrays["adam_v_D"], int(arrays["adam_step"]))
+    own_mean_O, own_std_O = arrays.get("own_mean_O"), arrays.get("own_std_O")
+    return Member(arrays["centre_D"], adam, int(arrays["entry"]), int(arrays["cell"]), own_mean_O, own_std_O)
+
+
+def weight_to_arrays(weight: FitnessWeight) -> Arrays:
+    """The fitness weight and what adapts it."""
+    return {
+        "value": np.asarray(weight.value, np.float64),
+        "record": np.asarray(weight.record, np.float64),
+        "stagnant": np.asarray(weight.stagnant, np.int64),
+    }
+
+
+def weight_from_arrays(arrays: Mapping[str, np.ndarray]) -> FitnessWeight:
+    """Inverse of `weight_to_arrays`."""
+    return FitnessWeight(float(arrays["value"]), float(arrays["record"]), int(arrays["stagnant"]))
+
+
+def archive_to_parts(archive: NoveltyArchive, stored: int) -> dict[str, Arrays]:
+    """The blocks that differ from those of the archive's first `stored` entries."""
+    parts = {}
+    for block in range(stored // BLOCK_ENTRIES, -(-archive.size // BLOCK_ENTRIES)):
+        entries = slice(block * BLOCK_ENTRIES, (block + 1) * BLOCK_ENTRIES)
+        parts[block_part(block)] = {
+            "descriptor_N_B": archive.descriptor_N_B[entries],
+            "generation_N": archive.generation_N[entries],
+            "member_N": archive.member_N[entries],
+        }
+    return parts
+
+
+def archive_from_parts(parts: Parts, dimensions: int) -> NoveltyArchive:
+    """Inverse of `archive_to_parts(archive, 0)`, among any other parts."""
+    blocks = []
+    while block_part(len(blocks)) in parts:
+        blocks.append(parts[block_part(len(blocks))])
+    if not blocks:
+        return empty_archive(dimensions)
+    descriptor_N_B, generation_N, member_N = (
+        np.concatenate([block[name] for block in blocks]) for name in ("descriptor_N_B", "generation_N", "member_N")
+    )
+    return archive_of(descriptor_N_B, generation_N, member_N)
+
+
+def geometry_to_arrays(geometry: Geometry) -> Arrays:
+    """The cells of a map: centroids too, since other versions of SciPy might place them otherwise."""
+    bounds = {"bounds_B_2": np.array(geometry.bounds, np.float64)}
+    if isinstance(geometry, Grid):
+        return bounds | {"shape_B": np.array(geometry.shape, np.int64)}
+    return bounds | {"centroid_C_B": geometry.centroid_C_B}
+
+
+def geometry_from_arrays(arrays: Mapping[str, np.ndarray]) -> Geometry:
+    """Inverse of `geometry_to_arrays`."""
+    bounds = tuple((float(low), float(high)) for low, high in arrays["bounds_B_2"])
+    if "shape_B" in arrays:
+        return Grid(bounds, tuple(int(n) for n in arrays["shape_B"]))
+    return Cvt(bounds, arrays["centroid_C_B"])
+
+
+def map_to_parts(map_: BehaviourMap, before: BehaviourMap | None) -> dict[str, Arrays]:
+    """What is known of the elites that differ from an earlier map; of None, of all, and the cells' own part."""
+    parts = {GEOMETRY_PART: geometry_to_arrays(map_.geometry)} if before is None else {}
+    same_N = np.zeros(map_.size, bool)
+    if before is not None:
+        known = slice(before.size)
+        same_score_N = np.isclose(map_.score_N[known], before.score_N, rtol=0, atol=0, equal_nan=True)
+        same_N[known] = (map_.generation_N[known] == before.generation_N) & same_score_N
+    for row in np.flatnonzero(~same_N):
+        parts[cell_part(int(map_.cell_N[row]))] = {
+            "order": np.asarray(row, np.int64),
+            "fitness": map_.fitness_N[row],
+            "descriptor_B": map_.descriptor_N_B[row],
+            "generation": map_.generation_N[row],
+            "member": map_.member_N[row],
+            "score": map_.score_N[row],
+        }
+    return parts
+
+
+def map_from_parts(parts: Parts) -> BehaviourMap | None:
+    """Inverse of `map_to_parts(map, None)`, among any other parts; None where there is no map."""
+    if GEOMETRY_PART not in parts:
+        return None
+    empty = empty_map(geometry_from_arrays(parts[GEOMETRY_PART]))
+    found = {int(name.removeprefix(CELL_PREFIX)): part for name, part in parts.items() if name.startswith(CELL_PREFIX)}
+    if not found:
+        return empty
+    cells = sorted(found, key=lambda cell: int(found[cell]["order"]))
+    return BehaviourMap(
+        empty.geometry,
+        np.array(cells, np.int64),
+        np.array([found[cell]["fitness"] for cell in cells], np.float64),
+        np.array([found[cell]["descriptor_B"] for cell in cells], np.float64),
+        np.array([found[cell]["generation"] for cell in cells], np.int64),
+        np.array([found[cell]["member"] for cell in cells], np.int64),
+        np.array([found[cell]["score"] for cell in cells], np.float64),
+    )
+
+
+def elite_to_arrays(elite: Elite) -> Arrays:
+    """What an elite is made of."""
+    return {name: getattr(elite, name) for name in Elite.__dataclass_fields__}
+
+
+def elite_from_arrays(arrays: Mapping[str, np.ndarray]) -> Elite:
+    """Inverse of `elite_to_arrays`."""
+    return Elite(**{name: arrays[name] for name in Elite.__dataclass_fields__})
+
+
+def best_to_arrays(best: Best) -> Arrays:
+    """The best centre so far."""
+    return {
+        "generation": np.asarray(best.generation, np.int64),
+        "fitness": np.asarray(best.fitness, np.float64),
+        "centre_D": best.centre_D,
+        "observation_mean_O": best.observation_mean_O,
+        "observation_std_O": best.observation_std_O,
+    }
+
+
+def best_from_arrays(arrays: Mapping[str, np.ndarray]) -> Best:
+    """Inverse of `best_to_arrays`."""
+    return Best(
+        generation=int(arrays["generation"]),
+        fitness=float(arrays["fitness"]),
+        centre_D=arrays["centre_D"],
+        observation_mean_O=arrays["observation_mean_O"],
+        observation_std_O=arrays["observation_std_O"],
+    )

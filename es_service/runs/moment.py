@@ -1,0 +1,198 @@
+"""A run as it was after one generation: what can be read out of its state, whatever its driver stores meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from operator import index
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.errors import NotInRunError
+from es_service.loop.parts import (
+    BEST,
+    OBSERVATIONS,
+    Parts,
+    archive_from_parts,
+    best_from_arrays,
+    elite_from_arrays,
+    elite_part,
+    map_from_parts,
+    member_from_arrays,
+    member_part,
+    moments_from_arrays,
+)
+from es_service.loop.state import Best, statistics_in_force
+from es_service.protocol.messages import FloatArray, PolicyShape
+from es_service.search.algorithms.base import Member
+from es_service.search.maps.behaviour_map import BehaviourMap, Elite
+from es_service.search.maps.geometry import Grid
+from es_service.store import reader
+from es_service.store.schema import RunMeta
+from workers.policy import act, normalise, split_layers
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A trained controller, NumPy only: observation [O] or [..., O] -> action [..., A] in [-1, 1].
+
+    It carries the observation statistics it runs with, so it needs nothing else.
+    """
+
+    shape: PolicyShape
+    parameters_D: FloatArray
+    observation_mean_O: FloatArray
+    observation_std_O: FloatArray
+    observation_clip: float | None
+
+    def __call__(self, observation: Any) -> FloatArray:
+        """Action for a raw (not normalised) observation; no action noise. Raises ValueError for another size."""
+        observation = np.asarray(observation, np.float32)
+        size = self.shape.widths[0]
+        if observation.shape[-1:] != (size,):
+            raise ValueError(
+                f"this policy takes observations of {size} numbers, [..., {size}]; got {observation.shape}"
+            )
+        x = normalise(np, observation, self.observation_mean_O, self.observation_std_O, self.observation_clip)
+        return act(np, split_layers(self.shape, self.parameters_D), x)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The state of a run after one generation, read at once and checked; perhaps only some of its parts."""
+
+    folder: Path
+    meta: RunMeta
+    generation: int
+    parts: Parts
+
+    @property
+    def novelty(self) -> pd.DataFrame:
+        """As `Run.novelty`."""
+        import pandas as pd
+
+        names = descriptor_names(self.meta)
+        archive = archive_from_parts(self.parts, len(names))
+        columns = {"generation": archive.generation_N, "member": archive.member_N}
+        return pd.DataFrame(columns | dict(zip(names, archive.descriptor_N_B.T, strict=True)))
+
+    @property
+    def behaviour_map(self) -> BehaviourMap:
+        """As `Run.behaviour_map`."""
+        map_ = map_from_parts(self.parts)
+        if map_ is None:
+            raise NotInRunError(f"{self.folder} keeps no map; it was started with map.enabled = false", run=self.folder)
+        return map_
+
+    @property
+    def map(self) -> pd.DataFrame:
+        """As `Run.map`."""
+        import pandas as pd
+
+        map_, names = self.behaviour_map, descriptor_names(self.meta)
+        labels = [f"cell_{name}" for name in names]
+        return pd.DataFrame(
+            {"cell": map_.cell_N}
+            | (dict(zip(labels, map_places(map_).T, strict=True)) if isinstance(map_.geometry, Grid) else {})
+            | {"fitness": map_.fitness_N}
+            | dict(zip(names, map_.descriptor_N_B.T, strict=True))
+            | {"generation": map_.generation_N, "member": map_.member_N}
+        )
+
+    def cell(self, place: int | Sequence[int]) -> int:
+        """As `Run.cell`."""
+        map_ = self.behaviour_map
+        place = (index(place),) if isinstance(place, int | np.integer) else tuple(map(_whole, place))
+        shown = ",".join(map(str, place))
+        dimensions = len(map_.geometry.shape)
+        if len(place) != dimensions:
+            near = ",".join(map(str, map_places(map_)[0])) if map_.size else "none yet"
+            raise NotInRunError(
+                f"cell {shown} is not in the map of {self.folder}: a cell has {dimensions} numbers there, "
+                f"such as {near}, the first that was filled",
+                field="cell",
+                value=place,
+                run=self.folder,
+            )
+        cell = map_.geometry.cell_at(place)
+        if cell is not None and map_.row_of(cell) is not None:
+            return cell
+        near = nearest_filled(map_, place)
+        hint = f"; the nearest filled cell is {','.join(map(str, near))}" if near else "; the map is empty"
+        if cell is None:
+            sizes = " and ".join(f"0 to {n - 1}" for n in map_.geometry.shape)
+            why = f"cell {shown} is not in the map of {self.folder}, whose cells are {sizes}"
+        else:
+            why = f"cell {shown} of {self.folder} is empty"
+        raise NotInRunError(f"{why}{hint}", field="cell", value=place, suggestion=near, run=self.folder)
+
+    def elites(self, cells: Collection[int] | None = None) -> tuple[BehaviourMap, dict[int, Elite]]:
+        """As `Run.elites`."""
+        map_ = self.behaviour_map
+        chosen = map_.cell_N.tolist() if cells is None else cells
+        return map_, {cell: elite_from_arrays(self.parts[elite_part(cell)]) for cell in chosen}
+
+    @property
+    def best(self) -> Best:
+        """The best centre so far."""
+        return best_from_arrays(self.parts[BEST])
+
+    @property
+    def newest_member(self) -> Member:
+        """The member that the history row of this generation is about."""
+        [row] = reader.read_history(self.folder, self.generation, 1)
+        return member_from_arrays(self.parts[member_part(int(row["member"]))])
+
+    def policy(self, which: Literal["best", "centre"]) -> Policy:
+        """As `Run.policy`."""
+        if which == "best":
+            best = self.best
+            return make_policy(self.meta, best.centre_D, best.observation_mean_O, best.observation_std_O)
+        member, enabled = self.newest_member, self.meta.constants["policy.observation_normalization"]
+        mean_O, std_O = statistics_in_force(moments_from_arrays(self.parts[OBSERVATIONS]), member, enabled)
+        return make_policy(self.meta, member.centre_D, mean_O, std_O)
+
+
+def make_policy(meta: RunMeta, parameters_D: FloatArray, mean_O: FloatArray, std_O: FloatArray) -> Policy:
+    """A policy of a run's shape."""
+    return Policy(policy_shape(meta), parameters_D, mean_O, std_O, meta.constants["policy.observation_clip"])
+
+
+def policy_shape(meta: RunMeta) -> PolicyShape:
+    """Layer widths of a run's policies."""
+    widths = (meta.task["observation_size"], *meta.constants["policy.hidden"], meta.task["action_size"])
+    return PolicyShape(widths)
+
+
+def descriptor_names(meta: RunMeta) -> list[str]:
+    """Of the descriptor's dimensions of a run, in order."""
+    return list(meta.task["descriptor_names"])
+
+
+def map_places(map_: BehaviourMap) -> NDArray[np.int64]:
+    """Place of each filled cell along each dimension of the map, [N, dimensions]."""
+    places = [map_.geometry.index_of(int(cell)) for cell in map_.cell_N]
+    return np.array(places, np.int64).reshape(map_.size, len(map_.geometry.shape))
+
+
+def nearest_filled(map_: BehaviourMap, place: Sequence[int]) -> tuple[int, ...] | None:
+    """Place of the filled cell nearest to another place, counted in cells (of a cvt: numbers); the first of equals."""
+    if not map_.size:
+        return None
+    return min(
+        (map_.geometry.index_of(int(cell)) for cell in map_.cell_N),
+        key=lambda other: sum((a - b) ** 2 for a, b in zip(other, place, strict=True)),
+    )
+
+
+def _whole(number: Any) -> int:
+    """A whole number; pandas makes floats of them where it takes a row out of a table."""
+    if int(number) != number:
+        raise TypeError(f"{number!r} is no whole number")
+    return int(number)
