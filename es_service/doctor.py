@@ -30,8 +30,8 @@ from es_service.statistics import no_observations, normalisation
 from es_service.store.folder import is_network_filesystem
 from es_service.tasks import TASKS
 from workers.policy import initial_parameters
-from workers.simd.kernel import compile_kernel
-from workers.simd.target import NoVectorsError, host_target
+from workers.simd.backend.target import NoVectorsError, host_target
+from workers.simd.episodes.kernel import compile_kernel
 
 Finding = tuple[str, str]
 """("ok" | "note" | "FAIL", text)."""

@@ -17,7 +17,7 @@ from es_service.errors import ConfigError
 from es_service.process_environment import child_environment
 from es_service.protocol import TaskSpec, with_options
 from workers import environments
-from workers.simd.target import NoVectorsError, host_target
+from workers.simd.backend.target import NoVectorsError, host_target
 
 DESCRIBE_S = 120.0
 """Longest wait for a description; the first import of Brax on a slow disk takes a while."""
