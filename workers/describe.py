@@ -12,7 +12,7 @@ import json
 import sys
 
 from workers.environments import TaskError, describe_environment
-from workers.simd.rollout import why_not
+from workers.simd.episodes.rollout import why_not
 
 
 def main(name: str) -> None:

@@ -24,10 +24,10 @@ from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, strea
 from workers.environments import SHIPPED, Environment, describe_environment, make_environment
 from workers.policy import initial_parameters
 from workers.rollout import make_training_rollout
-from workers.simd import rollout as simd_rollout
-from workers.simd.kernel import compile_kernel
-from workers.simd.primitives import UnsupportedError
-from workers.simd.target import NoVectorsError
+from workers.simd.backend.target import NoVectorsError
+from workers.simd.episodes import rollout as simd_rollout
+from workers.simd.episodes.kernel import compile_kernel
+from workers.simd.graph.unsupported import UnsupportedError
 
 STEPS, STEPS_WITH_POLICY = 50, 200
 """Control steps of one call. With a policy each call also makes the noise of its members, as a chunk of a run does."""

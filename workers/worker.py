@@ -32,7 +32,7 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
     """Build the compiled functions of a run (compiled on first use) and return what runs its chunks."""
     environment = make_environment(spec.environment, spec.environment_options)
     if spec.rollout == "simd":
-        from workers.simd import rollout as made_by
+        from workers.simd.episodes import rollout as made_by
     else:
         from workers import rollout as made_by
     training_rollout = made_by.make_training_rollout(environment, spec)

@@ -16,7 +16,7 @@ from es_service.errors import ConfigError
 from es_service.protocol.messages import TaskSpec, with_options
 from es_service.protocol.process_environment import child_environment
 from workers import environments
-from workers.simd.target import NoVectorsError, host_target
+from workers.simd.backend.target import NoVectorsError, host_target
 
 DESCRIBE_S = 120.0
 """Longest wait for a description; the first import of Brax on a slow disk takes a while."""

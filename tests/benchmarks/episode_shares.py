@@ -29,16 +29,16 @@ from tests.benchmarks.simd_physics import peak
 from workers.environments import make_environment
 from workers.episode import episode_steps
 from workers.policy import initial_parameters
-from workers.simd.code import Code, module
-from workers.simd.emit import graph_function
-from workers.simd.kernel import compile_kernel
-from workers.simd.layout import plan
-from workers.simd.network import policy_function
-from workers.simd.noise import fill_function
-from workers.simd.rollout import always_zero
-from workers.simd.target import compile_object, host_target, load_object
-from workers.simd.trace import trace_jaxpr
-from workers.simd.words import aligned, words_of
+from workers.simd.backend.code import Code, module
+from workers.simd.backend.emit import graph_function
+from workers.simd.backend.target import compile_object, host_target, load_object
+from workers.simd.backend.words import aligned, words_of
+from workers.simd.episodes.kernel import compile_kernel
+from workers.simd.episodes.layout import plan
+from workers.simd.episodes.network import policy_function
+from workers.simd.episodes.noise import fill_function
+from workers.simd.episodes.rollout import always_zero
+from workers.simd.frontend.trace import trace_jaxpr
 
 REPEATS = 2000
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys
 from workers.rollout import make_gradient_sum
-from workers.simd import rollout as simd
+from workers.simd.episodes import rollout as simd
 
 PAIRS = 64
 UNIT = np.float32(1 / NORMAL_STD)

@@ -50,10 +50,10 @@ def facts_of(task: str) -> dict:
     import jax.numpy as jnp
 
     from workers.environments import SHIPPED, describe_environment, make_environment
-    from workers.simd.graph import Graph
-    from workers.simd.kernel import compile_kernel
-    from workers.simd.schedule import Region, schedule
-    from workers.simd.trace import trace_jaxpr
+    from workers.simd.episodes.kernel import compile_kernel
+    from workers.simd.frontend.trace import trace_jaxpr
+    from workers.simd.graph.graph import Graph
+    from workers.simd.graph.schedule import Region, schedule
 
     environment = make_environment(task, {})
     size = SHIPPED[task] if task in SHIPPED else describe_environment(task)
@@ -104,10 +104,10 @@ def facts_of(task: str) -> dict:
 
 def peak() -> float:
     """GFLOP/s of independent fused operations, 24 in flight, on vectors of this machine's width."""
-    from workers.simd.emit import emit
-    from workers.simd.graph import Graph
-    from workers.simd.target import compile_object, host_target, load_object
-    from workers.simd.words import aligned
+    from workers.simd.backend.emit import emit
+    from workers.simd.backend.target import compile_object, host_target, load_object
+    from workers.simd.backend.words import aligned
+    from workers.simd.graph.graph import Graph
 
     graph, trips, lanes = Graph(), 100_000, host_target().width
     loop = graph.loop(trips, [graph.input("f", k) for k in range(24)])

@@ -27,8 +27,9 @@ from tests.laws.es_runs import SHAPE, run_in_memory, small_config
 from tests.twins import es as twin
 from workers.environments import SHIPPED
 from workers.policy import initial_parameters
-from workers.simd import episodes, target
-from workers.simd import rollout as simd_rollout
+from workers.simd.backend import target
+from workers.simd.episodes import program
+from workers.simd.episodes import rollout as simd_rollout
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +123,7 @@ def test_vectors_of_another_width_give_the_same_run(finished, monkeypatch, kind)
     """What a processor without AVX-512 computes: everything that is kept has the same bits."""
     config, state, store, _, _ = finished
     assert config.compute.rollout == "simd"
-    for module in (simd_rollout, episodes):
+    for module in (simd_rollout, program):
         monkeypatch.setattr(module, "host_target", partial(target.host_target, kind))
     again, other, _, _ = run_in_memory(config)
     assert again.generation == state.generation

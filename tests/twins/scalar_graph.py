@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.graph import Graph
-from workers.simd.operations import DTYPES
-from workers.simd.operations import compute as compute_operation
-from workers.simd.schedule import Region, schedule
+from workers.simd.graph.graph import Graph
+from workers.simd.graph.operations import DTYPES
+from workers.simd.graph.operations import compute as compute_operation
+from workers.simd.graph.schedule import Region, schedule
 
 
 def evaluate(

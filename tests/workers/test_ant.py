@@ -17,7 +17,7 @@ from workers.environments import SHIPPED, make_environment
 from workers.environments.ant import STEP_S, Ant, contact_forces, expand, load_system, make_ant, observe, physics_step
 from workers.environments.brax_parts import pipeline
 from workers.policy import act, initial_parameters, split_layers
-from workers.simd import rollout as simd
+from workers.simd.episodes import rollout as simd
 from workers.worker import episode_keys
 
 pytestmark = [

@@ -1,16 +1,11 @@
 """A compiler from JAX functions of one environment to vector code for many: rollouts at the speed of the core.
 
-    trace.py      jaxpr -> scalar graph    (primitives/, elementary.py, division.py; graph.py, folding.py, loops.py)
-    schedule.py   which order, which loop, which products are fused with their sums
-    emit.py       graph -> LLVM IR         (operations.py; code.py)
-    target.py     LLVM IR -> machine code, in process
-    kernel.py     all of it, with cache.py before; words.py
+    frontend/    jaxpr -> scalar graph                 trace, tracer, primitives/, kinds, digest
+    graph/       the graph, and what simplifies it     graph, folding, loops; elementary, division; schedule; operations
+    backend/     graph -> LLVM IR -> machine code      emit, code; target; native, cache; words
+    episodes/    what is compiled with them            kernel; layout, network, noise, program; rollout
 
-    noise.py      the generator, and weighted sums of it
-    layout.py     where a policy's weights are
-    network.py    the policy, whose members' weights are made where they are used
-    episodes.py   whole episodes: these, and what the task does between, in one kernel
-    rollout.py    what workers call
-
-Each lane of a vector is one environment. Environments stay written once, in JAX; `xla` is what this is held against.
+A folder imports from those it needs below it: episodes from all, frontend and backend from graph, graph from none. Each
+lane of a vector is one environment. Environments stay written once, in JAX; `xla` is what this is held against. The
+README beside this file follows a step through all stages.
 """

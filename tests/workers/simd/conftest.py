@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from workers.simd.target import NoVectorsError, host_target
+from workers.simd.backend.target import NoVectorsError, host_target
 
 
 @pytest.fixture(autouse=True)

@@ -13,8 +13,8 @@ from tests.helpers import spec
 from workers.environments import SHIPPED, make_environment
 from workers.episode import Episodes
 from workers.policy import initial_parameters
-from workers.simd import rollout
-from workers.simd.target import WIDTHS, NoVectorsError, host_target
+from workers.simd.backend.target import WIDTHS, NoVectorsError, host_target
+from workers.simd.episodes import rollout
 
 
 def targets() -> list[Any]:

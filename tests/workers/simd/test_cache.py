@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from workers.simd import cache
-from workers.simd.kernel import compile_kernel
+from workers.simd.backend import cache
+from workers.simd.episodes.kernel import compile_kernel
 
 X = np.linspace(-1, 1, 20, dtype=np.float32)
 

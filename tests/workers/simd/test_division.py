@@ -11,9 +11,9 @@ import pytest
 from jax import lax
 
 from tests.workers.simd.rollouts import kinds
-from workers.simd import division
-from workers.simd.kernel import compile_kernel
-from workers.simd.target import host_target
+from workers.simd.backend.target import host_target
+from workers.simd.episodes.kernel import compile_kernel
+from workers.simd.graph import division
 
 INF, NAN = math.inf, math.nan
 EDGES = np.array([0.0, -0.0, 1.0, -1.0, 2.5, -0.1, 5.0, 2.0**24, 2e-30, -2e-30, 1e14, 3e38, INF, -INF, NAN], np.float32)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from workers.simd.kernel import compile_kernel
+from workers.simd.episodes.kernel import compile_kernel
 
 INF, NAN = math.inf, math.nan
 TINY = float(np.finfo(np.float32).tiny)

@@ -19,13 +19,13 @@ from tests.helpers import random_parameters, spec
 from tests.workers.simd.rollouts import arguments, both, targets, task_spec
 from workers.environments import make_environment
 from workers.episode import Episodes
-from workers.simd import rollout
-from workers.simd.code import Code, module
-from workers.simd.episodes import compile_episodes
-from workers.simd.kernel import load_compiled
-from workers.simd.layout import plan
-from workers.simd.noise import UNROLLED, fill_function
-from workers.simd.target import WIDTHS, host_target
+from workers.simd.backend.code import Code, module
+from workers.simd.backend.native import load_compiled
+from workers.simd.backend.target import WIDTHS, host_target
+from workers.simd.episodes import rollout
+from workers.simd.episodes.layout import plan
+from workers.simd.episodes.noise import UNROLLED, fill_function
+from workers.simd.episodes.program import compile_episodes
 
 
 def test_episodes_of_point_maze_are_xlas():
@@ -138,14 +138,14 @@ def test_noise_is_the_published_generator_s(kind: str, tmp_path: Path):
     fill = fill_function(3, singles, target.width)
     code = Code("inside", fill.parameters, target.width)
     code.do("call void @fill(ptr %keys, ptr %places, ptr %noise)")
-    address, alive = load_compiled(f"noise {kind}", lambda: module([fill, code]), target, tmp_path)
+    native = load_compiled(f"noise {kind}", lambda: module([fill, code]), target, tmp_path)
     places = np.array([0, 1000, 2**32 - 5, 0, 1, 2, 77, 2**32 - 1], np.uint32)
     for (seed, domain, generation, ids), expected in TEST_VECTORS:
         keys = stream_keys(1, Domain.SELECTION, 2, np.arange(pairs))
         keys[0] = stream_keys(seed, domain, generation, *ids)
         noise = np.zeros((3 * pairs + singles) * target.width, np.int8)
         pointers = [array.ctypes.data for array in (keys, places, noise)]
-        ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3)(address)(*pointers)
+        ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3)(native.address)(*pointers)
         k = 2 * noise.astype(int) + 1
         of_vectors = k[: 3 * pairs * target.width].reshape(pairs, 3, target.width)
         of_singles = k[of_vectors.size :].reshape(singles, target.width)
@@ -155,7 +155,7 @@ def test_noise_is_the_published_generator_s(kind: str, tmp_path: Path):
             key = keys[member // 2]
             np.testing.assert_array_equal(of_vectors[member // 2], normal_integers(np, key, coordinates))
             np.testing.assert_array_equal(of_singles[:, member], normal_integers(np, key, places[3:]))
-    assert alive
+    assert native.alive
 
 
 @pytest.mark.parametrize("parameters", [1, UNROLLED * 16, 4482])

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.twins.scalar_graph import evaluate
-from workers.simd.graph import Graph
-from workers.simd.operations import OPERATIONS
+from workers.simd.graph.folding import FoldingGraph
+from workers.simd.graph.operations import OPERATIONS
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 2.5, -3.5, math.inf, -math.inf, math.nan, 1e-38, 3e38], np.float32)
 
@@ -20,9 +20,9 @@ def lanes(*columns: np.ndarray) -> np.ndarray:
     return np.array([np.asarray(column).view(np.uint32) for column in columns])
 
 
-def folded(name: str, build) -> tuple[Graph, int, bool]:
+def folded(name: str, build) -> tuple[FoldingGraph, int, bool]:
     """(graph, node, whether it is a simpler one) of an operation on what `build` makes of x, the input."""
-    graph = Graph()
+    graph = FoldingGraph()
     arguments = build(graph, graph.input("f", 0))
     node = graph.op(name, *arguments)
     return graph, node, graph.keys[node] not in ((name, *arguments), (name, *reversed(arguments)))
@@ -88,7 +88,7 @@ def test_these_hold_but_for_the_sign_of_zero(name: str, build, meaning) -> None:
 
 
 def test_zero_times_anything_is_zero_and_the_factor_is_still_seen_elsewhere() -> None:
-    graph = Graph()
+    graph = FoldingGraph()
     x = graph.input("f", 0)
     product = graph.op("mul", x, graph.f(0.0))
     assert graph.constant(product) == 0.0
@@ -116,7 +116,7 @@ def test_what_not_a_number_would_change_is_left_alone(name: str, build) -> None:
 
 
 def test_equal_expressions_are_one_node_and_operands_may_change_places() -> None:
-    graph = Graph()
+    graph = FoldingGraph()
     x, y = graph.input("f", 0), graph.input("f", 1)
     assert graph.op("add", x, y) == graph.op("add", y, x)
     assert graph.op("sub", x, y) != graph.op("sub", y, x)
@@ -125,7 +125,7 @@ def test_equal_expressions_are_one_node_and_operands_may_change_places() -> None
 
 
 def test_constants_fold_as_the_kernels_compute() -> None:
-    graph = Graph()
+    graph = FoldingGraph()
     assert graph.constant(graph.op("add", graph.f(0.1), graph.f(0.2))) == np.float32(0.1) + np.float32(0.2)
     assert graph.constant(graph.op("mul", graph.f(1e-30), graph.f(1e-10))) == 0.0, "denormal results are zeros"
     assert graph.constant(graph.op("bits", graph.op("unbits", graph.i(5)))) == 5, "bits are only moved"
@@ -169,7 +169,7 @@ def test_folded_expressions_equal_those_computed_one_by_one(expression, seed: in
     """For finite values: where every step is finite, folding changes no bit but signs of zeros."""
     x = np.random.default_rng(seed).normal(size=(3, 32)).astype(np.float32)
     constants = [0.0, 1.0, -1.0, 0.5]
-    graph = Graph()
+    graph = FoldingGraph()
     nodes = [graph.input("f", k) for k in range(3)] + [graph.f(value) for value in constants]
     plain = [*x, *(np.full(32, value, np.float32) for value in constants)]
     finite = np.ones(32, bool)

@@ -14,12 +14,13 @@ from jax import lax
 from tests.twins.scalar_graph import evaluate
 from tests.workers.simd.rollouts import kinds
 from workers.environments import make_environment
-from workers.simd import target
-from workers.simd.kernel import Kernel, compile_kernel, jaxpr_digest
-from workers.simd.operations import OPERATIONS
-from workers.simd.target import host_target
-from workers.simd.trace import trace_jaxpr
-from workers.simd.words import aligned, pack
+from workers.simd.backend import target
+from workers.simd.backend.target import host_target
+from workers.simd.backend.words import aligned, pack
+from workers.simd.episodes.kernel import Kernel, compile_kernel
+from workers.simd.frontend.digest import jaxpr_digest
+from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.graph.operations import OPERATIONS
 
 LANES = 100
 

@@ -13,11 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jax import lax
 
-from workers.simd import loops
-from workers.simd.graph import Graph, depending, live
-from workers.simd.kernel import compile_kernel
-from workers.simd.schedule import Region, schedule
-from workers.simd.trace import trace_jaxpr
+from workers.simd.episodes.kernel import compile_kernel
+from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.graph import loops
+from workers.simd.graph.graph import Graph, depending, live
+from workers.simd.graph.schedule import Region, schedule
 
 X = np.random.default_rng(0).uniform(-1, 1, (40, 3)).astype(np.float32)
 

@@ -13,13 +13,13 @@ from es_service.protocol.messages import PolicyShape
 from es_service.protocol.noise import NORMAL_STD, Domain, normals, stream_keys
 from tests.helpers import random_parameters
 from tests.workers.simd.rollouts import targets
-from workers.simd.code import Code, module
-from workers.simd.kernel import load_compiled
-from workers.simd.layout import Network, plan
-from workers.simd.network import policy_function
-from workers.simd.noise import fill_function
-from workers.simd.target import WIDTHS, Target
-from workers.simd.words import aligned
+from workers.simd.backend.code import Code, module
+from workers.simd.backend.native import load_compiled
+from workers.simd.backend.target import WIDTHS, Target
+from workers.simd.backend.words import aligned
+from workers.simd.episodes.layout import Network, plan
+from workers.simd.episodes.network import policy_function
+from workers.simd.episodes.noise import fill_function
 
 SIGMA = 0.1
 UNTOUCHED = 7.0
@@ -38,9 +38,7 @@ def run(
     given = "ptr %noise, float %unit, " if noisy else ""
     code.do(f"call void @policy(ptr %x, ptr %alive, ptr %centre, {given}ptr %hidden, ptr %action)")
     functions = [fill, policy_function(network, noisy=noisy), code]
-    address, alive_code = load_compiled(
-        f"policy {network.places.tolist()} {noisy}", lambda: module(functions), target, folder
-    )
+    native = load_compiled(f"policy {network.places.tolist()} {noisy}", lambda: module(functions), target, folder)
     lanes = aligned((network.inputs if not network.hidden else network.hidden[0].inputs, network.width))
     lanes.view(np.float32)[:] = x.T
     hidden = aligned((max(1, network.hidden_vectors), network.width)).view(np.float32)
@@ -49,9 +47,9 @@ def run(
     given_keys = keys if noisy else np.zeros((1, 4), np.uint32)
     noise = np.zeros(network.noise_bytes, np.int8)
     arrays = (lanes, alive, network.pack(centre_D), given_keys, network.places, noise, hidden, action)
-    call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * len(arrays), ctypes.c_float)(address)
+    call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * len(arrays), ctypes.c_float)(native.address)
     call(*(array.ctypes.data for array in arrays), SIGMA / NORMAL_STD)
-    assert alive_code
+    assert native.alive
     return action.view(np.float32).T.copy(), hidden.reshape(-1)
 
 

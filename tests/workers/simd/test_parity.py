@@ -20,7 +20,7 @@ import pytest
 from es_service.protocol.noise import Domain, stream_keys
 from workers.environments import SHIPPED, Environment, ant_maze, ant_trap, describe_environment, make_environment
 from workers.environments.ant import expand, make_ant, physics_step
-from workers.simd.kernel import compile_kernel
+from workers.simd.episodes.kernel import compile_kernel
 
 STATES = 1000
 STEPS = 30

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from jax import lax
 
 from tests.workers.simd.primitive_cases import CASES
-from workers.simd.kernel import compile_kernel
-from workers.simd.primitives import PRIMITIVES, UnsupportedError
+from workers.simd.episodes.kernel import compile_kernel
+from workers.simd.frontend.primitives import PRIMITIVES
+from workers.simd.graph.unsupported import UnsupportedError
 
 
 def check(function: Callable, arguments: list[np.ndarray]) -> None:

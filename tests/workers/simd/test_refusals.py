@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import workers.simd.episodes
+import workers.simd.episodes.program
 from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
 from es_service.protocol.noise import Domain, normal_integers, stream_keys
 from tests.helpers import centre, random_parameters, spec
 from workers.environments import SHIPPED, describe_environment, make_environment
-from workers.simd import noise, rollout
-from workers.simd.episodes import compile_episodes
-from workers.simd.primitives import UnsupportedError
+from workers.simd.episodes import noise, rollout
+from workers.simd.episodes.program import compile_episodes
+from workers.simd.graph.unsupported import UnsupportedError
 from workers.worker import make_worker
 
 
@@ -83,5 +83,5 @@ def test_a_step_without_a_text_of_its_own_is_refused_beforehand(monkeypatch: pyt
     def nameless(*_: Any) -> str:
         raise ValueError("<function at 0x7f>")
 
-    monkeypatch.setattr(workers.simd.episodes, "jaxpr_digest", nameless)
+    monkeypatch.setattr(workers.simd.episodes.program, "jaxpr_digest", nameless)
     assert rollout.why_not(SHIPPED["point_maze"]) == "ValueError: <function at 0x7f>"

@@ -12,9 +12,10 @@ import pytest
 from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
 from tests.helpers import centre, random_parameters, spec
 from workers.environments import describe_environment
-from workers.simd import rollout
-from workers.simd.kernel import compile_kernel
-from workers.simd.primitives import PRIMITIVES, UnsupportedError
+from workers.simd.episodes import rollout
+from workers.simd.episodes.kernel import compile_kernel
+from workers.simd.frontend.primitives import PRIMITIVES
+from workers.simd.graph.unsupported import UnsupportedError
 from workers.worker import make_worker
 
 

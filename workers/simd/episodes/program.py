@@ -21,16 +21,18 @@ from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from workers.environments import Environment
 from workers.episode import Carry, Episodes, EpisodeSteps, episode_steps
-from workers.simd.code import Code, Values, module
-from workers.simd.emit import graph_function
-from workers.simd.kernel import Kernel, compile_kernel, jaxpr_digest, load_compiled
-from workers.simd.layout import Network, plan
-from workers.simd.network import policy_function
-from workers.simd.noise import definition, fill_function
-from workers.simd.primitives import UnsupportedError
-from workers.simd.target import Target, host_target
-from workers.simd.trace import trace_jaxpr
-from workers.simd.words import ALIGNMENT, aligned, filled, pack, unpack, words_of
+from workers.simd.backend.code import Code, Values, module
+from workers.simd.backend.emit import graph_function
+from workers.simd.backend.native import load_compiled
+from workers.simd.backend.target import Target, host_target
+from workers.simd.backend.words import ALIGNMENT, aligned, filled, pack, unpack, words_of
+from workers.simd.episodes.kernel import Kernel, compile_kernel
+from workers.simd.episodes.layout import Network, plan
+from workers.simd.episodes.network import policy_function
+from workers.simd.episodes.noise import definition, fill_function
+from workers.simd.frontend.digest import jaxpr_digest
+from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.graph.unsupported import UnsupportedError
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ def compile_episodes(
     """
     target = target or host_target()
     written = write_episodes(environment, spec, inputs_O, target.width, training=training)
-    address, alive = load_compiled(written.name, written.text, target, folder)
+    native = load_compiled(written.name, written.text, target, folder)
     signature = [*[ctypes.c_void_p] * 8, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
     carry = written.carry
     return EpisodeKernel(
@@ -124,8 +126,8 @@ def compile_episodes(
         alive_word=written.alive_word,
         episode_avals=carry.episode,
         episode_words=sum(map(words_of, carry.episode)),
-        _call=ctypes.CFUNCTYPE(None, *signature)(address),
-        _alive=alive,
+        _call=ctypes.CFUNCTYPE(None, *signature)(native.address),
+        _alive=native.alive,
     )
 
 

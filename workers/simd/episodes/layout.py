@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.messages import PolicyShape
-from workers.simd.words import aligned
+from workers.simd.backend.words import aligned
 
 
 class Layer(NamedTuple):

@@ -5,17 +5,7 @@ A rule is `f(tracer, equation, *arrays of nodes) -> array of nodes`, or a list w
 it cannot do.
 """
 
-from workers.simd.primitives import arithmetic, choices, control, reductions, structure
-from workers.simd.primitives.registry import PRIMITIVES, Nodes, UnsupportedError, kind_of
+from workers.simd.frontend.primitives import arithmetic, choices, control, reductions, structure
+from workers.simd.frontend.primitives.registry import PRIMITIVES
 
-__all__ = [
-    "PRIMITIVES",
-    "Nodes",
-    "UnsupportedError",
-    "arithmetic",
-    "choices",
-    "control",
-    "kind_of",
-    "reductions",
-    "structure",
-]
+__all__ = ["PRIMITIVES", "arithmetic", "choices", "control", "reductions", "structure"]

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from workers.simd.graph import Graph
-from workers.simd.primitives.choices import choose, extreme_of, to_float
-from workers.simd.primitives.registry import PRIMITIVES, Nodes, Rule, UnsupportedError, dtype_in, kind_of, primitive
-
-if TYPE_CHECKING:
-    from workers.simd.trace import Tracer
+from workers.simd.frontend.kinds import dtype_in, kind_of
+from workers.simd.frontend.primitives.choices import choose, extreme_of, to_float
+from workers.simd.frontend.primitives.registry import PRIMITIVES, primitive
+from workers.simd.frontend.tracer import Nodes, Rule, Tracer
+from workers.simd.graph.graph import Graph
+from workers.simd.graph.unsupported import UnsupportedError
 
 
 def _reduce(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Rule:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from workers.simd.graph import Graph, Loop, depending, live
+from workers.simd.graph.graph import Graph, Loop, depending, live
 
 
 @dataclass

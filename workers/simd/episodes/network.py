@@ -17,11 +17,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from workers.simd import elementary
-from workers.simd.code import Code, Values
-from workers.simd.emit import inline
-from workers.simd.graph import Graph
-from workers.simd.layout import Layer, Network, sums_at_once
+from workers.simd.backend.code import Code, Values
+from workers.simd.backend.emit import inline
+from workers.simd.episodes.layout import Layer, Network, sums_at_once
+from workers.simd.graph import elementary
+from workers.simd.graph.folding import FoldingGraph
 
 OUTPUTS_AT_ONCE = 4
 """Of the last layer."""
@@ -248,7 +248,7 @@ def _any_alive(code: Code, first: str, members: int) -> str:
 
 
 def _tanh(code: Code, values: Sequence[str]) -> Values:
-    graph = Graph()
+    graph = FoldingGraph()
     nodes = [graph.input("f", k) for k in range(len(values))]
     outputs = [elementary.tanh(graph, node) for node in nodes]
     return inline(code, graph, outputs, dict(zip(nodes, values, strict=True)))

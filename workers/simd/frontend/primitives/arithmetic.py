@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jax import lax
 
-from workers.simd import division, elementary
-from workers.simd.primitives.registry import PRIMITIVES, Nodes, Rule, UnsupportedError, dtype_in, kind_of, primitive
-
-if TYPE_CHECKING:
-    from workers.simd.trace import Tracer
+from workers.simd.frontend.kinds import dtype_in, kind_of
+from workers.simd.frontend.primitives.registry import PRIMITIVES, primitive
+from workers.simd.frontend.tracer import Nodes, Rule, Tracer
+from workers.simd.graph import division, elementary
+from workers.simd.graph.unsupported import UnsupportedError
 
 
 def _by_kind(floats: str | None, integers: str | None, booleans: str | None = None) -> Rule:

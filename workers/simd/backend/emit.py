@@ -9,11 +9,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 
-from workers.simd.code import Code, module
-from workers.simd.graph import Graph
-from workers.simd.operations import OPERATIONS
-from workers.simd.primitives.registry import UnsupportedError, refusing
-from workers.simd.schedule import Region, schedule
+from workers.simd.backend.code import Code, module
+from workers.simd.graph.graph import Graph
+from workers.simd.graph.operations import OPERATIONS
+from workers.simd.graph.schedule import Region, schedule
+from workers.simd.graph.unsupported import UnsupportedError, refusing
 
 MOST_SLOTS = 8192
 """Vectors in the memory of a block, which is on the stack: half a MiB."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from workers.simd.graph import Graph
+from workers.simd.graph.graph import Graph
 
 SIN = (-0.16666655242443085, 0.008332177996635437, -0.0001951729936990887)
 """(sin x - x) / x^3 in x^2, |x| <= pi/4."""

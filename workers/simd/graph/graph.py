@@ -1,7 +1,6 @@
-"""A graph of scalar operations, folded while it is built. Nodes are numbers, in an order in which they can be computed.
+"""A graph of scalar operations. Nodes are numbers, in an order in which they can be computed.
 
-Equal expressions are one node (hash-consing), expressions of constants are constants, and the identities of
-`folding.py` are applied at once.
+Equal expressions are one node (hash-consing). `folding.py` has the graph that simplifies while it is built.
 
 A loop is a `Loop`: its carries are nodes ("carry") that its body hangs on, its results nodes ("result") that what comes
 after hangs on. What hangs on no carry lies outside by itself.
@@ -15,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.folding import RULES
-from workers.simd.operations import DTYPES, OPERATIONS, compute
+from workers.simd.graph.operations import DTYPES, OPERATIONS
 
 Key = tuple
 
@@ -105,7 +103,7 @@ class Graph:
         return loop.results
 
     def op(self, name: str, *arguments: int) -> int:
-        """The node of an operation on nodes, after folding."""
+        """The node of an operation on nodes."""
         operation = OPERATIONS[name]
         if operation.commutes and arguments[0] > arguments[1]:
             arguments = (arguments[1], arguments[0])
@@ -113,11 +111,12 @@ class Graph:
         if known is not None:
             return known
         assert "".join(self.kinds[a] for a in arguments) == operation.takes, (name, arguments)
-        folded = self._fold(name, arguments)
-        if folded is None:
-            return self._node((name, *arguments), operation.gives)
-        self._known[(name, *arguments)] = folded
-        return folded
+        node = self._known[(name, *arguments)] = self.build(name, arguments)
+        return node
+
+    def build(self, name: str, arguments: tuple[int, ...]) -> int:
+        """The node of an operation that was not asked for before. For `op` alone."""
+        return self._node((name, *arguments), OPERATIONS[name].gives)
 
     def _node(self, key: Key, kind: str) -> int:
         known = self._known.get(key)
@@ -126,19 +125,6 @@ class Graph:
             self.keys.append(key)
             self.kinds.append(kind)
         return known
-
-    def _fold(self, name: str, arguments: tuple[int, ...]) -> int | None:
-        """A simpler node of the same value, or None."""
-        values = [self.constant(a) for a in arguments]
-        if all(value is not None for value in values):
-            return self.const(OPERATIONS[name].gives, compute(name, values))
-        rule = RULES.get(name)
-        return rule(self, arguments, values) if rule else None
-
-    def negated(self, node: int) -> int | None:
-        """What a node is the negative of, or None."""
-        key = self.keys[node]
-        return key[1] if key[0] == "neg" else None
 
 
 def live(graph: Graph, outputs: Iterable[int]) -> set[int]:

@@ -1,4 +1,4 @@
-"""Identities that graphs apply while they are built.
+"""A graph that simplifies while it is built: what is made of constants is a constant, and identities apply at once.
 
 With NaN, infinities and signed zeros in mind, they are of three sorts:
 
@@ -20,21 +20,40 @@ A rule is f(graph, arguments, their values where constant) -> a simpler node of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from workers.simd.graph import Graph
+from workers.simd.graph.graph import Graph
+from workers.simd.graph.operations import OPERATIONS, compute
 
-Rule = Callable[["Graph", tuple[int, ...], list[Any]], int | None]
+
+class FoldingGraph(Graph):
+    """What everything that traces builds: `op` may give a simpler node of the same value."""
+
+    def build(self, name: str, arguments: tuple[int, ...]) -> int:
+        """The node of an operation that was not asked for before, or of what it comes to."""
+        values = [self.constant(a) for a in arguments]
+        if all(value is not None for value in values):
+            return self.const(OPERATIONS[name].gives, compute(name, values))
+        rule = RULES.get(name)
+        folded = rule(self, arguments, values) if rule else None
+        return super().build(name, arguments) if folded is None else folded
+
+    def negated(self, node: int) -> int | None:
+        """What a node is the negative of, or None."""
+        key = self.keys[node]
+        return key[1] if key[0] == "neg" else None
+
+
+Rule = Callable[[FoldingGraph, tuple[int, ...], list[Any]], int | None]
 
 
 def _is(value: Any, number: float) -> bool:
     return value is not None and value == number
 
 
-def _fold_add(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+def _fold_add(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     a, b = args
     for x, value in ((b, values[0]), (a, values[1])):
         if _is(value, 0.0):
@@ -46,7 +65,7 @@ def _fold_add(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
     return None
 
 
-def _fold_sub(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+def _fold_sub(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     a, b = args
     if _is(values[1], 0.0):
         return a
@@ -59,7 +78,7 @@ def _fold_sub(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
     return None
 
 
-def _fold_mul(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+def _fold_mul(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     a, b = args
     for x, value in ((b, values[0]), (a, values[1])):
         if _is(value, 1.0):
@@ -78,7 +97,7 @@ def _fold_mul(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
     return None
 
 
-def _fold_div(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+def _fold_div(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     a, _ = args
     if _is(values[1], 1.0):
         return a
@@ -89,25 +108,25 @@ def _fold_div(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
     return None
 
 
-def _fold_neg(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+def _fold_neg(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     key = g.keys[args[0]]
     if key[0] == "neg":
         return key[1]
     return g.op("sub", key[2], key[1]) if key[0] == "sub" else None
 
 
-def _fold_abs(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+def _fold_abs(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     key = g.keys[args[0]]
     if key[0] in ("abs", "sqrt"):
         return args[0]
     return g.op("abs", key[1]) if key[0] == "neg" else None
 
 
-def _fold_less(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+def _fold_less(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     return g.const("b", False) if args[0] == args[1] else None
 
 
-def _fold_select(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+def _fold_select(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     mask, a, b = args
     if a == b:
         return a
@@ -121,7 +140,7 @@ def _fold_select(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | No
 
 
 def _fold_logic(neutral: bool, absorbing: bool) -> Rule:
-    def fold(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+    def fold(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
         a, b = args
         for x, value in ((b, values[0]), (a, values[1])):
             if value is not None:
@@ -131,7 +150,7 @@ def _fold_logic(neutral: bool, absorbing: bool) -> Rule:
     return fold
 
 
-def _fold_xor(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+def _fold_xor(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     a, b = args
     for one, other, value in ((a, b, values[0]), (b, a, values[1])):
         if value is not None and not value:
@@ -142,12 +161,12 @@ def _fold_xor(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
     return None
 
 
-def _fold_by_zero(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+def _fold_by_zero(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     """x + 0, x - 0, x | 0, x ^ 0, x << 0 of integers."""
     return args[0] if _is(values[1], 0) else None
 
 
-def _fold_by_zero_either(g: Graph, args: tuple[int, ...], values: list[Any]) -> int | None:
+def _fold_by_zero_either(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
     return args[1] if _is(values[0], 0) else _fold_by_zero(g, args, values)
 
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jax import lax
 
-from workers.simd.primitives.registry import Nodes, UnsupportedError, kind_of, primitive
-
-if TYPE_CHECKING:
-    from workers.simd.trace import Tracer
+from workers.simd.frontend.kinds import kind_of
+from workers.simd.frontend.primitives.registry import primitive
+from workers.simd.frontend.tracer import Nodes, Tracer
+from workers.simd.graph.unsupported import UnsupportedError
 
 
 @primitive("broadcast_in_dim")

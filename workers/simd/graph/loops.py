@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from workers.simd.graph import Graph, Loop, depending, live
-from workers.simd.primitives.registry import UnsupportedError
+from workers.simd.graph.graph import Graph, Loop, depending, live
+from workers.simd.graph.unsupported import UnsupportedError
 
 Body = Callable[[list[int]], list[int]]
 UNROLLED_OPERATIONS = 2000

@@ -1,13 +1,12 @@
-"""First stage: a JAX function becomes a scalar graph.
+"""Jaxprs evaluated over nodes: each array is replaced by an array of nodes.
 
-Its jaxpr is evaluated with each array replaced by an array of nodes. What only moves values about (slices, gathers,
-transposes) happens here and now, to the numbers of the nodes, and costs the kernel nothing; arithmetic makes nodes.
+What only moves values about (slices, gathers, transposes) happens here and now, to the numbers of the nodes, and costs
+the kernel nothing; arithmetic makes nodes.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,40 +14,24 @@ from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from numpy.typing import NDArray
 
-from workers.simd.graph import Graph
-from workers.simd.loops import build_loop
-from workers.simd.primitives import PRIMITIVES, Nodes, UnsupportedError
-from workers.simd.primitives.registry import check_bytes, kind_of, refusing
+from workers.simd.frontend.kinds import check_bytes, kind_of
+from workers.simd.graph.folding import FoldingGraph
+from workers.simd.graph.loops import build_loop
+from workers.simd.graph.unsupported import UnsupportedError, refusing
 
+Nodes = NDArray[np.int64]
+"""Numbers of nodes, in the shape of the array they stand for."""
+Rule = Callable[..., Any]
+"""What a primitive means for arrays of nodes: f(tracer, equation, *arrays) -> an array, or a list of them."""
 GRAPH_LIMIT = 2_000_000
 """Nodes; what needs more would not be compiled in useful time."""
 
 
-@refusing()
-def trace_jaxpr(closed: ClosedJaxpr) -> tuple[Graph, int, list[int]]:
-    """The graph of a function of one lane: (graph, number of input words, output nodes).
-
-    Each element of each array that goes in is an input of the graph, in order; each that comes out an output.
-
-    Raises:
-        UnsupportedError: the function cannot be compiled.
-    """
-    graph = Graph()
-    words = itertools.count()
-    inputs = []
-    for variable in closed.jaxpr.invars:
-        kind = kind_of(variable.aval.dtype)
-        nodes = [graph.input(kind, next(words)) for _ in range(int(np.prod(variable.aval.shape)))]
-        inputs.append(np.array(nodes, np.int64).reshape(variable.aval.shape))
-    outputs = Tracer(graph).closed(closed, inputs)
-    return graph, next(words), [node for nodes in outputs for node in nodes.reshape(-1).tolist()]
-
-
 class Tracer:
-    """Evaluates jaxprs over nodes. What the rules of `primitives` need to make nodes is here."""
+    """Evaluates jaxprs by the rules of their primitives, and has what rules need to make nodes."""
 
-    def __init__(self, graph: Graph) -> None:
-        self.graph = graph
+    def __init__(self, graph: FoldingGraph, rules: Mapping[str, Rule]) -> None:
+        self.graph, self.rules = graph, rules
 
     def closed(self, closed: ClosedJaxpr, inputs: Sequence[Nodes]) -> list[Nodes]:
         """Outputs of a jaxpr with its constants."""
@@ -64,7 +47,7 @@ class Tracer:
             return self.constants(np.asarray(atom.val, aval.dtype)) if isinstance(atom, Literal) else values[atom]
 
         for equation in jaxpr.eqns:
-            rule = PRIMITIVES.get(equation.primitive.name)
+            rule = self.rules.get(equation.primitive.name)
             try:
                 if rule is None:
                     raise UnsupportedError(f"the primitive {equation.primitive.name}")

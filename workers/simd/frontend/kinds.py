@@ -1,47 +1,10 @@
-"""The table of primitives, and what its rules share."""
+"""JAX's types, and the kinds of nodes that stand for values of them."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-Nodes = NDArray[np.int64]
-"""Numbers of nodes, in the shape of the array they stand for."""
-Rule = Callable[..., Any]
-PRIMITIVES: dict[str, Rule] = {}
-"""Name of JAX's primitive -> its rule."""
-
-
-class UnsupportedError(Exception):
-    """The function uses what this compiler cannot compile; the message names it and where it comes from."""
-
-
-@contextlib.contextmanager
-def refusing() -> Iterator[None]:
-    """Whatever goes wrong in here is an UnsupportedError: no rule foresees everything that JAX can trace.
-
-    Only for what depends on the function alone. Who may fall back to JAX must do so on every worker, or on none.
-    """
-    try:
-        yield
-    except (UnsupportedError, MemoryError):
-        raise
-    except Exception as error:
-        raise UnsupportedError(f"{type(error).__name__}: {error}") from error
-
-
-def primitive(*names: str) -> Callable[[Rule], Rule]:
-    """Enter a rule under the names of primitives."""
-
-    def enter(rule: Rule) -> Rule:
-        PRIMITIVES.update(dict.fromkeys(names, rule))
-        return rule
-
-    return enter
+from workers.simd.graph.unsupported import UnsupportedError
 
 
 def kind_of(dtype: Any) -> str:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from workers.simd.primitives.choices import select
-from workers.simd.primitives.registry import Nodes, UnsupportedError, dtype_in, primitive
-
-if TYPE_CHECKING:
-    from workers.simd.trace import Tracer
+from workers.simd.frontend.kinds import dtype_in
+from workers.simd.frontend.primitives.choices import select
+from workers.simd.frontend.primitives.registry import primitive
+from workers.simd.frontend.tracer import Nodes, Tracer
+from workers.simd.graph.unsupported import UnsupportedError
 
 MOST_TRIPS = 10_000
 """Of loops that become straight code."""

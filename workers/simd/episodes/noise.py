@@ -8,10 +8,10 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, normal_integers
-from workers.simd.code import Code, Values, module
-from workers.simd.emit import inline
-from workers.simd.kernel import jaxpr_digest
-from workers.simd.trace import trace_jaxpr
+from workers.simd.backend.code import Code, Values, module
+from workers.simd.backend.emit import inline
+from workers.simd.frontend.digest import jaxpr_digest
+from workers.simd.frontend.trace import trace_jaxpr
 
 UNROLLED = 4
 """Vectors made at once."""

@@ -14,13 +14,13 @@ from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from workers.environments import Environment, make_environment
 from workers.episode import Episodes
-from workers.simd.episodes import EpisodeKernel, compile_episodes, write_episodes
-from workers.simd.kernel import load_compiled
-from workers.simd.noise import UNROLLED, definition, gradient_module
-from workers.simd.primitives import UnsupportedError
-from workers.simd.target import WIDTHS, Target, host_target
-from workers.simd.trace import trace_jaxpr
-from workers.simd.words import aligned
+from workers.simd.backend.native import load_compiled
+from workers.simd.backend.target import WIDTHS, Target, host_target
+from workers.simd.backend.words import aligned
+from workers.simd.episodes.noise import UNROLLED, definition, gradient_module
+from workers.simd.episodes.program import EpisodeKernel, compile_episodes, write_episodes
+from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.graph.unsupported import UnsupportedError
 
 
 def why_not(task: TaskSpec) -> str:
@@ -123,13 +123,14 @@ class _Kernels:
 def make_gradient_sum(parameters: int, target: Target | None = None) -> Callable:
     """As `workers.rollout.make_gradient_sum`."""
     target = target or host_target()
-    address, alive = load_compiled(f"gradient {definition()}", lambda: gradient_module(target.width), target)
-    call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 2, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64)(address)
+    native = load_compiled(f"gradient {definition()}", lambda: gradient_module(target.width), target)
+    signature = [*[ctypes.c_void_p] * 2, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64]
+    call = ctypes.CFUNCTYPE(None, *signature)(native.address)
     group = UNROLLED * target.width
     groups = -(-parameters // group)
 
     def gradient_sum(weights_P: np.ndarray, noise_keys_P: np.ndarray) -> np.ndarray:
-        assert alive
+        assert native.alive
         weights_P, keys_P = np.ascontiguousarray(weights_P, np.float32), np.ascontiguousarray(noise_keys_P)
         assert keys_P.dtype == np.uint32
         assert keys_P.shape == (len(weights_P), KEY_WORDS)

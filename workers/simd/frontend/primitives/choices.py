@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from workers.simd import elementary
-from workers.simd.graph import Graph
-from workers.simd.primitives.registry import Nodes, UnsupportedError, dtype_in, kind_of, primitive
-
-if TYPE_CHECKING:
-    from workers.simd.trace import Tracer
+from workers.simd.frontend.kinds import dtype_in, kind_of
+from workers.simd.frontend.primitives.registry import primitive
+from workers.simd.frontend.tracer import Nodes, Tracer
+from workers.simd.graph import elementary
+from workers.simd.graph.graph import Graph
+from workers.simd.graph.unsupported import UnsupportedError
 
 
 @primitive("eq", "ne", "lt", "le", "gt", "ge")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from workers.simd.elementary import with_sign_of
-from workers.simd.graph import Graph
+from workers.simd.graph.elementary import with_sign_of
+from workers.simd.graph.graph import Graph
 
 QUOTIENT_LIMIT = 2.0**48
 """Of |x / y| in `remainder`; beyond it, it is NaN."""

@@ -1,0 +1,125 @@
+"""A JAX function of one environment, compiled for many: the stages together, and what was compiled before kept."""
+
+from __future__ import annotations
+
+import ctypes
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from workers.simd.backend.emit import emit
+from workers.simd.backend.native import load_compiled
+from workers.simd.backend.target import Target, host_target
+from workers.simd.backend.words import ALIGNMENT, Words, aligned, pack, unpack, words_of
+from workers.simd.frontend.digest import jaxpr_digest
+from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.graph.graph import live
+from workers.simd.graph.operations import OPERATIONS
+
+
+class Facts(NamedTuple):
+    """What compiling took and gave."""
+
+    jaxpr_s: float
+    """Seconds of JAX's own tracing, which xla needs as well."""
+    computed: int
+    """Scalar operations that are left after folding, loops' bodies once; 0 from the cache."""
+    code_bytes: int
+    cached: bool
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A compiled function. Calls may run at the same time in several threads: they hold no lock and no state."""
+
+    target: Target
+    in_tree: Any
+    in_avals: tuple[Any, ...]
+    out_tree: Any
+    out_avals: tuple[Any, ...]
+    facts: Facts
+    _function: Callable[[int, int, int], None]
+    _alive: Any
+
+    @property
+    def words_in(self) -> int:
+        """Words of a lane that go in: all elements of all leaves."""
+        return sum(map(words_of, self.in_avals))
+
+    @property
+    def words_out(self) -> int:
+        """Words of a lane that come out."""
+        return sum(map(words_of, self.out_avals))
+
+    def run(self, words: Words, out: Words) -> None:
+        """Compute [block, words_in, width] -> [block, words_out, width]; both aligned to 64 bytes, as `aligned` makes
+        them. Releases the GIL."""
+        blocks = len(words)
+        assert words.shape == (blocks, self.words_in, self.target.width), words.shape
+        assert out.shape == (blocks, self.words_out, self.target.width), out.shape
+        for array in (words, out):
+            assert array.dtype == np.uint32
+            assert array.flags.c_contiguous
+            assert array.size == 0 or array.ctypes.data % ALIGNMENT == 0
+        assert out.flags.writeable
+        assert words is not out
+        self._function(words.ctypes.data, out.ctypes.data, blocks)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """The function of pytrees whose leaves have one more axis in front, of lanes; NumPy arrays come back."""
+        leaves, tree = jax.tree.flatten(arguments)
+        assert tree == self.in_tree, f"{tree} is not what was compiled for: {self.in_tree}"
+        lanes = len(leaves[0]) if leaves else 1
+        for leaf, aval in zip(leaves, self.in_avals, strict=True):
+            array = np.asarray(leaf)
+            assert array.dtype == aval.dtype, (array.dtype, aval)
+            assert array.shape == (lanes, *aval.shape), (array.shape, aval)
+        words = pack(leaves, self.target.width)
+        out = aligned((len(words), self.words_out, self.target.width))
+        self.run(words, out)
+        return jax.tree.unflatten(self.out_tree, unpack(out, self.out_avals, lanes))
+
+
+def compile_kernel(
+    function: Callable[..., Any], *arguments: Any, target: Target | None = None, folder: Path | None = None
+) -> Kernel:
+    """Compile a pure JAX function of one environment.
+
+    Args:
+        arguments: pytrees of arrays or ShapeDtypeStructs, without the axis of lanes.
+        target: what for; this machine's widest vectors if None.
+        folder: of compiled kernels; the user's cache if None.
+
+    Raises:
+        UnsupportedError: the function has something that cannot be compiled. NoVectorsError: the processor has no
+            AVX2 or FMA.
+    """
+    target = target or host_target()
+    started = time.perf_counter()
+    closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    jaxpr_s = time.perf_counter() - started
+    computed = 0
+
+    def text() -> str:
+        nonlocal computed
+        graph, inputs, outputs = trace_jaxpr(closed)
+        computed = sum(graph.keys[node][0] in OPERATIONS for node in live(graph, outputs))
+        return emit(graph, outputs, inputs, target.width)
+
+    native = load_compiled(jaxpr_digest(closed), text, target, folder)
+    leaves, out_tree = jax.tree.flatten(shape)
+    return Kernel(
+        target=target,
+        in_tree=jax.tree.structure(arguments),
+        in_avals=tuple(variable.aval for variable in closed.jaxpr.invars),
+        out_tree=out_tree,
+        out_avals=tuple(leaves),
+        facts=Facts(jaxpr_s, computed, native.code_bytes, native.cached),
+        _function=ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(native.address),
+        _alive=native.alive,
+    )

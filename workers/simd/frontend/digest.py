@@ -1,0 +1,65 @@
+"""What names a jaxpr: kernels are kept on disk under what they compute."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from workers.simd.graph.unsupported import refusing
+
+
+@refusing()
+def jaxpr_digest(closed: ClosedJaxpr) -> str:
+    """A hash of everything a jaxpr computes: its equations, their parameters and its constants; not names of variables.
+
+    Raises:
+        UnsupportedError: a parameter or constant has no text that is the same in every process.
+    """
+    digests: dict[int, str] = {}
+
+    def of_closed(one: ClosedJaxpr) -> str:
+        hasher = hashlib.sha256(of_jaxpr(one.jaxpr).encode())
+        for constant in one.consts:
+            hasher.update(of_value(constant).encode())
+        return hasher.hexdigest()
+
+    def of_jaxpr(jaxpr: Jaxpr) -> str:
+        if id(jaxpr) in digests:
+            return digests[id(jaxpr)]
+        numbers: dict[Any, int] = {}
+
+        def name(atom: Any) -> str:
+            if isinstance(atom, Literal):
+                return f"{of_value(atom.val)}:{atom.aval}"
+            return f"{numbers.setdefault(atom, len(numbers))}:{atom.aval}"
+
+        lines = [" ".join(map(name, [*jaxpr.constvars, *jaxpr.invars]))]
+        for equation in jaxpr.eqns:
+            parameters = [f"{key}={of_value(value)}" for key, value in sorted(equation.params.items()) if key != "name"]
+            lines.append(f"{list(map(name, equation.outvars))} {equation.primitive.name} {parameters} "
+                         f"{list(map(name, equation.invars))}")  # fmt: skip
+        lines.append(" ".join(map(name, jaxpr.outvars)))
+        digests[id(jaxpr)] = hashlib.sha256("\n".join(lines).encode()).hexdigest()
+        return digests[id(jaxpr)]
+
+    def of_value(value: Any) -> str:
+        if isinstance(value, ClosedJaxpr):
+            return of_closed(value)
+        if isinstance(value, Jaxpr):
+            return of_jaxpr(value)
+        if isinstance(value, tuple | list):
+            return f"({','.join(map(of_value, value))})"
+        if isinstance(value, np.ndarray | np.generic | jax.Array):
+            array = np.asarray(value)
+            return f"{array.dtype}{array.shape}{hashlib.sha256(array.tobytes()).hexdigest()}"
+        if callable(value):
+            return ""  # rules for derivatives
+        if " at 0x" in (text := repr(value)):
+            raise ValueError(text)
+        return text
+
+    return of_closed(closed)

@@ -1,0 +1,34 @@
+"""A JAX function, as a jaxpr, becomes a scalar graph: the tracer, joined with the rules of the primitives."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+
+from workers.simd.frontend.kinds import kind_of
+from workers.simd.frontend.primitives import PRIMITIVES
+from workers.simd.frontend.tracer import Tracer
+from workers.simd.graph.folding import FoldingGraph
+from workers.simd.graph.unsupported import refusing
+
+
+@refusing()
+def trace_jaxpr(closed: ClosedJaxpr) -> tuple[FoldingGraph, int, list[int]]:
+    """The graph of a function of one lane: (graph, number of input words, output nodes).
+
+    Each element of each array that goes in is an input of the graph, in order; each that comes out an output.
+
+    Raises:
+        UnsupportedError: the function cannot be compiled.
+    """
+    graph = FoldingGraph()
+    words = itertools.count()
+    inputs = []
+    for variable in closed.jaxpr.invars:
+        kind = kind_of(variable.aval.dtype)
+        nodes = [graph.input(kind, next(words)) for _ in range(int(np.prod(variable.aval.shape)))]
+        inputs.append(np.array(nodes, np.int64).reshape(variable.aval.shape))
+    outputs = Tracer(graph, PRIMITIVES).closed(closed, inputs)
+    return graph, next(words), [node for nodes in outputs for node in nodes.reshape(-1).tolist()]
