@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, Self, TypeVar
 
-from es_service.dispatch import events as messages
+from es_service.dispatch import events
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, told_last_words, usual_chunk_s
@@ -34,13 +34,7 @@ class Answer:
 
 
 Message = (
-    messages.Placed
-    | messages.WorkerUp
-    | messages.WorkerLost
-    | messages.Failure
-    | messages.Drain
-    | messages.SetWorkers
-    | Answer
+    events.Placed | events.WorkerUp | events.WorkerLost | events.Failure | events.Drain | events.SetWorkers | Answer
 )
 """What a transport reports: the scheduler's own events, and answers."""
 
@@ -70,7 +64,7 @@ class Transport(Protocol):
         ...
 
     def platforms(self) -> frozenset[str]:
-        """`platform_info.platform_text` of each kind of worker that has come up; of none that is this process's own."""
+        """`machine.platform_text` of each kind of worker that has come up; of none that is this process's own."""
         ...
 
     def silent(self) -> tuple[int, ...]:
@@ -107,7 +101,7 @@ class Engine(Generic[AnyTransport]):
     def __init__(
         self,
         transport: AnyTransport,
-        limits: messages.Limits,
+        limits: events.Limits,
         should_stop: Callable[[], int | None] = lambda: None,
         log: Log = no_log,
     ) -> None:
@@ -127,7 +121,7 @@ class Engine(Generic[AnyTransport]):
         self._chunks: dict[Hashable, Sequence[Chunk]] = {}
         self._results: dict[Hashable, list[ChunkResult]] = {}
         try:
-            self._step(messages.Tick())
+            self._step(events.Tick())
         except BaseException:
             self.close()
             raise
@@ -162,7 +156,7 @@ class Engine(Generic[AnyTransport]):
         self._phase += 1
         parts = self._parts(chunks)
         self._centre, self._chunks, self._results = centre, dict(parts), {}
-        self._step(messages.Submit(tuple(messages.Task(key, key.kind, key.chunks) for key, _ in parts)))
+        self._step(events.Submit(tuple(events.Task(key, key.kind, key.chunks) for key, _ in parts)))
         while pending(self._state):
             if (number := self._should_stop()) is not None:
                 raise Interrupted(number)
@@ -170,7 +164,7 @@ class Engine(Generic[AnyTransport]):
             if (message := self.transport.receive(wait_s)) is not None:
                 self._handle(message)
             else:  # only now: a late look at the clock must not kill workers whose answers were waiting
-                self._step(messages.Tick(self.transport.silent()))
+                self._step(events.Tick(self.transport.silent()))
         return [result for key, _ in parts for result in self._results.pop(key)]
 
     def close(self) -> None:
@@ -196,24 +190,24 @@ class Engine(Generic[AnyTransport]):
     def _handle(self, message: Message) -> None:
         if not isinstance(message, Answer):
             self._step(message)
-        elif self._step(messages.Result(message.worker, message.key, message.attempt)):
+        elif self._step(events.Result(message.worker, message.key, message.attempt)):
             self._results[message.key] = message.results
 
-    def _step(self, event: messages.Event) -> bool:
+    def _step(self, event: events.Event) -> bool:
         """Feed the scheduler and do as it says; whether it accepted a result."""
         self._state, commands = step(self._state, event, time.monotonic())
-        if commands or not isinstance(event, messages.Tick):
+        if commands or not isinstance(event, events.Tick):
             self._log(event)
         for command in commands:
             self._log(command)
             match command:
-                case messages.StartWorker(worker):
+                case events.StartWorker(worker):
                     self.transport.start(worker)
-                case messages.StopWorker(worker, _):
+                case events.StopWorker(worker, _):
                     self._state = told_last_words(self._state, worker, self.transport.kill(worker))
-                case messages.Assign(worker, key, attempt):
+                case events.Assign(worker, key, attempt):
                     assert self._centre is not None
                     self.transport.send(worker, self._centre, key, attempt, self._chunks[key])
         if self._state.failed is not None:
             raise EvaluationError(self._state.failed)
-        return any(isinstance(command, messages.Deliver) for command in commands)
+        return any(isinstance(command, events.Deliver) for command in commands)

@@ -12,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-VERSION = "0.5.0"
+VERSION = "0.6.0"
 """Of es-service itself: of the code that runs. What an editable installation says of it is as old as its last `pip
 install`."""
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "brax", "mujoco", "mujoco-mjx", "llvmlite")

@@ -1,6 +1,6 @@
 """Environment variables of the processes in which workers live, so that nothing set elsewhere changes their bits.
 
-A leaf of the import graph, as `protocol` is: the driver starts such processes, a Ray actor finds itself in one.
+The driver starts such processes, a Ray actor finds itself in one.
 """
 
 from __future__ import annotations

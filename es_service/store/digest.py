@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
 from es_service.loop.parts import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
-from es_service.protocol import machine as platform_info
+from es_service.protocol.machine import is_mixed
 from es_service.store.codec import decode_part, row_bytes
 from es_service.store.folder import DATABASE
 from es_service.store.reader import kept_states, platforms, reading, state_payload
@@ -77,7 +77,7 @@ def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
 
 def _is_mixed(connection: Connection) -> bool:
     newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
-    return platform_info.is_mixed(at for first, at in platforms(connection) if newest is not None and first <= newest)
+    return is_mixed(at for first, at in platforms(connection) if newest is not None and first <= newest)
 
 
 def _parts(folder: Path, connection: Connection, meta: RunMeta, until: int = NEWEST) -> dict[str, str]:

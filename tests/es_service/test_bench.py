@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from es_service.cli import bench_rollouts as bench
+from es_service.cli import bench_rollouts
 from es_service.errors import EvaluationError, Interrupted
 
 FAILS, HANGS = "raise SystemExit('no such task')", "import time; time.sleep(60)"
@@ -38,7 +38,7 @@ def test_nobody_goes_on_measuring_after_a_failure_or_a_signal(monkeypatch, progr
     began = time.monotonic()
     try:
         with pytest.raises((EvaluationError, Interrupted)):
-            bench._row({"task": "point_maze"}, 2)
+            bench_rollouts._row({"task": "point_maze"}, 2)
         assert [process.poll() is None for process in started] == [False, False]
         assert time.monotonic() - began < 30
     finally:

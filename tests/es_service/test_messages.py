@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from es_service import errors
-from es_service.protocol import messages as protocol
+from es_service.protocol import messages
 from tests.helpers import DirectEvaluator, centre, random_parameters, spec
 
 CHUNKS = (
-    protocol.TrainingChunk(1, 0),
-    protocol.EvaluationChunk(1, 0),
-    protocol.GradientChunk(1, 0, np.linspace(-1, 1, 8, dtype=np.float32)),
+    messages.TrainingChunk(1, 0),
+    messages.EvaluationChunk(1, 0),
+    messages.GradientChunk(1, 0, np.linspace(-1, 1, 8, dtype=np.float32)),
 )
 ERRORS = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, errors.ServiceError)]
 
@@ -27,7 +27,7 @@ def test_messages_survive_pickling_and_are_small(chunk):
         assert pickle.dumps(pickle.loads(text)) == text
         assert len(text) < 100 * 1024
     for name, value in vars(result).items():
-        assert isinstance(value, np.ndarray | protocol.Moments | None), name
+        assert isinstance(value, np.ndarray | messages.Moments | None), name
 
 
 @pytest.mark.parametrize("kind", ERRORS, ids=lambda k: k.__name__)

@@ -20,8 +20,7 @@ from es_service.config import tasks
 from es_service.config.changes import START_KEYS, start_afresh
 from es_service.errors import ConfigError
 from es_service.loop.parts import CELL_PREFIX
-from es_service.runs import checked_config as configs
-from es_service.runs import evaluation, lineage
+from es_service.runs import checked_config, evaluation, lineage
 from es_service.runs.session import dispatch_limits
 from es_service.runs.standing import look, more
 from es_service.store import reader
@@ -85,7 +84,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
             "place": (("x", "y"), bounds), "speed": (("u", "v"), bounds), "height": (("h",), bounds[:1])
         },
     )  # fmt: skip
-    for module in (configs, tasks):
+    for module in (checked_config, tasks):
         monkeypatch.setattr(module, "TASKS", {"point_maze": told})
     monkeypatch.setattr(api, "work", lambda *arguments: None)  # as workers know of no such option
     api.run(SMALL, tmp_path / "run")
@@ -95,7 +94,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
     for other in ("speed", "height"):
         with pytest.raises(ConfigError, match=rf"task\.options\.descriptor: place -> {other}\n[^$]*search\.init_from"):
             lineage.fork_config(tmp_path / "run", [f"task.options.descriptor={other}"])
-    for module in (configs, tasks):
+    for module in (checked_config, tasks):
         monkeypatch.setattr(module, "TASKS", {"point_maze": replace(told, descriptors={"place": (("a", "b"), bounds)})})
     with pytest.raises(ConfigError, match=r"the descriptor of point_maze: \[x, y\] -> \[a, b\]\n.*search\.init_from"):
         lineage.fork_config(tmp_path / "run")
@@ -104,7 +103,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
 def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkeypatch):
     """A user's own, edited: the same parameters would mean another network."""
     other = replace(SHIPPED["point_maze"], action_size=3)
-    for module in (configs, tasks):
+    for module in (checked_config, tasks):
         monkeypatch.setattr(module, "TASKS", {"point_maze": other})
     with pytest.raises(ConfigError, match=r"point_maze is not what it was \(action_size: 2 -> 3\)"):
         api.resume(parent.folder, ["budget.generations=7"])
@@ -120,7 +119,7 @@ def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkey
     ],
 )
 def test_a_task_with_other_columns_is_no_other_version(parent, monkeypatch, change, told):
-    for module in (configs, tasks):
+    for module in (checked_config, tasks):
         monkeypatch.setattr(module, "TASKS", {"point_maze": replace(SHIPPED["point_maze"], **change)})
     with pytest.raises(ConfigError, match=rf"the task point_maze is not what it was \({told}\)"):
         api.resume(parent.folder, ["budget.generations=7"])
