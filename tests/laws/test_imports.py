@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from es_service.search.algorithms import OURS
+
 ROOT = Path(__file__).parents[2]
 ROOMS = ("cli", "api", "report", "runs", "dispatch", "store", "loop", "search", "config", "protocol", "errors")
 """From what a person touches down to the ground. `report` is still to come."""
@@ -106,6 +108,11 @@ def test_a_wrong_arrow_is_named(module, source, sentence):
     (arrow,) = {one.rpartition(": ")[2]: one for one in wrong_arrows(module, source)}.values()
     assert arrow.startswith(f"{module} imports ")
     assert sentence in arrow
+
+
+def test_the_loop_knows_no_method_by_name():
+    methods = {f"es_service.search.algorithms.{name}" for name in OURS}
+    assert not {name for path in files("es_service/loop") for name in imports(path.read_text())} & methods
 
 
 def test_every_file_of_es_service_is_in_a_room():
