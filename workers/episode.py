@@ -44,9 +44,6 @@ class Carry(NamedTuple):
 
     state: Any
     alive: Any
-    last_reward: Any
-    """Read by nobody. But simd fuses a product with a sum that alone needs it, so without this one a reward that is a
-    product would be rounded otherwise on its way into the return."""
     episode: Episodes
 
 
@@ -94,7 +91,7 @@ def episode_steps(
             shifted_square_sum_O=sums_O,
             trace_T_B=trace_T_B,
         )
-        return Carry(state, jnp.array(True), zero, nothing)
+        return Carry(state, jnp.array(True), nothing)
 
     def look(carry: Carry, mean_O: Any, std_O: Any) -> Any:
         return normalise(jnp, observe(carry.state), mean_O, std_O, spec.observation_clip)
@@ -115,10 +112,10 @@ def episode_steps(
         state, reward, done = environment.step(carry.state, action_A)
         distance = jnp.asarray(environment.goal_distance(state), jnp.float32)
         descriptor_B = jnp.asarray(environment.descriptor(state), jnp.float32)
-        last_reward, returns = reward, before.returns + reward
+        returns = before.returns + reward
         shifted_O = observe(carry.state) - mean_O if training else before.shifted_sum_O
         after = Episodes(
-            fitness=last_reward if spec.fitness == "final" else returns,
+            fitness=reward if spec.fitness == "final" else returns,
             returns=returns,
             descriptor=descriptor_B,
             steps=before.steps + 1,
@@ -127,7 +124,7 @@ def episode_steps(
             shifted_square_sum_O=before.shifted_square_sum_O + shifted_O * shifted_O,
             trace_T_B=before.trace_T_B if training else traced(before.trace_T_B, before.steps, descriptor_B),
         )
-        new, old = (last_reward, after), (carry.last_reward, before)
-        return Carry(state, alive & ~done, *jax.tree.map(lambda new, old: jnp.where(alive, new, old), new, old))
+        masked = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)
+        return Carry(state, alive & ~done, masked)
 
     return EpisodeSteps(begin, look, move)

@@ -84,7 +84,6 @@ def facts_of(task: str) -> dict:
     with mock.patch.object(Graph, "op", asked):
         graph, _, outputs = trace_jaxpr(jax.make_jaxpr(step)(state, action))
     order = schedule(graph, outputs)
-    absorbed = set(order.fused.values())
     flops = {"add", "sub", "mul", "div", "sqrt", "neg", "abs", "fma"}
 
     def count(region: Region, times: int) -> None:
@@ -93,7 +92,7 @@ def facts_of(task: str) -> dict:
             if isinstance(one, Region):
                 assert one.loop is not None
                 count(one, times * one.loop.trips)
-            elif one not in absorbed:
+            else:
                 counts["operations"] += times
                 name = graph.keys[one][0]
                 counts["flops"] += times * (2 if one in order.fused or name == "fma" else name in flops)

@@ -38,28 +38,26 @@ def evaluate(
         if key[0] == "input":
             word = words[key[2]]
             return word != 0 if key[1] == "b" else word.view(DTYPES[key[1]])
-        return values[node]
+        return values[node] if node in values else computed(node)  # a product that only sums take in
 
-    def compute(node: int) -> None:
+    def computed(node: int) -> np.ndarray:
+        product = order.fused.get(node) if fuse else None
         arguments = [value(one) for one in graph.arguments(node)]
         seen(node, arguments)
-        product = order.fused.get(node) if fuse else None
         if product is None:
-            values[node] = compute_operation(graph.keys[node][0], arguments)
-            return
+            return compute_operation(graph.keys[node][0], arguments)
         left, right = graph.arguments(node)
         a, b = (value(one) for one in graph.arguments(product))
         if graph.keys[node][0] == "sub" and product == right:
-            values[node] = compute_operation("fma", [-a, b, value(left)])
-        elif graph.keys[node][0] == "sub":
-            values[node] = compute_operation("fma", [a, b, -value(right)])
-        else:
-            values[node] = compute_operation("fma", [a, b, value(right if product == left else left)])
+            return compute_operation("fma", [-a, b, value(left)])
+        if graph.keys[node][0] == "sub":
+            return compute_operation("fma", [a, b, -value(right)])
+        return compute_operation("fma", [a, b, value(right if product == left else left)])
 
     def run(region: Region) -> None:
         for step in region.steps:
             if not isinstance(step, Region):
-                compute(step)
+                values[step] = computed(step)
                 continue
             loop = step.loop
             assert loop is not None

@@ -115,10 +115,12 @@ def test_what_not_a_number_would_change_is_left_alone(name: str, build) -> None:
     assert not folded(name, build)[2]
 
 
-def test_equal_expressions_are_one_node_and_operands_may_change_places() -> None:
+def test_equal_expressions_are_one_node_and_factors_may_change_places() -> None:
     graph = FoldingGraph()
     x, y = graph.input("f", 0), graph.input("f", 1)
-    assert graph.op("add", x, y) == graph.op("add", y, x)
+    assert graph.op("mul", x, y) == graph.op("mul", y, x)
+    assert graph.op("add", x, y) == graph.op("add", x, y)
+    assert graph.op("add", x, y) != graph.op("add", y, x), "of two products the second is fused"
     assert graph.op("sub", x, y) != graph.op("sub", y, x)
     assert graph.f(0.0) != graph.f(-0.0)
     assert graph.f(math.nan) == graph.f(math.nan)

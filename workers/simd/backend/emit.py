@@ -86,7 +86,6 @@ class _Writer:
         self.words = {kind.upper(): vector for kind, vector in code.vector.items()}
         self.words |= {"N": f"v{code.width}f32", "M": f"v{code.width}i32"}
         self.schedule = schedule(graph, outputs)
-        self.absorbed = set(self.schedule.fused.values())
         self.slots: dict[int, int] = {}
         """Node -> its place in the memory of the block: carries, and what loops look at."""
         self.slot_count = 0
@@ -107,7 +106,7 @@ class _Writer:
         for step in region.steps:
             if isinstance(step, Region):
                 self.loop(step)
-            elif step not in self.absorbed:
+            else:
                 self.compute(step)
                 if step in region.wanted_inside:
                     self.store(step, step)

@@ -112,7 +112,9 @@ def _fold_neg(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int 
     key = g.keys[args[0]]
     if key[0] == "neg":
         return key[1]
-    return g.op("sub", key[2], key[1]) if key[0] == "sub" else None
+    if key[0] != "sub" or all(g.keys[one][0] == "mul" for one in key[1:]):
+        return None  # of two products a difference takes in the second, so that p - q and q - p round differently
+    return g.op("sub", key[2], key[1])
 
 
 def _fold_abs(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:

@@ -1,6 +1,7 @@
 """A graph of scalar operations. Nodes are numbers, in an order in which they can be computed.
 
-Equal expressions are one node (hash-consing). `folding.py` has the graph that simplifies while it is built.
+Equal expressions are one node (hash-consing); a + b and b + a are two, because of the rule in `schedule.py`. The graph
+that simplifies while it is built is in `folding.py`.
 
 A loop is a `Loop`: its carries are nodes ("carry") that its body hangs on, its results nodes ("result") that what comes
 after hangs on. What hangs on no carry lies outside by itself.
@@ -8,7 +9,7 @@ after hangs on. What hangs on no carry lies outside by itself.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -129,13 +130,18 @@ class Graph:
 
 def live(graph: Graph, outputs: Iterable[int]) -> set[int]:
     """Nodes that outputs hang on. A loop's carry is among them only where somebody needs it."""
+    return reached(outputs, graph.needs)
+
+
+def reached(starts: Iterable[int], needs: Callable[[int], Iterable[int]]) -> set[int]:
+    """Nodes that some nodes hang on, themselves among them."""
     found: set[int] = set()
-    waiting = list(outputs)
+    waiting = list(starts)
     while waiting:
         node = waiting.pop()
         if node not in found:
             found.add(node)
-            waiting += graph.needs(node)
+            waiting += needs(node)
     return found
 
 

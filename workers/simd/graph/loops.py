@@ -16,7 +16,8 @@ from workers.simd.graph.unsupported import UnsupportedError
 
 Body = Callable[[list[int]], list[int]]
 UNROLLED_OPERATIONS = 2000
-"""A loop whose trips have no more than this many operations in all becomes straight code."""
+"""A loop whose trips have no more than this many operations in all becomes straight code. Operations that hang on its
+carries count: how many others there are depends on what else was built before, and rounding would, too."""
 MOST_STRAIGHT_TRIPS = 64
 """Of a loop that can only be straight code, because its trips look at their numbers."""
 
@@ -27,16 +28,16 @@ def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> li
     `body` is called again for another set of carries, and must build the same for the same.
     """
     loop = graph.loop(trips, list(inits))
-    before = len(graph.keys)
     try:
         outs = body(loop.carries)
     except UnsupportedError:
         if trips > MOST_STRAIGHT_TRIPS:
             raise
         return _straight(trips, body, inits)  # where the number of the trip is an index, it has to be a constant
-    if trips * max(1, len(graph.keys) - before) <= UNROLLED_OPERATIONS:
+    inside = depending(graph, loop)
+    if trips * max(1, sum(bool(graph.arguments(node)) for node in inside)) <= UNROLLED_OPERATIONS:
         return _straight(trips, body, inits)
-    kept, derived, late, firsts = _sort(graph, loop, outs)
+    kept, derived, late, firsts = _sort(graph, loop, outs, inside)
     if len(kept) == len(inits):
         return graph.close(loop, outs)
 
@@ -69,14 +70,15 @@ def _straight(trips: int, body: Body, inits: Sequence[int]) -> list[int]:
     return nodes
 
 
-def _sort(graph: Graph, loop: Loop, outs: Sequence[int]) -> tuple[list[int], list[int], list[int], list[int]]:
+def _sort(
+    graph: Graph, loop: Loop, outs: Sequence[int], inside: set[int]
+) -> tuple[list[int], list[int], list[int], list[int]]:
     """Positions of carries: (kept, derived, late, those whose start stands for all with the same end).
 
     What is in none of the first three stays what it was.
     """
     inits, carries = loop.inits, loop.carries
     candidates = [k for k, out in enumerate(outs) if out != carries[k]]
-    inside = depending(graph, loop)
     used = live(graph, outs)
     first_with: dict[int, int] = {}
     for k in sorted(candidates, key=lambda k: carries[k] not in used):  # what trips look at comes first

@@ -27,6 +27,7 @@ class Operation(NamedTuple):
     """Its instruction: {0}, {1}, {2} are arguments; {F}, {I}, {B} the vector types. Or the intrinsic that it calls,
     with {N} or {M}, the suffixes of those on floats and on integers."""
     commutes: bool = False
+    """Whether its arguments may change places. Not those of a sum of floats: of two products the second is fused."""
 
 
 def _fused(a: Any, b: Any, c: Any) -> Any:
@@ -59,7 +60,7 @@ def _float(x: Any) -> Any:
 
 
 OPERATIONS: dict[str, Operation] = {
-    "add": Operation("ff", "f", np.add, "fadd {F} {0}, {1}", commutes=True),
+    "add": Operation("ff", "f", np.add, "fadd {F} {0}, {1}"),
     "sub": Operation("ff", "f", np.subtract, "fsub {F} {0}, {1}"),
     "mul": Operation("ff", "f", np.multiply, "fmul {F} {0}, {1}", commutes=True),
     "div": Operation("ff", "f", np.divide, "fdiv {F} {0}, {1}"),
@@ -108,7 +109,7 @@ OPERATIONS: dict[str, Operation] = {
     "select": Operation("bff", "f", np.where, "select {B} {0}, {F} {1}, {F} {2}"),
     "iselect": Operation("bii", "i", np.where, "select {B} {0}, {I} {1}, {I} {2}"),
 }
-"""Name -> operation. Products and sums stay apart until `schedule.py` fuses them."""
+"""Name -> operation. Products and sums stay apart until `schedule.py` fuses them by its rule."""
 
 DTYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtype(bool)}
 """Kind -> how NumPy holds it."""

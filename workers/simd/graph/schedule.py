@@ -1,13 +1,17 @@
-"""In which order a graph is computed, what inside of which loop, and which products are fused with their sums."""
+"""In which order a graph is computed, what inside of which loop, and which products are fused with their sums.
+
+Fusing goes by the expression alone. A sum or difference of floats takes in a product that it is made of, of two the
+second, whoever else uses that product; on its own a product is computed only where something else needs it. So an
+expression has the same bits in every kernel that contains it, whatever else that kernel computes.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from workers.simd.graph.graph import Graph, Loop, depending, live
+from workers.simd.graph.graph import Graph, Loop, depending, live, reached
 
 
 @dataclass
@@ -18,7 +22,7 @@ class Region:
     carried: list[int] = field(default_factory=list)
     """Positions of the loop's carries that somebody needs."""
     steps: list[int | Region] = field(default_factory=list)
-    """Nodes to compute, and loops to run, in this order."""
+    """Nodes to compute, and loops to run, in this order; products that only sums take in are not among them."""
     wanted_inside: set[int] = field(default_factory=set)
     """Nodes computed here that a loop in here looks at."""
 
@@ -33,13 +37,25 @@ class Schedule(NamedTuple):
 
 def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
     """Each node is computed as late as can be, before what first needs it."""
-    needed = live(graph, outputs)
-    numbers = sorted({graph.keys[node][2] for node in needed if graph.keys[node][0] == "carry"})
-    bodies = {number: depending(graph, graph.loops[number]) & needed for number in numbers}
-    home: dict[int, int | None] = dict.fromkeys(needed)
+    alive = live(graph, outputs)
+    numbers = sorted({graph.keys[node][2] for node in alive if graph.keys[node][0] == "carry"})
+    bodies = {number: depending(graph, graph.loops[number]) & alive for number in numbers}
+    home: dict[int, int | None] = dict.fromkeys(alive)
     for number in sorted(numbers, key=lambda number: -len(bodies[number])):
         home.update(dict.fromkeys(bodies[number], number))
-    outside = {number: _outside(graph, graph.loops[number], bodies[number], needed) for number in numbers}
+    fused = _fused(graph, alive, home)
+
+    def needs(node: int) -> tuple[int, ...]:
+        """As `graph.needs`, with the factors in the place of a product that is taken in."""
+        product = fused.get(node)
+        if product is None:
+            return graph.needs(node)
+        first, second = graph.arguments(node)
+        factors = graph.arguments(product)
+        return (*factors, second) if product == first else (first, *factors)
+
+    needed = reached(outputs, needs)
+    outside = {number: _outside(graph.loops[number], bodies[number] & needed, needed, needs) for number in numbers}
 
     def build(number: int | None, targets: Sequence[int]) -> Region:
         region = Region(None if number is None else graph.loops[number])
@@ -54,7 +70,7 @@ def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
             if node in done or home[node] != number or not _is_made(graph, node):
                 waiting.pop()
                 continue
-            first = outside[key[2]] if key[0] == "result" else graph.arguments(node)
+            first = outside[key[2]] if key[0] == "result" else needs(node)
             missing = [one for one in first if one not in done and home[one] == number and _is_made(graph, one)]
             if missing:
                 waiting += reversed(missing)
@@ -70,32 +86,33 @@ def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
                 done.add(node)
         return region
 
-    return Schedule(build(None, outputs), _fused(graph, needed, outputs, home))
+    return Schedule(build(None, outputs), fused)
 
 
 def _is_made(graph: Graph, node: int) -> bool:
     return graph.keys[node][0] not in ("const", "input", "carry")
 
 
-def _outside(graph: Graph, loop: Loop, body: set[int], needed: set[int]) -> list[int]:
+def _outside(loop: Loop, body: set[int], needed: set[int], needs: Callable[[int], tuple[int, ...]]) -> list[int]:
     """Nodes outside of a loop that it, or a loop inside of it, looks at or starts from."""
-    found = {one for node in body for one in graph.needs(node)}
+    found = {one for node in body for one in needs(node)}
     found.update(loop.inits[k] for k, carry in enumerate(loop.carries) if carry in needed)
     return sorted(found - body)
 
 
-def _fused(graph: Graph, needed: set[int], outputs: Sequence[int], home: dict[int, int | None]) -> dict[int, int]:
-    """A sum takes in a product that nobody else needs and that is computed in the same place; of two, the later one."""
-    uses = Counter(one for node in needed for one in graph.needs(node))
-    uses.update(outputs)
+def _fused(graph: Graph, nodes: Collection[int], home: Mapping[int, int | None]) -> dict[int, int]:
+    """Sums and differences that take in a product -> that product.
+
+    Not a product from outside of the loop that the sum is in: it is computed once, not in every trip. (What is in a
+    loop is what hangs on its carries, and so goes by the expression, too.) And not where both arguments are the same:
+    what is subtracted from itself leaves nothing.
+    """
     found = {}
-    for node in sorted(needed):
+    for node in nodes:
         if graph.keys[node][0] in ("add", "sub"):
-            products = [
-                one
-                for one in graph.arguments(node)
-                if graph.keys[one][0] == "mul" and uses[one] == 1 and home[one] == home[node]
-            ]
-            if products:
-                found[node] = max(products)
+            first, second = graph.arguments(node)
+            for one in (second, first):
+                if graph.keys[one][0] == "mul" and home[one] == home[node] and first != second:
+                    found[node] = one
+                    break
     return found
