@@ -33,7 +33,7 @@ from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
 class TaskConfig(Section):
     """What is to be learned. Constants of the run."""
 
-    environment: Text = Field(description="Name of the task; `es-service list` shows them.")
+    environment: Text = Field(description="Name of the task: one of ours, brax:NAME, or module:Class, one of your own.")
     episode_steps: Count = Field(description="Length of an episode in control steps. null: the task's own length.")
     fitness: Literal["sum", "final"] = Field(
         "sum",
@@ -45,7 +45,7 @@ class TaskConfig(Section):
     )
     options: dict[Text, Text] = Field(
         default_factory=dict,
-        description="The task's own settings, such as `start`; `es-service list` shows them.",
+        description="The task's own settings, such as `start`; by default the first value of each.",
     )
 
 
@@ -74,7 +74,7 @@ class SearchConfig(Section):
     """The evolution strategy. Constants of the run."""
 
     algorithm: Text = Field(
-        description="Name of the search algorithm, `es-service list` shows them; or module:function, one of your own."
+        description="Name of the search algorithm: one of ours, or module:function, one of your own."
     )
     preset: Literal["literature", "uber"] = Field(
         "literature", description="Which column of the preset table fills in the keys that the config leaves out."

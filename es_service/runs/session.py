@@ -73,7 +73,7 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
         task=task,
     )
     with (
-        _blaming(store.folder),
+        _naming_the_run(store.folder),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
         stop_on_signals() as should_stop,
         _engine(config, should_stop, log) as engine,
@@ -116,13 +116,13 @@ class _OnPlatforms:
 
 
 @contextmanager
-def _blaming(folder: Path) -> Iterator[None]:
+def _naming_the_run(folder: Path) -> Iterator[None]:
     """Add to an error of the rollouts which run it ended, and that this run can be resumed."""
     try:
         yield
     except EvaluationError as error:
         run = str(folder)
-        resume = WayOut("resume", "go on once the cause is gone; every finished generation is saved", run)
+        resume = WayOut("resume", "go on from the last finished generation once the cause is gone", run)
         ways_out = [replace(way, run=way.run or run) for way in error.ways_out]
         error.run, error.ways_out = run, (*ways_out, resume)
         raise

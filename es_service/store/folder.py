@@ -140,7 +140,7 @@ def explained(error: sqlite3.Error | OSError, folder: Path, doing: str, then: st
 
     `then` is what to do after the cause is gone; resuming if None.
     """
-    ways_out = [] if then else [WayOut("resume", "go on, once the cause is gone", str(folder))]
+    ways_out = [] if then else [WayOut("resume", "go on once the cause is gone", str(folder))]
     ending = f", then {then}." if then else "."
     if is_disk_full(error, folder):
         return StoreError(

@@ -4,6 +4,7 @@ The rules keep the driver light and the workers free of the driver.
 """
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -113,6 +114,18 @@ def test_a_wrong_arrow_is_named(module, source, sentence):
 def test_the_loop_knows_no_method_by_name():
     methods = {f"es_service.search.algorithms.{name}" for name in OURS}
     assert not {name for path in files("es_service/loop") for name in imports(path.read_text())} & methods
+
+
+@pytest.mark.parametrize(
+    "path", [path for path in files("es_service") if room_of(module_of(path)) not in ("cli", "__main__")], ids=module_of
+)
+def test_no_message_below_the_command_line_shows_a_command(path):
+    """An error has its way out as data, of which the command line makes a command."""
+    tree = ast.parse(path.read_text())
+    documents = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    shown = [text.value for text in texts if id(text) not in documents]
+    assert not [text for text in shown if re.search(r"es-service (run|resume|fork|status|list)|[ `]--(?!xla_)[a-z]", text)]
 
 
 def test_every_file_of_es_service_is_in_a_room():
