@@ -5,8 +5,8 @@ With NaN, infinities and signed zeros in mind, they are of three sorts:
 * exact for every value: x * 1, x / 1, x / 2^k = x * 2^-k, x - 0, x + (-0), -0 - x, -(-x), |-x|, ||x||,
   a + (-b) = a - b, a - (-b) = a + b, (-a) * b = -(a * b), (-a) * (-b) = a * b, choices between equal things or by
   constants, x < x (false for NaN too), logic with constants.
-* exact but for the sign of a zero: x + 0 = x, x - (-0) = x, -(a - b) = b - a, (-a) - b = -(a + b), |sqrt x| = sqrt x.
-  Only division by that zero, atan2 (whose angle is then off by 2 pi) and bit tricks could tell.
+* exact but for the sign of a zero: x + 0 = x, x - (-0) = x, -(a - b) = b - a but of two products, (-a) - b = -(a + b),
+  |sqrt x| = sqrt x. Only division by that zero, atan2 (whose angle is then off by 2 pi) and bit tricks could tell.
 * exact for finite values, but for the sign of a zero: x * 0 = 0. Brax's constant joint frames are full of it: without
   it an ant has twice as many operations. Where a factor is infinite or NaN, JAX has NaN and the graph 0; but the factor
   itself stays what it was on every other way through the graph; what hangs on that product alone does not see it.
