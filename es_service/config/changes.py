@@ -15,7 +15,7 @@ STATE_KEYS = (
     "task.options.descriptor",
     "policy.hidden",
     "search.algorithm",
-    "search.members",
+    "search.centres",
     "map.enabled",
     "map.kind",
     "map.bounds",
@@ -33,7 +33,7 @@ _FOLLOWERS = {
     f"{OPTIONS}descriptor": _MAP,
     "map.kind": ("map.cells",),
     "policy.observation_normalization": ("policy.observation_clip",),
-    "search.algorithm": ("search.members",),
+    "search.algorithm": ("search.centres",),
     "search.pairs": _SHAPES,
     "compute.chunk_pairs": _SHAPES[1:],
 }

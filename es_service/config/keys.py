@@ -37,6 +37,8 @@ ALIASES = {
     "std": "search.sigma",
 }
 """What others call a key of ours."""
+RENAMED = {"search.members": "search.centres", "search.member_choice": "search.centre_choice"}
+"""What keys of ours were called before version 0.6."""
 BUDGET = [name for name in FIELDS if name.startswith("budget.")]
 """Keys of which one must be set."""
 
@@ -113,6 +115,8 @@ def _unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:
     Args:
         candidates: what may have been meant.
     """
+    if name in RENAMED:
+        return unfit(name, value, f"this key is now {RENAMED[name]}", suggestion=RENAMED[name])
     section, _, leaf = name.rpartition(".")
     everywhere = {_leaf(key): key for key in candidates}
     near_by = {leaf: key for leaf, key in everywhere.items() if key.rpartition(".")[0] == section}

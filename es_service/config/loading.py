@@ -22,9 +22,9 @@ from es_service.config.presets import PRESETS, preset_values
 from es_service.config.problems import nearest, not_allowed, one_of, unfit
 from es_service.config.resolution import (
     LEFT_OPEN,
+    centre_problems,
     engine_problems,
     folder_problems,
-    member_problems,
     policy_problems,
     resolve,
     rollout_problems,
@@ -135,7 +135,7 @@ def _load(
     if task is not None:
         problems += task_problems(values, task) + policy_problems(values, task)
         problems += map_problems(values, task) + rollout_problems(values, task)
-    problems += member_problems(values) + shape_problems(values) + engine_problems(values)
+    problems += centre_problems(values) + shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):
         problems.append(unfit("budget", None, f"nothing ends this run; set at least one of {one_of(BUDGET)}"))

@@ -87,13 +87,13 @@ class SearchConfig(Section):
     l2: NotNegative = Field(
         0.005, description="Weight decay, added to the gradient before Adam: lambda in -g + lambda x."
     )
-    members: Count = Field(
-        description="Centres of the meta-population, each with its own optimiser; one is updated per generation. "
+    centres: Count = Field(
+        description="Centres searched side by side, each with its own optimiser; one is updated per generation. "
         "auto: 1 for es and me_es, which allow no other, and for one of your own, else 5."
     )
-    member_choice: Literal["novelty", "round_robin", "uniform"] = Field(
+    centre_choice: Literal["novelty", "round_robin", "uniform"] = Field(
         "novelty",
-        description="How the member to update is chosen: with probability proportional to its novelty, in turn, or all "
+        description="How the centre to update is chosen: with probability proportional to its novelty, in turn, or all "
         "alike.",
     )
     fitness_weight_start: Fraction = Field(

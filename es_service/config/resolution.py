@@ -24,7 +24,7 @@ from es_service.protocol.messages import PolicyShape, TaskSpec, with_options
 
 LEFT_OPEN: dict[str, str | None] = {
     "task.episode_steps": None,
-    "search.members": "auto",
+    "search.centres": "auto",
     "map.kind": "auto",
     "map.bounds": "auto",
     "map.cells": "auto",
@@ -35,10 +35,11 @@ LEFT_OPEN: dict[str, str | None] = {
     "compute.gradient_block_pairs": "auto",
 }
 """Keys that this module resolves -> the value that asks for it, in a file the same as leaving the key out."""
-SINGLE_MEMBER = ("es", "me_es")
-"""Algorithms without a meta-population."""
-MEMBERS = 5
-"""Of a meta-population: deep-neuroevolution's Humanoid settings and the released ME-ES code."""
+SINGLE_CENTRE = ("es", "me_es")
+"""Algorithms with a single centre."""
+CENTRES = 5
+"""Of the other searches (the meta-population of Conti et al. 2018): deep-neuroevolution's Humanoid settings and the
+released ME-ES code."""
 
 MOST_CHUNK_PAIRS = 64
 """Enough to fill vector units and hide a message's cost; few enough that a lost chunk is cheap."""
@@ -47,7 +48,7 @@ LEAST_CHUNK_PAIRS = 16
 CHUNKS = 8
 """Wanted of a population of 128 to 512 pairs, so that several workers can share it."""
 MOST_PARAMETERS = 80_000_000
-"""The store keeps a member's centre and Adam's two moments, 12 bytes a parameter, in one value: SQLite's end at 1e9."""
+"""The store keeps a centre and Adam's two moments, 12 bytes a parameter, in one value: SQLite's end at 1e9."""
 MOST_ROLLOUT_BLOCK_PAIRS = 32
 """Enough to fill vector units."""
 MOST_ROLLOUT_BLOCK_BYTES = 5 * 2**20
@@ -116,9 +117,9 @@ def resolve(
             values["map.cells"] = default_cells(kind, len(chosen.descriptor_names))
         if "map.qd_offset" in left_open:
             values["map.qd_offset"] = default_qd_offset(values, task)
-    if "search.members" in left_open and "search.algorithm" in values:
+    if "search.centres" in left_open and "search.algorithm" in values:
         algorithm = values["search.algorithm"]
-        values["search.members"] = 1 if algorithm in SINGLE_MEMBER or ":" in algorithm else MEMBERS
+        values["search.centres"] = 1 if algorithm in SINGLE_CENTRE or ":" in algorithm else CENTRES
     if "compute.rollout" in left_open and task is not None:
         values["compute.rollout"] = "xla" if _on_gpu(values) or _why_no_simd(values, task, no_vectors) else "simd"
     pairs = values.get("search.pairs")
@@ -174,12 +175,12 @@ def _policy_shape(values: Mapping[str, Any], task: TaskSpec) -> PolicyShape:
     return PolicyShape((task.observation_size, *_value(values, "policy.hidden"), task.action_size))
 
 
-def member_problems(values: Mapping[str, Any]) -> list[Problem]:
-    """Where the algorithm cannot have as many members."""
-    algorithm, members = values.get("search.algorithm"), values.get("search.members")
-    if algorithm not in SINGLE_MEMBER or members in (None, 1):
+def centre_problems(values: Mapping[str, Any]) -> list[Problem]:
+    """Where the algorithm cannot have as many centres."""
+    algorithm, centres = values.get("search.algorithm"), values.get("search.centres")
+    if algorithm not in SINGLE_CENTRE or centres in (None, 1):
         return []
-    return [not_allowed("search.members", members, "1 or auto", why=f" for {algorithm}, which has one centre")]
+    return [not_allowed("search.centres", centres, "1 or auto", why=f" for {algorithm}, which has one centre")]
 
 
 def shape_problems(values: Mapping[str, Any]) -> list[Problem]:

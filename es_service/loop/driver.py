@@ -1,4 +1,4 @@
-"""The loop everybody reads: plan, roll out, weigh, step, evaluate, keep.
+"""The loop everybody reads: ask, roll out, weigh, step, evaluate, tell, keep.
 
 It knows no Ray, no JAX, no files and no method by name; its collaborators are arguments. Whatever happens, the store
 holds the last finished generation, and the next one depends only on (config, seed, state).
@@ -19,12 +19,12 @@ from es_service.loop import budget as budgets
 from es_service.loop.clock import Clock
 from es_service.loop.generation import (
     better,
+    centre_evaluation,
     entered,
     estimate_gradient,
     evaluate_centre,
     evaluate_population,
     invalidate,
-    judge,
     make_centre,
     require_finite,
     steps_of,
@@ -78,8 +78,8 @@ class Search:
     config: RunConfig
     algorithm: Algorithm
     initial: Callable[[], tuple[Sequence[FloatArray], Moments]]
-    """First centre of each member, and the observation statistics they come with (none counted unless they are
-    another run's)."""
+    """The initial centres, and the observation statistics they come with (none counted unless they are another
+    run's)."""
     task: TaskSpec
 
 
@@ -150,12 +150,12 @@ def _first_generation(
     fittest = 0
     best = Best(0, -math.inf, centres[0], points[0].observation_mean_O, points[0].observation_std_O)
     elites: dict[int, Elite] = {}
-    for member, (point, evaluation) in enumerate(zip(points, evaluations, strict=True)):
-        judgement = judge(0, member, evaluation)
-        learned = algorithm.absorb(learned, judgement)
-        elites |= entered(learned, judgement, point, evaluation)
-        best_now = better(best, point, judgement)
-        best, fittest = best_now, fittest if best_now is best else member
+    for centre, (point, evaluation) in enumerate(zip(points, evaluations, strict=True)):
+        told = centre_evaluation(0, centre, evaluation)
+        learned = algorithm.tell(learned, told)
+        elites |= entered(learned, told, point, evaluation)
+        best_now = better(best, point, told)
+        best, fittest = best_now, fittest if best_now is best else centre
     state = RunState(
         generation=0,
         search=learned,
@@ -168,7 +168,7 @@ def _first_generation(
     )
     row: HistoryRow = {
         **search_columns(fittest, algorithm.fitness_weight, None, learned.archive.size),
-        **map_columns(learned.map, config.map.qd_offset, reachable, generation=0, member=fittest, start_cell=None),
+        **map_columns(learned.map, config.map.qd_offset, reachable, generation=0, centre=fittest, start_cell=None),
         **step_columns(None, centres[fittest]),
         **population_columns(None, 0),
         **evaluation_columns(evaluations[fittest], search.task),
@@ -190,41 +190,39 @@ def _next_generation(
     start_cell = algorithm.start_cell(begun, generation)
     if start_cell is not None:
         begun = algorithm.restart(begun, start_cell, elite_from_arrays(store.part(elite_part(start_cell))))
-    plan = algorithm.plan(begun, generation)
-    centre = make_centre(config, generation, plan.centre_D, state.observations, begun.members[plan.member])
+    asked = algorithm.ask(begun, generation)
+    centre = make_centre(config, generation, asked.centre_D, state.observations, begun.centres[asked.centre])
     clock.lap("seconds_driver")
     population, observed = evaluate_population(evaluator, centre, pairs=settings.pairs, chunk_pairs=sizes.chunk_pairs)
     clock.lap("seconds_rollout")
     population, invalid = invalidate(population, settings.max_invalid_fraction, generation)
-    weights_P = algorithm.weights(begun, plan, population)
+    weights_P = algorithm.weights(begun, asked, population)
     clock.lap("seconds_driver")
     gradient_D = estimate_gradient(evaluator, centre, weights_P, sizes.gradient_block_pairs)
     clock.lap("seconds_gradient")
-    moved = algorithm.step(begun, plan, gradient_D)
-    new_centre_D = moved.members[plan.member].centre_D
+    moved = algorithm.step(begun, asked, gradient_D)
+    new_centre_D = moved.centres[asked.centre].centre_D
     require_finite(new_centre_D, settings.learning_rate, generation)
     clock.lap("seconds_driver")
     new_centre = replace(centre, parameters_D=new_centre_D)  # evaluated with the statistics of the generation's start
     evaluation = evaluate_centre(evaluator, new_centre, settings.evaluation_episodes)
     clock.lap("seconds_evaluation")
-    judgement = judge(generation, plan.member, evaluation, population)
-    learned = algorithm.absorb(moved, judgement)
+    told = centre_evaluation(generation, asked.centre, evaluation, population)
+    learned = algorithm.tell(moved, told)
     nearest = config.novelty
-    centre_novelty = novelty(
-        moved.archive, judgement.descriptor_B, neighbours=nearest.neighbours, distance=nearest.distance
-    )
+    centre_novelty = novelty(moved.archive, told.descriptor_B, neighbours=nearest.neighbours, distance=nearest.distance)
 
     row: HistoryRow = {
-        **search_columns(plan.member, plan.fitness_weight, float(centre_novelty), learned.archive.size),
+        **search_columns(asked.centre, asked.fitness_weight, float(centre_novelty), learned.archive.size),
         **map_columns(
             learned.map,
             config.map.qd_offset,
             reachable,
             generation=generation,
-            member=plan.member,
+            centre=asked.centre,
             start_cell=start_cell,
         ),
-        **step_columns(plan.centre_D, new_centre_D),
+        **step_columns(asked.centre_D, new_centre_D),
         **population_columns(population, invalid),
         **evaluation_columns(evaluation, search.task),
         **fault_columns(evaluator.counts, since=counts),
@@ -234,11 +232,11 @@ def _next_generation(
         generation=generation,
         search=learned,
         observations=merge_moments(state.observations, observed),
-        best=better(state.best, new_centre, judgement),
+        best=better(state.best, new_centre, told),
         env_steps=state.env_steps + steps_of(population) + steps_of(evaluation),
         episodes=state.episodes + trained + evaluation.fitness.size,
         wall_clock_s=clock.total(),
-        elites=entered(learned, judgement, new_centre, evaluation),
+        elites=entered(learned, told, new_centre, evaluation),
     )
     return state, row
 

@@ -28,17 +28,17 @@ from es_service.protocol.messages import (
     Moments,
     TrainingChunk,
 )
-from es_service.search.algorithms.base import Judgement, Member, SearchState
+from es_service.search.algorithms.base import CentreEvaluation, CentreState, SearchState
 from es_service.search.maps.behaviour_map import Elite, make_elite
 
 Result = TypeVar("Result", EpisodesResult, GradientResult)
 
 
 def make_centre(
-    config: RunConfig, generation: int, centre_D: FloatArray, observations: Moments, member: Member | None = None
+    config: RunConfig, generation: int, centre_D: FloatArray, observations: Moments, state: CentreState | None = None
 ) -> Centre:
     """What is sent to the workers of a centre: its parameters, and the statistics in force."""
-    mean_O, std_O = statistics_in_force(observations, member, config.policy.observation_normalization)
+    mean_O, std_O = statistics_in_force(observations, state, config.policy.observation_normalization)
     return Centre(generation, centre_D, config.search.sigma, mean_O, std_O)
 
 
@@ -129,13 +129,13 @@ def require_finite(centre_D: FloatArray, learning_rate: float, generation: int) 
         )
 
 
-def judge(
-    generation: int, member: int, evaluation: EpisodesResult, population: EpisodesResult | None = None
-) -> Judgement:
+def centre_evaluation(
+    generation: int, centre: int, evaluation: EpisodesResult, population: EpisodesResult | None = None
+) -> CentreEvaluation:
     """What a centre's evaluation episodes say of it, and the population that led to it, invalid fitness being NaN."""
-    return Judgement(
+    return CentreEvaluation(
         generation,
-        member,
+        centre,
         bool(valid_members(evaluation).all()),
         float(np.mean(evaluation.fitness, dtype=np.float64)),
         evaluation.descriptor.astype(np.float64).mean(axis=0),
@@ -143,21 +143,21 @@ def judge(
     )
 
 
-def entered(state: SearchState, judged: Judgement, centre: Centre, evaluation: EpisodesResult) -> dict[int, Elite]:
-    """The centre just evaluated as an elite, by its cell, if it entered the map. The map says so, not its member: a
-    search of the user's need not keep `Member.cell`."""
-    if state.map is None or (cell := state.map.cell_of(judged.generation, judged.member)) is None:
+def entered(state: SearchState, told: CentreEvaluation, centre: Centre, evaluation: EpisodesResult) -> dict[int, Elite]:
+    """The centre just evaluated as an elite, by its cell, if it entered the map. The map says so, not the state: a
+    search of the user's need not keep `CentreState.cell`."""
+    if state.map is None or (cell := state.map.cell_of(told.generation, told.centre)) is None:
         return {}
     assert evaluation.trace_T_B is not None, "an evaluation has a trace"
     return {cell: make_elite(centre, evaluation.trace_T_B)}
 
 
-def better(best: Best, centre: Centre, judgement: Judgement) -> Best:
+def better(best: Best, centre: Centre, told: CentreEvaluation) -> Best:
     """The better of the best so far and a centre just evaluated; an invalid centre (not finite) is no improvement."""
-    if not judgement.valid or judgement.fitness <= best.fitness:
+    if not told.valid or told.fitness <= best.fitness:
         return best
     mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
-    return Best(centre.generation, judgement.fitness, centre.parameters_D, mean_O, std_O)
+    return Best(centre.generation, told.fitness, centre.parameters_D, mean_O, std_O)
 
 
 def steps_of(result: EpisodesResult) -> int:

@@ -67,7 +67,7 @@ _MAP = (
     Column("qd_score", "REAL", True, "sum over elites of fitness less map.qd_offset"),
 )
 _SEARCH_AND_TIMES = (
-    Column("member", "INTEGER", True, "member whose centre this row is about; of the initial ones, the fittest"),
+    Column("centre", "INTEGER", True, "which of the centres this row is about; of the initial ones, the fittest"),
     Column("fitness_weight", "REAL", True, "weight of fitness beside novelty in this generation's utilities"),
     Column("centre_novelty", "REAL", True, "novelty of the mean descriptor in the archive before it entered"),
     Column("archive_size", "INTEGER", True, "entries of the novelty archive after this generation"),
@@ -100,10 +100,10 @@ def history_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
     return (*_FITNESS, *descriptor, *(_GOAL if task.has_goal else ()), *(_MAP if has_map else ()), *_SEARCH_AND_TIMES)
 
 
-def search_columns(member: int, fitness_weight: float, centre_novelty: float | None, archive_size: int) -> HistoryRow:
+def search_columns(centre: int, fitness_weight: float, centre_novelty: float | None, archive_size: int) -> HistoryRow:
     """What the search did; no novelty in generation 0."""
     return {
-        "member": member,
+        "centre": centre,
         "fitness_weight": fitness_weight,
         "centre_novelty": centre_novelty,
         "archive_size": archive_size,
@@ -154,13 +154,13 @@ def map_columns(
     reachable: NDArray[np.bool_] | None,
     *,
     generation: int,
-    member: int,
+    centre: int,
     start_cell: int | None,
 ) -> HistoryRow:
     """What became of the map, and the cells that a generation began with and entered; nothing where there is no map."""
     if map_ is None:
         return {}
-    cell = map_.cell_of(generation, member)
+    cell = map_.cell_of(generation, centre)
     return {"start_cell": start_cell, "cell": cell, **map_statistics(map_, qd_offset, reachable)}
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from es_service.loop.state import Best, RunState, require_successor
 from es_service.protocol.messages import Moments
-from es_service.search.algorithms.base import FitnessWeight, Member, SearchState
+from es_service.search.algorithms.base import CentreState, FitnessWeight, SearchState
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map
 from es_service.search.maps.geometry import Cvt, Geometry, Grid
 from es_service.search.novelty import NoveltyArchive, archive_of, empty_archive
@@ -24,15 +24,15 @@ Parts = Mapping[str, Mapping[str, np.ndarray]]
 """Arrays by name, by the name of their part."""
 
 OBSERVATIONS, COUNTERS, WEIGHT, BEST, GEOMETRY_PART = "observations", "counters", "weight", "best", "map"
-MEMBER_PREFIX, CELL_PREFIX, ELITE_PREFIX, BLOCK_PREFIX = "member_", "cell_", "elite_", "novelty_"
+CENTRE_PREFIX, CELL_PREFIX, ELITE_PREFIX, BLOCK_PREFIX = "centre_", "cell_", "elite_", "novelty_"
 """How the names of parts begin that have a number."""
 BLOCK_ENTRIES = 256
 """Entries of the novelty archive in one part: a generation rewrites the last part and no other."""
 
 
-def member_part(index: int) -> str:
-    """Name of a member's part."""
-    return f"{MEMBER_PREFIX}{index}"
+def centre_part(index: int) -> str:
+    """Name of a centre's part."""
+    return f"{CENTRE_PREFIX}{index}"
 
 
 def cell_part(cell: int) -> str:
@@ -59,9 +59,9 @@ def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
     require_successor(before, state)
     search, earlier = state.search, before.search if before is not None else None
     parts = {OBSERVATIONS: moments_to_arrays(state.observations), COUNTERS: _counters_to_arrays(state)}
-    for index, member in enumerate(search.members):
-        if earlier is None or member is not earlier.members[index]:
-            parts[member_part(index)] = member_to_arrays(member)
+    for index, centre in enumerate(search.centres):
+        if earlier is None or centre is not earlier.centres[index]:
+            parts[centre_part(index)] = centre_to_arrays(centre)
     if earlier is None or search.weight != earlier.weight:
         parts[WEIGHT] = weight_to_arrays(search.weight)
     if earlier is None or search.archive is not earlier.archive:
@@ -80,14 +80,14 @@ def state_from_parts(parts: Parts, generation: int, wall_clock_s: float, dimensi
     Args:
         dimensions: of a descriptor, as long as the archive has no entry.
     """
-    members = []
-    while member_part(len(members)) in parts:
-        members.append(member_from_arrays(parts[member_part(len(members))]))
+    centres = []
+    while centre_part(len(centres)) in parts:
+        centres.append(centre_from_arrays(parts[centre_part(len(centres))]))
     counters = parts[COUNTERS]
     return RunState(
         generation=generation,
         search=SearchState(
-            tuple(members),
+            tuple(centres),
             archive_from_parts(parts, dimensions),
             weight_from_arrays(parts[WEIGHT]),
             map_from_parts(parts),
@@ -114,26 +114,26 @@ def moments_from_arrays(arrays: Mapping[str, np.ndarray]) -> Moments:
     return Moments(float(arrays["count"]), arrays["mean_O"], arrays["m2_O"])
 
 
-def member_to_arrays(member: Member) -> Arrays:
-    """A member: its centre, its optimiser, what it knows of itself."""
-    adam = member.adam
-    own = {"own_mean_O": member.own_mean_O, "own_std_O": member.own_std_O}
+def centre_to_arrays(centre: CentreState) -> Arrays:
+    """A centre with its optimiser, and what it knows of itself."""
+    adam = centre.adam
+    own = {"own_mean_O": centre.own_mean_O, "own_std_O": centre.own_std_O}
     return {
         **{name: values for name, values in own.items() if values is not None},
-        "centre_D": member.centre_D,
+        "centre_D": centre.centre_D,
         "adam_m_D": adam.m_D,
         "adam_v_D": adam.v_D,
         "adam_step": np.asarray(adam.step, np.int64),
-        "entry": np.asarray(member.entry, np.int64),
-        "cell": np.asarray(member.cell, np.int64),
+        "entry": np.asarray(centre.entry, np.int64),
+        "cell": np.asarray(centre.cell, np.int64),
     }
 
 
-def member_from_arrays(arrays: Mapping[str, np.ndarray]) -> Member:
-    """Inverse of `member_to_arrays`."""
+def centre_from_arrays(arrays: Mapping[str, np.ndarray]) -> CentreState:
+    """Inverse of `centre_to_arrays`."""
     adam = Adam(arrays["adam_m_D"], arrays["adam_v_D"], int(arrays["adam_step"]))
     own_mean_O, own_std_O = arrays.get("own_mean_O"), arrays.get("own_std_O")
-    return Member(arrays["centre_D"], adam, int(arrays["entry"]), int(arrays["cell"]), own_mean_O, own_std_O)
+    return CentreState(arrays["centre_D"], adam, int(arrays["entry"]), int(arrays["cell"]), own_mean_O, own_std_O)
 
 
 def weight_to_arrays(weight: FitnessWeight) -> Arrays:
@@ -158,7 +158,7 @@ def archive_to_parts(archive: NoveltyArchive, stored: int) -> dict[str, Arrays]:
         parts[block_part(block)] = {
             "descriptor_N_B": archive.descriptor_N_B[entries],
             "generation_N": archive.generation_N[entries],
-            "member_N": archive.member_N[entries],
+            "centre_N": archive.centre_N[entries],
         }
     return parts
 
@@ -170,10 +170,10 @@ def archive_from_parts(parts: Parts, dimensions: int) -> NoveltyArchive:
         blocks.append(parts[block_part(len(blocks))])
     if not blocks:
         return empty_archive(dimensions)
-    descriptor_N_B, generation_N, member_N = (
-        np.concatenate([block[name] for block in blocks]) for name in ("descriptor_N_B", "generation_N", "member_N")
+    descriptor_N_B, generation_N, centre_N = (
+        np.concatenate([block[name] for block in blocks]) for name in ("descriptor_N_B", "generation_N", "centre_N")
     )
-    return archive_of(descriptor_N_B, generation_N, member_N)
+    return archive_of(descriptor_N_B, generation_N, centre_N)
 
 
 def geometry_to_arrays(geometry: Geometry) -> Arrays:
@@ -206,7 +206,7 @@ def map_to_parts(map_: BehaviourMap, before: BehaviourMap | None) -> dict[str, A
             "fitness": map_.fitness_N[row],
             "descriptor_B": map_.descriptor_N_B[row],
             "generation": map_.generation_N[row],
-            "member": map_.member_N[row],
+            "centre": map_.centre_N[row],
             "score": map_.score_N[row],
         }
     return parts
@@ -227,7 +227,7 @@ def map_from_parts(parts: Parts) -> BehaviourMap | None:
         np.array([found[cell]["fitness"] for cell in cells], np.float64),
         np.array([found[cell]["descriptor_B"] for cell in cells], np.float64),
         np.array([found[cell]["generation"] for cell in cells], np.int64),
-        np.array([found[cell]["member"] for cell in cells], np.int64),
+        np.array([found[cell]["centre"] for cell in cells], np.int64),
         np.array([found[cell]["score"] for cell in cells], np.float64),
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from es_service.errors import StoreError
 from es_service.protocol.messages import FloatArray, Moments
-from es_service.search.algorithms.base import Member, SearchState
+from es_service.search.algorithms.base import CentreState, SearchState
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.novelty import extends
 from es_service.search.observation_statistics import normalisation
@@ -58,8 +58,8 @@ def require_successor(before: RunState | None, state: RunState) -> None:
 
 def _not_followed(before: SearchState, after: SearchState) -> str:
     """What is wrong with a state after another; empty if nothing is. Searches of ours are right by construction."""
-    if len(after.members) != len(before.members):
-        return f"the search has {len(after.members)} members, and had {len(before.members)}"
+    if len(after.centres) != len(before.centres):
+        return f"the search has {len(after.centres)} centres, and had {len(before.centres)}"
     if not extends(after.archive, before.archive):
         return "the novelty archive has lost or changed entries"
     if (after.map is None) != (before.map is None):
@@ -78,15 +78,17 @@ def _foreign_elite(before: BehaviourMap | None, after: BehaviourMap | None, elit
     new_N = np.ones(after.size, bool)
     if before is not None:
         known = slice(before.size)
-        same_N = (after.generation_N[known] == before.generation_N) & (after.member_N[known] == before.member_N)
+        same_N = (after.generation_N[known] == before.generation_N) & (after.centre_N[known] == before.centre_N)
         new_N[known] = ~same_N
     foreign = set(after.cell_N[new_N].tolist()) - set(elites)
     return f"the new elite of cell {min(foreign)} is not the centre that was evaluated" if foreign else ""
 
 
-def statistics_in_force(observations: Moments, member: Member | None, enabled: bool) -> tuple[FloatArray, FloatArray]:
-    """(mean, standard deviation) that a member's centres run with: its own if it has any, else the whole run's; 0 and 1
-    where observations are not normalised."""
-    if enabled and member is not None and member.own_mean_O is not None and member.own_std_O is not None:
-        return member.own_mean_O, member.own_std_O
+def statistics_in_force(
+    observations: Moments, centre: CentreState | None, enabled: bool
+) -> tuple[FloatArray, FloatArray]:
+    """(mean, standard deviation) that a centre's episodes run with: its own if it has any, else the whole run's; 0 and
+    1 where observations are not normalised."""
+    if enabled and centre is not None and centre.own_mean_O is not None and centre.own_std_O is not None:
+        return centre.own_mean_O, centre.own_std_O
     return normalisation(observations, enabled)

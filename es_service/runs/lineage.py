@@ -17,8 +17,8 @@ from es_service.errors import ConfigError, Problem
 from es_service.loop.parts import (
     BEST,
     CELL_PREFIX,
+    CENTRE_PREFIX,
     ELITE_PREFIX,
-    MEMBER_PREFIX,
     OBSERVATIONS,
     WEIGHT,
     Arrays,
@@ -120,7 +120,7 @@ def _without_fitness(parts: Parts) -> dict[str, Arrays]:
     """The parts of a state in which no fitness seen so far counts: no best centre, an empty map, no record to beat."""
     kept = {name: dict(part) for name, part in parts.items() if not name.startswith((CELL_PREFIX, ELITE_PREFIX))}
     for name, part in kept.items():
-        if name.startswith(MEMBER_PREFIX):
+        if name.startswith(CENTRE_PREFIX):
             part["cell"] = np.asarray(NO_CELL, np.int64)
     kept[BEST]["fitness"] = np.asarray(-np.inf)
     kept[WEIGHT] = weight_to_arrays(FitnessWeight(weight_from_arrays(parts[WEIGHT]).value))
@@ -135,7 +135,7 @@ def _without_scores(parts: Parts) -> dict[str, Arrays]:
 
 
 def _without_own_statistics(parts: Mapping[str, Part]) -> dict[str, Part]:
-    """The parts of a state whose members run with the whole run's observation statistics, also those in a block that
+    """The parts of a state whose centres run with the whole run's observation statistics, also those in a block that
     began with an elite's."""
     own = ("own_mean_O", "own_std_O")
     return {name: {key: values for key, values in part.items() if key not in own} for name, part in parts.items()}
@@ -160,19 +160,19 @@ def started(config: RunConfig, folder: str, tell: Callable[[str], None]) -> tupl
             run=origin.folder,
         )
     moment = origin.at(wanted=is_no_elite)
-    member, moments = moment.newest_member, moments_from_arrays(moment.parts[OBSERVATIONS])
+    centre, moments = moment.newest_centre, moments_from_arrays(moment.parts[OBSERVATIONS])
     if not origin.constants[NORMALISED]:
         moments = no_observations(shape.widths[0])  # its policy was never given any, though they were gathered
-    elif member.own_mean_O is not None and member.own_std_O is not None:
+    elif centre.own_mean_O is not None and centre.own_std_O is not None:
         # Those that its policy runs with, as if that many observations had given them.
-        mean_O, std_O = member.own_mean_O.astype(np.float64), member.own_std_O.astype(np.float64)
+        mean_O, std_O = centre.own_mean_O.astype(np.float64), centre.own_std_O.astype(np.float64)
         moments = Moments(moments.count, mean_O, moments.count * np.square(std_O))
     if other := _seen_otherwise(origin, config):
         tell(
             f"search.init_from: the policy of {origin.folder} acted on other observations than this run gives it "
             f"({other}), so it may act otherwise from generation 0 on"
         )
-    start = {"centre_D": member.centre_D, **moments_to_arrays(moments)}
+    start = {"centre_D": centre.centre_D, **moments_to_arrays(moments)}
     return _lineage(origin, moment.generation), Beginning(start=start)
 
 

@@ -18,16 +18,16 @@ from es_service.loop.parts import (
     Parts,
     archive_from_parts,
     best_from_arrays,
+    centre_from_arrays,
+    centre_part,
     elite_from_arrays,
     elite_part,
     map_from_parts,
-    member_from_arrays,
-    member_part,
     moments_from_arrays,
 )
 from es_service.loop.state import Best, statistics_in_force
 from es_service.protocol.messages import FloatArray, PolicyShape
-from es_service.search.algorithms.base import Member
+from es_service.search.algorithms.base import CentreState
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.maps.geometry import Grid
 from es_service.store import reader
@@ -79,7 +79,7 @@ class Moment:
 
         names = descriptor_names(self.meta)
         archive = archive_from_parts(self.parts, len(names))
-        columns = {"generation": archive.generation_N, "member": archive.member_N}
+        columns = {"generation": archive.generation_N, "centre": archive.centre_N}
         return pd.DataFrame(columns | dict(zip(names, archive.descriptor_N_B.T, strict=True)))
 
     @property
@@ -102,7 +102,7 @@ class Moment:
             | (dict(zip(labels, map_places(map_).T, strict=True)) if isinstance(map_.geometry, Grid) else {})
             | {"fitness": map_.fitness_N}
             | dict(zip(names, map_.descriptor_N_B.T, strict=True))
-            | {"generation": map_.generation_N, "member": map_.member_N}
+            | {"generation": map_.generation_N, "centre": map_.centre_N}
         )
 
     def cell(self, place: int | Sequence[int]) -> int:
@@ -144,19 +144,19 @@ class Moment:
         return best_from_arrays(self.parts[BEST])
 
     @property
-    def newest_member(self) -> Member:
-        """The member that the history row of this generation is about."""
+    def newest_centre(self) -> CentreState:
+        """The centre that the history row of this generation is about."""
         [row] = reader.read_history(self.folder, self.generation, 1)
-        return member_from_arrays(self.parts[member_part(int(row["member"]))])
+        return centre_from_arrays(self.parts[centre_part(int(row["centre"]))])
 
     def policy(self, which: Literal["best", "centre"]) -> Policy:
         """As `Run.policy`."""
         if which == "best":
             best = self.best
             return make_policy(self.meta, best.centre_D, best.observation_mean_O, best.observation_std_O)
-        member, enabled = self.newest_member, self.meta.constants["policy.observation_normalization"]
-        mean_O, std_O = statistics_in_force(moments_from_arrays(self.parts[OBSERVATIONS]), member, enabled)
-        return make_policy(self.meta, member.centre_D, mean_O, std_O)
+        centre, enabled = self.newest_centre, self.meta.constants["policy.observation_normalization"]
+        mean_O, std_O = statistics_in_force(moments_from_arrays(self.parts[OBSERVATIONS]), centre, enabled)
+        return make_policy(self.meta, centre.centre_D, mean_O, std_O)
 
 
 def make_policy(meta: RunMeta, parameters_D: FloatArray, mean_O: FloatArray, std_O: FloatArray) -> Policy:

@@ -163,13 +163,13 @@ def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) 
 
 
 def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Moments]:
-    """Each member's first centre, and the observation statistics: random ones with none, or all of them the one that
+    """The initial centres, and the observation statistics: random ones with none, or all of them the one that
     the run was created with."""
-    task, members = task_of(config), range(config.search.members)
+    task, centres = task_of(config), range(config.search.centres)
     if store.start is not None:
-        return [store.start["centre_D"] for _ in members], moments_from_arrays(store.start)
+        return [store.start["centre_D"] for _ in centres], moments_from_arrays(store.start)
     shape = policy_shape(config, task)
-    centres = [initial_parameters(shape, config.policy.init, config.seed, member) for member in members]
+    centres = [initial_parameters(shape, config.policy.init, config.seed, centre) for centre in centres]
     return centres, no_observations(task.observation_size)
 
 

@@ -101,7 +101,7 @@ class Run:
 
     @property
     def novelty(self) -> pd.DataFrame:
-        """The novelty archive, one row per evaluated valid centre in order: generation, member, descriptor."""
+        """The novelty archive, one row per evaluated valid centre in order: generation, centre, descriptor."""
         return self.at(wanted=lambda part: part.startswith(BLOCK_PREFIX)).novelty
 
     @property
@@ -112,7 +112,7 @@ class Run:
     @property
     def map(self) -> pd.DataFrame:
         """The map, one row per filled cell in the order of discovery: the cell's number, as the history has it, and its
-        place along each dimension (none of a cvt), fitness when it entered, descriptor, generation, member."""
+        place along each dimension (none of a cvt), fitness when it entered, descriptor, generation, centre."""
         return self.at(wanted=is_light).map
 
     def cell(self, place: int | Sequence[int]) -> int:

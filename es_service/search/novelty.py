@@ -37,7 +37,7 @@ class _Room:
 
     descriptor_B: NDArray[np.float64]
     generation: NDArray[np.int64]
-    member: NDArray[np.int64]
+    centre: NDArray[np.int64]
     used: int
 
 
@@ -63,8 +63,8 @@ class NoveltyArchive:
     descriptor_N_B: NDArray[np.float64]
     generation_N: NDArray[np.int64]
     """When each was evaluated; 0 for initial centres."""
-    member_N: NDArray[np.int64]
-    """Of which member each was the centre."""
+    centre_N: NDArray[np.int64]
+    """Which of the search's centres each was."""
     tree: _Tree | None = None
     """Follows from `descriptor_N_B`."""
     room: _Room | None = None
@@ -82,20 +82,20 @@ def empty_archive(dimensions: int) -> NoveltyArchive:
 
 
 def archive_of(
-    descriptor_N_B: NDArray[np.float64], generation_N: NDArray[np.int64], member_N: NDArray[np.int64]
+    descriptor_N_B: NDArray[np.float64], generation_N: NDArray[np.int64], centre_N: NDArray[np.int64]
 ) -> NoveltyArchive:
     """An archive of entries that were made before, in their order."""
-    return _with_tree(_Room(descriptor_N_B, generation_N, member_N, generation_N.size), None)
+    return _with_tree(_Room(descriptor_N_B, generation_N, centre_N, generation_N.size), None)
 
 
-def extended(archive: NoveltyArchive, descriptor_B: ArrayLike, generation: int, member: int) -> NoveltyArchive:
+def extended(archive: NoveltyArchive, descriptor_B: ArrayLike, generation: int, centre: int) -> NoveltyArchive:
     """The archive with one entry more; the old one stays as it is."""
     size, room = archive.size, archive.room
     if np.shape(descriptor_B) != archive.descriptor_N_B.shape[1:]:
         raise ValueError(f"a descriptor of {np.shape(descriptor_B)} for an archive of {archive.descriptor_N_B.shape}")
     if room is None or room.used != size or room.used == room.generation.size:
         room = _copied(archive)
-    room.descriptor_B[size], room.generation[size], room.member[size] = descriptor_B, generation, member
+    room.descriptor_B[size], room.generation[size], room.centre[size] = descriptor_B, generation, centre
     room.used = size + 1
     return _with_tree(room, archive.tree)
 
@@ -109,7 +109,7 @@ def extends(archive: NoveltyArchive, earlier: NoveltyArchive) -> bool:
         for of_archive, of_earlier in (
             (archive.descriptor_N_B, earlier.descriptor_N_B),
             (archive.generation_N, earlier.generation_N),
-            (archive.member_N, earlier.member_N),
+            (archive.centre_N, earlier.centre_N),
         )
     )
 
@@ -156,7 +156,7 @@ def _copied(archive: NoveltyArchive) -> _Room:
         np.empty((capacity, archive.descriptor_N_B.shape[1])), np.empty(capacity, int), np.empty(capacity, int), size
     )
     room.descriptor_B[:size], room.generation[:size] = archive.descriptor_N_B, archive.generation_N
-    room.member[:size] = archive.member_N
+    room.centre[:size] = archive.centre_N
     return room
 
 
@@ -168,7 +168,7 @@ def _with_tree(room: _Room, tree: _Tree | None) -> NoveltyArchive:
     covered = room.used // step * step
     if covered and (tree is None or tree.entries != covered):
         tree = _tree(descriptor_N_B[:covered])
-    return NoveltyArchive(descriptor_N_B, room.generation[: room.used], room.member[: room.used], tree, room)
+    return NoveltyArchive(descriptor_N_B, room.generation[: room.used], room.centre[: room.used], tree, room)
 
 
 def _tree(descriptor_N_B: NDArray[np.float64]) -> _Tree:

@@ -13,7 +13,9 @@ from es_service.errors import StoreError
 from es_service.loop.history import Column
 from es_service.store.codec import text_sha256
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
+READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0"}
+"""Older versions of the schema -> the newest es-service that reads them."""
 APPLICATION_ID = 0x45535256
 """In the file's header, for tools that tell database files apart."""
 PAGE_BYTES = 8192
@@ -116,8 +118,8 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
         raise Damaged("the record of what the run is is missing")
     if version < SCHEMA_VERSION:
         raise StoreError(
-            f"{file} has schema version {version}; this es-service reads version {SCHEMA_VERSION}. Use the es-service "
-            f"that wrote it."
+            f"{file} was written by an older es-service; version {READ_BY[version]} reads and continues it "
+            f"(its schema version is {version}, this es-service reads {SCHEMA_VERSION})"
         )
     return meta_from_text(found["run"])
 

@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.novelty_time
 
-A generation adds one entry, judges 1,024 descriptors and five members. The mean over TREE_STEP generations includes one
+A generation adds one entry, judges 1,024 descriptors and five centres. The mean over TREE_STEP generations includes one
 new tree; the brute-force row judges the same queries against every entry. Ends are anywhere, or a fifth of them, of the
 archive's and the queries', among the 600 places of a border.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from es_service.search.novelty import TREE_STEP, NoveltyArchive, extended, novelty
 
 QUERIES = 1024
-MEMBERS = 5
+CENTRES = 5
 
 
 def ends(rng: np.random.Generator, count: int, at_border: float) -> np.ndarray:
@@ -38,16 +38,16 @@ def main() -> None:
         archive = NoveltyArchive(descriptors[:-1], np.arange(entries - 1), np.zeros(entries - 1, np.int64))
         archive = extended(archive, descriptors[-1], entries, 0)  # plants the tree
         queries = ends(rng, QUERIES, at_border)
-        newest = np.arange(entries - MEMBERS, entries)
+        newest = np.arange(entries - CENTRES, entries)
         seconds = []
         for generation in range(TREE_STEP):
             start = time.perf_counter()
             archive = extended(archive, rng.uniform(-1, 1, 2), entries + generation, 0)
-            members = archive.descriptor_N_B[newest]
-            novelty(archive, members, neighbours=10, distance="euclidean", exclude_Q=newest)
+            centres = archive.descriptor_N_B[newest]
+            novelty(archive, centres, neighbours=10, distance="euclidean", exclude_Q=newest)
             with_tree = novelty(archive, queries, neighbours=10, distance="euclidean")
             seconds.append(time.perf_counter() - start)
-        without = NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.member_N)
+        without = NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.centre_N)
         start = time.perf_counter()
         brute = np.concatenate(
             [novelty(without, some, neighbours=10, distance="euclidean") for some in np.array_split(queries, 16)]

@@ -18,6 +18,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -135,7 +136,7 @@ def compare(before: Path, after: Path) -> bool:
     """Whether all is equal; prints a line per run, and what differs."""
     equal = True
     for name in REFERENCES:
-        old, new = (np.load(folder / f"{name}.npz") for folder in (before, after))
+        old, new = (renamed(np.load(folder / f"{name}.npz")) for folder in (before, after))
         names = sorted({*old, *new})
         other = [one for one in names if one not in old or one not in new or not same(old[one], new[one])]
         values = sum(new[one].size for one in new)
@@ -144,6 +145,12 @@ def compare(before: Path, after: Path) -> bool:
         print(f"{name:<18}{generations:>5} generations {len(names):>6} arrays {values:>12,} values  {verdict}")
         equal &= not other
     return equal
+
+
+def renamed(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Arrays by the names that they have since version 0.6: what was a member is a centre."""
+    invalid = "history/invalid_members"
+    return {name if name == invalid else name.replace("member", "centre"): arrays[name] for name in arrays}
 
 
 def same(one: np.ndarray, other: np.ndarray) -> bool:

@@ -23,7 +23,7 @@ COLUMNS = (
     Column("goal_distance", "REAL", True, ""),
     Column("seconds_rollout", "REAL", False, ""),
 )
-MEMBERS = 3
+CENTRES = 3
 
 
 def meta(**changes):
@@ -40,9 +40,9 @@ def meta(**changes):
 
 
 def parts_of(generation, seed=0):
-    """The parts that this generation changes: the statistics, and one member of three (all of them at first)."""
-    members = range(MEMBERS) if generation == 0 else [generation * 7 % 5 % MEMBERS]
-    parts = {f"member_{member}": _member(seed, generation, member) for member in members}
+    """The parts that this generation changes: the statistics, and one centre of three (all of them at first)."""
+    centres = range(CENTRES) if generation == 0 else [generation * 7 % 5 % CENTRES]
+    parts = {f"centre_{centre}": _centre(seed, generation, centre) for centre in centres}
     parts["observations"] = {
         "count": np.asarray(100.0 * generation),
         "mean_O": np.random.default_rng([seed, generation, 99]).standard_normal(5),
@@ -51,8 +51,8 @@ def parts_of(generation, seed=0):
     return parts
 
 
-def _member(seed, generation, member):
-    rng = np.random.default_rng([seed, generation, member])
+def _centre(seed, generation, centre):
+    rng = np.random.default_rng([seed, generation, centre])
     return {
         "centre_D": rng.standard_normal(150).astype(np.float32),
         "adam_m_D": rng.standard_normal(150).astype(np.float32),

@@ -172,11 +172,11 @@ def test_init_from_is_made_absolute(tmp_path, monkeypatch):
 
 
 def test_members_follow_from_the_algorithm():
-    assert load().search.members == 1
-    assert load(MINIMAL, "search.algorithm=ns_es").search.members == 5
-    assert load(MINIMAL, "search.algorithm=nsra_es", "search.members=3").search.members == 3
-    with pytest.raises(ConfigError, match=r"search\.members: 3 is not allowed for es, which has one centre"):
-        load(MINIMAL, "search.members=3")
+    assert load().search.centres == 1
+    assert load(MINIMAL, "search.algorithm=ns_es").search.centres == 5
+    assert load(MINIMAL, "search.algorithm=nsra_es", "search.centres=3").search.centres == 3
+    with pytest.raises(ConfigError, match=r"search\.centres: 3 is not allowed for es, which has one centre"):
+        load(MINIMAL, "search.centres=3")
 
 
 # Round trip and constants

@@ -46,7 +46,7 @@ def test_refused_changes_shows_all_and_the_ways_to_make_them():
     assert {"  search.sigma: 0.02 -> 0.05", "  policy.hidden: [64, 64] -> [8, 8]"} < set(lines)
     assert kept == "a fork has to keep policy.hidden"
     assert in_python.endswith(f": fork('runs/a', {fork.settings!r})")
-    for key in ("search.members", "search.preset", "map.cells", "task.environment", "task.options.descriptor"):
+    for key in ("search.centres", "search.preset", "map.cells", "task.environment", "task.options.descriptor"):
         assert [way.action for way in refused_changes("runs/a", [(key, "a", "b")]).ways_out] == ["run"]
 
 
@@ -85,7 +85,7 @@ def test_what_follows_from_a_changed_key_is_resolved_anew():
     clipped = ["policy.observation_normalization: True -> False", "policy.observation_clip: 5.0 -> None"]
     assert changes("policy.observation_normalization=false") == clipped
     assert changes("policy.observation_normalization=false", "policy.observation_clip=5") == clipped[:1]
-    assert changes("search.algorithm=ns_es") == ["search.algorithm: es -> ns_es", "search.members: 1 -> 5"]
+    assert changes("search.algorithm=ns_es") == ["search.algorithm: es -> ns_es", "search.centres: 1 -> 5"]
     shaped = load(MINIMAL, "search.pairs=16", "compute.chunk_pairs=4", "map.qd_offset=3")
     assert changes("search.pairs=16", "task.fitness=sum", config=shaped) == []
     assert changes("task.fitness=final", "map.qd_offset=3", config=shaped) == ["task.fitness: sum -> final"]

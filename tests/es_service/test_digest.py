@@ -47,8 +47,8 @@ def changed_names(before, after):
 
 def test_names_are_the_state_parts_and_the_tables(folder):
     parts = digest_parts(folder)
-    assert list(parts) == ["state/member_0", "state/member_1", "state/member_2", "state/observations", "history"]
-    assert parts["state/member_1"] == arrays_sha256(state_at(GENERATIONS - 1)["member_1"])
+    assert list(parts) == ["state/centre_0", "state/centre_1", "state/centre_2", "state/observations", "history"]
+    assert parts["state/centre_1"] == arrays_sha256(state_at(GENERATIONS - 1)["centre_1"])
     assert all(len(value) == 64 for value in (*parts.values(), digest(folder)))
 
 
@@ -95,7 +95,7 @@ def test_platforms_and_meta_do_not_count(folder, tmp_path):
     assert digest(tmp_path / "elsewhere") == digest(folder)
 
 
-@pytest.mark.parametrize("part", ["member_0", "member_1", "member_2", "observations"])
+@pytest.mark.parametrize("part", ["centre_0", "centre_1", "centre_2", "observations"])
 def test_one_flipped_bit_in_a_state_counts(folder, part):
     before, whole = digest_parts(folder), digest(folder)
     payload = encode_part(state_at(GENERATIONS - 1)[part])

@@ -54,7 +54,7 @@ def test_an_empty_cell_is_entered_and_a_fitter_one_replaces_while_an_equal_one_d
     better, cell, entered = insert(first, np.array([1.5, 0.2]), np.nextafter(5.0, 6.0), 8, 3, 7.0)
     assert (cell, entered, better.size) == (0, True, 1)
     assert better.descriptor_N_B.tolist() == [[1.5, 0.2]]
-    assert (better.generation_N[0], better.member_N[0], better.score_N[0]) == (8, 3, 7.0)
+    assert (better.generation_N[0], better.centre_N[0], better.score_N[0]) == (8, 3, 7.0)
 
 
 def test_cells_stay_in_the_order_of_their_discovery():
@@ -76,11 +76,11 @@ def test_insertion_and_scores_leave_the_old_map_as_it_was():
         np.testing.assert_array_equal(values, before[name])
 
 
-def test_a_score_is_changed_where_the_member_has_an_elite():
+def test_a_score_is_changed_where_the_centre_has_an_elite():
     map_ = filled(((1.0, 0.1), 5.0), ((5.0, 1.9), 1.0))
     assert with_score(map_, 11, 0, -3.0).score_N.tolist() == [100.0, -3.0]
     assert with_score(map_, 5, 0, -3.0) is map_
-    assert with_score(map_, 11, 1, -3.0) is map_, "it is another member's by now"
+    assert with_score(map_, 11, 1, -3.0) is map_, "it is another centre's by now"
 
 
 @given(
@@ -149,7 +149,7 @@ def test_a_map_comes_back_from_its_parts():
     map_ = with_score(map_, 0, 0, math.nan)
     parts = map_to_parts(map_, None)
     assert set(parts) == {GEOMETRY_PART, cell_part(11), cell_part(0), cell_part(6)}
-    others = {"member_0": {"cell": np.asarray(3)}, elite_part(4): {"centre_D": np.zeros(1)}}
+    others = {"centre_0": {"cell": np.asarray(3)}, elite_part(4): {"centre_D": np.zeros(1)}}
     again = map_from_parts(dict(reversed((parts | others).items())))
     assert isinstance(again, BehaviourMap)
     assert_same_map(again, map_)
@@ -159,7 +159,7 @@ def test_an_empty_map_comes_back_and_no_map_stays_none():
     again = map_from_parts(map_to_parts(empty_map(PLANE), None))
     assert isinstance(again, BehaviourMap)
     assert_same_map(again, empty_map(PLANE))
-    assert map_from_parts({"member_0": {}}) is None
+    assert map_from_parts({"centre_0": {}}) is None
 
 
 def test_only_rows_that_changed_are_written():

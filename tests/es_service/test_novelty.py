@@ -30,7 +30,7 @@ def many(descriptor_N_B) -> NoveltyArchive:
         block_part(i): {
             "descriptor_N_B": entries[first : first + BLOCK_ENTRIES],
             "generation_N": np.arange(first, min(first + BLOCK_ENTRIES, len(entries))),
-            "member_N": np.zeros(min(BLOCK_ENTRIES, len(entries) - first), np.int64),
+            "centre_N": np.zeros(min(BLOCK_ENTRIES, len(entries) - first), np.int64),
         }
         for i, first in enumerate(blocks)
     }
@@ -75,7 +75,7 @@ def test_an_archive_never_changes():
     assert first.size == 1
     assert second.size == 2
     assert second.generation_N.tolist() == [0, 7]
-    assert second.member_N.tolist() == [0, 3]
+    assert second.centre_N.tolist() == [0, 3]
 
 
 def test_archives_that_share_room_do_not_see_each_others_entries():
@@ -87,7 +87,7 @@ def test_archives_that_share_room_do_not_see_each_others_entries():
     assert left.descriptor_N_B[:, 0].tolist() == [0.0, 1.0, 2.0, 9.0]
     assert right.descriptor_N_B[:, 0].tolist() == [0.0, 1.0, 2.0, 7.0]
     assert longer.descriptor_N_B[:, 0].tolist() == [0.0, 1.0, 2.0, 9.0, 8.0]
-    assert (left.member_N[-1], right.member_N[-1], longer.generation_N[-1]) == (0, 1, 4)
+    assert (left.centre_N[-1], right.centre_N[-1], longer.generation_N[-1]) == (0, 1, 4)
 
 
 @given(st.lists(points, max_size=40), st.lists(points, min_size=1, max_size=5), st.integers(1, 12))
@@ -123,7 +123,7 @@ def test_the_tree_changes_no_bit(dimensions, scatter, neighbours):
     queries = np.concatenate([entries(40), archive.descriptor_N_B[:10], archive.descriptor_N_B[-10:]])
     exclude = np.concatenate([np.full(40, -1), np.arange(10), np.arange(archive.size - 10, archive.size)])
     with_tree = of(archive, queries, neighbours, exclude=exclude)
-    brute = NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.member_N)
+    brute = NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.centre_N)
     assert with_tree == of(brute, queries, neighbours, exclude=exclude)
     some = [twin.novelty(archive.descriptor_N_B, queries[i], neighbours, without=int(exclude[i])) for i in (0, 41, 59)]
     assert [with_tree[i] for i in (0, 41, 59)] == some
@@ -144,7 +144,7 @@ def test_a_pile_of_equal_ends_costs_no_more_than_its_copies(monkeypatch):
 
     monkeypatch.setattr(type(archive.tree.kd), "query_ball_point", counted)
     queries = np.full((20, 2), 0.25) + rng.normal(size=(20, 2)) / 100
-    brute = NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.member_N)
+    brute = NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.centre_N)
     assert of(archive, queries, 10) == of(brute, queries, 10)
     assert looked_at
     assert max(looked_at) < 2 * COPIES
@@ -159,7 +159,7 @@ def test_trees_become_rare_where_they_are_large():
         same = extended(same, (0.5, 0.5), 0, 0)
         assert same.tree is archive.tree
     assert extended(same, (0.5, 0.5), 0, 0).size == 2**18 + 1001
-    brute = NoveltyArchive(same.descriptor_N_B, same.generation_N, same.member_N)
+    brute = NoveltyArchive(same.descriptor_N_B, same.generation_N, same.centre_N)
     assert of(same, [(0.5, 0.5), (0.1, 0.7)], 10) == of(brute, [(0.5, 0.5), (0.1, 0.7)], 10)
 
 
@@ -168,7 +168,7 @@ def test_a_tree_that_rounds_otherwise_changes_no_bit(monkeypatch, off):
     """Though its last bits be off: queries that it cannot decide are compared with all that is as near."""
     archive = many(np.random.default_rng(1).integers(0, 6, (2 * TREE_STEP, 2)) / 7.0)
     queries = archive.descriptor_N_B[:50] + 1 / 3
-    expected = of(NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.member_N), queries, 3)
+    expected = of(NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.centre_N), queries, 3)
     assert archive.tree is not None
     tree, undecided = type(archive.tree.kd), []
     query, ball = tree.query, tree.query_ball_point
@@ -198,7 +198,7 @@ def test_parts_hold_all_of_it_and_only_changed_blocks_are_written(before, more):
     changed = archive_to_parts(new, before)
     assert len(changed) <= 1 + math.ceil(more / BLOCK_ENTRIES)
     again = archive_from_parts(archive_to_parts(old, 0) | changed, 2)
-    for name in ("descriptor_N_B", "generation_N", "member_N"):
+    for name in ("descriptor_N_B", "generation_N", "centre_N"):
         np.testing.assert_array_equal(getattr(again, name), getattr(new, name))
     queries = rng.normal(size=(20, 2))
     assert of(again, queries, 10) == of(new, queries, 10)

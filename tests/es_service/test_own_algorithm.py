@@ -11,7 +11,7 @@ from es_service import api
 from es_service.errors import ConfigError, StoreError
 from es_service.protocol.messages import EpisodesResult
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.algorithms.base import Judgement, Plan
+from es_service.search.algorithms.base import Ask, CentreEvaluation
 from es_service.search.algorithms.steps import archived, first_state
 from es_service.search.maps.behaviour_map import insert
 from es_service.search.novelty import NoveltyArchive
@@ -29,16 +29,16 @@ CONFIG = {
 
 def test_the_example_weighs_novelty_of_the_better_half_alone():
     config = api.load_config(CONFIG)
-    assert config.search.members == 1
+    assert config.search.centres == 1
     search = ALGORITHMS[EXAMPLE](config)
     state = first_state([np.zeros(3, np.float32)], 2, search.fitness_weight)
-    state = archived(state, Judgement(0, 0, True, 0.0, np.zeros(2)))
+    state = archived(state, CentreEvaluation(0, 0, True, 0.0, np.zeros(2)))
     # Two pairs: the first's + is far and good, its - farther and bad; the other's + near and good, its - invalid.
     fitness = np.array([[4.0, 1.0], [3.0, np.nan]], np.float32)
     descriptor = np.array([[(2.0, 0.0), (9.0, 0.0)], [(1.0, 0.0), (5.0, 0.0)]], np.float32)
     steps = np.ones((2, 2), np.int32)
     population = EpisodesResult(fitness, fitness, descriptor, steps, descriptor, no_observations(2))
-    weights_P = search.weights(state, Plan(0, state.members[0].centre_D, 0.0), population)
+    weights_P = search.weights(state, Ask(0, state.centres[0].centre_D, 0.0), population)
     lowest, second, best = 0.5 / 3 - 0.5, 2 / 3 - 0.5, 0.5  # two share the ranks 0 and 1
     np.testing.assert_allclose(weights_P, [best - lowest, second - lowest], rtol=1e-6)
 
@@ -98,49 +98,49 @@ def something_else(config):
 
 def forgetful(config):
     """Keeps the three newest entries."""
-    return _absorbing(config, lambda state: replace(state, archive=_newest(state.archive, 3)))
+    return _telling(config, lambda state: replace(state, archive=_newest(state.archive, 3)))
 
 
 def growing(config):
-    """One member more after each generation."""
-    return _absorbing(config, lambda state: replace(state, members=(*state.members, state.members[0])))
+    """One centre more after each generation."""
+    return _telling(config, lambda state: replace(state, centres=(*state.centres, state.centres[0])))
 
 
 def emptying(config):
     """A map of the newest elite alone."""
-    return _absorbing(config, lambda state: replace(state, map=_rows(state.map, slice(-1, None))))
+    return _telling(config, lambda state: replace(state, map=_rows(state.map, slice(-1, None))))
 
 
 def foreign(config):
     """An elite of a cell far away, which no centre of the run has been to."""
 
-    def absorb(state, judgement):
+    def tell(state, evaluation):
         elsewhere = np.array([-0.9, 0.9])
-        return replace(state, map=insert(state.map, elsewhere, 1.0 * judgement.generation, 10**6, 0, 0.0)[0])
+        return replace(state, map=insert(state.map, elsewhere, 1.0 * evaluation.generation, 10**6, 0, 0.0)[0])
 
-    return replace(ALGORITHMS["es"](config), absorb=absorb)
+    return replace(ALGORITHMS["es"](config), tell=tell)
 
 
 def choosy(config):
-    """Offers every third centre to the map, and does not tell its member."""
+    """Offers every third centre to the map, and does not tell its centre."""
 
-    def absorb(state, judgement):
-        if judgement.generation % 3 != 1:
+    def tell(state, evaluation):
+        if evaluation.generation % 3 != 1:
             return state
-        fitness = 1.0 * judgement.generation  # later ones are fitter, wherever they are
-        return replace(state, map=insert(state.map, judgement.descriptor_B, fitness, judgement.generation, 0, 0.0)[0])
+        fitness = 1.0 * evaluation.generation  # later ones are fitter, wherever they are
+        return replace(state, map=insert(state.map, evaluation.descriptor_B, fitness, evaluation.generation, 0, 0.0)[0])
 
-    return replace(ALGORITHMS["es"](config), absorb=absorb)
+    return replace(ALGORITHMS["es"](config), tell=tell)
 
 
-def _absorbing(config, change):
+def _telling(config, change):
     ours = ALGORITHMS["es"](config)
-    return replace(ours, absorb=lambda state, judgement: change(ours.absorb(state, judgement)))
+    return replace(ours, tell=lambda state, evaluation: change(ours.tell(state, evaluation)))
 
 
 def _newest(archive, count):
     rows = slice(-count, None)
-    return NoveltyArchive(archive.descriptor_N_B[rows], archive.generation_N[rows], archive.member_N[rows])
+    return NoveltyArchive(archive.descriptor_N_B[rows], archive.generation_N[rows], archive.centre_N[rows])
 
 
 def _rows(map_, rows):
@@ -152,7 +152,7 @@ def _rows(map_, rows):
     ("name", "reason"),
     [
         ("forgetful", r"generation 3 cannot be kept: the novelty archive has lost or changed entries; .* 2 is saved"),
-        ("growing", r"generation 1 cannot be kept: the search has 3 members, and had 2"),
+        ("growing", r"generation 1 cannot be kept: the search has 3 centres, and had 2"),
         ("emptying", r"the map has lost cells, or has them in another order"),
         ("foreign", r"generation 0 cannot be kept: the new elite of cell \d+ is not the centre that was evaluated"),
     ],

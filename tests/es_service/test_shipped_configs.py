@@ -43,7 +43,7 @@ def test_comments_of_shipped_configs_say_the_numbers_that_are_used(path):
     assert said["hidden"].endswith(f"; here {spec.policy.parameters:,} parameters")
     assert said["episode_steps"].endswith(f", here {spec.episode_steps:,}")
     assert f"auto: here {list(config.map.cells)}" in said["cells"]
-    assert said.get("members", "auto: 1").endswith(f"auto: {config.search.members}")
+    assert said.get("centres", "auto: 1").endswith(f"auto: {config.search.centres}")
     assert said["chunk_pairs"].endswith(f"auto: {compute.chunk_pairs} for {config.search.pairs}")
     block = compute.rollout_block_pairs
     assert said["rollout_block_pairs"].endswith((f"auto: here {block}", f"auto: {block} for {compute.chunk_pairs}"))

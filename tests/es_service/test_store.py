@@ -148,7 +148,7 @@ def test_what_does_not_fit_leaves_the_store_as_it_was(tmp_path):
         with pytest.raises(StoreError, match="missing columns"):
             run.commit(3, parts_of(3), {})
         with pytest.raises(StoreError, match="dtype"):
-            run.commit(3, {"member_0": {"a": "text"}}, history_row(3))
+            run.commit(3, {"centre_0": {"a": "text"}}, history_row(3))
         assert_same_state(run.load(), state_at(2))
         advance(run, 3)
         assert_same_state(run.load(), state_at(3))

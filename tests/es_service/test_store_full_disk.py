@@ -31,7 +31,7 @@ def test_a_full_database_stops_the_commit_and_keeps_the_rest(tmp_path):
         connection = run._connection
         pages = connection.execute("PRAGMA page_count").fetchone()[0]
         connection.execute(f"PRAGMA max_page_count = {pages}")
-        big = {"member_0": {"centre_D": np.zeros(100_000, np.float32)}}
+        big = {"centre_0": {"centre_D": np.zeros(100_000, np.float32)}}
         with pytest.raises(StoreError, match=r"disk full while storing generation 3 .* free space\.\n.* resume\("):
             run.commit(3, big, history_row(3))
         assert run.generation == 2

@@ -113,8 +113,8 @@ def test_a_database_that_somebody_locks_is_no_damage(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("version", "message"),
     [
-        (7, r"schema version 7; .* versions up to 3\. Upgrade"),
-        (1, r"schema version 1; this es-service reads version 3\. Use the"),
+        (7, r"schema version 7; .* versions up to 4\. Upgrade"),
+        (1, r"older es-service; version 0\.1 reads and continues it .* is 1, this es-service reads 4"),
     ],
 )
 def test_another_schema_version_names_both_and_says_what_to_use(tmp_path, monkeypatch, version, message):

@@ -9,7 +9,7 @@ import numpy as np
 
 from es_service.config.model import RunConfig
 from es_service.protocol.messages import EpisodesResult
-from es_service.search.algorithms.base import Algorithm, Plan, SearchState
+from es_service.search.algorithms.base import Algorithm, Ask, SearchState
 from es_service.search.algorithms.steps import novelty_search
 from es_service.search.novelty import novelty
 from es_service.search.shaping import centred_ranks, pair_weights
@@ -18,7 +18,7 @@ from es_service.search.shaping import centred_ranks, pair_weights
 def minimal_criterion(config: RunConfig) -> Algorithm:
     """Novelty, but only of members that do at least as well as half of their population."""
 
-    def weights(state: SearchState, plan: Plan, population: EpisodesResult) -> np.ndarray:
+    def weights(state: SearchState, asked: Ask, population: EpisodesResult) -> np.ndarray:
         nearest = config.novelty
         novelty_P_S = novelty(
             state.archive, population.descriptor, neighbours=nearest.neighbours, distance=nearest.distance

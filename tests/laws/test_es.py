@@ -50,7 +50,7 @@ def test_twenty_generations_equal_the_twin(finished):
         fitness_P_S = np.concatenate([fitness for _, fitness in sorted(results, key=lambda item: item[0])])
         keys = stream_keys(0, Domain.PARAMETER_NOISE, generation, np.arange(48))
         es.generation([normals(key, SHAPE.parameters) for key in keys], fitness_P_S)
-    difference = np.linalg.norm(state.search.members[0].centre_D - es.centre) / np.linalg.norm(es.centre)
+    difference = np.linalg.norm(state.search.centres[0].centre_D - es.centre) / np.linalg.norm(es.centre)
     assert difference < 1e-6
 
 
@@ -113,9 +113,9 @@ def test_normalisation_off_means_raw_observations():
 def test_same_config_same_bits_other_seed_other_bits(finished):
     config, state, _, _, _ = finished
     again, *_ = run_in_memory(config)
-    np.testing.assert_array_equal(again.search.members[0].centre_D, state.search.members[0].centre_D)
+    np.testing.assert_array_equal(again.search.centres[0].centre_D, state.search.centres[0].centre_D)
     other, *_ = run_in_memory(config.model_copy(update={"seed": 1}))
-    assert not np.array_equal(other.search.members[0].centre_D, state.search.members[0].centre_D)
+    assert not np.array_equal(other.search.centres[0].centre_D, state.search.centres[0].centre_D)
 
 
 @pytest.mark.parametrize("kind", ["avx2", "four"])
@@ -171,7 +171,7 @@ def test_invalid_members_rank_last_are_counted_and_do_not_stop_the_run():
     config = small_config()
     state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config, SHIPPED["point_maze"]), spoil))
     assert [row.get("invalid_members") for row in store.rows[1:]] == [2] * 20
-    assert np.isfinite(state.search.members[0].centre_D).all()
+    assert np.isfinite(state.search.centres[0].centre_D).all()
     assert all(np.isfinite(row["population_fitness_min"]) for row in store.rows[1:])
 
 

@@ -86,7 +86,7 @@ def test_thirty_generations_equal_the_twin(preset, mode):
 
 def test_a_block_has_a_fresh_optimiser_and_keeps_it():
     _, store, _ = run_in_memory(config_of(generations=12))
-    assert [int(parts["member_0"]["adam_step"]) for parts in store.after] == [0] + [1, 2, 3] * 4
+    assert [int(parts["centre_0"]["adam_step"]) for parts in store.after] == [0] + [1, 2, 3] * 4
 
 
 def test_a_block_starts_from_its_elite_and_goes_on_from_wherever_it_comes():
@@ -159,7 +159,7 @@ def test_an_invalid_centre_enters_neither_archive_nor_map_and_the_search_goes_on
         row, before = store.rows[generation], store.rows[generation - 1]
         assert np.isnan(row["centre_novelty"])
         assert row["cell"] is None
-        assert store.after[generation]["member_0"]["cell"] == NO_CELL
+        assert store.after[generation]["centre_0"]["cell"] == NO_CELL
         for name in (*names[:-1], "best_fitness"):
             assert row[name] == before[name]
     led = store.after[7][cell_part(store.rows[7]["start_cell"])]
@@ -170,7 +170,7 @@ def test_an_invalid_centre_enters_neither_archive_nor_map_and_the_search_goes_on
     assert state.search.map is not None
     assert not set(spoiled) & {*state.search.archive.generation_N.tolist(), *state.search.map.generation_N.tolist()}
     assert state.search.archive.size == 10
-    assert np.isfinite(state.search.members[0].centre_D).all()
+    assert np.isfinite(state.search.centres[0].centre_D).all()
 
 
 # Observation statistics
@@ -212,7 +212,7 @@ def test_a_block_can_run_with_the_run_s_statistics():
     _, store, evaluator = run_in_memory(config_of(parent_statistics="global"))
     for generation in range(1, 31):
         assert statistics_of(evaluator, generation) == of_the_run(store.after[generation - 1])
-        assert "own_mean_O" not in store.after[generation]["member_0"]
+        assert "own_mean_O" not in store.after[generation]["centre_0"]
 
 
 # Interruption
@@ -222,8 +222,8 @@ def test_a_block_can_run_with_the_run_s_statistics():
 def test_a_search_put_together_again_inside_a_block_equals_an_uninterrupted_one(preset):
     _, straight, _ = run_in_memory(config_of(preset, generations=12))
     _, store, _ = run_in_memory(config_of(preset, generations=7))
-    assert store.parts["member_0"]["adam_step"] == 1
-    assert ("own_mean_O" in store.parts["member_0"]) == (preset == "literature")
+    assert store.parts["centre_0"]["adam_step"] == 1
+    assert ("own_mean_O" in store.parts["centre_0"]) == (preset == "literature")
     store.parts = {name: decode_part(encode_part(part)) for name, part in store.parts.items()}
     run_in_memory(config_of(preset, generations=12), store=store)
     assert store.parts.keys() == straight.parts.keys()

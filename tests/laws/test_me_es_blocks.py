@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.algorithms.base import NO_CELL, Judgement
+from es_service.search.algorithms.base import NO_CELL, CentreEvaluation
 from es_service.search.algorithms.me_es import cell_shares, elite_novelty
 from es_service.search.algorithms.steps import archived, first_state, mapped
 from es_service.search.maps.behaviour_map import BehaviourMap
@@ -128,10 +128,10 @@ def test_an_elite_s_own_entry_is_no_neighbour_but_an_equal_one_is():
 
 def test_of_several_initial_centres_each_elite_leaves_out_its_own_entry():
     """And one that made none leaves out nothing."""
-    map_ = replace(line([0, 10, 25, 40], generations=[0, 0, 0, 7]), member_N=np.array([0, 2, 1, 0]))
+    map_ = replace(line([0, 10, 25, 40], generations=[0, 0, 0, 7]), centre_N=np.array([0, 2, 1, 0]))
     archive = empty_archive(1)
-    for member, descriptor in enumerate([0.0, 25.0, 10.0]):
-        archive = extended(archive, [descriptor], 0, member)
+    for centre, descriptor in enumerate([0.0, 25.0, 10.0]):
+        archive = extended(archive, [descriptor], 0, centre)
     novelty_N = elite_novelty(map_, archive, config_of(neighbours=1).novelty)
     assert novelty_N.tolist() == [10.0, 10.0, 15.0, 15.0]
 
@@ -184,10 +184,10 @@ def test_scores_by_hand():
             (50, -9, 6.0, {1: 50, 4: 7, 6: 50}, 6),
         ]
     ):
-        judgement = Judgement(generation, 0, place is not None, fitness, np.array([place or np.nan]), best)
-        state = mapped(archived(state, judgement), judgement)
+        evaluation = CentreEvaluation(generation, 0, place is not None, fitness, np.array([place or np.nan]), best)
+        state = mapped(archived(state, evaluation), evaluation)
         assert state.map is not None
         known = dict(zip(state.map.cell_N.tolist(), state.map.score_N.tolist(), strict=True))
         assert {cell: None if np.isnan(score) else score for cell, score in known.items()} == scores
-        assert state.members[0].cell == cell
+        assert state.centres[0].cell == cell
     assert state.archive.size == 7

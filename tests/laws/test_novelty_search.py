@@ -1,4 +1,4 @@
-"""NS-ES, NSR-ES and NSRA-ES against their twin; choice of members, weight rule, invalid centres."""
+"""NS-ES, NSR-ES and NSRA-ES against their twin; choice of centres, weight rule, invalid centres."""
 
 import numpy as np
 import pytest
@@ -11,15 +11,15 @@ from es_service.loop.parts import state_from_parts
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicyShape, TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.algorithms.base import FitnessWeight, Judgement
+from es_service.search.algorithms.base import CentreEvaluation, FitnessWeight
 from es_service.search.algorithms.nsra_es import adapted_weight
 from es_service.search.algorithms.steps import (
-    MEMBER_CHOICE,
+    CENTRE_CHOICE,
     archived,
-    choose_member,
+    choose_centre,
     first_state,
-    member_novelty,
     mixed_utilities,
+    novelty_of_centres,
 )
 from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
@@ -55,7 +55,7 @@ def config_of(algorithm, distance="euclidean", **search):
 
 def run_in_memory(config, evaluator=None, store=None):
     evaluator = evaluator or DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
-    centres = [initial_parameters(SHAPE, config.policy.init, config.seed, m) for m in range(config.search.members)]
+    centres = [initial_parameters(SHAPE, config.policy.init, config.seed, m) for m in range(config.search.centres)]
     search = driver.Search(
         config,
         ALGORITHMS[config.search.algorithm](config),
@@ -67,13 +67,13 @@ def run_in_memory(config, evaluator=None, store=None):
     return state, store, evaluator
 
 
-def episodes(evaluator, kind, generation, centre=None):
+def episodes(evaluator, kind, generation, centre_D=None):
     """Fitness and descriptors of all chunks of a kind, in the order of their ids."""
     found = [
         (chunk.chunk_id, result)
         for point, chunk, result in evaluator.recorded
         if isinstance(chunk, kind) and chunk.generation == generation
-        if centre is None or np.array_equal(point.parameters_D, centre)
+        if centre_D is None or np.array_equal(point.parameters_D, centre_D)
     ]
     results = [result for _, result in sorted(found, key=lambda item: item[0])]
     return np.concatenate([r.fitness for r in results]), np.concatenate([r.descriptor for r in results])
@@ -88,58 +88,58 @@ def test_twenty_generations_equal_the_twin(algorithm, distance):
     state, store, evaluator = run_in_memory(config)
     search = config.search
     rule = (search.fitness_weight_step, search.fitness_weight_patience, 0.0) if algorithm == "nsra_es" else None
-    centres = [initial_parameters(SHAPE, config.policy.init, 0, member) for member in range(5)]
+    centres = [initial_parameters(SHAPE, config.policy.init, 0, index) for index in range(5)]
     other = twin.NoveltySearch(
         centres, search.learning_rate, search.l2, neighbours=3, weight=STARTS[algorithm], rule=rule, squared=squared
     )
-    for member, centre in enumerate(centres):
-        _, descriptor = episodes(evaluator, EvaluationChunk, 0, centre)
-        other.initial(member, descriptor[:20].astype(float).mean(axis=0))
+    for index, centre_D in enumerate(centres):
+        _, descriptor = episodes(evaluator, EvaluationChunk, 0, centre_D)
+        other.initial(index, descriptor[:20].astype(float).mean(axis=0))
     for generation in range(1, 21):
         row = store.rows[generation]
-        drawn = uniforms(stream_keys(0, Domain.SELECTION, generation, MEMBER_CHOICE), np.zeros(1, np.uint32))[0]
-        member = other.chosen(float(drawn))
-        assert row["member"] == member
+        drawn = uniforms(stream_keys(0, Domain.SELECTION, generation, CENTRE_CHOICE), np.zeros(1, np.uint32))[0]
+        centre = other.chosen(float(drawn))
+        assert row["centre"] == centre
         assert row["fitness_weight"] == other.weight
         noise = [
             normals(key, SHAPE.parameters) for key in stream_keys(0, Domain.PARAMETER_NOISE, generation, np.arange(32))
         ]
-        other.generation(member, noise, *episodes(evaluator, TrainingChunk, generation))
+        other.generation(centre, noise, *episodes(evaluator, TrainingChunk, generation))
         fitness, descriptor = (x[:20] for x in episodes(evaluator, EvaluationChunk, generation))
         mean = descriptor.astype(float).mean(axis=0)
         assert row["centre_novelty"] == pytest.approx(twin.novelty(other.archive, mean, 3, squared), rel=1e-12)
-        other.evaluated(member, fitness.astype(float).mean(), mean)
+        other.evaluated(centre, fitness.astype(float).mean(), mean)
         assert row["archive_size"] == len(other.archive) == 5 + generation
-    for ours, theirs in zip(state.search.members, other.members, strict=True):
+    for ours, theirs in zip(state.search.centres, other.centres, strict=True):
         assert np.linalg.norm(ours.centre_D - theirs.centre) < 1e-6 * np.linalg.norm(theirs.centre)
-    assert len({row["member"] for row in store.rows}) >= 3
+    assert len({row["centre"] for row in store.rows}) >= 3
     weights = len({row["fitness_weight"] for row in store.rows})
     assert weights >= 4 if algorithm == "nsra_es" else weights == 1
     np.testing.assert_allclose(state.search.archive.descriptor_N_B, other.archive, rtol=1e-12)
 
 
-def test_a_state_put_together_again_is_the_same_and_only_the_moved_member_is_written():
+def test_a_state_put_together_again_is_the_same_and_only_the_moved_centre_is_written():
     config = config_of("nsra_es")
 
     class Recording(MemoryStore):
         def commit(self, generation, parts, history):
             super().commit(generation, parts, history)
-            members = {name for name in parts if name.startswith("member_")}
-            wanted = range(5) if generation == 0 else [history["member"]]
-            assert members == {f"member_{member}" for member in wanted}
+            centres = {name for name in parts if name.startswith("centre_")}
+            wanted = range(5) if generation == 0 else [history["centre"]]
+            assert centres == {f"centre_{centre}" for centre in wanted}
 
     state, store, _ = run_in_memory(config, store=Recording())
     again = state_from_parts(store.load(), 20, state.wall_clock_s, 2)
     assert again.search.weight == state.search.weight
-    for name in ("descriptor_N_B", "generation_N", "member_N"):
+    for name in ("descriptor_N_B", "generation_N", "centre_N"):
         np.testing.assert_array_equal(getattr(again.search.archive, name), getattr(state.search.archive, name))
-    for ours, theirs in zip(state.search.members, again.search.members, strict=True):
+    for ours, theirs in zip(state.search.centres, again.search.centres, strict=True):
         assert ours.entry == theirs.entry
         assert ours.adam.step == theirs.adam.step
         np.testing.assert_array_equal(ours.centre_D, theirs.centre_D)
         np.testing.assert_array_equal(ours.adam.m_D, theirs.adam.m_D)
         np.testing.assert_array_equal(ours.adam.v_D, theirs.adam.v_D)
-    assert sum(member.adam.step for member in again.search.members) == 20  # each has an optimiser of its own
+    assert sum(centre.adam.step for centre in again.search.centres) == 20  # each has an optimiser of its own
 
 
 def test_initial_members_differ_and_are_evaluated_on_resets_of_their_own():
@@ -150,38 +150,38 @@ def test_initial_members_differ_and_are_evaluated_on_resets_of_their_own():
     assert store.rows[0]["episodes"] == 100
 
 
-# Choice of the member to update
+# Choice of the centre to update
 
 
 def state_with(descriptors, dimensions=2):
-    """A state whose members' newest entries are these; None for a member without one."""
+    """A state whose centres' newest entries are these; None for a centre without one."""
     state = first_state([np.zeros(3, np.float32)] * len(descriptors), dimensions, 0.0)
-    for member, descriptor in enumerate(descriptors):
+    for centre, descriptor in enumerate(descriptors):
         if descriptor is not None:
-            state = archived(state, Judgement(0, member, True, 0.0, np.array(descriptor, float)))
+            state = archived(state, CentreEvaluation(0, centre, True, 0.0, np.array(descriptor, float)))
     return state
 
 
 def choices(state, generations=4000, **search):
-    config = config_of("ns_es", members=len(state.members), **search)
-    picked = [choose_member(state, generation, config) for generation in range(1, generations + 1)]
-    return np.bincount(picked, minlength=len(state.members)) / generations, picked
+    config = config_of("ns_es", centres=len(state.centres), **search)
+    picked = [choose_centre(state, generation, config) for generation in range(1, generations + 1)]
+    return np.bincount(picked, minlength=len(state.centres)) / generations, picked
 
 
 def test_members_are_chosen_in_proportion_to_their_novelty():
     state = state_with([(0, 0), (1, 0), (7, 0)])
-    novelty_M = member_novelty(state, config_of("ns_es").novelty)
+    novelty_M = novelty_of_centres(state, config_of("ns_es").novelty)
     assert novelty_M.tolist() == [4.0, 3.5, 6.5]  # itself is no neighbour
     share, _ = choices(state)
     np.testing.assert_allclose(share, novelty_M / 14.0, atol=4 * np.sqrt(0.25 / 4000))
 
 
-def test_novelty_is_that_of_today_s_archive_and_of_the_member_s_newest_entry():
+def test_novelty_is_that_of_today_s_archive_and_of_the_centre_s_newest_entry():
     state = state_with([(0, 0), (10, 0)])
-    for _ in range(3):  # others crowd around the first member
-        state = archived(state, Judgement(1, 1, True, 0.0, np.array([0.0, 0.0])))
-    state = archived(state, Judgement(2, 1, True, 0.0, np.array([5.0, 0.0])))
-    assert member_novelty(state, config_of("ns_es").novelty).tolist() == [0.0, 5.0]
+    for _ in range(3):  # others crowd around the first centre
+        state = archived(state, CentreEvaluation(1, 1, True, 0.0, np.array([0.0, 0.0])))
+    state = archived(state, CentreEvaluation(2, 1, True, 0.0, np.array([5.0, 0.0])))
+    assert novelty_of_centres(state, config_of("ns_es").novelty).tolist() == [0.0, 5.0]
     share, _ = choices(state, 200)
     assert share.tolist() == [0.0, 1.0]
 
@@ -192,20 +192,24 @@ def test_all_novelties_zero_is_a_uniform_choice():
         np.testing.assert_allclose(share, 0.25, atol=0.03)
 
 
-def test_a_member_without_a_valid_centre_has_no_novelty():
-    assert member_novelty(state_with([(0, 0), None, (2, 0)]), config_of("ns_es").novelty).tolist() == [2.0, 0.0, 2.0]
+def test_a_centre_that_was_never_valid_has_no_novelty():
+    assert novelty_of_centres(state_with([(0, 0), None, (2, 0)]), config_of("ns_es").novelty).tolist() == [
+        2.0,
+        0.0,
+        2.0,
+    ]
 
 
-def test_a_member_without_a_valid_centre_is_chosen_like_the_most_novel_one():
+def test_a_centre_that_was_never_valid_is_chosen_like_the_most_novel_one():
     share, _ = choices(state_with([(0, 0), None, (2, 0), (2, 1)]))  # novelties 2.1, none, 1.5, 1.6
     np.testing.assert_allclose(share, np.array([2.118, 2.118, 1.5, 1.618]) / 7.354, atol=0.03)
 
 
 def test_other_choices():
     state = state_with([(0, 0), (0, 0), (9, 9)])
-    share, _ = choices(state, member_choice="uniform")
+    share, _ = choices(state, centre_choice="uniform")
     np.testing.assert_allclose(share, 1 / 3, atol=0.03)
-    _, picked = choices(state, 7, member_choice="round_robin")
+    _, picked = choices(state, 7, centre_choice="round_robin")
     assert picked == [0, 1, 2, 0, 1, 2, 0]
 
 
@@ -217,7 +221,7 @@ def weights_of(fitnesses, start, **rule):
     weight, values = FitnessWeight(start), []
     for generation, fitness in enumerate(fitnesses, 1):
         valid = fitness is not None
-        weight = adapted_weight(search, weight, Judgement(generation, 0, valid, fitness or 0.0, np.zeros(2)))
+        weight = adapted_weight(search, weight, CentreEvaluation(generation, 0, valid, fitness or 0.0, np.zeros(2)))
         values.append(round(weight.value, 10))
     return values, weight
 
@@ -266,7 +270,7 @@ def test_invalid_members_are_last_whatever_is_climbed(weight):
     population = EpisodesResult(fitness, fitness, descriptor, np.ones((2, 2), np.int32), fitness, no_observations(2))
     population, invalid = invalidate(population, 0.5, 1)
     assert invalid == 2
-    state = archived(first_state([np.zeros(1, np.float32)], 2, weight), Judgement(0, 0, True, 0.0, np.zeros(2)))
+    state = archived(first_state([np.zeros(1, np.float32)], 2, weight), CentreEvaluation(0, 0, True, 0.0, np.zeros(2)))
     utility = mixed_utilities(state, weight, population, config_of("nsr_es").novelty)
     assert utility[0, 1] == utility[1, 0] == utility.min() < utility[0, 0] < utility[1, 1] == utility.max()
 
@@ -291,4 +295,4 @@ def test_an_invalid_centre_never_enters_the_archive():
     assert np.isnan(store.rows[3]["centre_novelty"])
     assert 3 not in state.search.archive.generation_N
     assert all(row["invalid_members"] == 2 for row in store.rows[1:])
-    assert all(np.isfinite(member.centre_D).all() for member in state.search.members)
+    assert all(np.isfinite(centre.centre_D).all() for centre in state.search.centres)

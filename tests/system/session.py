@@ -27,7 +27,7 @@ SMALL = {
     "budget": {"generations": 30},
     "compute": {"engine": "inline", "workers": 1, "chunk_pairs": 8, "gradient_block_pairs": 8},
 }
-"""A run of some milliseconds a generation: five members, archive, adaptive weight."""
+"""A run of some milliseconds a generation: five centres, archive, adaptive weight."""
 
 
 def start(folder: Path, *, config: dict | None = None, kill: dict | None = None) -> Started:

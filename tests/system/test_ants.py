@@ -21,7 +21,7 @@ def run(folder: Path, environment: str, workers: int, on_generation=lambda row: 
     config = {
         "task": {"environment": environment, "episode_steps": 1000},
         "policy": {"hidden": [64, 64]},
-        "search": {"algorithm": "nsra_es", "pairs": 32, "evaluation_episodes": 4, "members": 2},
+        "search": {"algorithm": "nsra_es", "pairs": 32, "evaluation_episodes": 4, "centres": 2},
         "budget": {"generations": 6},
         "compute": {
             "engine": "inline",

@@ -61,7 +61,7 @@ def test_a_record_of_another_fitness_does_not_hold_the_weight_down(tmp_path):
     [
         ("policy.hidden=[16]", "policy.hidden: [8] -> [16]"),
         ("search.algorithm=es", "search.algorithm: nsra_es -> es"),
-        ("search.members=3", "search.members: 5 -> 3"),
+        ("search.centres=3", "search.centres: 5 -> 3"),
         ("task.environment=ant_trap", "task.environment: point_maze -> ant_trap"),
         ("map.kind=cvt", "map.kind: grid -> cvt"),
     ],
@@ -144,12 +144,12 @@ def test_what_would_change_nothing_is_refused(parent, key):
     assert caught.value.way_out == start_afresh(parent.folder)
 
 
-def test_without_normalisation_no_statistics_are_used_nor_a_member_s_own(parent, tmp_path):
+def test_without_normalisation_no_statistics_are_used_nor_a_centre_s_own(parent, tmp_path):
     """Whose block began from an elite that brought its own, and goes on in the fork; their bound goes with them."""
     search = {"algorithm": "me_es", "pairs": 16, "evaluation_episodes": 4, "parent_statistics": "elite"}
     wanted = ("search.block_generations=8", f"search.init_from={parent.folder}", "budget.generations=6")
     begun = run(tmp_path / "begun", *wanted, config=SMALL | {"search": search})
-    assert "own_std_O" in begun.parts()[1]["member_0"]
+    assert "own_std_O" in begun.parts()[1]["centre_0"]
     assert (begun.policy("centre").observation_std_O != 1.0).all()
     forked = fork(begun, tmp_path / "fork", "policy.observation_normalization=false", "budget.generations=7")
     assert forked.constants["policy.observation_clip"] is None
@@ -160,7 +160,7 @@ def test_without_normalisation_no_statistics_are_used_nor_a_member_s_own(parent,
         np.testing.assert_array_equal(policy.observation_std_O, 1.0)
     assert len(elites) == 1
     kept, gone = (
-        lineage.forked(begun, lineage.fork_config(begun.folder, overrides), None)[1].parts["member_0"]
+        lineage.forked(begun, lineage.fork_config(begun.folder, overrides), None)[1].parts["centre_0"]
         for overrides in ([], ["search.parent_statistics=global"])
     )
     assert kept.keys() - gone.keys() == {"own_mean_O", "own_std_O"}
@@ -279,8 +279,8 @@ def test_init_from_starts_at_the_other_run_s_centre(config, finished, tmp_path):
     assert child.generation == 0
     _, parts = child.parts()
     assert (parts["observations"]["m2_O"] == parent.parts()[1]["observations"]["m2_O"]).all()
-    for member in range(5):
-        assert (parts[f"member_{member}"]["centre_D"] == parent.policy("centre").parameters_D).all()
+    for centre in range(5):
+        assert (parts[f"centre_{centre}"]["centre_D"] == parent.policy("centre").parameters_D).all()
     assert child.meta.parent is not None
     assert child.meta.parent["digest"] == digest(finished[0])
     code, printed = es("run", config, "--out", tmp_path / "s", "--set", f"search.init_from={finished[0]}",

@@ -79,7 +79,7 @@ def test_a_fork_with_another_task_begins_with_an_empty_map(tmp_path, mapped):
 
 
 def test_every_algorithm_fills_the_same_map(tmp_path):
-    one = run(tmp_path / "ns", config=CONFIG | {"search": {"algorithm": "ns_es", "pairs": 16, "members": 3}})
+    one = run(tmp_path / "ns", config=CONFIG | {"search": {"algorithm": "ns_es", "pairs": 16, "centres": 3}})
     assert len(one.map) > 1
     assert one.history["start_cell"].isna().all()
     without = run(tmp_path / "none", "map.enabled=false", config=CONFIG | {"search": {"algorithm": "es", "pairs": 16}})

@@ -26,13 +26,13 @@ def novelty(archive, descriptor, neighbours, squared=False, without=None):
 class NoveltySearch:
     def __init__(self, centres, learning_rate, l2, *, neighbours, weight, rule=None, squared=False):
         """rule: None, or (step, patience, minimum relative gain) of the adaptive weight."""
-        self.members = [ES(centre, learning_rate, l2) for centre in centres]
+        self.centres = [ES(centre, learning_rate, l2) for centre in centres]
         self.archive, self.newest_entry = [], [None] * len(centres)
         self.neighbours, self.squared, self.weight, self.rule = neighbours, squared, weight, rule
         self.record, self.stagnant = None, 0
 
     def chosen(self, uniform):
-        """Roulette over the members' novelties, for a number drawn from [0, 1)."""
+        """Roulette over the centres' novelties, for a number drawn from [0, 1)."""
         newest = [(i, self.archive[i]) for i in self.newest_entry]
         shares = [novelty(self.archive, x, self.neighbours, self.squared, without=i) for i, x in newest]
         if sum(shares) == 0.0:
@@ -44,21 +44,21 @@ class NoveltySearch:
                 return index
         raise AssertionError
 
-    def generation(self, member, noise_P_D, fitness_P_S, descriptor_P_S_B):
+    def generation(self, centre, noise_P_D, fitness_P_S, descriptor_P_S_B):
         pairs = len(noise_P_D)
         reward = averaged_centred_ranks(fitness_P_S.ravel())
         novel = averaged_centred_ranks(
             [novelty(self.archive, x, self.neighbours, self.squared) for x in descriptor_P_S_B.reshape(2 * pairs, -1)]
         )
         mixed = self.weight * reward + (1 - self.weight) * novel
-        self.members[member].climb(noise_P_D, mixed.reshape(pairs, 2))
+        self.centres[centre].climb(noise_P_D, mixed.reshape(pairs, 2))
 
-    def initial(self, member, descriptor):
-        self.newest_entry[member] = len(self.archive)
+    def initial(self, centre, descriptor):
+        self.newest_entry[centre] = len(self.archive)
         self.archive.append(descriptor)
 
-    def evaluated(self, member, fitness, descriptor):
-        self.initial(member, descriptor)
+    def evaluated(self, centre, fitness, descriptor):
+        self.initial(centre, descriptor)
         if self.rule is None:
             return
         step, patience, gain = self.rule

@@ -52,8 +52,8 @@ TABLES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("centre_{}", "centre_{}_std"),
         ("centre_fitness_mean", "centre_fitness_std", "centre_return_mean", "centre_return_std", "centre_novelty"),
     ),
-    "the map": (("{}", "cell_{}"), ("cell", "fitness", "generation", "member")),
-    "the novelty archive": (("{}",), ("generation", "member")),
+    "the map": (("{}", "cell_{}"), ("cell", "fitness", "generation", "centre")),
+    "the novelty archive": (("{}",), ("generation", "centre")),
     "evaluate --out": (
         ("{}", "{}_std"),
         ("policy", "generation", "episodes", "stored_fitness", "fresh_fitness", "fresh_standard_error"),

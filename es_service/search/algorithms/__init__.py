@@ -1,8 +1,8 @@
 """Search algorithms: a name -> a factory. One method, one short file; shared steps are functions.
 
 An algorithm is a handful of pure functions on a `SearchState`; it never evaluates anything itself. Each generation the
-driver asks it whether to start afresh from an elite (`start_cell`), what to perturb (`plan`), how to weigh the noise
-(`weights`) and where that leads (`step`), and lets it learn from the new centre's evaluation (`absorb`).
+driver asks it whether to start afresh from an elite (`start_cell`), what to perturb (`ask`), how to weigh the noise
+(`weights`) and where that leads (`step`), and lets it learn from the new centre's evaluation (`tell`).
 """
 
 from __future__ import annotations

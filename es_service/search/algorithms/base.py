@@ -1,4 +1,4 @@
-"""What every search algorithm is made of: its state, its plan, its functions."""
+"""What every search algorithm is made of: its state, what it asks for, its functions."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ from es_service.search.novelty import NoveltyArchive
 from es_service.search.optimizer import Adam, fresh_adam
 
 NO_ENTRY = -1
-"""`Member.entry` of a member none of whose centres was valid so far."""
+"""`CentreState.entry` of a centre that has never been valid so far."""
 NO_CELL = -1
-"""`Member.cell` of a member whose centre is no elite."""
+"""`CentreState.cell` of a centre that is no elite."""
 
 
 @dataclass(frozen=True)
-class Member:
-    """One centre with its optimiser. A meta-population has several, plain ES one."""
+class CentreState:
+    """One centre with its optimiser. NS-ES and its kin search with several side by side (the meta-population of Conti
+    et al. 2018), ES and ME-ES with one."""
 
     centre_D: FloatArray
     adam: Adam
     entry: int = NO_ENTRY
     """Index of its newest entry in the novelty archive."""
     cell: int = NO_CELL
-    """Cell of the map whose elite its centre is."""
+    """Cell of the map whose elite it is."""
     own_mean_O: FloatArray | None = None
     own_std_O: FloatArray | None = None
-    """Observation statistics that its centres run with instead of the whole run's; None if they do not."""
+    """Observation statistics that it runs with instead of the whole run's; None if it does not."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +50,13 @@ class FitnessWeight:
 class SearchState:
     """All that a search remembers between generations.
 
-    The store writes what a generation has changed, so a search of one's own may replace members (never add or drop
+    The store writes what a generation has changed, so a search of one's own may replace centres (never add or drop
     one), extend the archive (`novelty.extended`; never take entries out: compare with the newest, if those alone are to
     count) and insert into the map (`behaviour_map.insert`; never empty a cell). Anything else ends the run with a
     StoreError.
     """
 
-    members: tuple[Member, ...]
+    centres: tuple[CentreState, ...]
     archive: NoveltyArchive
     weight: FitnessWeight
     map: BehaviourMap | None = None
@@ -63,36 +64,36 @@ class SearchState:
 
 
 def from_elite(state: SearchState, cell: int, elite: Elite, *, own_statistics: bool = False) -> SearchState:
-    """The state with an elite in the place of member 0: its parameters, a fresh optimiser and, if wanted, the
-    observation statistics it came with, which its centres then run with."""
-    member = Member(
+    """The state with an elite in the place of centre 0: its parameters, a fresh optimiser and, if wanted, the
+    observation statistics it came with, which it then keeps."""
+    centre = CentreState(
         elite.centre_D,
         fresh_adam(elite.centre_D.size),
-        state.members[0].entry,
+        state.centres[0].entry,
         cell,
         elite.observation_mean_O if own_statistics else None,
         elite.observation_std_O if own_statistics else None,
     )
-    return replace(state, members=(member, *state.members[1:]))
+    return replace(state, centres=(centre, *state.centres[1:]))
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What to evaluate in this generation: the population around one member's centre."""
+class Ask:
+    """What to evaluate in this generation: the population around one centre."""
 
-    member: int
+    centre: int
     centre_D: FloatArray
     fitness_weight: float
     """How much fitness counts beside novelty in this generation, from 0 to 1."""
 
 
 @dataclass(frozen=True)
-class Judgement:
+class CentreEvaluation:
     """What the evaluation episodes say of a centre."""
 
     generation: int
     """0 for an initial centre."""
-    member: int
+    centre: int
     valid: bool
     """Whether fitness and descriptor of every episode are finite."""
     fitness: float
@@ -107,13 +108,13 @@ class Judgement:
 class Algorithm:
     """The functions of one method. All are pure."""
 
-    plan: Callable[[SearchState, int], Plan]
+    ask: Callable[[SearchState, int], Ask]
     """(state, generation) -> what to evaluate in that generation."""
-    weights: Callable[[SearchState, Plan, EpisodesResult], NDArray[np.float32]]
-    """(state, plan, the whole population's results with axes P, S) -> weight of each pair's noise [P]."""
-    step: Callable[[SearchState, Plan, FloatArray], SearchState]
-    """(state, plan, gradient estimate [D]) -> state with the planned member moved."""
-    absorb: Callable[[SearchState, Judgement], SearchState]
+    weights: Callable[[SearchState, Ask, EpisodesResult], NDArray[np.float32]]
+    """(state, asked, the whole population's results with axes P, S) -> weight of each pair's noise [P]."""
+    step: Callable[[SearchState, Ask, FloatArray], SearchState]
+    """(state, asked, gradient estimate [D]) -> state with the planned centre moved."""
+    tell: Callable[[SearchState, CentreEvaluation], SearchState]
     """(state, a centre's evaluation) -> state that has learned from it; initial centres come first, in order."""
     fitness_weight: float
     """What the state's `weight` starts with."""

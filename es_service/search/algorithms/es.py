@@ -12,5 +12,5 @@ from es_service.search.algorithms.steps import novelty_search
 
 
 def es(config: RunConfig) -> Algorithm:
-    """Plain evolution strategy: fitness alone, one member. Its archive is kept for comparison and steers nothing."""
+    """Plain evolution strategy: fitness alone, one centre. Its archive is kept for comparison and steers nothing."""
     return novelty_search(config, fitness_weight=1.0)

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from es_service.config.model import NoveltyConfig, RunConfig, SearchConfig
 from es_service.protocol.noise import Domain, stream_keys, uniforms
-from es_service.search.algorithms.base import Algorithm, Plan, SearchState, from_elite
+from es_service.search.algorithms.base import Algorithm, Ask, SearchState, from_elite
 from es_service.search.algorithms.steps import novelty_search
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.novelty import NoveltyArchive, novelty
@@ -56,11 +56,11 @@ def me_es(config: RunConfig) -> Algorithm:
         cumulative_N = np.add.accumulate(share_N)
         return int(state.map.cell_N[np.searchsorted(cumulative_N, second * cumulative_N[-1], side="right")])
 
-    def plan(state: SearchState, generation: int) -> Plan:
-        return Plan(0, state.members[0].centre_D, _weight(block_mode(search, config.seed, generation)))
+    def ask(state: SearchState, generation: int) -> Ask:
+        return Ask(0, state.centres[0].centre_D, _weight(block_mode(search, config.seed, generation)))
 
     restart = partial(from_elite, own_statistics=search.parent_statistics == "elite")
-    return replace(shared, plan=plan, start_cell=start_cell, restart=restart)
+    return replace(shared, ask=ask, start_cell=start_cell, restart=restart)
 
 
 def block_mode(search: SearchConfig, seed: int, generation: int) -> Mode:
@@ -128,9 +128,9 @@ def elite_novelty(map_: BehaviourMap, archive: NoveltyArchive, settings: Novelty
 
 def _own_entries(map_: BehaviourMap, archive: NoveltyArchive) -> NDArray[np.int64]:
     """Index of the entry that each elite made, [N]; -1 of one that made none. Entries ascend by generation and, among
-    those of generation 0, member."""
-    members = 1 + max(map_.member_N.max(initial=0), archive.member_N.max(initial=0))
-    entry_N, elite_N = (one.generation_N * members + one.member_N for one in (archive, map_))
+    those of generation 0, centre."""
+    centres = 1 + max(map_.centre_N.max(initial=0), archive.centre_N.max(initial=0))
+    entry_N, elite_N = (one.generation_N * centres + one.centre_N for one in (archive, map_))
     found_N = np.searchsorted(entry_N, elite_N)
     is_there_N = np.append(entry_N, -1)[found_N] == elite_N
     return np.where(is_there_N, found_N, -1)

@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 
 from es_service.config.model import RunConfig, SearchConfig
-from es_service.search.algorithms.base import Algorithm, FitnessWeight, Judgement
+from es_service.search.algorithms.base import Algorithm, CentreEvaluation, FitnessWeight
 from es_service.search.algorithms.steps import novelty_search
 
 
@@ -22,15 +22,15 @@ def nsra_es(config: RunConfig) -> Algorithm:
     return novelty_search(config, config.search.fitness_weight_start, partial(adapted_weight, config.search))
 
 
-def adapted_weight(search: SearchConfig, weight: FitnessWeight, judgement: Judgement) -> FitnessWeight:
+def adapted_weight(search: SearchConfig, weight: FitnessWeight, evaluation: CentreEvaluation) -> FitnessWeight:
     """w after one more evaluated centre. An invalid centre is no improvement."""
     bar = (
         weight.record + search.fitness_weight_min_gain * abs(weight.record)
         if math.isfinite(weight.record)
         else -math.inf
     )
-    if judgement.valid and judgement.fitness > bar:
-        return FitnessWeight(min(1.0, weight.value + search.fitness_weight_step), judgement.fitness, 0)
+    if evaluation.valid and evaluation.fitness > bar:
+        return FitnessWeight(min(1.0, weight.value + search.fitness_weight_step), evaluation.fitness, 0)
     if weight.stagnant + 1 < search.fitness_weight_patience:
         return replace(weight, stagnant=weight.stagnant + 1)
     return replace(weight, value=max(0.0, weight.value - search.fitness_weight_step), stagnant=0)

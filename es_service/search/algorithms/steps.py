@@ -15,10 +15,10 @@ from es_service.search.algorithms.base import (
     NO_CELL,
     NO_ENTRY,
     Algorithm,
+    Ask,
+    CentreEvaluation,
+    CentreState,
     FitnessWeight,
-    Judgement,
-    Member,
-    Plan,
     SearchState,
 )
 from es_service.search.maps.behaviour_map import BehaviourMap, insert, with_score
@@ -26,10 +26,10 @@ from es_service.search.novelty import empty_archive, extended, novelty
 from es_service.search.optimizer import adam_ascent, fresh_adam
 from es_service.search.shaping import centred_ranks, pair_weights
 
-MEMBER_CHOICE = 0
-"""Last id of the streams of Domain.SELECTION: which member to update."""
+CENTRE_CHOICE = 0
+"""Last id of the streams of Domain.SELECTION: which centre to update."""
 
-AdaptWeight = Callable[[FitnessWeight, Judgement], FitnessWeight]
+AdaptWeight = Callable[[FitnessWeight, CentreEvaluation], FitnessWeight]
 
 
 def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight | None = None) -> Algorithm:
@@ -40,61 +40,61 @@ def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight 
         adapt: how an evaluated centre (not an initial one) changes w; None if nothing does.
     """
 
-    def plan(state: SearchState, generation: int) -> Plan:
-        member = choose_member(state, generation, config)
-        return Plan(member, state.members[member].centre_D, state.weight.value)
+    def ask(state: SearchState, generation: int) -> Ask:
+        centre = choose_centre(state, generation, config)
+        return Ask(centre, state.centres[centre].centre_D, state.weight.value)
 
-    def weights(state: SearchState, plan: Plan, population: EpisodesResult) -> NDArray[np.float32]:
-        return pair_weights(mixed_utilities(state, plan.fitness_weight, population, config.novelty))
+    def weights(state: SearchState, asked: Ask, population: EpisodesResult) -> NDArray[np.float32]:
+        return pair_weights(mixed_utilities(state, asked.fitness_weight, population, config.novelty))
 
-    def step(state: SearchState, plan: Plan, gradient_D: FloatArray) -> SearchState:
-        return moved(state, plan, gradient_D, config.search)
+    def step(state: SearchState, asked: Ask, gradient_D: FloatArray) -> SearchState:
+        return moved(state, asked, gradient_D, config.search)
 
-    def absorb(state: SearchState, judgement: Judgement) -> SearchState:
+    def tell(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
         weight = state.weight
-        if adapt is not None and judgement.generation > 0:
-            weight = adapt(weight, judgement)
-        return replace(mapped(archived(state, judgement), judgement), weight=weight)
+        if adapt is not None and evaluation.generation > 0:
+            weight = adapt(weight, evaluation)
+        return replace(mapped(archived(state, evaluation), evaluation), weight=weight)
 
-    return Algorithm(plan, weights, step, absorb, fitness_weight)
+    return Algorithm(ask, weights, step, tell, fitness_weight)
 
 
 def first_state(
     centres: Sequence[FloatArray], dimensions: int, fitness_weight: float, map_: BehaviourMap | None = None
 ) -> SearchState:
     """The state before any evaluation: initial centres, fresh optimisers, an empty archive, an empty map or none."""
-    members = tuple(Member(centre_D, fresh_adam(centre_D.size)) for centre_D in centres)
-    return SearchState(members, empty_archive(dimensions), FitnessWeight(fitness_weight), map_)
+    states = tuple(CentreState(centre_D, fresh_adam(centre_D.size)) for centre_D in centres)
+    return SearchState(states, empty_archive(dimensions), FitnessWeight(fitness_weight), map_)
 
 
-def choose_member(state: SearchState, generation: int, config: RunConfig) -> int:
-    """Index of the member to update in a generation.
+def choose_centre(state: SearchState, generation: int, config: RunConfig) -> int:
+    """Index of the centre to update in a generation.
 
-    novelty: with probability proportional to its novelty among all centres ever evaluated, judged now, a member none of
-    whose centres was valid counting as the most novel one; uniform if all are 0. uniform: each with the same
-    probability. round_robin: in turn, member 0 in generation 1.
+    novelty: with probability proportional to its novelty among all centres ever evaluated, judged now; a centre that
+    was never valid counts as the most novel one; uniform if all are 0. uniform: each with the same probability.
+    round_robin: in turn, centre 0 in generation 1.
     """
-    count, how = len(state.members), config.search.member_choice
+    count, how = len(state.centres), config.search.centre_choice
     if count == 1:
         return 0
     if how == "round_robin":
         return (generation - 1) % count
     share_M = np.ones(count)
     if how == "novelty":
-        novelty_M = member_novelty(state, config.novelty)
-        # Or it would be a centre fewer for good, for one bad episode at the start.
-        novelty_M[[member.entry == NO_ENTRY for member in state.members]] = novelty_M.max()
+        novelty_M = novelty_of_centres(state, config.novelty)
+        # Otherwise a centre whose first evaluation failed would never be selected again.
+        novelty_M[[centre.entry == NO_ENTRY for centre in state.centres]] = novelty_M.max()
         share_M = novelty_M if novelty_M.any() else share_M
-    key = stream_keys(config.seed, Domain.SELECTION, generation, MEMBER_CHOICE)
+    key = stream_keys(config.seed, Domain.SELECTION, generation, CENTRE_CHOICE)
     drawn = float(uniforms(key, np.zeros(1, np.uint32))[0])
     cumulative_M = np.add.accumulate(share_M)
     return int(np.searchsorted(cumulative_M, drawn * cumulative_M[-1], side="right"))
 
 
-def member_novelty(state: SearchState, settings: NoveltyConfig) -> NDArray[np.float64]:
-    """Novelty of each member's newest valid centre in the archive without that entry; 0 for a member without one."""
-    novelty_M = np.zeros(len(state.members))
-    entry_M = np.array([member.entry for member in state.members])
+def novelty_of_centres(state: SearchState, settings: NoveltyConfig) -> NDArray[np.float64]:
+    """Novelty of each centre, as it was when last valid, in the archive without that entry; 0 if it never was."""
+    novelty_M = np.zeros(len(state.centres))
+    entry_M = np.array([centre.entry for centre in state.centres])
     known_M = np.flatnonzero(entry_M != NO_ENTRY)
     novelty_M[known_M] = novelty(
         state.archive,
@@ -126,47 +126,47 @@ def mixed_utilities(
     return utility_P_S
 
 
-def moved(state: SearchState, plan: Plan, gradient_D: FloatArray, search: SearchConfig) -> SearchState:
-    """The state with the planned member one step up the gradient estimate, by its own Adam; the others untouched."""
-    member = state.members[plan.member]
+def moved(state: SearchState, asked: Ask, gradient_D: FloatArray, search: SearchConfig) -> SearchState:
+    """The state with the asked centre one step up the gradient estimate, by its own Adam; the others untouched."""
+    centre = state.centres[asked.centre]
     adam, centre_D = adam_ascent(
-        member.adam, member.centre_D, gradient_D, learning_rate=search.learning_rate, l2=search.l2
+        centre.adam, centre.centre_D, gradient_D, learning_rate=search.learning_rate, l2=search.l2
     )
-    return _with_member(state, plan.member, replace(member, centre_D=centre_D, adam=adam))
+    return _with_centre(state, asked.centre, replace(centre, centre_D=centre_D, adam=adam))
 
 
-def archived(state: SearchState, judgement: Judgement) -> SearchState:
-    """The state with a valid centre in the archive, as the newest entry of its member."""
-    if not judgement.valid:
+def archived(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
+    """The state with a valid centre in the archive, as its newest entry."""
+    if not evaluation.valid:
         return state
-    archive = extended(state.archive, judgement.descriptor_B, judgement.generation, judgement.member)
-    member = replace(state.members[judgement.member], entry=archive.size - 1)
-    return replace(_with_member(state, judgement.member, member), archive=archive)
+    archive = extended(state.archive, evaluation.descriptor_B, evaluation.generation, evaluation.centre)
+    centre = replace(state.centres[evaluation.centre], entry=archive.size - 1)
+    return replace(_with_centre(state, evaluation.centre, centre), archive=archive)
 
 
-def mapped(state: SearchState, judgement: Judgement) -> SearchState:
-    """The state with a valid centre offered to the map; the member then knows of which cell it is the elite, if any.
+def mapped(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
+    """The state with a valid centre offered to the map; the centre then knows of which cell it is the elite, if any.
 
-    A member whose centre was an elite first hands that cell the score of the population it led.
+    A centre that was an elite first hands that cell the score of the population it led.
     """
-    member, map_ = state.members[judgement.member], state.map
+    centre, map_ = state.centres[evaluation.centre], state.map
     if map_ is None:
         return state
-    if member.cell != NO_CELL and np.isfinite(judgement.population_max):
-        map_ = with_score(map_, member.cell, judgement.member, judgement.population_max)
+    if centre.cell != NO_CELL and np.isfinite(evaluation.population_max):
+        map_ = with_score(map_, centre.cell, evaluation.centre, evaluation.population_max)
     cell = NO_CELL
-    if judgement.valid:
+    if evaluation.valid:
         map_, offered, entered = insert(
             map_,
-            judgement.descriptor_B,
-            judgement.fitness,
-            judgement.generation,
-            judgement.member,
-            judgement.population_max,
+            evaluation.descriptor_B,
+            evaluation.fitness,
+            evaluation.generation,
+            evaluation.centre,
+            evaluation.population_max,
         )
         cell = offered if entered else NO_CELL
-    return replace(_with_member(state, judgement.member, replace(member, cell=cell)), map=map_)
+    return replace(_with_centre(state, evaluation.centre, replace(centre, cell=cell)), map=map_)
 
 
-def _with_member(state: SearchState, index: int, member: Member) -> SearchState:
-    return replace(state, members=(*state.members[:index], member, *state.members[index + 1 :]))
+def _with_centre(state: SearchState, index: int, centre: CentreState) -> SearchState:
+    return replace(state, centres=(*state.centres[:index], centre, *state.centres[index + 1 :]))

@@ -28,7 +28,7 @@ class BehaviourMap:
     descriptor_N_B: NDArray[np.float64]
     generation_N: NDArray[np.int64]
     """In which each elite was evaluated."""
-    member_N: NDArray[np.int64]
+    centre_N: NDArray[np.int64]
     score_N: NDArray[np.float64]
     """Highest fitness of a population member in the generation that made the elite, or in the latest one that started
     from it: a lucky number, by which `cell_sampling: score` chooses. NaN where there was no population."""
@@ -43,9 +43,9 @@ class BehaviourMap:
         found = np.flatnonzero(self.cell_N == cell)
         return int(found[0]) if found.size else None
 
-    def cell_of(self, generation: int, member: int) -> int | None:
-        """The cell whose elite the centre is that a member had in a generation; None if it is none's."""
-        found = np.flatnonzero((self.generation_N == generation) & (self.member_N == member))
+    def cell_of(self, generation: int, centre: int) -> int | None:
+        """The cell whose elite a centre is as it was in a generation; None if it is none's."""
+        found = np.flatnonzero((self.generation_N == generation) & (self.centre_N == centre))
         return int(self.cell_N[found[0]]) if found.size else None
 
 
@@ -69,7 +69,7 @@ def empty_map(geometry: Geometry) -> BehaviourMap:
 
 
 def insert(
-    map_: BehaviourMap, descriptor_B: NDArray[np.float64], fitness: float, generation: int, member: int, score: float
+    map_: BehaviourMap, descriptor_B: NDArray[np.float64], fitness: float, generation: int, centre: int, score: float
 ) -> tuple[BehaviourMap, int, bool]:
     """Offer an evaluated centre to its cell: (map, cell, whether it is the cell's elite now).
 
@@ -85,7 +85,7 @@ def insert(
                 np.append(map_.fitness_N, fitness),
                 np.concatenate([map_.descriptor_N_B, descriptor_B[None]]),
                 np.append(map_.generation_N, np.int64(generation)),
-                np.append(map_.member_N, np.int64(member)),
+                np.append(map_.centre_N, np.int64(centre)),
                 np.append(map_.score_N, score),
             ),
             cell,
@@ -97,7 +97,7 @@ def insert(
         "fitness_N": fitness,
         "descriptor_N_B": descriptor_B,
         "generation_N": generation,
-        "member_N": member,
+        "centre_N": centre,
         "score_N": score,
     }
     return (
@@ -107,10 +107,10 @@ def insert(
     )
 
 
-def with_score(map_: BehaviourMap, cell: int, member: int, score: float) -> BehaviourMap:
-    """The map with another score of the elite that a member has in a cell; unchanged if it is another member's now."""
+def with_score(map_: BehaviourMap, cell: int, centre: int, score: float) -> BehaviourMap:
+    """The map with another score of the elite that a centre has in a cell; unchanged if it is another centre's now."""
     row = map_.row_of(cell)
-    if row is None or map_.member_N[row] != member:
+    if row is None or map_.centre_N[row] != centre:
         return map_
     return replace(map_, score_N=_with(map_.score_N, row, score))
 

@@ -28,7 +28,7 @@ OUTER_LATTICE = 100
 SAMPLES_PER_CENTROID = 50
 LLOYD_STEPS = 20
 CENTROID_STREAM = 2**32
-"""Last id of the stream of Domain.INITIALISATION that places centroids; no member has it."""
+"""Last id of the stream of Domain.INITIALISATION that places centroids; no centre has it."""
 
 
 @dataclass(frozen=True)
