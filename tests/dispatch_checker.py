@@ -22,7 +22,7 @@ def read_dispatch_log(folder: Path) -> list[dict[str, Any]]:
 def check_dispatch(folder: Path) -> dict[str, int]:
     """Assert that each chunk was delivered once, by a worker that was there and had it, and generations are contiguous.
 
-    Returns counts: sessions, generations committed, tasks delivered, chunks handed out again, workers lost.
+    Returns counts: sessions, generations committed, items delivered, chunks handed out again, workers lost.
     """
     entries = read_dispatch_log(folder)
     assert entries[0]["is"] == "Session"
@@ -33,7 +33,7 @@ def check_dispatch(folder: Path) -> dict[str, int]:
     waiting: set[tuple] = set()
     answered: tuple | None = None
     for entry in entries:
-        key = tuple(entry["key"]) if "key" in entry else None
+        item_id = tuple(entry["item_id"]) if "item_id" in entry else None
         worker = entry.get("worker")
         match entry["is"]:
             case "Session":
@@ -44,8 +44,8 @@ def check_dispatch(folder: Path) -> dict[str, int]:
                 counts["sessions"] += 1
             case "Submit":
                 assert not waiting, f"{waiting} were never delivered"
-                waiting = {tuple(task) for task in entry["tasks"]}
-                assert len(waiting) == len(entry["tasks"])
+                waiting = {tuple(item) for item in entry["items"]}
+                assert len(waiting) == len(entry["items"])
                 assert not waiting & holders.keys(), "submitted twice in one session"
             case "WorkerUp":
                 assert worker not in up
@@ -55,14 +55,14 @@ def check_dispatch(folder: Path) -> dict[str, int]:
                 up.discard(worker)
             case "Assign":
                 assert worker in up
-                assert key in waiting
-                counts["repeated"] += key[-1] if key in holders else 0
-                holders.setdefault(key, set()).add(worker)
+                assert item_id in waiting
+                counts["repeated"] += item_id[-1] if item_id in holders else 0
+                holders.setdefault(item_id, set()).add(worker)
             case "Result":
-                answered = key if worker in up and worker in holders.get(key, ()) else None
+                answered = item_id if worker in up and worker in holders.get(item_id, ()) else None
             case "Deliver":
-                assert key == answered, "delivered without an answer of a live worker that had it"
-                waiting.remove(key)
+                assert item_id == answered, "delivered without an answer of a live worker that had it"
+                waiting.remove(item_id)
                 counts["delivered"] += 1
             case "Committed":
                 assert not waiting, "committed before every chunk was there"

@@ -1,9 +1,9 @@
-"""Who gets which task, and by when it must have answered.
+"""Who gets which work item, and by when it must have answered.
 
-Dispatch station, a part of `scheduler.step`. Idle workers come first, then those that have room for another task behind
-the one they run. A task that raised waits for another worker rather than go back to the same one, as long as another is
-up: a broken worker that raises at once must not use up the attempts of good tasks. The clock of a task starts when its
-worker begins it; one that compiles, or whose usual duration is not known, has longer.
+A part of `scheduler.step`. Idle workers come first, then those that have room for another item behind the one they run.
+A work item that raised waits for another worker rather than go back to the same one, as long as another is up: a broken
+worker that raises at once must not use up the attempts of good items. The clock of a work item starts when its worker
+begins it; one that compiles, or whose usual duration is not known, has longer.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from es_service.dispatch.scheduler_state import SchedulerState, Slot, Worker, us
 
 
 def assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
-    """Give queued tasks to workers with room, idle ones first; changes the containers of `s`, which are this step's."""
+    """Give queued items to workers with room, idle ones first; changes the containers of `s`, which are this step's."""
     retries = s.retries
     for load in range(s.limits.in_flight):
         if not s.queue:
@@ -24,15 +24,15 @@ def assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
             index = _next_for(s, worker)
             if index is None:
                 continue
-            key = s.queue[index]
+            item_id = s.queue[index]
             del s.queue[index]
-            waiting, record = s.tasks[key], s.up[worker]
-            s.tasks[key] = waiting._replace(holder=worker)
-            retries += waiting.task.size if waiting.last_holder is not None else 0
-            slot = Slot(waiting.task, waiting.faults + 1)
+            waiting, record = s.items[item_id], s.up[worker]
+            s.items[item_id] = waiting._replace(holder=worker)
+            retries += waiting.item.size if waiting.last_holder is not None else 0
+            slot = Slot(waiting.item, waiting.faults + 1)
             record = record._replace(slots=(*record.slots, slot))
             s.up[worker] = begin_first_slot(s, record, now) if load == 0 else record
-            out.append(Assign(worker, key, slot.attempt))
+            out.append(Assign(worker, item_id, slot.attempt))
     return s if retries == s.retries else s._replace(retries=retries)
 
 
@@ -40,18 +40,18 @@ def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worke
     """The worker with the clock of its first slot started, and how long that may take."""
     if not worker.slots:
         return worker._replace(deadline_s=math.inf)
-    task, limits = worker.slots[0].task, state.limits
-    usual_s = usual_chunk_s(state, task.kind)
-    limit, limit_s = "min_deadline_s", max(limits.min_deadline_s, limits.deadline_factor * task.size * (usual_s or 0.0))
-    compiles = usual_s is None or task.kind not in worker.warm
+    item, limits = worker.slots[0].item, state.limits
+    usual_s = usual_chunk_s(state, item.kind)
+    limit, limit_s = "min_deadline_s", max(limits.min_deadline_s, limits.deadline_factor * item.size * (usual_s or 0.0))
+    compiles = usual_s is None or item.kind not in worker.warm
     if compiles and limit_s < limits.first_deadline_s:
         limit, limit_s = "first_deadline_s", limits.first_deadline_s
     return worker._replace(started_s=now, deadline_s=now + limit_s, limit=limit)
 
 
 def _next_for(state: SchedulerState, worker: int) -> int | None:
-    """Index of the first queued task that a worker may have."""
-    for index, key in enumerate(state.queue):
-        if state.tasks[key].last_holder != worker or len(state.up) == 1:
+    """Index of the first queued item that a worker may have."""
+    for index, item_id in enumerate(state.queue):
+        if state.items[item_id].last_holder != worker or len(state.up) == 1:
             return index
     return None

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from es_service.dispatch.events import Command, Event, Task
+from es_service.dispatch.events import Command, Event, WorkItem
 from es_service.store.folder import explained
 
 FILE = "dispatch.jsonl"
@@ -78,5 +78,5 @@ def dispatch_log(folder: Path, after_generation: int | None, *, enabled: bool) -
 
 
 def _plain(value: Any) -> Any:
-    """What JSON has no form for: a task is its key."""
-    return value.key if isinstance(value, Task) else str(value)
+    """What JSON has no form for: a work item is its id."""
+    return value.id if isinstance(value, WorkItem) else str(value)

@@ -17,7 +17,7 @@ from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, told_last_words, usual_chunk_s
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol.messages import Centre, Chunk, ChunkResult, DispatchCounts, TaskKey
+from es_service.protocol.messages import Centre, Chunk, ChunkResult, DispatchCounts, WorkItemId
 
 POLL_S = 0.1
 """Longest wait before a request to stop is noticed."""
@@ -25,10 +25,10 @@ POLL_S = 0.1
 
 @dataclass(frozen=True)
 class Answer:
-    """A worker has run the chunks of a task: the event `Result` with what it stands for."""
+    """A worker has run the chunks of a work item: the event `Result` with what it stands for."""
 
     worker: int
-    key: Hashable
+    item_id: Hashable
     attempt: int
     results: list[ChunkResult]
 
@@ -59,7 +59,7 @@ class Transport(Protocol):
         """
         ...
 
-    def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
+    def send(self, worker: int, centre: Centre, item_id: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
         """Have a worker that is up run the chunks around the centre, behind those it was sent before."""
         ...
 
@@ -86,13 +86,13 @@ class Transport(Protocol):
 AnyTransport = TypeVar("AnyTransport", bound=Transport)
 
 
-def task_sizes(chunks: int, workers: int, chunk_s: float | None, task_s: float) -> list[int]:
-    """How many neighbouring chunks make each task: about as many as take `task_s`, one while `chunk_s`, what one takes,
-    is not known; equal numbers, and of tasks as many for each worker."""
-    most = 1 if chunk_s is None else max(1, int(task_s / max(chunk_s, 1e-9)))
+def item_sizes(chunks: int, workers: int, chunk_s: float | None, item_s: float) -> list[int]:
+    """How many neighbouring chunks make each item: about as many as take `item_s`, one while `chunk_s`, what one takes,
+    is not known; equal numbers, and of items as many for each worker."""
+    most = 1 if chunk_s is None else max(1, int(item_s / max(chunk_s, 1e-9)))
     rounds = -(-chunks // (most * workers))
     count = min(chunks, rounds * workers)
-    return [chunks // count + (task < chunks % count) for task in range(count)]
+    return [chunks // count + (item < chunks % count) for item in range(count)]
 
 
 class Engine(Generic[AnyTransport]):
@@ -156,7 +156,7 @@ class Engine(Generic[AnyTransport]):
         self._phase += 1
         parts = self._parts(chunks)
         self._centre, self._chunks, self._results = centre, dict(parts), {}
-        self._step(events.Submit(tuple(events.Task(key, key.kind, key.chunks) for key, _ in parts)))
+        self._step(events.Submit(tuple(events.WorkItem(item_id, item_id.kind, item_id.chunks) for item_id, _ in parts)))
         while pending(self._state):
             if (number := self._should_stop()) is not None:
                 raise Interrupted(number)
@@ -165,7 +165,7 @@ class Engine(Generic[AnyTransport]):
                 self._handle(message)
             else:  # only now: a late look at the clock must not kill workers whose answers were waiting
                 self._step(events.Tick(self.transport.silent()))
-        return [result for key, _ in parts for result in self._results.pop(key)]
+        return [result for item_id, _ in parts for result in self._results.pop(item_id)]
 
     def close(self) -> None:
         """Kill all workers and wait for them to end; those in a cluster that was joined end soon after."""
@@ -177,21 +177,23 @@ class Engine(Generic[AnyTransport]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _parts(self, chunks: Sequence[Chunk]) -> list[tuple[TaskKey, Sequence[Chunk]]]:
+    def _parts(self, chunks: Sequence[Chunk]) -> list[tuple[WorkItemId, Sequence[Chunk]]]:
         """Chunks, all of one kind, as they are to travel. What is known of their duration never changes a result."""
         if not chunks:
             return []
         kind, limits = type(chunks[0]).__name__, self._state.limits
-        sizes = task_sizes(len(chunks), self._state.wanted, usual_chunk_s(self._state, kind), limits.task_s)
+        sizes = item_sizes(len(chunks), self._state.wanted, usual_chunk_s(self._state, kind), limits.item_s)
         ends = list(itertools.accumulate(sizes))
         parts = [chunks[end - size : end] for end, size in zip(ends, sizes, strict=True)]
-        return [(TaskKey(self._phase, kind, part[0].generation, part[0].chunk_id, len(part)), part) for part in parts]
+        return [
+            (WorkItemId(self._phase, kind, part[0].generation, part[0].chunk_id, len(part)), part) for part in parts
+        ]
 
     def _handle(self, message: Message) -> None:
         if not isinstance(message, Answer):
             self._step(message)
-        elif self._step(events.Result(message.worker, message.key, message.attempt)):
-            self._results[message.key] = message.results
+        elif self._step(events.Result(message.worker, message.item_id, message.attempt)):
+            self._results[message.item_id] = message.results
 
     def _step(self, event: events.Event) -> bool:
         """Feed the scheduler and do as it says; whether it accepted a result."""
@@ -205,9 +207,9 @@ class Engine(Generic[AnyTransport]):
                     self.transport.start(worker)
                 case events.StopWorker(worker, _):
                     self._state = told_last_words(self._state, worker, self.transport.kill(worker))
-                case events.Assign(worker, key, attempt):
+                case events.Assign(worker, item_id, attempt):
                     assert self._centre is not None
-                    self.transport.send(worker, self._centre, key, attempt, self._chunks[key])
+                    self.transport.send(worker, self._centre, item_id, attempt, self._chunks[item_id])
         if self._state.failed is not None:
             raise EvaluationError(self._state.failed)
         return any(isinstance(command, events.Deliver) for command in commands)

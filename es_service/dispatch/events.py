@@ -1,4 +1,4 @@
-"""What the scheduler and its engines say to each other: tasks, limits, events in, commands out."""
+"""What the scheduler and its engines say to each other: work items, limits, events in, commands out."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
-class Task:
-    """One piece of work. Two tasks with the same key must have the same result."""
+class WorkItem:
+    """What travels to a worker and back: chunks of one kind. Two items with the same id must have the same result."""
 
-    key: Hashable
+    id: Hashable
     kind: str
     """Tasks of one kind compile together and take about equally long, each in proportion to its size."""
     size: int = 1
@@ -25,20 +25,20 @@ class Limits:
     """Workers wanted at the start; `SetWorkers` changes it."""
     in_flight: int = 2
     """Tasks assigned to one worker at a time: the one it runs and those prefetched behind it."""
-    task_s: float = 0.03
+    item_s: float = 0.03
     """Chunks that take less travel together, as many as take this long: with Ray a message costs two milliseconds of a
     core. What a lost worker had in hand, and what others wait for in the end, remain little."""
     max_attempts: int = 4
-    """A task that raised, or lost the worker running it, this often is poison. Keep above `max_failures_in_a_row`, so
-    that a single broken worker is replaced before its task is blamed."""
+    """A work item that raised, or lost the worker running it, this often is poison. Keep above
+    `max_failures_in_a_row`, so that a single broken worker is replaced before its item is blamed."""
     start_deadline_s: float = 120.0
     """For a worker to come up, counted anew once it has a place."""
     first_deadline_s: float = 600.0
-    """For the first task of a kind on a worker, which compiles, and for any task while no duration is known; or what
+    """For the first item of a kind on a worker, which compiles, and for any item while no duration is known; or what
     later ones may take, if that is longer."""
     min_deadline_s: float = 30.0
     deadline_factor: float = 5.0
-    """Later tasks may take max(min_deadline_s, deadline_factor x size x median of recent durations of their kind)."""
+    """Later items may take max(min_deadline_s, deadline_factor x size x median of recent durations of their kind)."""
     max_failures_in_a_row: int = 3
     """A worker that raises this often in a row is killed and replaced."""
     restart_backoff_s: float = 1.0
@@ -49,7 +49,7 @@ class Limits:
     """This many tries in a row to start workers that failed, and none up meanwhile: the environment is broken. All that
     were started before the first of them was lost are one try, however many are lost and when."""
     no_worker_timeout_s: float = 300.0
-    """Longest time with tasks waiting and no worker up; longer than `start_deadline_s` to be of any use."""
+    """Longest time with items waiting and no worker up; longer than `start_deadline_s` to be of any use."""
     names: Mapping[str, str] = field(default_factory=dict)
     """What messages call a limit, so that a user knows what to change: field -> name; others are called as they are."""
 
@@ -68,9 +68,9 @@ class Limits:
 
 @dataclass(frozen=True)
 class Submit:
-    """New tasks, to be assigned in this order. Raises ValueError for a key that still waits."""
+    """New items, to be assigned in this order. Raises ValueError for an id that still waits."""
 
-    tasks: tuple[Task, ...]
+    items: tuple[WorkItem, ...]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class WorkerUp:
-    """The worker can take tasks."""
+    """The worker can take items."""
 
     worker: int
 
@@ -102,16 +102,16 @@ class Result:
     """The worker answered; the engine holds the result until this step says `Deliver` or says nothing."""
 
     worker: int
-    key: Hashable
+    item_id: Hashable
     attempt: int
 
 
 @dataclass(frozen=True)
 class Failure:
-    """The task raised; the worker lives."""
+    """The item raised; the worker lives."""
 
     worker: int
-    key: Hashable
+    item_id: Hashable
     attempt: int
     message: str
 
@@ -127,7 +127,7 @@ class Tick:
 
 @dataclass(frozen=True)
 class Drain:
-    """The worker gets no new task, finishes those it has, and is stopped; it is replaced now, without blame."""
+    """The worker gets no new item, finishes those it has, and is stopped; it is replaced now, without blame."""
 
     worker: int
 
@@ -162,18 +162,18 @@ class StopWorker:
 
 @dataclass(frozen=True)
 class Assign:
-    """Send the task to the worker, behind those it has. `attempt` is 1 + the faults charged to the task so far."""
+    """Send the item to the worker, behind those it has. `attempt` is 1 + the faults charged to the item so far."""
 
     worker: int
-    key: Hashable
+    item_id: Hashable
     attempt: int
 
 
 @dataclass(frozen=True)
 class Deliver:
-    """Accept the result just reported; once per submitted task."""
+    """Accept the result just reported; once per submitted item."""
 
-    key: Hashable
+    item_id: Hashable
 
 
 @dataclass(frozen=True)

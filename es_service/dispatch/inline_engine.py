@@ -109,14 +109,14 @@ class ChildProcesses:
         child = self._forget(worker)
         return self._lose(child, f"worker {worker}, a thread of the same process, had to be killed", bystanders=True)
 
-    def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
+    def send(self, worker: int, centre: Centre, item_id: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
         """Send the chunks, behind the centre if the worker does not know it."""
         to = self._workers.get(worker)
         if to is None:
             return  # lost with another thread of its child; that is on its way to the scheduler
         if self._centre[0] is not centre:
             self._centre = centre, framed(("centre", centre))
-        frames = [framed(("chunks", key, attempt, chunks))]
+        frames = [framed(("chunks", item_id, attempt, chunks))]
         if to.centre is not centre:
             to.centre = centre
             frames.insert(0, self._centre[1])
@@ -184,12 +184,12 @@ class ChildProcesses:
                 match said:
                     case ("up",):
                         self._ready.append(WorkerUp(number))
-                    case ("results", key, attempt, results):
+                    case ("results", item_id, attempt, results):
                         worker.unanswered -= 1
-                        self._ready.append(Answer(number, key, attempt, results))
-                    case ("failure", key, attempt, text):
+                        self._ready.append(Answer(number, item_id, attempt, results))
+                    case ("failure", item_id, attempt, text):
                         worker.unanswered -= 1
-                        self._ready.append(Failure(number, key, attempt, text))
+                        self._ready.append(Failure(number, item_id, attempt, text))
                     case ("broken", text):
                         return text
                     case _:

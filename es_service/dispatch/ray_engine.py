@@ -76,7 +76,7 @@ class _Call:
     worker: int
     what: str
     """place, build or run."""
-    key: Hashable = None
+    item_id: Hashable = None
     attempt: int = 0
 
 
@@ -153,7 +153,7 @@ class Actors:
                 self._ray.kill(handle, no_restart=True)
         return ""
 
-    def send(self, worker: int, centre: Centre, key: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
+    def send(self, worker: int, centre: Centre, item_id: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
         """Call the actor. A centre is stored once, however many calls share it, and dropped with the next one.
 
         That an idle actor is gone shows only when it is called. So after a loss, which may have been that of a node,
@@ -173,7 +173,7 @@ class Actors:
         except self._ray.exceptions.RayError as error:
             self._lose(worker, _reason(error))
             return
-        self._calls[ref] = _Call(worker, "run", key, attempt)
+        self._calls[ref] = _Call(worker, "run", item_id, attempt)
 
     def platforms(self) -> frozenset[str]:
         """What each kind of actor that has come up said of its packages and processor."""
@@ -234,13 +234,13 @@ class Actors:
             if call.what != "run":
                 return self._lost(call.worker, _text(error))
             del self._calls[ref]
-            return Failure(call.worker, call.key, call.attempt, _text(error))
+            return Failure(call.worker, call.item_id, call.attempt, _text(error))
         except errors.RayError as error:
             where = self._places.get(call.worker)
             return self._lost(call.worker, f"{where or 'before it had a place'}: {_reason(error)}")
         del self._calls[ref]
         if call.what == "run":
-            return Answer(call.worker, call.key, call.attempt, pickle.loads(value))
+            return Answer(call.worker, call.item_id, call.attempt, pickle.loads(value))
         if call.what == "build":
             self._platforms.add(value)
             return WorkerUp(call.worker)

@@ -1,6 +1,6 @@
-"""Who runs which task, when to give up on a worker, when to give up altogether: a pure state machine.
+"""Who runs which work item, when to give up on a worker, when to give up altogether: a pure state machine.
 
-Dispatch station, between the driver's tasks and the engines that own the workers. `step(state, event, now)` returns the
+It stands between the driver's work items and the engines that own the workers. `step(state, event, now)` returns the
 next state and the commands the engine must carry out, in order. No I/O, no clock, no randomness, no threads: the same
 arguments give the same answer, and a published state never changes, so a simulation can try every interleaving.
 
@@ -8,14 +8,14 @@ An engine starts with `initial_state(limits)` of scheduler_state.py and a `Tick`
 an event, and sends a `Tick` whenever `next_deadline(state)` has come. It must feed the messages that already wait
 *before* a late `Tick`: otherwise a driver that was busy elsewhere would kill workers whose answers it had not read.
 
-Choices. A result is a pure function of its key, so any result of a known worker for a key that still waits is accepted,
-even of a superseded attempt; a stopped worker is forgotten at once, so what it still says is dropped and counted. Only
-the task a worker was running is charged with its loss; one prefetched behind it goes back with its attempt unused. So
-does one sent to a worker that was gone already, if the transport says so: a machine that dies under many workers is one
-fault, however many of them are tried before all are known to be gone. A worker lost while draining is nobody's fault.
+Choices. A result is a pure function of its id, so any result of a known worker for an id that still waits is
+accepted, even of a superseded attempt; a stopped worker is forgotten at once, so what it still says is dropped and
+counted. Only the item a worker was running is charged with its loss; one prefetched behind it goes back with its
+attempt unused. So does one sent to a worker that was gone already, if the transport says so: a machine that dies under
+many workers is one fault, however many of them are tried before all are known to be gone. A worker lost while draining is nobody's fault.
 One that was given no place in time is started anew, since one that hangs before it can say where it is looks the same,
 but counts as no loss. Workers that are lost before they come up show a broken environment only if others, started after
-the first of them was lost, are lost, too. Which worker gets which task, and by when it must answer: assignment.py.
+the first of them was lost, are lost, too. Which worker gets which item, and by when it must answer: assignment.py.
 
 Cost: each step makes shallow copies of the containers (C speed, a few microseconds for a thousand entries) and changes
 only the records touched.
@@ -40,15 +40,15 @@ from es_service.dispatch.events import (
     StartWorker,
     StopWorker,
     Submit,
-    Task,
     Tick,
     WorkerLost,
     WorkerUp,
+    WorkItem,
 )
 from es_service.dispatch.scheduler_state import SchedulerState, Waiting, Worker, find_slot, holds, next_deadline
 
 RECENT_DURATIONS = 31
-"""Durations per kind of task that the running median is taken over."""
+"""Durations per kind of item that the running median is taken over."""
 
 
 def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerState, list[Command]]:
@@ -57,7 +57,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
     Args:
         now: seconds of a clock that never goes back; any origin.
     Raises:
-        ValueError: for a `Submit` of a key that still waits, or `SetWorkers` below 1.
+        ValueError: for a `Submit` of an id that still waits, or `SetWorkers` below 1.
     """
     if state.failed is not None or (isinstance(event, Tick) and now < next_deadline(state)):
         return state, []
@@ -66,14 +66,14 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
         starting=state.starting.copy(),
         up=state.up.copy(),
         draining=state.draining.copy(),
-        tasks=state.tasks.copy(),
+        items=state.items.copy(),
         queue=state.queue.copy(),
         durations_s=state.durations_s.copy(),
     )
     out: list[Command] = []
     match event:
-        case Submit(tasks):
-            _submit(s, tasks)
+        case Submit(items):
+            _submit(s, items)
         case Placed(worker):
             if worker in s.starting:
                 s.starting[worker] = now + s.limits.start_deadline_s
@@ -83,8 +83,8 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
                 s = s._replace(start_failures=0)
         case WorkerLost(worker, reason, bystander):
             s = _lose(s, out, worker, reason, now, fault=worker not in s.draining, charge=not bystander)
-        case Result(worker, key, attempt):
-            s = _result(s, out, worker, key, attempt, now)
+        case Result(worker, item_id, attempt):
+            s = _result(s, out, worker, item_id, attempt, now)
         case Failure():
             s = _failure(s, out, event, now)
         case Tick(silent):
@@ -100,40 +100,40 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
     if s.failed is None:
         s = _start_workers(s, out, now)
         s = assign(s, out, now)
-        down = bool(s.tasks) and not s.up and not s.draining
+        down = bool(s.items) and not s.up and not s.draining
         if down != (s.down_since_s is not None):
             s = s._replace(down_since_s=now if down else None)
     return s, out
 
 
-def _submit(s: SchedulerState, tasks: tuple[Task, ...]) -> None:
-    for task in tasks:
-        if task.key in s.tasks:
-            raise ValueError(f"task {task.key} was submitted twice")
-        s.tasks[task.key] = Waiting(task)
-        s.queue.append(task.key)
+def _submit(s: SchedulerState, items: tuple[WorkItem, ...]) -> None:
+    for item in items:
+        if item.id in s.items:
+            raise ValueError(f"work item {item.id} was submitted twice")
+        s.items[item.id] = Waiting(item)
+        s.queue.append(item.id)
 
 
 def _result(
-    s: SchedulerState, out: list[Command], worker: int, key: Hashable, attempt: int, now: float
+    s: SchedulerState, out: list[Command], worker: int, item_id: Hashable, attempt: int, now: float
 ) -> SchedulerState:
     record = s.up.get(worker) or s.draining.get(worker)
     if record is None:
         return s._replace(duplicates=s.duplicates + 1)
-    if key in s.tasks:
-        if s.tasks.pop(key).holder is None:
-            s.queue.remove(key)
-        out.append(Deliver(key))
+    if item_id in s.items:
+        if s.items.pop(item_id).holder is None:
+            s.queue.remove(item_id)
+        out.append(Deliver(item_id))
         s = s._replace(losses_in_a_row=0)
     else:
         s = s._replace(duplicates=s.duplicates + 1)
-    index = find_slot(record, key, attempt)
+    index = find_slot(record, item_id, attempt)
     if index is not None:
-        task = record.slots[index].task
-        kind = task.kind
+        item = record.slots[index].item
+        kind = item.kind
         # How long an answer out of order took is not known, nor whether its kind was compiled before.
         if index == 0 and kind in record.warm:
-            duration_s = (now - record.started_s) / task.size
+            duration_s = (now - record.started_s) / item.size
             s.durations_s[kind] = (*s.durations_s.get(kind, ()), duration_s)[-RECENT_DURATIONS:]
         warm = record.warm | {kind} if index == 0 else record.warm
         record = record._replace(warm=warm, failures_in_a_row=0)
@@ -142,23 +142,23 @@ def _result(
 
 
 def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) -> SchedulerState:
-    worker, key = event.worker, event.key
+    worker, item_id = event.worker, event.item_id
     record = s.up.get(worker) or s.draining.get(worker)
-    index = find_slot(record, key, event.attempt) if record is not None else None
+    index = find_slot(record, item_id, event.attempt) if record is not None else None
     if record is None or index is None:
         return s._replace(duplicates=s.duplicates + 1)
     record = record._replace(failures_in_a_row=record.failures_in_a_row + 1)
     _close_slot(s, out, worker, record, index, now)
     if worker in s.up and record.failures_in_a_row >= s.limits.max_failures_in_a_row:
-        reason = f"{record.failures_in_a_row} tasks in a row raised; the last: {event.message}"
+        reason = f"{record.failures_in_a_row} work items in a row raised; the last: {event.message}"
         out.append(StopWorker(worker, reason))
         # What it began a moment ago is not to blame.
         s = _lose(s, out, worker, reason, now, charge=False)
-    waiting = s.tasks.get(key)
+    waiting = s.items.get(item_id)
     if waiting is None or waiting.holder != worker:
         return s._replace(duplicates=s.duplicates + 1)
-    _requeue(s, worker, key)
-    return _charge(s, out, key, f"it raised on worker {worker}: {event.message}")
+    _requeue(s, worker, item_id)
+    return _charge(s, out, item_id, f"it raised on worker {worker}: {event.message}")
 
 
 def _close_slot(s: SchedulerState, out: list[Command], worker: int, record: Worker, index: int, now: float) -> None:
@@ -185,16 +185,16 @@ def _lose(
     fault: bool = True,
     charge: bool = True,
 ) -> SchedulerState:
-    """Forget a worker, put its tasks back at the front, plan its replacement; unknown workers change nothing."""
+    """Forget a worker, put its items back at the front, plan its replacement; unknown workers change nothing."""
     starting = s.starting.pop(worker, None) is not None
     record = s.up.pop(worker, None) or s.draining.pop(worker, None)
     if not starting and record is None:
         return s
     slots = record.slots if record is not None else ()
-    running = slots[0].task.key if slots and holds(s, worker, slots[0].task.key) else None
+    running = slots[0].item.id if slots and holds(s, worker, slots[0].item.id) else None
     for slot in reversed(slots):
-        if holds(s, worker, slot.task.key):
-            _requeue(s, worker, slot.task.key)
+        if holds(s, worker, slot.item.id):
+            _requeue(s, worker, slot.item.id)
     if not fault:
         return s
     s = s._replace(lost_workers=s.lost_workers + 1, last_lost=worker, last_loss=f"worker {worker}: {reason}")
@@ -213,17 +213,17 @@ def _lose(
     return s
 
 
-def _requeue(s: SchedulerState, worker: int, key: Hashable) -> None:
-    s.tasks[key] = s.tasks[key]._replace(holder=None, last_holder=worker)
-    s.queue.appendleft(key)
+def _requeue(s: SchedulerState, worker: int, item_id: Hashable) -> None:
+    s.items[item_id] = s.items[item_id]._replace(holder=None, last_holder=worker)
+    s.queue.appendleft(item_id)
 
 
-def _charge(s: SchedulerState, out: list[Command], key: Hashable, message: str) -> SchedulerState:
-    """One fault more for this task; too many fail the run."""
-    waiting = s.tasks[key] = s.tasks[key]._replace(faults=s.tasks[key].faults + 1)
+def _charge(s: SchedulerState, out: list[Command], item_id: Hashable, message: str) -> SchedulerState:
+    """One fault more for this item; too many fail the run."""
+    waiting = s.items[item_id] = s.items[item_id]._replace(faults=s.items[item_id].faults + 1)
     if waiting.faults < s.limits.max_attempts:
         return s
-    return _fail(s, out, f"task {key} failed in {waiting.faults} attempts; the last time {message}")
+    return _fail(s, out, f"work item {item_id} failed in {waiting.faults} attempts; the last time {message}")
 
 
 def _fail(s: SchedulerState, out: list[Command], message: str) -> SchedulerState:
@@ -240,8 +240,8 @@ def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int
     for worker, record in (*s.up.items(), *s.draining.items()):
         if now >= record.deadline_s:
             limit_s = record.deadline_s - record.started_s
-            key, name = record.slots[0].task.key, limits.name_of(record.limit)
-            late[worker] = f"no answer to task {key} in {_plain(limit_s)} s ({name})"
+            item_id, name = record.slots[0].item.id, limits.name_of(record.limit)
+            late[worker] = f"no answer to work item {item_id} in {_plain(limit_s)} s ({name})"
     for worker, reason in late.items():
         if s.failed is None:
             out.append(StopWorker(worker, reason))
@@ -250,7 +250,9 @@ def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int
             s = _lose(s, out, worker, reason, now, fault=not has_no_place, charge=not is_silent)
     if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + limits.no_worker_timeout_s:
         for_s = f"{_plain(limits.no_worker_timeout_s)} s ({limits.name_of('no_worker_timeout_s')})"
-        return _fail(s, out, f"{len(s.tasks)} tasks wait and no worker was up for {for_s}; last loss: {s.last_loss}")
+        return _fail(
+            s, out, f"{len(s.items)} work items wait and no worker was up for {for_s}; last loss: {s.last_loss}"
+        )
     return s
 
 

@@ -11,13 +11,13 @@ from collections import deque
 from collections.abc import Hashable
 from typing import NamedTuple
 
-from es_service.dispatch.events import Limits, Task, with_last_words
+from es_service.dispatch.events import Limits, WorkItem, with_last_words
 
 
 class Waiting(NamedTuple):
-    """A task that has not been delivered."""
+    """A work item that has not been delivered."""
 
-    task: Task
+    item: WorkItem
     faults: int = 0
     holder: int | None = None
     """The worker it is assigned to; None while it is in the queue."""
@@ -26,7 +26,7 @@ class Waiting(NamedTuple):
 
 
 class Slot(NamedTuple):
-    task: Task
+    item: WorkItem
     attempt: int
 
 
@@ -41,7 +41,7 @@ class Worker(NamedTuple):
     limit: str = ""
     """Field of the limits that this comes from."""
     warm: frozenset[str] = frozenset()
-    """Kinds it has finished a task of, hence compiled."""
+    """Kinds it has finished a work item of, hence compiled."""
     failures_in_a_row: int = 0
 
 
@@ -54,7 +54,7 @@ class SchedulerState(NamedTuple):
     """Deadline of each worker that has not come up yet."""
     up: dict[int, Worker]
     draining: dict[int, Worker]
-    tasks: dict[Hashable, Waiting]
+    items: dict[Hashable, Waiting]
     queue: deque[Hashable]
     """Keys to assign, next first."""
     durations_s: dict[str, tuple[float, ...]]
@@ -68,14 +68,14 @@ class SchedulerState(NamedTuple):
     tried: int = 0
     """Workers below this had been started when the last such failure was counted: they are part of it."""
     down_since_s: float | None = None
-    """Since when tasks wait and no worker is up."""
+    """Since when work items wait and no worker is up."""
     last_lost: int | None = None
     """The worker that was lost last, and why:"""
     last_loss: str = "none was ever lost"
     failed: str | None = None
     """The message of `Fail`; the state is then terminal."""
     retries: int = 0
-    """Chunks assigned again: of each assignment of a task beyond its first."""
+    """Chunks assigned again: of each assignment of a work item beyond its first."""
     lost_workers: int = 0
     """Workers lost, or stopped for a fault."""
     duplicates: int = 0
@@ -83,13 +83,13 @@ class SchedulerState(NamedTuple):
 
 
 def initial_state(limits: Limits) -> SchedulerState:
-    """No task and no worker yet; the first step, whatever its event, starts the workers."""
+    """No item and no worker yet; the first step, whatever its event, starts the workers."""
     return SchedulerState(limits, limits.workers, {}, {}, {}, {}, deque(), {})
 
 
 def pending(state: SchedulerState) -> int:
-    """Number of tasks submitted and not delivered."""
-    return len(state.tasks)
+    """Number of items submitted and not delivered."""
+    return len(state.items)
 
 
 def usual_chunk_s(state: SchedulerState, kind: str) -> float | None:
@@ -120,15 +120,15 @@ def told_last_words(state: SchedulerState, worker: int, last_words: str) -> Sche
     return state._replace(last_loss=with_last_words(state.last_loss, last_words), failed=failed)
 
 
-def find_slot(worker: Worker, key: Hashable, attempt: int) -> int | None:
+def find_slot(worker: Worker, item_id: Hashable, attempt: int) -> int | None:
     """Index of what a worker has not answered yet; None if it was sent no such thing, or has answered it."""
     for index, slot in enumerate(worker.slots):
-        if slot.attempt == attempt and slot.task.key == key:
+        if slot.attempt == attempt and slot.item.id == item_id:
             return index
     return None
 
 
-def holds(state: SchedulerState, worker: int, key: Hashable) -> bool:
-    """Whether a task waits for the answer of this worker."""
-    waiting = state.tasks.get(key)
+def holds(state: SchedulerState, worker: int, item_id: Hashable) -> bool:
+    """Whether a work item waits for the answer of this worker."""
+    waiting = state.items.get(item_id)
     return waiting is not None and waiting.holder == worker

@@ -163,8 +163,8 @@ class GradientChunk:
 Chunk = TrainingChunk | EvaluationChunk | GradientChunk
 
 
-class TaskKey(NamedTuple):
-    """What engines, scheduler and workers call chunks that travel together."""
+class WorkItemId(NamedTuple):
+    """Which work item: what engines and workers call the chunks that travel together."""
 
     phase: int
     """Number of the `evaluate` call, so that a late answer of an earlier call is never taken for one of this call."""

@@ -1,10 +1,10 @@
-"""The scheduler by hand: limits, tasks named by letters, workers that are ready."""
+"""The scheduler by hand: limits, items named by letters, workers that are ready."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from es_service.dispatch.events import Command, Event, Limits, StartWorker, Submit, Task, Tick, WorkerUp
+from es_service.dispatch.events import Command, Event, Limits, StartWorker, Submit, Tick, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import SchedulerState, initial_state
 
@@ -32,9 +32,9 @@ def play(state: SchedulerState, *events: tuple[float, Event]) -> tuple[Scheduler
     return state, commands
 
 
-def tasks(keys: str) -> Submit:
-    """One task per letter; capitals are of another kind."""
-    return Submit(tuple(Task(key, "train" if key.islower() else "evaluate") for key in keys))
+def items(item_ids: str) -> Submit:
+    """One item per letter; capitals are of another kind."""
+    return Submit(tuple(WorkItem(item_id, "train" if item_id.islower() else "evaluate") for item_id in item_ids))
 
 
 def ready(workers: int = 2, **changes: object) -> SchedulerState:

@@ -23,19 +23,19 @@ from es_service.dispatch.events import (
     StartWorker,
     StopWorker,
     Submit,
-    Task,
     Tick,
     WorkerLost,
     WorkerUp,
+    WorkItem,
 )
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending
 
 START_FATES = ("start_dies", "start_hangs", "no_place")
-TASK_FATES = ("task_dies", "task_hangs", "task_slow", "task_raises", "contradicts")
+ITEM_FATES = ("item_dies", "item_hangs", "item_slow", "item_raises", "contradicts")
 FAULTS = (
     *START_FATES,
-    *TASK_FATES,
+    *ITEM_FATES,
     "dies_idle",
     "duplicates",
     "reports_stopped",
@@ -68,7 +68,7 @@ class World:
         self.faultless = harshness == 0.0
         self.rate = {fault: harshness * r.random() ** 2 for fault in FAULTS}
         if harshness and r.random() < 0.1:
-            self.rate[r.choice(("start_dies", "start_hangs", "task_raises", "task_dies"))] = 1.0
+            self.rate[r.choice(("start_dies", "start_hangs", "item_raises", "item_dies"))] = 1.0
         self.poison_rate = harshness * r.choice((0.0, 0.0, 0.1))
         self.check_purity = seed % 31 == 0
         self.state, self.now = initial_state(self.limits), 0.0
@@ -150,23 +150,25 @@ class World:
         if worker not in self.alive or worker in self.busy or not self.inbox[worker]:
             return
         self.busy.add(worker)
-        key, attempt = self.inbox[worker].popleft()
-        fate = self.poison.get(key) or next((fate for fate in TASK_FATES if self.happens(fate)), "ok")
-        if fate != "task_hangs":
-            self.at(self.random.random() + 10.0 * (fate == "task_slow"), self.end, worker, key, attempt, fate)
+        item_id, attempt = self.inbox[worker].popleft()
+        fate = self.poison.get(item_id) or next((fate for fate in ITEM_FATES if self.happens(fate)), "ok")
+        if fate != "item_hangs":
+            self.at(self.random.random() + 10.0 * (fate == "item_slow"), self.end, worker, item_id, attempt, fate)
 
-    def end(self, worker: int, key: tuple, attempt: int, fate: str) -> None:
+    def end(self, worker: int, item_id: tuple, attempt: int, fate: str) -> None:
         if worker not in self.alive and not self.happens("speaks_after_stop"):
             return
-        if fate == "task_dies":
+        if fate == "item_dies":
             self.die(worker)
             return
-        if fate in ("task_raises", "contradicts"):
-            self.say(worker, Failure(worker, key, attempt, "ValueError: no"))
-        if fate != "task_raises":
-            self.say(worker, Result(worker, key, attempt))
+        if fate in ("item_raises", "contradicts"):
+            self.say(worker, Failure(worker, item_id, attempt, "ValueError: no"))
+        if fate != "item_raises":
+            self.say(worker, Result(worker, item_id, attempt))
         if self.happens("duplicates"):
-            self.say(worker, Result(worker, key, attempt) if fate == "ok" else Failure(worker, key, attempt, "again"))
+            self.say(
+                worker, Result(worker, item_id, attempt) if fate == "ok" else Failure(worker, item_id, attempt, "again")
+            )
         self.busy.discard(worker)
         self.begin(worker)
 
@@ -193,10 +195,10 @@ class World:
     def note(self, event: Event) -> None:
         """What the event means, before the scheduler is asked."""
         match event:
-            case Submit(tasks):
-                self.fresh.extend(task.key for task in tasks)
-                self.waiting.update(task.key for task in tasks)
-                self.size.update((task.key, task.size) for task in tasks)
+            case Submit(items):
+                self.fresh.extend(item.id for item in items)
+                self.waiting.update(item.id for item in items)
+                self.size.update((item.id, item.size) for item in items)
             case Placed(worker):
                 self.unplaced.discard(worker)
                 if worker in self.known:
@@ -209,17 +211,17 @@ class World:
                 expected = worker in self.draining
                 self.seen["lost while draining"] += expected
                 self.forget(worker, fault=not expected, charge=not expected)
-            case Result(worker, key, attempt):
-                if worker in self.known and (key, attempt) in self.open[worker]:
-                    self.open[worker].remove((key, attempt))
-                elif worker in self.known and key in self.waiting:
+            case Result(worker, item_id, attempt):
+                if worker in self.known and (item_id, attempt) in self.open[worker]:
+                    self.open[worker].remove((item_id, attempt))
+                elif worker in self.known and item_id in self.waiting:
                     self.seen["superseded result"] += 1
-            case Failure(worker, key, attempt):
-                valid = worker in self.known and (key, attempt) in self.open[worker]
+            case Failure(worker, item_id, attempt):
+                valid = worker in self.known and (item_id, attempt) in self.open[worker]
                 if valid:
-                    self.open[worker].remove((key, attempt))
-                if valid and key in self.waiting:
-                    self.faults[key] += 1
+                    self.open[worker].remove((item_id, attempt))
+                if valid and item_id in self.waiting:
+                    self.faults[item_id] += 1
                 else:
                     self.dropped += 1
             case Drain(worker) if worker in self.known:
@@ -253,21 +255,21 @@ class World:
                     self.start_process(worker)
                 case StopWorker(worker, reason):
                     self.stop(worker, reason, event)
-                case Assign(worker, key, attempt):
-                    self.check_assign(worker, key, attempt)
-                case Deliver(key):
+                case Assign(worker, item_id, attempt):
+                    self.check_assign(worker, item_id, attempt)
+                case Deliver(item_id):
                     assert isinstance(event, Result)
-                    assert event.key == key
+                    assert event.item_id == item_id
                     assert speaker_known
-                    assert key in self.waiting
-                    self.waiting.remove(key)
-                    self.delivered.add(key)
+                    assert item_id in self.waiting
+                    self.waiting.remove(item_id)
+                    self.delivered.add(item_id)
                     accepted += 1
                 case Fail(message):
                     self.failed = message
                     self.check_fail(message)
         if isinstance(event, Result) and not accepted:
-            assert not (speaker_known and event.key in self.waiting)
+            assert not (speaker_known and event.item_id in self.waiting)
             self.dropped += 1
         self.check_books()
         if isinstance(event, Tick):
@@ -291,27 +293,27 @@ class World:
         if self.happens("reports_stopped"):
             self.say(worker, WorkerLost(worker, "stopped"))
 
-    def check_assign(self, worker: int, key: tuple, attempt: int) -> None:
+    def check_assign(self, worker: int, item_id: tuple, attempt: int) -> None:
         assert worker in self.up - self.draining
-        assert key in self.waiting
-        assert all(key != held for slots in self.open.values() for held, _ in slots)
-        assert attempt == self.faults[key] + 1 <= self.limits.max_attempts
-        if key in self.last_holder:
-            self.again += self.size[key]
+        assert item_id in self.waiting
+        assert all(item_id != held for slots in self.open.values() for held, _ in slots)
+        assert attempt == self.faults[item_id] + 1 <= self.limits.max_attempts
+        if item_id in self.last_holder:
+            self.again += self.size[item_id]
         else:
-            assert key == self.fresh.popleft(), "out of submission order"
-        assert self.last_holder.get(key) != worker or len(self.up - self.draining) == 1
-        self.last_holder[key] = worker
-        self.open[worker].append((key, attempt))
+            assert item_id == self.fresh.popleft(), "out of submission order"
+        assert self.last_holder.get(item_id) != worker or len(self.up - self.draining) == 1
+        self.last_holder[item_id] = worker
+        self.open[worker].append((item_id, attempt))
         assert len(self.open[worker]) <= self.limits.in_flight
-        self.inbox[worker].append((key, attempt))
+        self.inbox[worker].append((item_id, attempt))
         self.at(0.0, self.begin, worker)
 
     def check_fail(self, message: str) -> None:
-        worn_out = [key for key in self.waiting if self.faults[key] >= self.limits.max_attempts]
-        if message.startswith("task"):
+        worn_out = [item_id for item_id in self.waiting if self.faults[item_id] >= self.limits.max_attempts]
+        if message.startswith("work item"):
             self.seen["poison"] += 1
-            assert any(str(key) in message for key in worn_out)
+            assert any(str(item_id) in message for item_id in worn_out)
         elif "tries in a row" in message:
             self.seen["start failures"] += 1
             assert self.start_failures == self.limits.max_start_failures
@@ -332,18 +334,20 @@ class World:
             assert state.failed == self.failed
             assert not self.known, "a worker was left running"
             return
-        assert all(self.faults[key] < self.limits.max_attempts for key in self.waiting), "poison went unnoticed"
+        assert all(self.faults[item_id] < self.limits.max_attempts for item_id in self.waiting), "poison went unnoticed"
         assert self.start_failures < self.limits.max_start_failures, "a broken environment went unnoticed"
         if not self.waiting or self.up:
             self.down_since = None
         elif self.down_since is None:
             self.down_since = self.now
         usable = self.up - self.draining
-        queued = self.waiting - {key for slots in self.open.values() for key, _ in slots}
+        queued = self.waiting - {item_id for slots in self.open.values() for item_id, _ in slots}
         for worker in usable if queued else ():
             if len(self.open[worker]) < self.limits.in_flight:
                 assert len(usable) > 1
-                assert {self.last_holder.get(key) for key in queued} == {worker}, "work waits beside a free worker"
+                assert {self.last_holder.get(item_id) for item_id in queued} == {worker}, (
+                    "work waits beside a free worker"
+                )
 
     # The run.
 
@@ -351,15 +355,15 @@ class World:
         self.feed(Tick(tuple(sorted(self.unplaced))))
 
     def submit(self, generation: int) -> None:
-        tasks = tuple(
-            Task((kind, generation, index), kind, self.random.randint(1, 3))
+        items = tuple(
+            WorkItem((kind, generation, index), kind, self.random.randint(1, 3))
             for kind in ("TrainingChunk", "EvaluationChunk")
             for index in range(self.random.randint(0, 7))
         )
-        for task in tasks:
+        for item in items:
             if self.random.random() < self.poison_rate:
-                self.poison[task.key] = self.random.choice(("task_raises", "task_dies", "task_hangs"))
-        self.feed(Submit(tasks))
+                self.poison[item.id] = self.random.choice(("item_raises", "item_dies", "item_hangs"))
+        self.feed(Submit(items))
 
     def operate(self) -> None:
         """An operator, or a cloud, at work."""

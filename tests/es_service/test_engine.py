@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from es_service.dispatch import engine as engine_module
-from es_service.dispatch.engine import POLL_S, Answer, Engine, task_sizes
+from es_service.dispatch.engine import POLL_S, Answer, Engine, item_sizes
 from es_service.dispatch.events import Failure, Limits, WorkerLost, WorkerUp
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.messages import TrainingChunk
@@ -32,16 +32,16 @@ class Sent:
 
     worker: int
     centre: Any
-    key: Any
+    item_id: Any
     attempt: int
     chunks: Any
 
     def answer(self) -> Answer:
         results = [expected(self.centre, chunk) for chunk in self.chunks]
-        return Answer(self.worker, self.key, self.attempt, results)
+        return Answer(self.worker, self.item_id, self.attempt, results)
 
     def failure(self) -> Failure:
-        return Failure(self.worker, self.key, self.attempt, "no")
+        return Failure(self.worker, self.item_id, self.attempt, "no")
 
 
 def expected(point, chunk) -> Any:
@@ -69,8 +69,8 @@ class Scripted:
         self.killed.append(worker)
         return self.last_words.get(worker, "")
 
-    def send(self, worker, centre, key, attempt, chunks):
-        self.sent.append(Sent(worker, centre, key, attempt, chunks))
+    def send(self, worker, centre, item_id, attempt, chunks):
+        self.sent.append(Sent(worker, centre, item_id, attempt, chunks))
         self.on_send(self.sent[-1])
 
     def silent(self):
@@ -115,14 +115,14 @@ def test_results_come_in_chunk_order_whatever_the_order_of_the_answers(seed):
 
 @given(st.integers(1, 500), st.integers(1, 70), st.floats(1e-7, 10.0))
 def test_tasks_are_of_equal_size_as_many_for_each_worker_and_none_takes_too_long(chunks, workers, chunk_s):
-    sizes = task_sizes(chunks, workers, chunk_s, 0.01)
+    sizes = item_sizes(chunks, workers, chunk_s, 0.01)
     assert sum(sizes) == chunks
     assert max(sizes) - min(sizes) <= 1
     assert max(sizes) == 1 or max(sizes) * chunk_s < 0.01001
     assert len(sizes) % workers == 0 or len(sizes) == chunks
     with_a_round_less = len(sizes) - workers
     assert with_a_round_less <= 0 or -(-chunks // with_a_round_less) * chunk_s > 0.00999
-    assert task_sizes(chunks, workers, None, 0.01) == [1] * chunks
+    assert item_sizes(chunks, workers, None, 0.01) == [1] * chunks
 
 
 def test_short_chunks_travel_together_once_their_duration_is_known(monkeypatch):
@@ -136,7 +136,7 @@ def test_short_chunks_travel_together_once_their_duration_is_known(monkeypatch):
         transport.inbox.append(sent.answer())
 
     transport.on_send = take_a_millisecond_each
-    with Engine(transport, Limits(workers=2, in_flight=1, task_s=0.01)) as engine:
+    with Engine(transport, Limits(workers=2, in_flight=1, item_s=0.01)) as engine:
         numbers = []
         for count in (8, 6, 200):
             transport.sent.clear()
@@ -202,7 +202,7 @@ def test_what_a_lost_worker_still_says_is_dropped(before):
     transport = Scripted()
 
     def contradict(sent: Sent):
-        last_words = Answer(0, sent.key, sent.attempt, ["not to be trusted"])
+        last_words = Answer(0, sent.item_id, sent.attempt, ["not to be trusted"])
         if sent.worker == 0:
             transport.inbox.extend([WorkerLost(0, "gone"), WorkerUp(0), sent.failure()])
         else:

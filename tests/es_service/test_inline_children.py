@@ -45,7 +45,7 @@ def test_killed_children_change_no_result_and_leave_nothing_behind():
         if countdown == 0:
             os.kill(victim, signal.SIGKILL)
 
-    limits = Limits(workers=1, task_s=0.0, restart_backoff_s=0.01)
+    limits = Limits(workers=1, item_s=0.0, restart_backoff_s=0.01)
     with inline_engine(SPEC, limits, kill_in_the_middle) as engine:
         first = engine.evaluate(FIRST, chunks)
         settled = footprint()
@@ -140,7 +140,7 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
 
 def test_an_error_says_in_which_of_the_chunks_that_travelled_together_it_was():
     broken = [*CHUNKS[:3], TrainingChunk(3, "four")]
-    with inline_engine(SPEC, Limits(workers=1, task_s=60.0, restart_backoff_s=0.0)) as engine:
+    with inline_engine(SPEC, Limits(workers=1, item_s=60.0, restart_backoff_s=0.0)) as engine:
         engine.evaluate(FIRST, CHUNKS)
-        with pytest.raises(EvaluationError, match=r"(?s)task TrainingChunk 0 and 3 more of.*in TrainingChunk four of"):
+        with pytest.raises(EvaluationError, match=r"(?s)item TrainingChunk 0 and 3 more of.*in TrainingChunk four of"):
             engine.evaluate(FIRST, broken)

@@ -202,7 +202,7 @@ def test_an_actor_that_is_given_no_place_is_not_lost():
         assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
         assert len(ray.actors) > 8
         assert engine.counts.lost_workers == 1
-        assert "no answer to task" in engine.last_loss
+        assert "no answer to work item" in engine.last_loss
 
 
 @pytest.mark.parametrize(

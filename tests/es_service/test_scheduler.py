@@ -1,4 +1,4 @@
-"""The scheduler by hand: who gets which task, deadlines, blame, late and double answers."""
+"""The scheduler by hand: who gets which item, deadlines, blame, late and double answers."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from es_service.dispatch.events import (
     StartWorker,
     StopWorker,
     Submit,
-    Task,
     Tick,
     WorkerLost,
     WorkerUp,
+    WorkItem,
 )
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, usual_chunk_s
-from tests.es_service.scheduler_play import LIMITS, play, ready, tasks
+from tests.es_service.scheduler_play import LIMITS, items, play, ready
 
 
 def test_tasks_go_out_in_order_to_idle_workers_first():
-    state, commands = step(ready(), tasks("abcde"), 1.0)
+    state, commands = step(ready(), items("abcde"), 1.0)
     assert commands == [Assign(0, "a", 1), Assign(1, "b", 1), Assign(0, "c", 1), Assign(1, "d", 1)]
     state, commands = step(state, Result(1, "b", 1), 2.0)
     assert commands == [Deliver("b"), Assign(1, "e", 1)]
@@ -37,13 +37,13 @@ def test_tasks_go_out_in_order_to_idle_workers_first():
 
 
 def test_tasks_submitted_before_any_worker_is_up_wait_for_it():
-    state, commands = step(initial_state(LIMITS), tasks("ab"), 0.0)
+    state, commands = step(initial_state(LIMITS), items("ab"), 0.0)
     assert commands == [StartWorker(0), StartWorker(1)]
     assert step(state, WorkerUp(1), 1.0)[1] == [Assign(1, "a", 1), Assign(1, "b", 1)]
 
 
 def test_a_lost_worker_is_replaced_and_only_its_running_task_is_charged():
-    state, commands = play(ready(), (1.0, tasks("abcdef")), (2.0, WorkerLost(0, "killed")))
+    state, commands = play(ready(), (1.0, items("abcdef")), (2.0, WorkerLost(0, "killed")))
     assert commands == [StartWorker(2)]
     assert list(state.queue) == ["a", "c", "e", "f"]
     state, commands = step(state, WorkerUp(2), 3.0)
@@ -52,9 +52,9 @@ def test_a_lost_worker_is_replaced_and_only_its_running_task_is_charged():
 
 
 def test_what_a_bystander_was_computing_is_not_to_blame():
-    """A worker lost only because another was: its task goes back, and no number of such losses makes it poison."""
+    """A worker lost only because another was: its item goes back, and no number of such losses makes it poison."""
     state = ready(1)
-    state, _ = play(state, (1.0, tasks("a")))
+    state, _ = play(state, (1.0, items("a")))
     for worker in range(5):
         now = 100.0 * worker + 2.0
         lost = WorkerLost(worker, "its process was killed", bystander=True)
@@ -66,43 +66,43 @@ def test_what_a_bystander_was_computing_is_not_to_blame():
 
 
 def test_a_task_that_raised_waits_for_another_worker():
-    state, commands = play(ready(in_flight=1), (1.0, tasks("abcd")), (2.0, Failure(0, "a", 1, "no")))
+    state, commands = play(ready(in_flight=1), (1.0, items("abcd")), (2.0, Failure(0, "a", 1, "no")))
     assert commands == [Assign(0, "c", 1)]
     assert step(state, Result(1, "b", 1), 3.0)[1] == [Deliver("b"), Assign(1, "a", 2)]
-    state, commands = play(ready(in_flight=1), (1.0, tasks("ab")), (2.0, Failure(0, "a", 1, "no")))
+    state, commands = play(ready(in_flight=1), (1.0, items("ab")), (2.0, Failure(0, "a", 1, "no")))
     assert commands == []
     # With nobody else left it may go back.
     assert Assign(0, "b", 2) in play(state, (3.0, WorkerLost(1, "killed")))[1]
-    assert step(step(ready(1), tasks("a"), 1.0)[0], Failure(0, "a", 1, "no"), 2.0)[1] == [Assign(0, "a", 2)]
+    assert step(step(ready(1), items("a"), 1.0)[0], Failure(0, "a", 1, "no"), 2.0)[1] == [Assign(0, "a", 2)]
 
 
 def test_a_poison_task_fails_the_run_with_its_name_and_nothing_happens_after():
     state, commands = play(
         ready(in_flight=1, max_failures_in_a_row=3),
-        (1.0, tasks("ab")),
+        (1.0, items("ab")),
         (2.0, Failure(0, "a", 1, "no")),
         (3.0, Result(1, "b", 1)),
         (4.0, WorkerLost(1, "out of memory")),
         (5.0, Failure(0, "a", 3, "ValueError: never")),
     )
-    message = "task a failed in 3 attempts; the last time it raised on worker 0: ValueError: never"
+    message = "work item a failed in 3 attempts; the last time it raised on worker 0: ValueError: never"
     assert commands == [Fail(message), StopWorker(0, "the run failed"), StopWorker(2, "the run failed")]
     assert state.failed == message
-    for event in (WorkerUp(2), Result(0, "a", 3), tasks("z"), SetWorkers(5), Tick(), WorkerLost(0, "stopped")):
+    for event in (WorkerUp(2), Result(0, "a", 3), items("z"), SetWorkers(5), Tick(), WorkerLost(0, "stopped")):
         assert step(state, event, 1e9) == (state, [])
     assert next_deadline(state) == math.inf
 
 
 def test_a_task_that_kills_its_workers_is_poison_too():
     state = ready(1)
-    state, _ = play(state, (1.0, tasks("abc")), (2.0, WorkerLost(0, "died")), (2.0, WorkerUp(1)))
+    state, _ = play(state, (1.0, items("abc")), (2.0, WorkerLost(0, "died")), (2.0, WorkerUp(1)))
     state, _ = play(state, (3.0, WorkerLost(1, "died")), (5.0, Tick()), (5.0, WorkerUp(2)))
     state, commands = step(state, WorkerLost(2, "signal 11"), 6.0)
-    assert commands == [Fail("task a failed in 3 attempts; the last time it took worker 2 with it: signal 11")]
+    assert commands == [Fail("work item a failed in 3 attempts; the last time it took worker 2 with it: signal 11")]
 
 
 def test_deadlines_exempt_compiling_and_follow_the_median_of_their_kind():
-    state, _ = play(ready(1, in_flight=1), (0.0, tasks("abcdefE")))
+    state, _ = play(ready(1, in_flight=1), (0.0, items("abcdefE")))
     assert next_deadline(state) == 100.0
     state, _ = step(state, Result(0, "a", 1), 40.0)
     assert state.durations_s == {}
@@ -116,15 +116,15 @@ def test_deadlines_exempt_compiling_and_follow_the_median_of_their_kind():
     state, _ = step(state, Result(0, "e", 1), 48.0)
     assert next_deadline(state) == 48.0 + 10.0, "never below min_deadline_s"
     state, _ = step(state, Result(0, "f", 1), 49.0)
-    assert next_deadline(state) == 49.0 + 100.0, "the first task of another kind compiles"
+    assert next_deadline(state) == 49.0 + 100.0, "the first item of another kind compiles"
     assert state.durations_s == {"train": (4.0, 2.0, 1.0, 1.0, 1.0)}
-    state, _ = play(ready(1), *((float(n), event) for n in range(40) for event in (tasks("a"), Result(0, "a", 1))))
+    state, _ = play(ready(1), *((float(n), event) for n in range(40) for event in (items("a"), Result(0, "a", 1))))
     assert len(state.durations_s["train"]) == 31, "a bounded window"
 
 
 def test_what_compiles_may_take_no_less_time_than_what_does_not():
     """Neither while no duration is known, nor on a worker that is new."""
-    state, _ = play(ready(1, in_flight=1, first_deadline_s=10.0, min_deadline_s=60.0), (0.0, tasks("abcde")))
+    state, _ = play(ready(1, in_flight=1, first_deadline_s=10.0, min_deadline_s=60.0), (0.0, items("abcde")))
     assert next_deadline(state) == 60.0
     state, _ = play(state, (50.0, Result(0, "a", 1)), (100.0, Result(0, "b", 1)))
     assert next_deadline(state) == 100.0 + 5.0 * 50.0
@@ -132,8 +132,8 @@ def test_what_compiles_may_take_no_less_time_than_what_does_not():
     assert next_deadline(state) == 111.0 + 5.0 * 50.0
 
 
-def test_deadlines_and_durations_are_in_proportion_to_the_size_of_a_task():
-    sized = Submit(tuple(Task(key, "train", size) for key, size in (("a", 1), ("b", 4), ("c", 3), ("d", 1))))
+def test_deadlines_and_durations_are_in_proportion_to_the_size_of_an_item():
+    sized = Submit(tuple(WorkItem(name, "train", size) for name, size in (("a", 1), ("b", 4), ("c", 3), ("d", 1))))
     state, _ = play(ready(1, in_flight=1), (0.0, sized), (5.0, Result(0, "a", 1)), (17.0, Result(0, "b", 1)))
     assert usual_chunk_s(state, "train") == 3.0
     assert next_deadline(state) == 17.0 + 5.0 * 3 * 3.0
@@ -147,39 +147,39 @@ def test_deadlines_and_durations_are_in_proportion_to_the_size_of_a_task():
     ("limit_s", "said"), [(0.25, "0.25"), (12.5, "12.5"), (99.96, "100"), (3600.0, "3600"), (1_234_567.8, "1234568")]
 )
 def test_seconds_are_said_without_an_exponent(limit_s, said):
-    state, _ = play(ready(1, first_deadline_s=limit_s, min_deadline_s=0.1), (0.0, tasks("a")))
-    reason = f"no answer to task a in {said} s (first_deadline_s)"
+    state, _ = play(ready(1, first_deadline_s=limit_s, min_deadline_s=0.1), (0.0, items("a")))
+    reason = f"no answer to work item a in {said} s (first_deadline_s)"
     assert step(state, Tick(), limit_s)[1][0] == StopWorker(0, reason)
 
 
 def test_chunks_handed_out_again_are_counted_not_tasks():
-    sized = Submit((Task("a", "train", 5), Task("b", "train", 3)))
+    sized = Submit((WorkItem("a", "train", 5), WorkItem("b", "train", 3)))
     state, _ = play(ready(1), (0.0, sized), (1.0, WorkerLost(0, "killed")), (2.0, WorkerUp(1)))
     assert state.retries == 8
 
 
 def test_the_clock_of_a_prefetched_task_starts_when_the_one_ahead_is_done():
-    state, _ = play(ready(1), (0.0, tasks("abcd")), (10.0, Result(0, "a", 1)), (12.0, Result(0, "b", 1)))
+    state, _ = play(ready(1), (0.0, items("abcd")), (10.0, Result(0, "a", 1)), (12.0, Result(0, "b", 1)))
     assert state.durations_s == {"train": (2.0,)}
     assert next_deadline(state) == 22.0
     state, _ = step(state, Result(0, "c", 1), 15.0)
     assert next_deadline(state) == 15.0 + 12.5
     assert step(state, Tick(), 27.4) == (state, [])
     state, commands = step(state, Tick(), 27.5)
-    assert commands == [StopWorker(0, "no answer to task d in 12.5 s (min_deadline_s)"), StartWorker(1)]
+    assert commands == [StopWorker(0, "no answer to work item d in 12.5 s (min_deadline_s)"), StartWorker(1)]
     assert step(state, WorkerUp(1), 28.0)[1] == [Assign(1, "d", 2)]
 
 
 def test_a_result_out_of_order_leaves_the_clock_of_the_running_task_alone():
-    state, _ = play(ready(1, in_flight=3), (0.0, tasks("abc")), (9.0, Result(0, "b", 1)))
+    state, _ = play(ready(1, in_flight=3), (0.0, items("abc")), (9.0, Result(0, "b", 1)))
     assert next_deadline(state) == 100.0
-    state, _ = play(state, (10.0, Result(0, "a", 1)), (12.0, tasks("de")), (15.0, Result(0, "d", 1)))
+    state, _ = play(state, (10.0, Result(0, "a", 1)), (12.0, items("de")), (15.0, Result(0, "d", 1)))
     assert state.durations_s == {}, "how long an answer out of order took is not known"
     assert play(state, (16.0, Result(0, "c", 1)))[0].durations_s == {"train": (6.0,)}
 
 
 def test_stale_answers_are_dropped_and_counted():
-    state, _ = play(ready(1), (1.0, tasks("abc")), (2.0, Result(0, "a", 1)))
+    state, _ = play(ready(1), (1.0, items("abc")), (2.0, Result(0, "a", 1)))
     for now, event in enumerate(
         (Result(0, "a", 1), Failure(0, "a", 1, "no"), Result(7, "b", 1), Failure(7, "b", 1, "no"))
     ):
@@ -189,35 +189,35 @@ def test_stale_answers_are_dropped_and_counted():
 
 
 def test_a_late_result_of_a_superseded_attempt_is_accepted():
-    base, _ = play(ready(in_flight=1), (1.0, tasks("ab")), (2.0, Failure(0, "a", 1, "lost contact")))
+    base, _ = play(ready(in_flight=1), (1.0, items("ab")), (2.0, Failure(0, "a", 1, "lost contact")))
     queued, commands = step(base, Result(0, "a", 1), 3.0)
     assert commands == [Deliver("a")]
     assert not queued.queue
     held, commands = play(base, (3.0, Result(1, "b", 1)), (4.0, Result(0, "a", 1)))
     assert commands == [Deliver("a")]
     # Worker 1 is still busy with its copy, whatever becomes of it.
-    state, commands = step(held, tasks("cd"), 5.0)
+    state, commands = step(held, items("cd"), 5.0)
     assert commands == [Assign(0, "c", 1)]
     state, commands = step(state, Result(1, "a", 2), 6.0)
     assert (commands, state.duplicates) == ([Assign(1, "d", 1)], 1)
     assert step(held, WorkerLost(1, "killed"), 6.0)[1] == [StartWorker(2)]
-    assert not step(held, WorkerLost(1, "killed"), 6.0)[0].tasks
+    assert not step(held, WorkerLost(1, "killed"), 6.0)[0].items
 
 
 def test_a_key_may_be_submitted_again_only_after_it_was_delivered():
-    state, _ = play(ready(), (1.0, tasks("ab")))
+    state, _ = play(ready(), (1.0, items("ab")))
     with pytest.raises(ValueError, match="submitted twice"):
-        step(state, tasks("b"), 2.0)
-    assert pending(play(state, (2.0, Result(1, "b", 1)), (3.0, tasks("b")))[0]) == 2
+        step(state, items("b"), 2.0)
+    assert pending(play(state, (2.0, Result(1, "b", 1)), (3.0, items("b")))[0]) == 2
 
 
 def test_a_worker_busy_with_an_old_copy_does_not_answer_for_the_new_one():
-    held, _ = play(ready(in_flight=1), (1.0, tasks("ab")), (2.0, Failure(0, "a", 1, "no")), (3.0, Result(1, "b", 1)))
-    held, _ = play(held, (4.0, Result(0, "a", 1)), (5.0, tasks("a")))
-    assert held.tasks["a"].holder == 0
+    held, _ = play(ready(in_flight=1), (1.0, items("ab")), (2.0, Failure(0, "a", 1, "no")), (3.0, Result(1, "b", 1)))
+    held, _ = play(held, (4.0, Result(0, "a", 1)), (5.0, items("a")))
+    assert held.items["a"].holder == 0
     for event in (WorkerLost(1, "killed"), Failure(1, "a", 2, "no")):
         state, _ = step(held, event, 6.0)
-        assert (list(state.queue), state.tasks["a"]) == ([], held.tasks["a"])
+        assert (list(state.queue), state.items["a"]) == ([], held.items["a"])
     assert step(held, Result(1, "a", 2), 6.0)[1] == [Deliver("a")]
 
 
@@ -229,13 +229,13 @@ def test_limits_without_workers_or_attempts_is_refused():
 
 def test_an_event_costs_little():
     """About 25 microseconds on one core; the bound leaves room for a slow and busy machine."""
-    state, commands = step(ready(), Submit(tuple(Task(index, "train") for index in range(640))), 1.0)
+    state, commands = step(ready(), Submit(tuple(WorkItem(index, "train") for index in range(640))), 1.0)
     started, events = time.process_time(), 0
     while commands:
         assigned = [command for command in commands if isinstance(command, Assign)]
         commands = []
         for command in assigned:
-            state, more = step(state, Result(command.worker, command.key, command.attempt), 2.0)
+            state, more = step(state, Result(command.worker, command.item_id, command.attempt), 2.0)
             commands += more
             events += 1
     assert pending(state) == 0

@@ -23,25 +23,25 @@ from es_service.dispatch.events import (
 )
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline
-from tests.es_service.scheduler_play import LIMITS, play, ready, tasks
+from tests.es_service.scheduler_play import LIMITS, items, play, ready
 
 
 def test_a_worker_that_keeps_raising_is_quarantined_without_blaming_its_next_task():
-    state, _ = play(ready(), (1.0, tasks("abcdefg")), (2.0, Failure(0, "a", 1, "no")), (3.0, Failure(0, "c", 1, "bad")))
+    state, _ = play(ready(), (1.0, items("abcdefg")), (2.0, Failure(0, "a", 1, "no")), (3.0, Failure(0, "c", 1, "bad")))
     assert sorted(state.up) == [1]
     assert list(state.queue) == ["c", "e", "a", "f", "g"]
     assert state.lost_workers == 1
     assert step(state, WorkerUp(2), 4.0)[1] == [Assign(2, "c", 2), Assign(2, "e", 1)]
-    assert state.tasks["e"].faults == 0
+    assert state.items["e"].faults == 0
     state, _ = play(
-        ready(1), (1.0, tasks("abc")), (2.0, Failure(0, "a", 1, "no")), (3.0, Result(0, "b", 1)),
+        ready(1), (1.0, items("abc")), (2.0, Failure(0, "a", 1, "no")), (3.0, Result(0, "b", 1)),
         (4.0, Failure(0, "a", 2, "no")),
     )  # fmt: skip
     assert sorted(state.up) == [0], "a success in between"
 
 
 def test_replacements_back_off_until_a_success():
-    state, commands = step(ready(1, max_attempts=99), tasks("a"), 0.0)
+    state, commands = step(ready(1, max_attempts=99), items("a"), 0.0)
     now, waits = 0.0, []
     for worker in range(6):
         state, commands = step(state, WorkerLost(worker, "killed"), now)
@@ -132,7 +132,7 @@ def test_a_worker_that_never_comes_up_is_killed_and_replaced():
 def test_a_worker_without_a_place_is_started_anew_and_nobody_hears_of_it():
     """However often: then the last that is up is lost, and the run waits for others as long as it should."""
     patient = initial_state(replace(LIMITS, first_deadline_s=1000.0))
-    state, _ = play(patient, (0.0, Tick()), (1.0, WorkerUp(0)), (1.0, tasks("a")))
+    state, _ = play(patient, (0.0, Tick()), (1.0, WorkerUp(0)), (1.0, items("a")))
     for number in range(1, 6):
         state, commands = step(state, Tick(silent=(number,)), 50.0 * number)
         assert commands == [StopWorker(number, "did not come up in 50 s (start_deadline_s)"), StartWorker(number + 1)]
@@ -142,27 +142,27 @@ def test_a_worker_without_a_place_is_started_anew_and_nobody_hears_of_it():
 
 
 def test_what_a_silent_worker_does_not_answer_in_time_is_not_to_blame():
-    state, _ = play(ready(1), (0.0, tasks("a")))
+    state, _ = play(ready(1), (0.0, items("a")))
     state, commands = step(state, Tick(silent=(0,)), 100.0)
-    assert commands == [StopWorker(0, "no answer to task a in 100 s (first_deadline_s)"), StartWorker(1)]
+    assert commands == [StopWorker(0, "no answer to work item a in 100 s (first_deadline_s)"), StartWorker(1)]
     assert state.lost_workers == 1
     assert step(state, WorkerUp(1), 101.0)[1] == [Assign(1, "a", 1)]
 
 
 def test_no_worker_for_too_long_fails_the_run():
-    state, _ = play(initial_state(LIMITS), (0.0, Tick()), (25.0, tasks("ab")))
+    state, _ = play(initial_state(LIMITS), (0.0, Tick()), (25.0, items("ab")))
     assert next_deadline(state) == 50.0
-    assert next_deadline(play(initial_state(LIMITS), (0.0, Tick()), (5.0, tasks("a")))[0]) == 35.0
+    assert next_deadline(play(initial_state(LIMITS), (0.0, Tick()), (5.0, items("a")))[0]) == 35.0
     state, commands = play(state, (50.0, Tick()), (55.0, Tick()))
     assert commands[0] == Fail(
-        "2 tasks wait and no worker was up for 30 s (no_worker_timeout_s); "
+        "2 work items wait and no worker was up for 30 s (no_worker_timeout_s); "
         "last loss: worker 1: did not come up in 50 s (start_deadline_s)"
     )
     assert play(initial_state(LIMITS), (0.0, Tick()), (40.0, Tick()))[0].failed is None, "nothing waits"
 
 
 def test_a_drained_worker_finishes_what_it_has_and_is_replaced_without_blame():
-    state, commands = play(ready(), (1.0, tasks("abcdef")), (2.0, Drain(0)))
+    state, commands = play(ready(), (1.0, items("abcdef")), (2.0, Drain(0)))
     assert commands == [StartWorker(2)]
     assert step(state, Result(0, "a", 1), 3.0)[1] == [Deliver("a")]
     done, commands = play(state, (3.0, Result(0, "a", 1)), (4.0, Result(0, "c", 1)))
@@ -174,11 +174,11 @@ def test_a_drained_worker_finishes_what_it_has_and_is_replaced_without_blame():
     assert play(initial_state(LIMITS), (0.0, Tick()), (1.0, Drain(0)))[1] == [StopWorker(0, "drained"), StartWorker(2)]
     # One that hangs while draining is killed all the same.
     state, commands = play(state, (3.0, WorkerUp(2)), (101.0, Tick()))
-    assert StopWorker(0, "no answer to task a in 100 s (first_deadline_s)") in commands
+    assert StopWorker(0, "no answer to work item a in 100 s (first_deadline_s)") in commands
 
 
 def test_the_number_of_workers_follows_the_wish():
-    state, commands = play(ready(3, in_flight=1), (1.0, tasks("abc")), (2.0, SetWorkers(5)))
+    state, commands = play(ready(3, in_flight=1), (1.0, items("abc")), (2.0, SetWorkers(5)))
     assert commands == [StartWorker(3), StartWorker(4)]
     state, commands = step(state, SetWorkers(2), 3.0)
     assert commands == [StopWorker(3, "drained"), StopWorker(4, "drained")]

@@ -6,7 +6,7 @@ import re
 
 from es_service.api import load_config
 from es_service.config.compute import ComputeConfig
-from es_service.dispatch.events import Result, StopWorker, Submit, Task, Tick, WorkerUp
+from es_service.dispatch.events import Result, StopWorker, Submit, Tick, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state
 from es_service.runs.session import LIMIT_NAMES, dispatch_limits
@@ -29,20 +29,20 @@ def messages_after(*events) -> list[str]:
 
 
 def test_messages_of_deadlines_name_the_keys_that_set_them():
-    work = Submit(tuple(Task(key, "train") for key in "abcd"))
+    work = Submit(tuple(WorkItem(item_id, "train") for item_id in "abcd"))
     late = messages_after((0.0, work), (10.0, Tick()), (20.0, Tick()))
     assert late[0] == "did not come up in 10 s (half of compute.no_worker_timeout_s)"
     assert "no worker was up for 20 s (compute.no_worker_timeout_s); last loss" in late[-1]
     assert messages_after((0.0, work), (1.0, WorkerUp(0)), (9.0, Tick()))[0] == (
-        "no answer to task a in 8 s (compute.compile_timeout_s)"
+        "no answer to work item a in 8 s (compute.compile_timeout_s)"
     )
     answers = [(1.0, WorkerUp(0)), (2.0, Result(0, "a", 1)), (2.1, Result(0, "b", 1))]
     assert messages_after((0.0, work), *answers, (7.1, Tick()))[0] == (
-        "no answer to task c in 5 s (at least compute.chunk_timeout_s)"
+        "no answer to work item c in 5 s (at least compute.chunk_timeout_s)"
     )
 
 
 def test_keys_that_messages_name_exist():
     for name in LIMIT_NAMES.values():
-        (key,) = re.findall(r"compute\.(\w+)", name)
-        assert key in ComputeConfig.model_fields
+        (item_id,) = re.findall(r"compute\.(\w+)", name)
+        assert item_id in ComputeConfig.model_fields

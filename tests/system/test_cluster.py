@@ -56,10 +56,10 @@ def repeated_episodes(folder: Path, since: float) -> int:
     seen: set[tuple] = set()
     repeated = 0
     for entry in entries(folder, "Assign", 0.0):
-        key = tuple(entry["key"])
-        if entry["time"] >= since and key in seen and key[1] != "GradientChunk":
-            repeated += key[-1] * EPISODES_PER_CHUNK
-        seen.add(key)
+        item_id = tuple(entry["item_id"])
+        if entry["time"] >= since and item_id in seen and item_id[1] != "GradientChunk":
+            repeated += item_id[-1] * EPISODES_PER_CHUNK
+        seen.add(item_id)
     return repeated
 
 

@@ -98,7 +98,7 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
     assert outcome.run.history["lost_workers"].sum() == 2
     assert [notice.partition(" lost ")[0] for notice in notices] == ["generation 4:", "generation 12:"]
     assert "its process or its node died" in notices[0]
-    assert "no answer to task TrainingChunk" in notices[1]
+    assert "no answer to work item TrainingChunk" in notices[1]
     counts = check_dispatch(tmp_path / "run")
     assert (counts["sessions"], counts["generations"]) == (1, 31)
     assert counts["repeated"] == outcome.run.history["retries"].sum() >= 2
