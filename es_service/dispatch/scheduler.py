@@ -8,11 +8,11 @@ An engine starts with `initial_state(limits)` of scheduler_state.py and a `Tick`
 an event, and sends a `Tick` whenever `next_deadline(state)` has come. It must feed the messages that already wait
 *before* a late `Tick`: otherwise a driver that was busy elsewhere would kill workers whose answers it had not read.
 
-Choices. A result is a pure function of its id, so any result of a known worker for an id that still waits is
-accepted, even of a superseded attempt; a stopped worker is forgotten at once, so what it still says is dropped and
-counted. Only the item a worker was running is charged with its loss; one prefetched behind it goes back with its
-attempt unused. So does one sent to a worker that was gone already, if the transport says so: a machine that dies under
-many workers is one fault, however many of them are tried before all are known to be gone. A worker lost while draining is nobody's fault.
+Choices. A result is a pure function of its id, so any result of a known worker for an id that still waits is accepted,
+even of a superseded attempt; a stopped worker is forgotten at once, so what it still says is dropped and counted. Only
+the item a worker was running is charged with its loss; one prefetched behind it goes back with its attempt unused. So
+does one sent to a worker that was gone already, if the transport says so: a machine that dies under many workers is one
+fault, however many of them are tried before all are known to be gone. A worker lost while draining is nobody's fault.
 One that was given no place in time is started anew, since one that hangs before it can say where it is looks the same,
 but counts as no loss. Workers that are lost before they come up show a broken environment only if others, started after
 the first of them was lost, are lost, too. Which worker gets which item, and by when it must answer: assignment.py.
