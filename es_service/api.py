@@ -59,7 +59,8 @@ def run(
     """Start a run and work until its budget is spent.
 
     Args:
-        out: folder of the run, new or empty; default runs/<environment>_<algorithm>_seed<seed>_<time>-<process>.
+        out: folder of the run, new or empty, made with its parents; default
+            runs/<environment>_<algorithm>_seed<seed>_<time>-<process>.
         hook: called at the store's named points; for tests that kill the process there.
 
     Raises:
@@ -226,13 +227,6 @@ def _create_and_work(
     hook: Callable[[str], None],
 ) -> Outcome:
     folder = Path(out) if out is not None else default_folder(config)
-    if folder.parent == RUNS_FOLDER:
-        try:
-            RUNS_FOLDER.mkdir(exist_ok=True)
-        except OSError as error:
-            raise StoreError(
-                f"cannot create the folder {RUNS_FOLDER} in {Path.cwd()}: {error.strerror}; choose another folder"
-            ) from error
     task = task_of(config)
     meta = RunMeta(
         run_id=uuid4().hex,

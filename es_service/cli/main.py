@@ -39,11 +39,13 @@ from es_service.cli.tables.catalogue import print_catalogue
 from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.progress import show_progress
 from es_service.cli.tables.status import follow_status, print_status, print_summary
+from es_service.config.loading import left_out
 from es_service.config.resolution import config_warnings
 from es_service.config.tasks import TASKS, no_vectors, task_of
 from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError
 from es_service.loop.history import Row
 from es_service.protocol.machine import VERSION
+from es_service.runs.standing import newest_runs
 from es_service.store import digest
 from es_service.store.folder import holds_run
 
@@ -88,6 +90,9 @@ def run(
         raise ConfigError("--or-resume needs --out: without it every run has a folder of its own")
     begun = or_resume and out is not None and holds_run(out)
     loaded = api.load_config(config, wanted, new=not begun)
+    if foreign := left_out(config, wanted):
+        task = loaded.task.environment
+        print_note(f"note: {', '.join(foreign)} of {config} is not for {task}, which has its default options")
     for warning in config_warnings(loaded, task_of(loaded), no_vectors()):
         print_note(f"note: {warning}")
     folder = out if out is not None else api.default_folder(loaded)
@@ -127,12 +132,21 @@ def fork(
 
 @app.command()
 def status(
-    folders: Annotated[list[Path], typer.Argument(help="Folders of runs.", show_default=False)],
+    folders: Annotated[
+        list[Path] | None, typer.Argument(help="Folders of runs; default: the newest under runs/.", show_default=False)
+    ] = None,
     follow: Annotated[bool, typer.Option("--follow", help="Keep watching one run until its driver ends.")] = False,
 ) -> None:
     """Show where a run stands, also while it is being written; of several runs, a line each."""
-    if follow and len(folders) > 1:
-        raise ConfigError(f"--follow: watches one run, got {len(folders)} folders; name one, or leave --follow out")
+    if follow and len(folders or ()) != 1:
+        raise ConfigError(f"--follow: watches one run, got {len(folders or ())} folders; name one, or leave it out")
+    if not folders:
+        folders = newest_runs(api.RUNS_FOLDER)
+        if not folders:
+            print_note(f"there is no run under {api.RUNS_FOLDER}/ here; name the folder of one")
+            return
+        print_overview(console, folders)
+        return
     if len(folders) > 1:
         raise typer.Exit(0 if print_overview(console, folders) else 1)
     run = api.open_run(folders[0])

@@ -49,6 +49,14 @@ def without_followers(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> d
     return {key: value for key, value in values.items() if not key.startswith(followers)}
 
 
+def foreign_options(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
+    """The options of a config's task that mean nothing once another task is wanted instead of it."""
+    task = "task.environment"
+    if task not in wanted or wanted[task] == values.get(task):
+        return []
+    return [key for key in values if key.startswith(OPTIONS) and key not in wanted]
+
+
 def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
     """Where two results of `constants()` differ: (dotted key, old value, new value), ABSENT where a side lacks it."""
     return [

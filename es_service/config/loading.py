@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import ValidationError
 
-from es_service.config.changes import without_followers
+from es_service.config.changes import foreign_options, without_followers
 from es_service.config.keys import BUDGET, FIELDS, SECTIONS, Overrides, parse_overrides, sort_keys
 from es_service.config.map_rules import map_problems
 from es_service.config.model import RunConfig
@@ -52,7 +52,8 @@ def load_config(
 
     Args:
         source: a YAML file, or a nested mapping like one.
-        overrides: "search.sigma=0.05" and the like, values in YAML, of which a later one wins; or values by key.
+        overrides: "search.sigma=0.05" and the like, values in YAML, of which a later one wins; or values by key. Where
+            they name another task, options of the source's own task are left out (`left_out` says which).
         tasks: what `task.environment` may name.
         algorithms: what `search.algorithm` may name.
         no_vectors: why this machine's processor cannot run what simd compiles; empty where it can.
@@ -62,6 +63,13 @@ def load_config(
         ConfigError: names the file, then lists every problem on a line of its own.
     """
     return _load(source, overrides, tasks, algorithms, no_vectors, new=new, resolved=False)
+
+
+def left_out(source: Source, overrides: Overrides) -> list[str]:
+    """The options that `load_config` leaves out of a config because the overrides want another task than it has, which
+    gets its own default options. `source` and `overrides` as they were accepted by `load_config`."""
+    mapping = source if isinstance(source, Mapping) else read_yaml_file(os.fspath(source))[0]
+    return foreign_options(sort_keys(mapping)[0], parse_overrides(overrides)[0])
 
 
 def changed_config(
@@ -103,7 +111,10 @@ def _load(
     problems += more
     wanted, more = parse_overrides(overrides)
     problems += more
-    values = (without_followers(values, wanted) if resolved else values) | wanted
+    if resolved:
+        values = without_followers(values, wanted)
+    foreign = foreign_options(values, wanted)
+    values = {key: value for key, value in values.items() if key not in foreign} | wanted
 
     left_open = {key for key, ask in LEFT_OPEN.items() if _asks(values.get(key, ask), ask)}
     values = {key: value for key, value in values.items() if key not in left_open}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
@@ -13,7 +14,7 @@ from es_service.errors import ConfigError, WayOut
 from es_service.loop.budget import REACHED, limits_of, raised, spent
 from es_service.loop.history import Row
 from es_service.runs.view import Run
-from es_service.store.folder import CONFIG
+from es_service.store.folder import CONFIG, DATABASE
 from es_service.store.lock import lock_holder
 from es_service.store.reader import read_newest
 
@@ -38,6 +39,12 @@ class Standing:
         return spent(self.limits, self.row) if self.row else {}
 
 
+def newest_runs(folder: Path, most: int = 10) -> list[Path]:
+    """The runs right below a folder that were written last, the newest first; none if there is no such folder."""
+    written = {path.parent: path.stat().st_mtime for path in folder.glob(f"*/{DATABASE}")}
+    return sorted(written, key=lambda run: written[run], reverse=True)[:most]
+
+
 def look(run: Run) -> Standing:
     """Where a run stands now. Raises StoreError if it cannot be read."""
     driver = lock_holder(run.folder)  # asked before reading, so that the last row is not missed
@@ -45,7 +52,7 @@ def look(run: Run) -> Standing:
     try:
         return Standing(run, driver, row, limits_of(BudgetConfig.model_validate(run.present_config["budget"])))
     except ConfigError as error:
-        return Standing(run, driver, row, {}, " ".join(str(error).split()))
+        return Standing(run, driver, row, {}, " ".join(error.sentence.split()))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, ("budget", *first["loc"])))

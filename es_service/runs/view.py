@@ -17,8 +17,8 @@ from es_service.loop.parts import BEST, BLOCK_PREFIX, CELL_PREFIX, ELITE_PREFIX,
 from es_service.protocol.messages import PolicyShape
 from es_service.runs.moment import Moment, Policy, descriptor_names, make_policy, policy_shape
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
-from es_service.store import digest as run_digest
 from es_service.store import reader
+from es_service.store.digest import checked_parts, digest_of
 from es_service.store.folder import CONFIG
 from es_service.store.schema import RunMeta
 
@@ -151,8 +151,11 @@ class Run:
         return reader.read_generation(self.folder)
 
     def digest(self) -> str:
-        """SHA-256 over everything deterministic in the run."""
-        return run_digest.digest(self.folder)
+        """SHA-256 over everything deterministic in the run, after checking all that is stored.
+
+        Raises StoreError that names what is damaged, as the command does.
+        """
+        return digest_of(checked_parts(self.folder)[0])
 
     @property
     def policy_shape(self) -> PolicyShape:

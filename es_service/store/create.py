@@ -45,14 +45,11 @@ def create_run_folder(folder: Path, config_yaml: str, meta: RunMeta, beginning: 
 def _create(folder: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -> RunLock:
     _refuse_taken(folder)
     parent = folder.absolute().parent
-    if not parent.is_dir():
-        raise StoreError(
-            f"cannot create {folder}: its parent folder {parent} does not exist; create it first", run=folder
-        )
     # A folder that exists may be a mount point or somebody's working directory, which cannot be renamed over.
     beside = not folder.is_dir()
     place = parent / f".{folder.name}.creating" if beside else folder
     try:
+        parent.mkdir(parents=True, exist_ok=True)
         place.mkdir(exist_ok=True)
     except OSError as error:
         if is_disk_full(error, parent):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import pytest
 
 from es_service.config.changes import changed_constants, refused_changes
-from es_service.config.loading import changed_config
+from es_service.config.loading import changed_config, left_out, load_config
 from es_service.config.model import RunConfig
 from es_service.config.yaml_text import parse_value
 from es_service.errors import ConfigError
 from es_service.search.algorithms import ALGORITHMS
 from tests.es_service.config_examples import MINIMAL, TASKS, load
+from workers.environments import SHIPPED
 
 
 def test_constants_name_what_fixes_the_results():
@@ -48,6 +49,19 @@ def test_refused_changes_shows_all_and_the_ways_to_make_them():
     assert in_python.endswith(f": fork('runs/a', {fork.settings!r})")
     for key in ("search.centres", "search.preset", "map.cells", "task.environment", "task.options.descriptor"):
         assert [way.action for way in refused_changes("runs/a", [(key, "a", "b")]).ways_out] == ["run"]
+
+
+def test_another_task_has_its_own_default_options():
+    source = MINIMAL | {"task": {"environment": "point_maze", "options": {"start": "corner"}}}
+    other = {"tasks": SHIPPED, "algorithms": ALGORITHMS}
+    loaded = load_config(source, ["task.environment=ant_maze"], **other)
+    assert (loaded.task.environment, loaded.task.options) == ("ant_maze", {})
+    assert left_out(source, ["task.environment=ant_maze"]) == ["task.options.start"]
+    for same in ([], ["task.environment=point_maze"]):
+        assert load_config(source, same, **other).task.options == {"start": "corner"}
+        assert left_out(source, same) == []
+    with pytest.raises(ConfigError, match=r"task\.options\.start: unknown option; ant_maze has none"):
+        load_config(source, ["task.environment=ant_maze", "task.options.start=corner"], **other)
 
 
 def changed(*overrides: str, config: RunConfig | None = None) -> RunConfig:

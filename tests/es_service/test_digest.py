@@ -6,6 +6,7 @@ import sqlite3
 import numpy as np
 import pytest
 
+from es_service.api import open_run
 from es_service.errors import StoreError
 from es_service.store import schema as store_schema
 from es_service.store.codec import encode_part
@@ -170,6 +171,8 @@ def test_parts_and_total_are_of_one_moment_and_of_a_sound_run(folder):
     change(folder, "UPDATE history SET seconds_rollout = 1e9 WHERE generation = 3")  # which no digest would show
     with pytest.raises(StoreError, match=r"damaged: history row of generation 3 .*; .*\n.* resume\("):
         checked_parts(folder)
+    with pytest.raises(StoreError, match="damaged: history row of generation 3"):
+        open_run(folder).digest()
 
 
 def test_a_run_without_a_generation_has_a_digest(tmp_path):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 
 import pytest
 from rich.console import Console
@@ -83,6 +85,19 @@ def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, cap
         api.resume(run.folder, suggested[1::2]),
     ):
         assert (going_on.run.generation or 0) > before
+
+
+def test_without_a_folder_the_newest_runs_are_shown(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told = CliRunner().invoke(app, ["status"])
+    assert (told.exit_code, told.stdout) == (0, "")
+    for age, name in ((5, "old"), (1, "new")):
+        shutil.copytree(run.folder, tmp_path / "runs" / name)
+        os.utime(tmp_path / "runs" / name / "run.db", (1e9 - age, 1e9 - age))
+    shown = CliRunner().invoke(app, ["status"], env={"COLUMNS": "200"}).stdout.splitlines()
+    assert [line.split()[0] for line in shown] == ["run", "runs/new", "runs/old"]
+    refused = CliRunner().invoke(app, ["status", "--follow"])
+    assert "--follow: watches one run, got 0 folders" in str(refused.exception)
 
 
 def test_budgets_are_shown_beside_what_is_reached(run, console, capsys):

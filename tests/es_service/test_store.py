@@ -80,9 +80,12 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path):
         create(tmp_path / "thesis.tex")
 
 
-def test_a_missing_or_unwritable_parent_is_named(tmp_path):
-    with pytest.raises(StoreError, match=f"parent folder {tmp_path / 'no'} does not exist"):
-        create(tmp_path / "no" / "run")
+def test_missing_parents_are_made_and_those_that_cannot_be_are_named(tmp_path):
+    create(tmp_path / "a" / "b" / "run", generations=1).close()
+    assert read_generation(tmp_path / "a" / "b" / "run") == 0
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match=f"{tmp_path / 'file'}"):
+        create(tmp_path / "file" / "b" / "run")
     with tempfile.TemporaryDirectory() as parent:
         os.chmod(parent, 0o555)
         with without_root_rights(), pytest.raises(StoreError, match=f"Permission denied in {parent}"):

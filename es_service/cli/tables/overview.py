@@ -22,7 +22,7 @@ def print_overview(console: Console, folders: Sequence[Path]) -> bool:
         try:
             rows.append(_row(look(open_run(folder))))
         except ServiceError as error:
-            rows.append((str(folder), *["-"] * (len(_COLUMNS) - 2), f"error: {' '.join(str(error).split())}"))
+            rows.append((str(folder), *["-"] * (len(_COLUMNS) - 2), f"error: {' '.join(error.sentence.split())}"))
             problems += 1
     widths = [max(map(len, column)) for column in zip(_COLUMNS, *rows, strict=True)]
     for row in (_COLUMNS, *rows):
