@@ -23,7 +23,7 @@ from es_service.search.algorithms import OURS
 ROOT = Path(__file__).parents[2]
 BUDGET_S = {
     "README.md": 420,
-    "configs/README.md": 150,
+    "configs/README.md": 90,
     "docker/README.md": 10,
     "workers/README.md": 200,
     "tests/README.md": 10,
