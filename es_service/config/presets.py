@@ -1,4 +1,4 @@
-"""The keys on which the presets differ, in one table; the README prints it, the config loader reads it.
+"""The keys on which the presets differ, in one table; configs/README.md shows it, the config loader reads it.
 
 A preset fills in what a config leaves out. A key written in the config wins, and the run's own `config.yaml` records
 every value, so a later change of this table changes no existing run.

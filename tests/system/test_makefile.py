@@ -1,9 +1,12 @@
-"""The Makefile on a machine that lacks something."""
+"""The Makefile on a machine that lacks something, and the hooks that do what one of its targets does."""
 
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+import yaml
 
 MAKEFILE = Path(__file__).parents[2] / "Makefile"
 DEBIANS_PYTHON = f"""#!/bin/sh
@@ -32,3 +35,13 @@ def test_half_a_virtual_environment_is_not_taken_for_a_whole_one(tmp_path):
         assert "install python3-venv" in result.stdout
         assert "then again: make run" in result.stdout
         assert not (tmp_path / ".venv").exists()
+
+
+def test_commits_are_checked_by_what_make_lint_runs():
+    recipe = re.search(r"^lint:.*\n((?:\t.*\n)+)", MAKEFILE.read_text(), re.MULTILINE)
+    assert recipe is not None
+    commands = [line.strip().replace("$(BIN)", ".venv/bin") for line in recipe[1].splitlines()]
+    (local,) = yaml.safe_load((MAKEFILE.parent / ".pre-commit-config.yaml").read_text())["repos"]
+    assert local["repo"] == "local"
+    assert [hook["entry"] for hook in local["hooks"]] == commands
+    assert {hook["language"] for hook in local["hooks"]} == {"system"}

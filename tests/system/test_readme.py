@@ -1,66 +1,90 @@
-"""The README's commands and code, run in order as a reader would, and its tables held against the code."""
+"""The guides: their commands and code are run in order, as a reader would; their tables, links and names are held
+against the code and the files."""
+
+from __future__ import annotations
 
 import os
 import re
 import subprocess
 import sys
+import time
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from es_service.config.keys import FIELDS
 from es_service.config.presets import preset_table
+from es_service.config.resolution import LEFT_OPEN
 from es_service.config.yaml_text import show
+from es_service.search.algorithms import OURS
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text()
-MEASUREMENTS = (ROOT / "tests" / "benchmarks" / "README.md").read_text()
+BUDGET_S = {
+    "README.md": 420,
+    "configs/README.md": 90,
+    "docker/README.md": 10,
+    "workers/README.md": 200,
+    "tests/README.md": 10,
+    "tests/benchmarks/README.md": 150,
+    "CONTRIBUTING.md": 10,
+}
+"""Guide -> seconds that all its commands may take together, several times what they take on two idle cores."""
+LOOKED_AT = (*BUDGET_S, "CHANGELOG.md", "es_service/README.md", "workers/simd/README.md")
+"""Guides whose links and names are checked."""
+TEXT = {guide: (ROOT / guide).read_text() for guide in LOOKED_AT}
+LONGEST_README = 250
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", README + MEASUREMENTS, re.MULTILINE | re.DOTALL)
+def steps(guide: str) -> list[tuple[str, str]]:
+    """(language, text) of what a guide has its reader run: each line of a bash block, each Python block."""
+    found = []
+    for language, text in re.findall(r"^```(bash|python)\n(.*?)^```", TEXT[guide], re.MULTILINE | re.DOTALL):
+        found += [(language, line) for line in text.splitlines()] if language == "bash" else [(language, text)]
+    return found
 
 
-def between(name: str) -> str:
-    return README.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0].strip()
-
-
-COMMANDS = [line for block in blocks("bash") for line in block.splitlines()]
-SCRIPTS = blocks("python")
-ALL_OF_THEM = pytest.mark.timeout(3600)  # the first test that needs the reader waits for every command
+STEPS = [(guide, text) for guide in BUDGET_S for _, text in steps(guide)]
+ALL_OF_THEM = pytest.mark.timeout(3600)  # the first test that needs a guide's reader waits for all its commands
 
 
 @pytest.fixture(scope="module")
-def reader(tmp_path_factory):
-    """The folder in which everything was run in order, and what each command and script that failed has printed."""
-    folder, failed = tmp_path_factory.mktemp("reader"), {}
-    (folder / "configs").symlink_to(ROOT / "configs")
-    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
-    shell, python = ["sh", "-c"], [sys.executable, "-c"]
-    for text, program in [*((line, shell) for line in COMMANDS), *((code, python) for code in SCRIPTS)]:
-        limited = ["timeout", "--kill-after=10", "300", *program, text]  # ends what a command has started, too
-        result = subprocess.run(limited, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-        if result.returncode:
-            failed[text] = f"exit code {result.returncode}:\n{result.stdout}{result.stderr}"
-    return folder, failed
+def read(tmp_path_factory):
+    """Guide -> the folder in which everything in it was run in order, and what each step that failed has printed."""
+
+    @cache
+    def read(guide: str) -> tuple[Path, dict[str, str]]:
+        folder, failed = tmp_path_factory.mktemp("reader"), {}
+        (folder / "configs").symlink_to(ROOT / "configs")
+        path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+        environment = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT)}
+        programs = {"bash": ["sh", "-c"], "python": [sys.executable, "-c"]}
+        end = time.monotonic() + BUDGET_S[guide]
+        for language, text in steps(guide):
+            left = f"{max(1.0, end - time.monotonic()):.0f}"
+            limited = ["timeout", "--kill-after=10", left, *programs[language], text]  # ends what a step started, too
+            result = subprocess.run(limited, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+            if result.returncode:
+                late = f"; {guide} has {BUDGET_S[guide]} s for all its steps" if result.returncode == 124 else ""
+                failed[text] = f"exit code {result.returncode}{late}:\n{result.stdout}{result.stderr}"
+        return folder, failed
+
+    return read
 
 
 @ALL_OF_THEM
-@pytest.mark.parametrize("text", COMMANDS + SCRIPTS, ids=lambda text: text.splitlines()[0])
-def test_every_command_and_every_script_works(reader, text):
-    _, failed = reader
+@pytest.mark.parametrize(("guide", "text"), STEPS, ids=[f"{guide}: {text.splitlines()[0]}" for guide, text in STEPS])
+def test_every_command_and_every_script_works(read, guide, text):
+    _, failed = read(guide)
     assert text not in failed, failed[text]
 
 
-def test_every_important_command_is_shown():
-    assert {line.split()[1] for line in COMMANDS} >= {"run", "resume", "fork", "status", "digest", "list", "doctor"}
-
-
 @ALL_OF_THEM
-def test_exported_policies_replayed_by_the_readme_s_lines_return_what_the_run_says(reader, monkeypatch):
+def test_exported_policies_replayed_by_a_guide_s_lines_return_what_the_run_says(read, monkeypatch):
     """From the corner, so that there is no luck in an episode: but for last bits, which 200 steps add up."""
-    folder, failed = reader
-    (code,) = [script for script in SCRIPTS if "policies.npz" in script]
+    ((guide, code),) = [(guide, text) for guide, text in STEPS if "np.load" in text]
+    folder, failed = read(guide)
     assert code not in failed, failed[code]
     monkeypatch.chdir(folder)
     names: dict = {}
@@ -70,19 +94,74 @@ def test_exported_policies_replayed_by_the_readme_s_lines_return_what_the_run_sa
     names["file"].close()
 
 
+def test_the_readme_shows_every_important_command_and_is_short():
+    shown = {text.split()[1] for guide, text in STEPS if guide == "README.md"}
+    assert shown >= {"run", "resume", "fork", "status", "evaluate", "export", "digest", "list", "doctor"}
+    assert len(TEXT["README.md"].splitlines()) <= LONGEST_README
+
+
 def test_make_targets_exist():
     makefile = (ROOT / "Makefile").read_text()
-    for target in re.findall(r"^make (\w+)", README, re.MULTILINE):
-        assert re.search(rf"^{target}:", makefile, re.MULTILINE)
+    named = {target for text in TEXT.values() for target in re.findall(r"(?:^|`)make (\w+)", text, re.MULTILINE)}
+    assert named >= {"run", "test"}
+    for target in named:
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
     assert "make test" in (ROOT / ".ci" / "run").read_text()
 
 
 def test_preset_table_is_the_code_s():
+    shown = TEXT["configs/README.md"].split("<!-- presets -->")[1].split("<!-- /presets -->")[0].strip()
     rows = [f"| `{row.key}` | {show(row.literature)} | {show(row.uber)} |" for row in preset_table()]
-    assert between("presets").splitlines()[2:] == rows
+    assert shown.splitlines()[2:] == rows
 
 
-def test_files_it_names_exist():
-    for text, place in ((README, ROOT), (MEASUREMENTS, ROOT / "tests" / "benchmarks")):
-        for path in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
-            assert (place / path).exists(), path
+def default(key: str) -> str:
+    """A key's default as the guide writes it."""
+    by_preset = {row.key: f"{show(row.literature)} / {show(row.uber)}" for row in preset_table()}
+    if key in by_preset:
+        return by_preset[key]
+    if key in LEFT_OPEN:
+        return show(LEFT_OPEN[key])
+    if FIELDS[key].is_required():
+        return "required"
+    return show(FIELDS[key].get_default(call_default_factory=True))
+
+
+def test_every_key_of_a_config_is_explained_with_its_default():
+    tables = TEXT["configs/README.md"].split("\n## Every key\n")[1].split("\n## ")[0]
+    shown = re.findall(r"^\| `([\w.]+)` \| (.+?) \| \S.* \|$", tables, re.MULTILINE)
+    assert len(shown) == len(dict(shown))
+    options = {"task.options.NAME": "the first value"}
+    assert dict(shown) == {key: default(key) for key in FIELDS} | options
+
+
+@pytest.mark.parametrize("name", [*OURS, "module:function"])
+def test_every_method_has_its_section(name):
+    assert re.search(rf"^### .*`{name}`$", TEXT["configs/README.md"], re.MULTILINE)
+
+
+def test_every_shipped_config_is_named():
+    for path in (ROOT / "configs").glob("*.yaml"):
+        assert f"]({path.name})" in TEXT["configs/README.md"], path.name
+
+
+def anchors(text: str) -> set[str]:
+    """What links into a guide may name: its headings in lower case, hyphens for spaces, without punctuation."""
+    headings = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("guide", LOOKED_AT)
+def test_links_lead_somewhere(guide):
+    for path, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", TEXT[guide]):
+        target = (ROOT / guide).parent / path if path else ROOT / guide
+        assert target.exists(), path
+        assert not anchor or anchor in anchors(target.read_text()), f"{path}#{anchor}"
+
+
+@pytest.mark.parametrize("guide", LOOKED_AT)
+def test_files_it_names_exist(guide):
+    """Named from the top of the repository, or from the guide's own folder."""
+    for path in re.findall(r"(?<![\w/.])(?:es_service|workers|configs|tests|docker)/[\w./*-]+", TEXT[guide]):
+        path = path.rstrip("./")
+        assert any([*ROOT.glob(path), *(ROOT / guide).parent.glob(path)]), path

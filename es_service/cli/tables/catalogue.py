@@ -20,7 +20,7 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
     for task in known_tasks.values():
         tasks.add_row(task.name, _about(task))
     tasks.add_row("brax:NAME", "any environment of the installed Brax")
-    tasks.add_row("module:Class", "one of your own; the README says what it has to have")
+    tasks.add_row("module:Class", "one of your own; workers/README.md says what it has to have")
     console.print(tasks)
 
     algorithms = _table("algorithms (search.algorithm)")
