@@ -27,6 +27,7 @@ from es_service.loop.generation import (
     invalidate,
     make_centre,
     require_finite,
+    require_some_finite,
     steps_of,
 )
 from es_service.loop.history import (
@@ -147,6 +148,7 @@ def _first_generation(
     episodes = config.search.evaluation_episodes
     evaluations = [evaluate_centre(evaluator, point, episodes, index) for index, point in enumerate(points)]
     clock.lap("seconds_evaluation")
+    require_some_finite(evaluations, config.task.environment)
     fittest = 0
     best = Best(0, -math.inf, centres[0], points[0].observation_mean_O, points[0].observation_std_O)
     elites: dict[int, Elite] = {}

@@ -111,6 +111,26 @@ def invalidate(population: EpisodesResult, max_invalid_fraction: float, generati
     return replace(population, fitness=fitness_P_S), invalid
 
 
+def require_some_finite(evaluations: Sequence[EpisodesResult], environment: str) -> None:
+    """Raise an EvaluationError where no episode of any initial centre is valid: the task is wrong, not the policy."""
+    count = sum(evaluation.fitness.size for evaluation in evaluations)
+    if any(valid_members(evaluation).any() for evaluation in evaluations):
+        return
+    finite = {
+        "return": any(np.isfinite(evaluation.returns).any() for evaluation in evaluations),
+        "descriptor": any(np.isfinite(evaluation.descriptor).any() for evaluation in evaluations),
+    }
+    wrong = " and ".join(name for name, is_finite in finite.items() if not is_finite) or "fitness or descriptor"
+    steps = min(int(evaluation.steps.min()) for evaluation in evaluations)
+    raise EvaluationError(
+        f"generation 0: the {wrong} is NaN or infinite in each of the {count} episodes of the initial policies, the "
+        f"shortest of which has {steps} steps. Nothing can be learned from it: look for a division by 0, a root or "
+        f"logarithm of a negative number, or physics that diverges, in the task {environment}",
+        field="task.environment",
+        value=environment,
+    )
+
+
 def require_finite(centre_D: FloatArray, learning_rate: float, generation: int) -> None:
     """Raise an EvaluationError for a centre that an update has made infinite."""
     if not np.isfinite(centre_D).all():
@@ -129,6 +149,7 @@ def require_finite(centre_D: FloatArray, learning_rate: float, generation: int) 
         )
 
 
+@np.errstate(invalid="ignore", over="ignore")  # an infinite fitness makes the centre invalid, which is told
 def centre_evaluation(
     generation: int, centre: int, evaluation: EpisodesResult, population: EpisodesResult | None = None
 ) -> CentreEvaluation:

@@ -115,6 +115,7 @@ def step_columns(old_D: FloatArray | None, new_D: FloatArray) -> HistoryRow:
     return {"update_norm": None if old_D is None else _norm(new_D - old_D), "parameter_norm": _norm(new_D)}
 
 
+@np.errstate(invalid="ignore", over="ignore")
 def population_columns(population: EpisodesResult | None, invalid_members: int) -> HistoryRow:
     """Quartiles of the valid members' fitness and return; None for generation 0, which has no population."""
     columns: HistoryRow = {"invalid_members": invalid_members}
@@ -130,6 +131,7 @@ def population_columns(population: EpisodesResult | None, invalid_members: int) 
     return columns
 
 
+@np.errstate(invalid="ignore", over="ignore")  # of infinite values there is no deviation: NaN says so
 def evaluation_columns(evaluation: EpisodesResult, task: TaskSpec) -> HistoryRow:
     """What the new centre's evaluation episodes say: fitness, return, where they end, how near the goal."""
     mean_B = evaluation.descriptor.mean(axis=0, dtype=np.float64).tolist()

@@ -203,13 +203,45 @@ def test_a_centre_that_is_not_finite_stops_the_run_before_it_is_kept():
 def test_an_invalid_centre_is_never_the_best():
     def spoil(chunk, result):
         if type(chunk).__name__ == "EvaluationChunk" and chunk.generation != 4:
-            return dataclasses.replace(result, fitness=result.fitness * np.nan)
+            spoilt = slice(1) if chunk.generation == 0 else slice(None)  # one episode is enough
+            result.fitness[spoilt] = np.nan
         return result
 
     config = small_config()
     state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config, SHIPPED["point_maze"]), spoil))
     assert state.best.generation == 4
     assert store.rows[3]["best_fitness"] == -np.inf
+
+
+@pytest.mark.parametrize(("name", "value"), [("return", np.nan), ("return", -np.inf), ("descriptor", np.inf)])
+def test_a_task_that_gives_no_finite_number_is_told_before_anything_is_kept(name, value):
+    def spoil(chunk, result):
+        if name == "return":
+            return dataclasses.replace(result, fitness=result.fitness + value, returns=result.returns + value)
+        return dataclasses.replace(result, descriptor=result.descriptor + value)
+
+    config, store = small_config(), MemoryStore()
+    evaluator = Tampering(worker_spec(config, SHIPPED["point_maze"]), spoil)
+    first = initial_parameters(SHAPE, config.policy.init, config.seed)
+    initial = lambda: ([first], no_observations(2))  # noqa: E731
+    search = driver.Search(config, ALGORITHMS["es"](config), initial, SHIPPED["point_maze"])
+    with pytest.raises(EvaluationError, match=f"the {name} is NaN or infinite in each of the 20 episodes") as error:
+        driver.run(search, evaluator, store, None, lambda row: None)
+    assert (error.value.field, error.value.value) == ("task.environment", "point_maze")
+    assert store.generation is None
+
+
+def test_an_infinite_fitness_gives_no_warning():
+    """Warnings are errors in tests."""
+
+    def spoil(chunk, result):
+        result.fitness[1], result.returns[1] = np.inf, np.inf
+        return result
+
+    config = small_config()
+    state, store, _, _ = run_in_memory(config, Tampering(worker_spec(config, SHIPPED["point_maze"]), spoil))
+    assert (state.generation, state.best.fitness) == (20, -np.inf)
+    assert np.isnan(store.rows[5]["centre_fitness_std"])
 
 
 class Inventing:
