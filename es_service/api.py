@@ -190,7 +190,8 @@ def fork(
     The history up to there comes along and generations count on, so a fork that changes nothing ends with the same
     bits as its parent would. Where a setting changes what an evaluation means, of the task or of how observations are
     normalised, no fitness seen so far counts any more: the best centre, nsra_es's record and the map begin anew; the
-    weight of fitness stays as it is. A generation's number alone says what me_es does in it, so that other blocks
+    weight of fitness stays as it is. From one of ns_es, nsr_es and nsra_es a fork may go to another, whose weight of
+    fitness then begins anew. A generation's number alone says what me_es does in it, so that other blocks
     (`search.block_generations`, `mode`, `first_block`, `alternation`) count at once, also in the middle of one.
 
     Raises:

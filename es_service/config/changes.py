@@ -22,6 +22,9 @@ STATE_KEYS = (
     "map.cells",
 )
 """What the form and meaning of a run's state depend on: with another value no state of an earlier run can be used."""
+ALIKE = ("ns_es", "nsr_es", "nsra_es")
+"""Searches with the same state: a fork may go from one to another. Only the weight of fitness, which then begins anew,
+tells them apart."""
 START_KEYS = ("search.preset", "search.init_from", "policy.init", "search.fitness_weight_start")
 """What is used where a run starts and never again."""
 _SHAPES = ("compute.chunk_pairs", "compute.rollout_block_pairs", "compute.gradient_block_pairs")
@@ -44,9 +47,23 @@ ABSENT = "(absent)"
 
 def without_followers(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
     """Resolved values without those that follow from one that is about to be another."""
-    changed = [key for key in _FOLLOWERS if key in wanted and wanted[key] != values.get(key)]
+    changed = [
+        key
+        for key in _FOLLOWERS
+        if key in wanted and wanted[key] != values.get(key) and not are_alike(key, values.get(key), wanted[key])
+    ]
     followers = tuple(name for key in changed for name in _FOLLOWERS[key])
     return {key: value for key, value in values.items() if not key.startswith(followers)}
+
+
+def are_alike(name: str, old: Any, new: Any) -> bool:
+    """Whether a change of a key leaves the state what it is although its key says otherwise."""
+    return name == "search.algorithm" and old in ALIKE and new in ALIKE
+
+
+def does_not_fit(name: str, old: Any, new: Any) -> bool:
+    """Whether no state of a run with the old value of a key can be used with the new one."""
+    return name in STATE_KEYS and not are_alike(name, old, new)
 
 
 def foreign_options(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
@@ -75,7 +92,7 @@ def refused_changes(
         run: folder of the run.
         besides: keys that a fork has to set as well, and their values.
     """
-    fixed = [name for name, _, _ in changes if name in (*STATE_KEYS, *START_KEYS)]
+    fixed = [name for name, old, new in changes if does_not_fit(name, old, new) or name in START_KEYS]
     forkable = {name: new for name, _, new in changes if name not in fixed and new != ABSENT}
     problems = [Problem(f"{name}: {show(old)} -> {show(new)}", name, new, show(old), old) for name, old, new in changes]
     heading = (

@@ -143,7 +143,9 @@ class SearchConfig(Section):
         0.5, description="Share of members with a non-finite fitness or descriptor above which the run stops."
     )
     init_from: Text | None = Field(
-        None, description="Folder of another run whose centre this one starts from; null for a random centre."
+        None,
+        description="Policy of another run that this one starts from: RUN, its folder, for the centre updated last, "
+        "RUN:best, or RUN:3,17 for a cell's elite; null for random weights.",
     )
 
 

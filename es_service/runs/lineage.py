@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from es_service.config.changes import START_KEYS, STATE_KEYS, changed_constants, start_afresh
+from es_service.config.changes import START_KEYS, changed_constants, does_not_fit, start_afresh
 from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.model import RunConfig, policy_shape
+from es_service.config.resolution import start_of
 from es_service.config.tasks import task_of
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, Problem
@@ -31,6 +32,7 @@ from es_service.loop.parts import (
 from es_service.protocol.messages import Moments
 from es_service.runs.checked_config import changed_config
 from es_service.runs.view import Run, is_no_elite, open_run
+from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import NO_CELL, FitnessWeight
 from es_service.search.observation_statistics import no_observations
 from es_service.store import reader
@@ -57,7 +59,8 @@ def fork_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> Ru
     if not isinstance(overrides, str | Mapping):
         overrides = list(overrides)  # it is gone through twice
     wanted = parse_overrides(overrides)[0]
-    if idle := [key for key in START_KEYS if key in wanted]:
+    started = {"search.fitness_weight_start"} if "search.algorithm" in wanted else set()
+    if idle := [key for key in START_KEYS if key in wanted and key not in started]:
         raise _refused(
             origin,
             "a fork has its state and all its settings, so these would change nothing",
@@ -68,7 +71,7 @@ def fork_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> Ru
     mapping = present | {"search": present["search"] | {"init_from": None}}  # it has the parent's state instead
     config = changed_config(mapping, overrides)
     changes = changed_constants(origin.constants, config.constants())
-    unfit = [_unfit(name, old, new, name) for name, old, new in changes if name in STATE_KEYS]
+    unfit = [_unfit(name, old, new, name) for name, old, new in changes if does_not_fit(name, old, new)]
     names = task_of(config).descriptor_names
     if not unfit and list(names) != origin.descriptor_names:  # a task of the user's that is not what it was
         what = f"the descriptor of {config.task.environment}"
@@ -103,6 +106,9 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
         parts = _without_fitness(parts)
     elif changed.intersection(LUCK):
         parts = _without_scores(parts)
+    if "search.algorithm" in changed:
+        weight = FitnessWeight(ALGORITHMS[config.search.algorithm](config).fitness_weight)
+        parts = {**parts, WEIGHT: weight_to_arrays(weight)}
     if "search.parent_statistics" in changed and config.search.parent_statistics == "global":
         parts = _without_own_statistics(parts)
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
@@ -141,38 +147,49 @@ def _without_own_statistics(parts: Mapping[str, Part]) -> dict[str, Part]:
     return {name: {key: values for key, values in part.items() if key not in own} for name, part in parts.items()}
 
 
-def started(config: RunConfig, folder: str, tell: Callable[[str], None]) -> tuple[dict[str, Any], Beginning]:
-    """What a run that starts from the newest centre of the run in `folder` records of that, and begins with.
+def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> tuple[dict[str, Any], Beginning]:
+    """What a run that starts from a policy of another run records of that, and begins with: from its newest centre, its
+    best one, or the elite of a cell, with the statistics that it runs with.
 
     Args:
+        init_from: RUN, RUN:best or RUN:3,17.
         tell: called with a notice where the policy will see other observations than it did.
 
     Raises:
-        ConfigError: the centre is of another network.
+        ConfigError: the policy is of another network. NotInRunError: there is no such cell, or nothing in it.
     """
+    folder, which = start_of(init_from)
     origin, shape = open_run(folder), policy_shape(config, task_of(config))
     if origin.policy_shape != shape:
         raise ConfigError(
             f"search.init_from: the policy of {origin.folder} has layers {list(origin.policy_shape.widths)}, "
             f"this run's has {list(shape.widths)}; use the same task and policy.hidden",
             field="search.init_from",
-            value=folder,
+            value=init_from,
             run=origin.folder,
         )
     moment = origin.at(wanted=is_no_elite)
-    centre, moments = moment.newest_centre, moments_from_arrays(moment.parts[OBSERVATIONS])
+    moments, own = moments_from_arrays(moment.parts[OBSERVATIONS]), None
+    if which == "centre":
+        centre = moment.newest_centre
+        centre_D = centre.centre_D
+        if centre.own_mean_O is not None and centre.own_std_O is not None:
+            own = centre.own_mean_O, centre.own_std_O
+    else:
+        kept = moment.best if isinstance(which, str) else origin.elite(which)
+        centre_D, own = kept.centre_D, (kept.observation_mean_O, kept.observation_std_O)
     if not origin.constants[NORMALISED]:
         moments = no_observations(shape.widths[0])  # its policy was never given any, though they were gathered
-    elif centre.own_mean_O is not None and centre.own_std_O is not None:
+    elif own is not None:
         # Those that its policy runs with, as if that many observations had given them.
-        mean_O, std_O = centre.own_mean_O.astype(np.float64), centre.own_std_O.astype(np.float64)
+        mean_O, std_O = (values.astype(np.float64) for values in own)
         moments = Moments(moments.count, mean_O, moments.count * np.square(std_O))
     if other := _seen_otherwise(origin, config):
         tell(
             f"search.init_from: the policy of {origin.folder} acted on other observations than this run gives it "
             f"({other}), so it may act otherwise from generation 0 on"
         )
-    start = {"centre_D": centre.centre_D, **moments_to_arrays(moments)}
+    start = {"centre_D": centre_D, **moments_to_arrays(moments)}
     return _lineage(origin, moment.generation), Beginning(start=start)
 
 

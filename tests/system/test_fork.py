@@ -18,7 +18,7 @@ from es_service import api, open_run
 from es_service.cli.commands import error_message
 from es_service.config import tasks
 from es_service.config.changes import START_KEYS, start_afresh
-from es_service.errors import ConfigError
+from es_service.errors import ConfigError, NotInRunError
 from es_service.loop.parts import CELL_PREFIX
 from es_service.runs import checked_config, evaluation, lineage
 from es_service.runs.session import dispatch_limits
@@ -54,6 +54,30 @@ def test_a_record_of_another_fitness_does_not_hold_the_weight_down(tmp_path):
     assert before["value"] < 1.0
     assert after["record"] == history["centre_fitness_mean"].iloc[7:].max() < before["record"]
     assert history["fitness_weight"].iloc[7] == before["value"] < history["fitness_weight"].iloc[8]
+
+
+@pytest.mark.parametrize(("algorithm", "weight"), [("ns_es", 0.0), ("nsr_es", 0.5), ("nsra_es", 0.75)])
+def test_searches_with_the_same_state_may_follow_one_another(tmp_path, algorithm, weight):
+    other = "nsra_es" if algorithm == "nsr_es" else "nsr_es"
+    settings = ["search.centres=3", "budget.generations=4"]
+    parent = api.run(api.load_config(SMALL, [f"search.algorithm={other}", *settings]), tmp_path / "parent").run
+    wanted = [f"search.algorithm={algorithm}", "budget.generations=6"]
+    wanted += ["search.fitness_weight_start=0.75"] if algorithm == "nsra_es" else []
+    child = api.fork(parent.folder, wanted, out=tmp_path / "child").run
+    assert child.constants["search.centres"] == 3
+    rows = child.history
+    for column in ("env_steps", "centre_fitness_mean", "fitness_weight"):
+        assert rows.loc[:4, column].tolist() == parent.history[column].tolist()
+    assert rows.loc[5, "fitness_weight"] == weight
+    assert rows.loc[5, "archive_size"] == rows.loc[4, "archive_size"] + 1
+    before, after = parent.parts()[1], child.parts(5)[1]
+    moved = int(rows.loc[5, "centre"])
+    for index in {0, 1, 2} - {moved}:
+        assert (after[f"centre_{index}"]["centre_D"] == before[f"centre_{index}"]["centre_D"]).all()
+    with pytest.raises(ConfigError) as refused:
+        api.resume(parent.folder, [f"search.algorithm={algorithm}"])
+    assert refused.value.way_out is not None
+    assert refused.value.way_out.settings["search.algorithm"] == algorithm
 
 
 @pytest.mark.parametrize(
@@ -288,6 +312,33 @@ def test_init_from_starts_at_the_other_run_s_centre(config, finished, tmp_path):
     assert code == 2
     assert "has layers [2, 8, 2], this run's has [2, 16, 2]" in printed
     assert not (tmp_path / "s").exists()
+
+
+def test_init_from_the_best_centre_or_a_cell_s_elite(tmp_path):
+    """With the statistics that each was evaluated with; and `RUN` alone is still the centre updated last."""
+    mapping = SMALL | {"map": {"enabled": True, "cells": [4, 4]}, "budget": {"generations": 5}}
+    origin = api.run(mapping, tmp_path / "origin").run
+    place = tuple(origin.map[[name for name in origin.map if name.startswith("cell_")]].iloc[-1])
+    for which, wanted in (("best", "best"), (",".join(map(str, place)), place)):
+        setting = {"search.init_from": f"{origin.folder}:{which}", "budget.generations": 1}
+        child = api.run(api.load_config(mapping, setting), tmp_path / f"from_{which}").run
+        policy, parts = origin.policy(wanted), child.parts()[1]
+        kept = api.run(api.load_config(mapping, setting | {"budget.generations": None, "budget.target_fitness": -1e9}),
+                       tmp_path / f"at_{which}").run.parts()[1]  # fmt: skip
+        for index in range(child.constants["search.centres"]):
+            assert (kept[f"centre_{index}"]["centre_D"] == policy.parameters_D).all()
+        observed = kept["observations"]
+        if observed["count"]:
+            np.testing.assert_array_equal(observed["mean_O"].astype(np.float32), policy.observation_mean_O)
+            std_O = np.sqrt(observed["m2_O"] / observed["count"])
+            np.testing.assert_allclose(std_O, policy.observation_std_O, rtol=1e-6)
+        assert child.config["search"]["init_from"] == f"{origin.folder}:{which}"
+        assert parts["best"]["generation"] in (0, 1)
+    with pytest.raises(NotInRunError, match="cell 9,9 is not in the map"):
+        api.run(api.load_config(mapping, {"search.init_from": f"{origin.folder}:9,9"}), tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+    with pytest.raises(ConfigError, match=r"no_run does not exist; must be the folder of another run"):
+        api.load_config(mapping, {"search.init_from": f"{tmp_path}/no_run:best"})
 
 
 def test_init_from_keeps_what_it_started_from(config, finished, tmp_path):
