@@ -47,7 +47,7 @@ def normalise(xp: Any, observation_O: Any, mean_O: Any, std_O: Any, clip: float 
     return x if clip is None else xp.clip(x, np.float32(-clip), np.float32(clip))
 
 
-def initial_parameters(shape: PolicyShape, init: str, seed: int, member: int = 0) -> FloatArray:
+def initial_parameters(shape: PolicyShape, init: str, seed: int, centre: int = 0) -> FloatArray:
     """First centre of a member: Gaussian weights scaled so that each output's column of weights has a set norm.
 
     Args:
@@ -55,7 +55,7 @@ def initial_parameters(shape: PolicyShape, init: str, seed: int, member: int = 0
         member: members of one run start from different streams.
     """
     hidden_norm, output_norm = INITIAL_COLUMN_NORMS[init]
-    key = stream_keys(seed, Domain.INITIALISATION, 0, member)
+    key = stream_keys(seed, Domain.INITIALISATION, 0, centre)
     parameters_D = normals(key, shape.parameters)
     for layer, (weights, biases) in enumerate(split_layers(shape, parameters_D)):
         norm = output_norm if layer == len(shape.layers) - 1 else hidden_norm

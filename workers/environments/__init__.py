@@ -97,10 +97,10 @@ def make_environment(name: str, options: Mapping[str, str]) -> Environment:
     Args:
         name: one of SHIPPED, `brax:NAME`, or `package.module:Class`. Raises TaskError if that cannot be had.
     """
-    kind, colon, rest = name.partition(":")
+    prefix, colon, rest = name.partition(":")
     if not colon:
         return importlib.import_module(f"workers.environments.{name}").make(**options)
-    if kind == "brax":
+    if prefix == "brax":
         from workers.environments import brax_task
 
         return brax_task.make(rest, **options)
@@ -114,8 +114,8 @@ def describe_environment(name: str) -> TaskSpec:
 
     Imports JAX. Raises TaskError as `make_environment`.
     """
-    kind, _, rest = name.partition(":")
-    if kind == "brax":
+    prefix, _, rest = name.partition(":")
+    if prefix == "brax":
         from workers.environments import brax_task
 
         return brax_task.describe(rest)

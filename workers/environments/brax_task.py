@@ -143,18 +143,18 @@ def _descriptors(system: Any) -> dict[str, tuple[tuple[str, ...], Bounds]]:
 
 def _root_coordinates(system: Any) -> int:
     """How many of the first coordinates say where a base is that moves about, and are no joints; 0 if it stays."""
-    kind = system.link_types[0]
-    if kind == "f":
+    link_type = system.link_types[0]
+    if link_type == "f":
         return 7  # place and quaternion
-    return int(kind) if np.asarray(system.dof.motion.vel)[: int(kind), 0].any() else 0
+    return int(link_type) if np.asarray(system.dof.motion.vel)[: int(link_type), 0].any() else 0
 
 
 def _feet(system: Any) -> list[int]:
     """Links without children of which a part can touch the floor, in the order of the model."""
     links = range(system.num_links())
     leaves = [link for link in links if link not in system.link_parents]
-    bodies, kinds = np.asarray(system.geom_bodyid), np.asarray(system.geom_contype)
-    touchable = set((bodies[(kinds | np.asarray(system.geom_conaffinity)) != 0] - 1).tolist())
+    bodies, contact_types = np.asarray(system.geom_bodyid), np.asarray(system.geom_contype)
+    touchable = set((bodies[(contact_types | np.asarray(system.geom_conaffinity)) != 0] - 1).tolist())
     has_floor = -1 in touchable
     return [link for link in leaves if has_floor and link in touchable]
 

@@ -69,9 +69,9 @@ def describe(path: str) -> TaskSpec:
     if missing:
         raise TaskError(f"{path} has no {', '.join(missing)}; workers/environments/user_task.py says what is needed")
     wrong = [
-        f"{name} = {getattr(task, name)!r} is no {kind.__name__}"
-        for name, kind in ATTRIBUTES.items()
-        if not isinstance(getattr(task, name), kind)
+        f"{name} = {getattr(task, name)!r} is no {type_.__name__}"
+        for name, type_ in ATTRIBUTES.items()
+        if not isinstance(getattr(task, name), type_)
     ]
     options = getattr(task, "options", {})
     for name, values in options.items() if isinstance(options, dict) else [("options", options)]:
@@ -91,7 +91,7 @@ def describe(path: str) -> TaskSpec:
             "least_reward": 0.0 if least is None else least,
         }
         wrong += [f"{name} = {x!r} is no finite number" for name, x in numbers.items() if not _are_finite((x,))]
-        sizes = {name: getattr(task, name) for name, kind in ATTRIBUTES.items() if kind is int}
+        sizes = {name: getattr(task, name) for name, type_ in ATTRIBUTES.items() if type_ is int}
         wrong += [f"{name} = {size} is not positive" for name, size in sizes.items() if size < 1]
     if wrong:
         raise TaskError(f"{path}: {'; '.join(wrong)}")
@@ -169,8 +169,8 @@ def _check_shapes(path: str) -> None:
     except Exception as error:  # the user's code can raise anything
         raise TaskError(f"{path} cannot be traced: {type(error).__name__}: {error}") from error
     wrong = [f"{what} has the shape {is_}, not {should}" for what, (is_, should) in found.items() if is_ != should]
-    kinds = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), one) for one in (state, after)]
-    if jax.tree.structure(state) != jax.tree.structure(after) or kinds[0] != kinds[1]:
+    arrays = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), one) for one in (state, after)]
+    if jax.tree.structure(state) != jax.tree.structure(after) or arrays[0] != arrays[1]:
         wrong.append(f"step returns a state of other arrays than reset: {after} after {state}")
     if wrong:
         raise TaskError(f"{path}: {'; '.join(wrong)}")

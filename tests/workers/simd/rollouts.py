@@ -1,4 +1,4 @@
-"""What tests of whole episodes begin with: processors, tasks, arguments; and an episode of each kind."""
+"""What tests of whole episodes begin with: processors, tasks, arguments; and an episode of each isa."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from workers.simd.episodes import rollout
 def targets() -> list[Any]:
     """Of this processor, the widest first."""
     found = []
-    for kind in WIDTHS:
+    for isa in WIDTHS:
         try:
-            found.append(host_target(kind))
+            found.append(host_target(isa))
         except NoVectorsError:
             continue
     return found
 
 
-def kinds() -> list[str]:
+def isas() -> list[str]:
     """Of code that this machine runs."""
-    return [target.kind for target in targets()]
+    return [target.isa for target in targets()]
 
 
 def task_spec(task: str, **changes: Any) -> WorkerSpec:

@@ -20,7 +20,7 @@ class NoVectorsError(Exception):
 class Target:
     """What code is made for."""
 
-    kind: str
+    isa: str
     """A key of WIDTHS."""
     cpu: str
     features: str
@@ -29,12 +29,12 @@ class Target:
     @property
     def width(self) -> int:
         """Lanes of a vector."""
-        return WIDTHS[self.kind]
+        return WIDTHS[self.isa]
 
     def describe(self) -> str:
         """For people: `znver5, AVX-512, 16 lanes`."""
         names = {"avx512": "AVX-512", "avx2": "AVX2", "four": "AVX2 on half vectors"}
-        return f"{self.cpu}, {names[self.kind]}, {self.width} lanes"
+        return f"{self.cpu}, {names[self.isa]}, {self.width} lanes"
 
 
 @cache
@@ -44,7 +44,7 @@ def _host() -> tuple[str, dict[str, bool]]:
     return llvm.get_host_cpu_name(), dict(llvm.get_host_cpu_features())
 
 
-def host_target(kind: str | None = None) -> Target:
+def host_target(isa: str | None = None) -> Target:
     """The widest this machine has, or a narrower kind.
 
     Raises:
@@ -57,12 +57,12 @@ def host_target(kind: str | None = None) -> Target:
             f"the processor ({cpu}) has no {' and no '.join(name.upper() for name in lacks)}, which simd needs"
         )
     has_512 = all(features.get(name) for name in ("avx512f", "avx512dq", "avx512vl", "avx512bw"))
-    if kind is None:
-        kind = "avx512" if has_512 else "avx2"
-    if kind == "avx512" and not has_512:
+    if isa is None:
+        isa = "avx512" if has_512 else "avx2"
+    if isa == "avx512" and not has_512:
         raise NoVectorsError(f"the processor ({cpu}) has no AVX-512")
-    wanted = {name: on and (kind == "avx512" or not name.startswith("avx512")) for name, on in features.items()}
-    return Target(kind, cpu, ",".join(f"{'+' if on else '-'}{name}" for name, on in sorted(wanted.items())))
+    wanted = {name: on and (isa == "avx512" or not name.startswith("avx512")) for name, on in features.items()}
+    return Target(isa, cpu, ",".join(f"{'+' if on else '-'}{name}" for name, on in sorted(wanted.items())))
 
 
 def machine(target: Target) -> llvm.TargetMachine:

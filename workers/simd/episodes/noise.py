@@ -8,8 +8,8 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, normal_integers
-from workers.simd.backend.code import Code, Values, module
 from workers.simd.backend.emit import inline
+from workers.simd.backend.function_builder import FunctionBuilder, Values, module
 from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
 
@@ -29,73 +29,73 @@ def definition() -> str:
     return f"{jaxpr_digest(_jaxpr())} {NORMAL_STD}"
 
 
-def noise_of(code: Code, key: Values, coordinate: str, *, halved: bool) -> str:
+def noise_of(builder: FunctionBuilder, key: Values, coordinate: str, *, halved: bool) -> str:
     """k of vectors of key words and coordinates, as integers; or j, where k = 2 j + 1."""
     graph, _, (output,) = trace_jaxpr(_jaxpr())
     if halved:
         output = graph.op("ashr", graph.op("isub", output, graph.i(1)), graph.i(1))
     given = {graph.input("i", place): name for place, name in enumerate([*key, coordinate])}
-    return inline(code, graph, [output], given)[0]
+    return inline(builder, graph, [output], given)[0]
 
 
-def load_key(code: Code, keys: str, pair: str) -> Values:
+def load_key(builder: FunctionBuilder, keys: str, pair: str) -> Values:
     """The words of key number `pair`, each in all lanes."""
-    words = [code.load("i32", keys, code.index((pair, KEY_WORDS), (word, 1))) for word in range(KEY_WORDS)]
-    return [code.splat(word, "i") for word in words]
+    words = [builder.load("i32", keys, builder.index((pair, KEY_WORDS), (word, 1))) for word in range(KEY_WORDS)]
+    return [builder.splat(word, "i") for word in words]
 
 
-def keys_of_members(code: Code, keys: str) -> Values:
+def keys_of_members(builder: FunctionBuilder, keys: str) -> Values:
     """The words of the keys of as many members as there are lanes, neighbours having that of their pair."""
     words = []
     for word in range(KEY_WORDS):
         vector = "poison"
-        for lane in range(code.width):
-            one = code.load("i32", keys, lane // 2 * KEY_WORDS + word)
-            vector = code.value(f"insertelement {code.vector['i']} {vector}, i32 {one}, i64 {lane}")
+        for lane in range(builder.width):
+            one = builder.load("i32", keys, lane // 2 * KEY_WORDS + word)
+            vector = builder.value(f"insertelement {builder.llvm_types['i']} {vector}, i32 {one}, i64 {lane}")
         words.append(vector)
     return words
 
 
-def lanes(code: Code) -> str:
+def lanes(builder: FunctionBuilder) -> str:
     """0, 1, 2, ... as a constant vector."""
-    return f"<{', '.join(f'i32 {lane}' for lane in range(code.width))}>"
+    return f"<{', '.join(f'i32 {lane}' for lane in range(builder.width))}>"
 
 
-def fill_function(vectors: int, singles: int, width: int) -> Code:
+def fill_function(vectors: int, singles: int, width: int) -> FunctionBuilder:
     """`void fill(ptr keys, ptr places, ptr noise)`: j of each pair of a block of members, as bytes.
 
     noise is [pair, vector, lane] of the vectors, each along coordinates, of which `places` has the first; behind it
     [single, member] of the single coordinates, whose places follow, the members of a pair having the same.
     """
-    code = Code("fill", ["ptr noalias %keys", "ptr noalias %places", "ptr noalias %noise"], width)
+    builder = FunctionBuilder("fill", ["ptr noalias %keys", "ptr noalias %places", "ptr noalias %noise"], width)
     bytes_ = f"<{width} x i8>"
 
     def pair(number: str, _: Values) -> Values:
-        key = load_key(code, "%keys", number)
+        key = load_key(builder, "%keys", number)
 
         def vector(at: str, _: Values) -> Values:
-            start = code.splat(code.load("i32", "%places", at), "i")
-            coordinate = code.value(f"add {code.vector['i']} {start}, {lanes(code)}")
-            keep(noise_of(code, key, coordinate, halved=True), code.index((number, vectors), (at, 1)))
+            start = builder.splat(builder.load("i32", "%places", at), "i")
+            coordinate = builder.value(f"add {builder.llvm_types['i']} {start}, {lanes(builder)}")
+            keep(noise_of(builder, key, coordinate, halved=True), builder.index((number, vectors), (at, 1)))
             return []
 
-        code.loop(vectors, vector)
+        builder.loop(vectors, vector)
         return []
 
     def keep(j: str, at: str) -> None:
-        code.store(bytes_, code.value(f"trunc {code.vector['i']} {j} to {bytes_}"), "%noise", at)
+        builder.store(bytes_, builder.value(f"trunc {builder.llvm_types['i']} {j} to {bytes_}"), "%noise", at)
 
     if vectors:
-        code.loop(width // 2, pair)
-    key = keys_of_members(code, "%keys")
+        builder.loop(width // 2, pair)
+    key = keys_of_members(builder, "%keys")
 
     def single(number: str, _: Values) -> Values:
-        coordinate = code.splat(code.load("i32", "%places", code.index((number, 1), (vectors, 1))), "i")
-        keep(noise_of(code, key, coordinate, halved=True), code.index((number, 1), (width // 2 * vectors, 1)))
+        coordinate = builder.splat(builder.load("i32", "%places", builder.index((number, 1), (vectors, 1))), "i")
+        keep(noise_of(builder, key, coordinate, halved=True), builder.index((number, 1), (width // 2 * vectors, 1)))
         return []
 
-    code.loop(singles, single)
-    return code
+    builder.loop(singles, single)
+    return builder
 
 
 def gradient_module(width: int) -> str:
@@ -105,33 +105,36 @@ def gradient_module(width: int) -> str:
     weight x standard normal.
     """
     parameters = ["ptr noalias %weights", "ptr noalias %keys", "i64 %pairs", "ptr noalias %sums", "i64 %groups"]
-    code = Code("inside", parameters, width)
-    floats = code.vector["f"]
+    builder = FunctionBuilder("inside", parameters, width)
+    floats = builder.llvm_types["f"]
 
     def group(number: str, _: Values) -> Values:
-        first = code.value(f"trunc i64 {code.index((number, UNROLLED * width))} to i32")
-        start = code.value(f"add {code.vector['i']} {code.splat(first, 'i')}, {lanes(code)}")
+        first = builder.value(f"trunc i64 {builder.index((number, UNROLLED * width))} to i32")
+        start = builder.value(f"add {builder.llvm_types['i']} {builder.splat(first, 'i')}, {lanes(builder)}")
         coordinates = [
-            code.value(f"add {code.vector['i']} {start}, splat (i32 {vector * width})") for vector in range(UNROLLED)
+            builder.value(f"add {builder.llvm_types['i']} {start}, splat (i32 {vector * width})")
+            for vector in range(UNROLLED)
         ]
 
         def add(pair: str, sums: Values) -> Values:
-            key = load_key(code, "%keys", pair)
-            weight = code.splat(code.load("float", "%weights", pair))
+            key = load_key(builder, "%keys", pair)
+            weight = builder.splat(builder.load("float", "%weights", pair))
             found = []
             for coordinate, one in zip(coordinates, sums, strict=True):
-                k = noise_of(code, key, coordinate, halved=False)
-                found.append(code.fma(weight, code.value(f"sitofp {code.vector['i']} {k} to {floats}"), one))
+                k = noise_of(builder, key, coordinate, halved=False)
+                found.append(
+                    builder.fma(weight, builder.value(f"sitofp {builder.llvm_types['i']} {k} to {floats}"), one)
+                )
             return found
 
-        scale = code.splat(_float(np.float32(1.0 / NORMAL_STD)))
-        for vector, one in enumerate(code.loop("%pairs", add, [(floats, "zeroinitializer")] * UNROLLED)):
-            scaled = code.value(f"fmul {floats} {one}, {scale}")
-            code.store(floats, scaled, "%sums", code.index((number, UNROLLED), (vector, 1)))
+        scale = builder.splat(_float(np.float32(1.0 / NORMAL_STD)))
+        for vector, one in enumerate(builder.loop("%pairs", add, [(floats, "zeroinitializer")] * UNROLLED)):
+            scaled = builder.value(f"fmul {floats} {one}, {scale}")
+            builder.store(floats, scaled, "%sums", builder.index((number, UNROLLED), (vector, 1)))
         return []
 
-    code.loop("%groups", group)
-    return module([code])
+    builder.loop("%groups", group)
+    return module([builder])
 
 
 def _float(value: np.float32) -> str:

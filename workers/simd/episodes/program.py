@@ -21,8 +21,8 @@ from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from workers.environments import Environment
 from workers.episode import Carry, Episodes, EpisodeSteps, episode_steps
-from workers.simd.backend.code import Code, Values, module
 from workers.simd.backend.emit import graph_function
+from workers.simd.backend.function_builder import FunctionBuilder, Values, module
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import Target, host_target
 from workers.simd.backend.words import ALIGNMENT, aligned, filled, pack, unpack, words_of
@@ -113,17 +113,17 @@ def compile_episodes(
         UnsupportedError: a step of the environment cannot be compiled. NoVectorsError: this processor cannot run it.
     """
     target = target or host_target()
-    written = write_episodes(environment, spec, inputs_O, target.width, training=training)
-    native = load_compiled(written.name, written.text, target, folder)
+    program = write_episodes(environment, spec, inputs_O, target.width, training=training)
+    native = load_compiled(program.name, program.text, target, folder)
     signature = [*[ctypes.c_void_p] * 8, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
-    carry = written.carry
+    carry = program.carry
     return EpisodeKernel(
         training=training,
         spec=spec,
         inputs_O=inputs_O,
-        network=written.network,
-        begin=_begin(written.steps, target, folder),
-        alive_word=written.alive_word,
+        network=program.network,
+        begin=_begin(program.steps, target, folder),
+        alive_word=program.alive_word,
         episode_avals=carry.episode,
         episode_words=sum(map(words_of, carry.episode)),
         _call=ctypes.CFUNCTYPE(None, *signature)(native.address),
@@ -131,7 +131,7 @@ def compile_episodes(
     )
 
 
-class Written(NamedTuple):
+class EpisodeProgram(NamedTuple):
     """Episodes before they go to LLVM."""
 
     steps: EpisodeSteps
@@ -147,7 +147,7 @@ class Written(NamedTuple):
 
 def write_episodes(
     environment: Environment, spec: WorkerSpec, inputs_O: np.ndarray, width: int, *, training: bool
-) -> Written:
+) -> EpisodeProgram:
     """All of `compile_episodes` but LLVM's part, and without asking what this processor can.
 
     Raises:
@@ -173,7 +173,7 @@ def write_episodes(
 
     digests = f"{definition()} {jaxpr_digest(look)} {jaxpr_digest(move)}"
     name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {training}"
-    return Written(steps, carry, alive_word, network, name, text)
+    return EpisodeProgram(steps, carry, alive_word, network, name, text)
 
 
 def _begin(steps: EpisodeSteps, target: Target, folder: Path | None) -> Callable[[np.ndarray], np.ndarray]:
@@ -215,33 +215,33 @@ def _module(
     fill_code = fill_function(network.vectors, len(network.places) - network.vectors, width)
 
     pointers = ["carries", "action_keys", "constants", "centre", "keys", "places", "noise", "room"]
-    code = Code(
+    builder = FunctionBuilder(
         "inside", [*(f"ptr noalias %{name}" for name in pointers), "float %unit", "i64 %blocks", "i64 %steps"], width
     )
-    vector = code.vector["i"]
-    seen, action = "%room", code.at("%room", inputs, vector)
-    hidden = code.at("%room", inputs + actions, vector)
+    vector = builder.llvm_types["i"]
+    seen, action = "%room", builder.at("%room", inputs, vector)
+    hidden = builder.at("%room", inputs + actions, vector)
 
     def block(number: str, _: Values) -> Values:
-        carry = code.at("%carries", code.index((number, words)), vector)
-        action_key = code.at("%action_keys", code.index((number, KEY_WORDS)), vector)
-        alive = code.at(carry, alive_word, vector)
+        carry = builder.at("%carries", builder.index((number, words)), vector)
+        action_key = builder.at("%action_keys", builder.index((number, KEY_WORDS)), vector)
+        alive = builder.at(carry, alive_word, vector)
         if training:
-            keys = code.at("%keys", code.index((number, KEY_WORDS * width // 2)), "i32")
-            code.do(f"call void @fill(ptr {keys}, ptr %places, ptr %noise)")
+            keys = builder.at("%keys", builder.index((number, KEY_WORDS * width // 2)), "i32")
+            builder.do(f"call void @fill(ptr {keys}, ptr %places, ptr %noise)")
 
         def step(_: str, __: Values) -> Values:
-            code.do(f"call void @look(ptr {carry}, ptr %constants, ptr {seen})")
+            builder.do(f"call void @look(ptr {carry}, ptr %constants, ptr {seen})")
             noise = "ptr %noise, float %unit, " if training else ""
-            code.do(f"call void @policy(ptr {seen}, ptr {alive}, ptr %centre, {noise}ptr {hidden}, ptr {action})")
-            code.do(f"call void @move(ptr {carry}, ptr %constants, ptr {action}, ptr {action_key})")
+            builder.do(f"call void @policy(ptr {seen}, ptr {alive}, ptr %centre, {noise}ptr {hidden}, ptr {action})")
+            builder.do(f"call void @move(ptr {carry}, ptr %constants, ptr {action}, ptr {action_key})")
             return []
 
         def all_done() -> str:
-            return code.value(f"xor i1 {code.any(code.load(vector, alive))}, true")
+            return builder.value(f"xor i1 {builder.any(builder.load(vector, alive))}, true")
 
-        code.loop("%steps", step, until=all_done)
+        builder.loop("%steps", step, until=all_done)
         return []
 
-    code.loop("%blocks", block)
-    return module([look_code, move_code, policy_code, *([fill_code] if training else []), code])
+    builder.loop("%blocks", block)
+    return module([look_code, move_code, policy_code, *([fill_code] if training else []), builder])

@@ -100,23 +100,23 @@ class _Kernels:
         self._lock = threading.Lock()
         self._packed: tuple[bool, np.ndarray, np.ndarray] | None = None
 
-    def _kernel(self, short: bool) -> EpisodeKernel:
+    def _kernel(self, omit_zero_inputs: bool) -> EpisodeKernel:
         with self._lock:  # threads share it
-            if short not in self._compiled:
-                inputs_O = np.flatnonzero(~self._zero_O) if short else np.arange(self._zero_O.size)
+            if omit_zero_inputs not in self._compiled:
+                inputs_O = np.flatnonzero(~self._zero_O) if omit_zero_inputs else np.arange(self._zero_O.size)
                 try:
                     kernel = compile_episodes(self._environment, self._spec, inputs_O, training=self._training)
                 except UnsupportedError as error:  # with options that nobody asked about before
                     raise UnsupportedError(f"{error}. compute.rollout=xla runs it") from error
-                self._compiled[short] = kernel
-        return self._compiled[short]
+                self._compiled[omit_zero_inputs] = kernel
+        return self._compiled[omit_zero_inputs]
 
     def for_centre(self, centre_D: np.ndarray, mean_O: np.ndarray) -> tuple[EpisodeKernel, np.ndarray]:
         """(kernel, packed weights), those of the last centre being kept."""
-        short = not mean_O[self._zero_O].any()  # (0 - mean) / std is 0 then, and adds nothing
-        kernel, last = self._kernel(short), self._packed
-        if last is None or last[0] != short or not np.array_equal(last[1], centre_D):
-            last = self._packed = (short, centre_D.copy(), kernel.network.pack(centre_D))
+        omit_zero_inputs = not mean_O[self._zero_O].any()  # (0 - mean) / std is 0 then, and adds nothing
+        kernel, last = self._kernel(omit_zero_inputs), self._packed
+        if last is None or last[0] != omit_zero_inputs or not np.array_equal(last[1], centre_D):
+            last = self._packed = (omit_zero_inputs, centre_D.copy(), kernel.network.pack(centre_D))
         return kernel, last[2]
 
 

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from workers.simd.frontend.kinds import kind_of
+from workers.simd.frontend.dtypes import graph_dtype
 from workers.simd.frontend.primitives import PRIMITIVES
 from workers.simd.frontend.tracer import Tracer
 from workers.simd.graph.folding import FoldingGraph
@@ -27,8 +27,8 @@ def trace_jaxpr(closed: ClosedJaxpr) -> tuple[FoldingGraph, int, list[int]]:
     words = itertools.count()
     inputs = []
     for variable in closed.jaxpr.invars:
-        kind = kind_of(variable.aval.dtype)
-        nodes = [graph.input(kind, next(words)) for _ in range(int(np.prod(variable.aval.shape)))]
+        node_dtype = graph_dtype(variable.aval.dtype)
+        nodes = [graph.input(node_dtype, next(words)) for _ in range(int(np.prod(variable.aval.shape)))]
         inputs.append(np.array(nodes, np.int64).reshape(variable.aval.shape))
     outputs = Tracer(graph, PRIMITIVES).closed(closed, inputs)
     return graph, next(words), [node for nodes in outputs for node in nodes.reshape(-1).tolist()]

@@ -14,7 +14,7 @@ from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from numpy.typing import NDArray
 
-from workers.simd.frontend.kinds import check_bytes, kind_of
+from workers.simd.frontend.dtypes import check_bytes, graph_dtype
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.loops import build_loop
 from workers.simd.graph.unsupported import UnsupportedError, refusing
@@ -67,16 +67,16 @@ class Tracer:
             for variable, nodes in zip(equation.outvars, outputs, strict=True):
                 aval: Any = variable.aval
                 assert nodes.shape == aval.shape, (equation.primitive.name, nodes.shape, aval)
-                kinds = {self.graph.kinds[node] for node in nodes.reshape(-1).tolist()}
-                assert kinds <= {kind_of(aval.dtype)}, (equation.primitive.name, kinds, aval)
+                dtypes = {self.graph.dtypes[node] for node in nodes.reshape(-1).tolist()}
+                assert dtypes <= {graph_dtype(aval.dtype)}, (equation.primitive.name, dtypes, aval)
                 values[variable] = nodes
         return [read(atom) for atom in jaxpr.outvars]
 
     def constants(self, numbers: Any) -> Nodes:
         """Nodes of an array of numbers."""
         array = np.asarray(numbers)
-        kind = kind_of(array.dtype)
-        made = self.graph.i if kind == "i" else lambda value: self.graph.const(kind, value)
+        node_dtype = graph_dtype(array.dtype)
+        made = self.graph.i if node_dtype == "i" else lambda value: self.graph.const(node_dtype, value)
         return np.array([made(value) for value in array.reshape(-1).tolist()], np.int64).reshape(array.shape)
 
     def values(self, nodes: Nodes) -> NDArray | None:

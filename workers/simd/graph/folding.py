@@ -137,7 +137,7 @@ def _fold_select(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> i
     key = g.keys[mask]
     for one, other in ((key[1], key[2]), (key[2], key[1])) if key[0] == "xor" else ():
         if _is(g.constant(one), True):  # a negation
-            return g.op("iselect" if g.kinds[a] == "i" else "select", other, b, a)
+            return g.op("iselect" if g.dtypes[a] == "i" else "select", other, b, a)
     return None
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.graph.operations import DTYPES, OPERATIONS
+from workers.simd.graph.operations import NUMPY_DTYPES, OPERATIONS
 
 Key = tuple
 
@@ -35,20 +35,20 @@ class Loop:
 class Graph:
     """Append-only; `keys[node]` is what a node is: (operation, *argument nodes), or
 
-    ("const", kind, bits), ("input", kind, position), ("carry", kind, loop, position), ("result", kind, loop, position).
+    ("const", dtype, bits), ("input", dtype, position), ("carry", dtype, loop, position), ("result", dtype, loop, position).
     """
 
     def __init__(self) -> None:
         self.keys: list[Key] = []
-        self.kinds: list[str] = []
+        self.dtypes: list[str] = []
         self.loops: list[Loop] = []
         self._known: dict[Key, int] = {}
 
-    def const(self, kind: str, value: float | int | bool) -> int:
+    def const(self, dtype: str, value: float | int | bool) -> int:
         """A constant."""
-        array = np.asarray(value, DTYPES[kind])
-        bits = int(array.view(np.int32)) if kind == "f" else int(array)
-        return self._node(("const", kind, bits), kind)
+        array = np.asarray(value, NUMPY_DTYPES[dtype])
+        bits = int(array.view(np.int32)) if dtype == "f" else int(array)
+        return self._node(("const", dtype, bits), dtype)
 
     def f(self, value: float) -> int:
         """A float32 constant."""
@@ -58,16 +58,16 @@ class Graph:
         """An integer constant; numbers of 2^31 and more are those of the same bits."""
         return self.const("i", (value + 2**31) % 2**32 - 2**31)
 
-    def input(self, kind: str, position: int) -> int:
+    def input(self, dtype: str, position: int) -> int:
         """The kernel's input word at a position."""
-        return self._node(("input", kind, position), kind)
+        return self._node(("input", dtype, position), dtype)
 
     def constant(self, node: int) -> Any:
         """The value of a constant node, a NumPy scalar; else None."""
         key = self.keys[node]
         if key[0] != "const":
             return None
-        array = np.array(key[2], np.int32 if key[1] == "f" else DTYPES[key[1]])
+        array = np.array(key[2], np.int32 if key[1] == "f" else NUMPY_DTYPES[key[1]])
         return array.view(np.float32)[()] if key[1] == "f" else array[()]
 
     def arguments(self, node: int) -> tuple[int, ...]:
@@ -89,8 +89,8 @@ class Graph:
     def loop(self, trips: int, inits: list[int]) -> Loop:
         """Open a loop; its body is whatever is then built on its carries. Close it with `close`."""
         number = len(self.loops)
-        kinds = [self.kinds[node] for node in inits]
-        carries = [self._node(("carry", kind, number, k), kind) for k, kind in enumerate(kinds)]
+        dtypes = [self.dtypes[node] for node in inits]
+        carries = [self._node(("carry", dtype, number, k), dtype) for k, dtype in enumerate(dtypes)]
         self.loops.append(Loop(number, trips, list(inits), carries))
         return self.loops[-1]
 
@@ -98,9 +98,9 @@ class Graph:
         """Give a loop its ends; returns its results."""
         loop.outs = list(outs)
         for k, out in enumerate(outs):
-            assert self.kinds[out] == self.kinds[loop.carries[k]], "a loop carries values of one kind"
-        kinds = [self.kinds[node] for node in outs]
-        loop.results = [self._node(("result", kind, loop.number, k), kind) for k, kind in enumerate(kinds)]
+            assert self.dtypes[out] == self.dtypes[loop.carries[k]], "a loop carries values of one dtype"
+        dtypes = [self.dtypes[node] for node in outs]
+        loop.results = [self._node(("result", dtype, loop.number, k), dtype) for k, dtype in enumerate(dtypes)]
         return loop.results
 
     def op(self, name: str, *arguments: int) -> int:
@@ -111,7 +111,7 @@ class Graph:
         known = self._known.get((name, *arguments))
         if known is not None:
             return known
-        assert "".join(self.kinds[a] for a in arguments) == operation.takes, (name, arguments)
+        assert "".join(self.dtypes[a] for a in arguments) == operation.takes, (name, arguments)
         node = self._known[(name, *arguments)] = self.build(name, arguments)
         return node
 
@@ -119,12 +119,12 @@ class Graph:
         """The node of an operation that was not asked for before. For `op` alone."""
         return self._node((name, *arguments), OPERATIONS[name].gives)
 
-    def _node(self, key: Key, kind: str) -> int:
+    def _node(self, key: Key, dtype: str) -> int:
         known = self._known.get(key)
         if known is None:
             known = self._known[key] = len(self.keys)
             self.keys.append(key)
-            self.kinds.append(kind)
+            self.dtypes.append(dtype)
         return known
 
 

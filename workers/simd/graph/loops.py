@@ -42,18 +42,18 @@ def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> li
         return graph.close(loop, outs)
 
     # The same body again, on the carries that are kept and what is derived from them.
-    short = graph.loop(trips, [inits[k] for k in kept])
+    reduced = graph.loop(trips, [inits[k] for k in kept])
     # Of carries with one end, the start that `_sort` compared with counts.
-    starts = {outs[k]: carry for k, carry in zip(kept, short.carries, strict=True) if k in firsts}
+    starts = {outs[k]: carry for k, carry in zip(kept, reduced.carries, strict=True) if k in firsts}
     carries = list(inits)
-    for k, carry in zip(kept, short.carries, strict=True):
+    for k, carry in zip(kept, reduced.carries, strict=True):
         carries[k] = carry
     for k in derived:
         carries[k] = substitute(graph, outs[k], starts)
     for k in late:
         carries[k] = inits[k]  # nothing looks at it
     new_outs = body(carries)
-    results = graph.close(short, [new_outs[k] for k in kept])
+    results = graph.close(reduced, [new_outs[k] for k in kept])
     found = list(inits)  # what is constant stays
     for k, result in zip(kept, results, strict=True):
         found[k] = result

@@ -1,6 +1,6 @@
 """The operations that a scalar graph is made of: what each takes, gives and means, and how LLVM writes it.
 
-Three kinds of values: "f" float32, "i" 32 bits (signed or not is the operation's affair), "b" truth. Every operation is
+Three dtypes of values: "f" float32, "i" 32 bits (signed or not is the operation's affair), "b" truth. Every operation is
 one instruction of a vector unit, or nearly; all of them give the same bits on every machine and at every width. There
 is no approximate division or root here, no tangent and no exponential: `elementary.py` makes those of these. Vector
 units do not divide integers, so LLVM does it lane by lane, but for constant divisors.
@@ -111,7 +111,7 @@ OPERATIONS: dict[str, Operation] = {
 }
 """Name -> operation. Products and sums stay apart until `schedule.py` fuses them by its rule."""
 
-DTYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtype(bool)}
+NUMPY_DTYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtype(bool)}
 """Kind -> how NumPy holds it."""
 BIT_MOVES = {"unbits", "bits", "neg", "abs", "select"}
 """Operations that take floats as they are. All others see zeros for denormal numbers, and give zeros for them."""
@@ -122,9 +122,9 @@ def compute(name: str, arguments: Sequence[Any]) -> Any:
     """An operation in NumPy, as kernels do it."""
     operation = OPERATIONS[name]
     if name not in BIT_MOVES:
-        arguments = [_flushed(x) if kind == "f" else x for kind, x in zip(operation.takes, arguments, strict=True)]
+        arguments = [_flushed(x) if dtype == "f" else x for dtype, x in zip(operation.takes, arguments, strict=True)]
     with np.errstate(all="ignore"):
-        found = np.asarray(operation.meaning(*arguments), DTYPES[operation.gives])
+        found = np.asarray(operation.meaning(*arguments), NUMPY_DTYPES[operation.gives])
     return _flushed(found) if operation.gives == "f" and name not in BIT_MOVES else found
 
 

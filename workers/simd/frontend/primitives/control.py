@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.frontend.kinds import dtype_in
+from workers.simd.frontend.dtypes import dtype_in
 from workers.simd.frontend.primitives.choices import select
 from workers.simd.frontend.primitives.registry import primitive
 from workers.simd.frontend.tracer import Nodes, Tracer

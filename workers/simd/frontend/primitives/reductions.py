@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.frontend.kinds import dtype_in, kind_of
+from workers.simd.frontend.dtypes import dtype_in, graph_dtype
 from workers.simd.frontend.primitives.choices import choose, extreme_of, to_float
 from workers.simd.frontend.primitives.registry import PRIMITIVES, primitive
 from workers.simd.frontend.tracer import Nodes, Rule, Tracer
@@ -37,18 +37,18 @@ def _reduce(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Rule
 
 def _of_nothing(t: Tracer, equation: Any) -> int:
     """What a reduction of no elements gives."""
-    name, kind = equation.primitive.name, kind_of(dtype_in(equation))
+    name, node_dtype = equation.primitive.name, graph_dtype(dtype_in(equation))
     neutral = {"reduce_sum": 0, "reduce_prod": 1, "reduce_and": True, "reduce_or": False}
-    if kind == "f":
+    if node_dtype == "f":
         neutral |= {"reduce_max": -np.inf, "reduce_min": np.inf}
     if name not in neutral:
         raise UnsupportedError(f"{name} of no {dtype_in(equation)}")
-    return t.graph.const(kind, neutral[name])
+    return t.graph.const(node_dtype, neutral[name])
 
 
 def _numbers(name: str) -> Callable[[Tracer, Any], Callable[[int, int], int]]:
     def combine(t: Tracer, equation: Any) -> Callable[[int, int], int]:
-        own = name if kind_of(dtype_in(equation)) == "f" else f"i{name}"
+        own = name if graph_dtype(dtype_in(equation)) == "f" else f"i{name}"
         return lambda a, b: t.graph.op(own, a, b)
 
     return combine
@@ -56,7 +56,7 @@ def _numbers(name: str) -> Callable[[Tracer, Any], Callable[[int, int], int]]:
 
 def _logic(name: str) -> Callable[[Tracer, Any], Callable[[int, int], int]]:
     def combine(t: Tracer, equation: Any) -> Callable[[int, int], int]:
-        if kind_of(dtype_in(equation)) != "b":
+        if graph_dtype(dtype_in(equation)) != "b":
             raise UnsupportedError(f"{equation.primitive.name} of {dtype_in(equation)}")
         return lambda a, b: t.graph.op(name, a, b)
 
@@ -93,15 +93,15 @@ def _arg_extreme(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 
 def _beats(g: Graph, name: str, dtype: str) -> Callable[[int, int], int]:
     """Whether a node is more extreme than the best before it."""
-    kind = kind_of(dtype)
-    less = {"f": "lt", "i": "slt" if dtype == "int32" else "ult"}.get(kind)
+    node_dtype = graph_dtype(dtype)
+    less = {"f": "lt", "i": "slt" if dtype == "int32" else "ult"}.get(node_dtype)
 
     def beats(node: int, best: int) -> int:
         low, high = (node, best) if name == "argmin" else (best, node)
         if less is None:
             return g.op("and", g.op("xor", g.const("b", True), low), high)
         ahead = g.op(less, low, high)
-        if kind == "f":
+        if node_dtype == "f":
             ahead = g.op("or", ahead, g.op("and", g.op("ne", node, node), g.op("eq", best, best)))
         return ahead
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jax import lax
 
-from workers.simd.frontend.kinds import kind_of
+from workers.simd.frontend.dtypes import graph_dtype
 from workers.simd.frontend.primitives.registry import primitive
 from workers.simd.frontend.tracer import Nodes, Tracer
 from workers.simd.graph.unsupported import UnsupportedError
@@ -159,9 +159,9 @@ def _scatter(t: Tracer, equation: Any, x: Nodes, indices: Nodes, updates: Nodes)
     """Updates outside are dropped, negative indices among them; or moved inside, where the mode says so."""
     numbers, mode = equation.params["dimension_numbers"], equation.params["mode"]
     starts = _indices(t, equation, indices, str(equation.invars[1].aval.dtype))
-    float_kind = kind_of(equation.invars[0].aval.dtype) == "f"
+    is_float = graph_dtype(equation.invars[0].aval.dtype) == "f"
     name = {"scatter": None, "scatter-add": "add", "scatter-mul": "mul"}[equation.primitive.name]
-    name = name if float_kind or name is None else f"i{name}"
+    name = name if is_float or name is None else f"i{name}"
     window_axes = list(numbers.update_window_dims)
     batch_axes = [axis for axis in range(updates.ndim) if axis not in window_axes]
     rows = np.transpose(updates, [*batch_axes, *window_axes])

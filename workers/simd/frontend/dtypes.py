@@ -7,7 +7,7 @@ from typing import Any
 from workers.simd.graph.unsupported import UnsupportedError
 
 
-def kind_of(dtype: Any) -> str:
+def graph_dtype(dtype: Any) -> str:
     """Kind of node that holds values of a dtype. Raises UnsupportedError for any but float32, int32, uint32 and bool.
 
     And uint8, in which JAX counts bits: `check_bytes` sees that it is only converted and moved.

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 MXCSR = 0x9FC0
 """Round to nearest, no traps, denormal results and operands are zeros: as XLA computes, and five times faster."""
-SCALARS = {"f": "float", "i": "i32", "b": "i1"}
+SCALAR_TYPES = {"f": "float", "i": "i32", "b": "i1"}
 
 KERNEL = """\
 define void @kernel({parameters}) #0 {{
@@ -38,13 +38,13 @@ attributes #0 = {{ nounwind "prefer-vector-width"="512" "min-legal-vector-width"
 Values = list[str]
 
 
-class Code:
+class FunctionBuilder:
     """The body of one function, written line by line. Values are names; each is given once."""
 
     def __init__(self, name: str, parameters: Sequence[str], width: int) -> None:
         """Begin `void @name(parameters)`, each "type %name", for vectors of `width` lanes."""
         self.name, self.parameters, self.width = name, list(parameters), width
-        self.vector = {kind: f"<{width} x {scalar}>" for kind, scalar in SCALARS.items()}
+        self.llvm_types = {dtype: f"<{width} x {scalar}>" for dtype, scalar in SCALAR_TYPES.items()}
         self.lines: list[str] = []
         self.memory: list[str] = []
         """Lines that reserve memory on the stack, which stand first."""
@@ -62,29 +62,29 @@ class Code:
         self.lines.append(f"  %v{self._names} = {instruction}")
         return f"%v{self._names}"
 
-    def call(self, kind: str, intrinsic: str, *arguments: tuple[str, str]) -> str:
+    def call(self, llvm_type: str, intrinsic: str, *arguments: tuple[str, str]) -> str:
         """Value of an intrinsic, which is declared, of (type, value)s."""
-        self.declarations.add(f"declare {kind} @{intrinsic}({', '.join(type_ for type_, _ in arguments)})")
-        return self.value(f"call {kind} @{intrinsic}({', '.join(map(' '.join, arguments))})")
+        self.declarations.add(f"declare {llvm_type} @{intrinsic}({', '.join(type_ for type_, _ in arguments)})")
+        return self.value(f"call {llvm_type} @{intrinsic}({', '.join(map(' '.join, arguments))})")
 
-    def at(self, pointer: str, index: str | int, kind: str) -> str:
+    def at(self, pointer: str, index: str | int, llvm_type: str) -> str:
         """A pointer `index` elements of a type further on."""
-        return self.value(f"getelementptr {kind}, ptr {pointer}, i64 {index}")
+        return self.value(f"getelementptr {llvm_type}, ptr {pointer}, i64 {index}")
 
-    def load(self, kind: str, pointer: str, index: str | int = 0) -> str:
+    def load(self, llvm_type: str, pointer: str, index: str | int = 0) -> str:
         """Element `index` of a type in memory; vectors of 32-bit words are aligned."""
-        place = self.at(pointer, index, kind)
-        return self.value(f"load {kind}, ptr {place}, align {self._alignment(kind)}")
+        place = self.at(pointer, index, llvm_type)
+        return self.value(f"load {llvm_type}, ptr {place}, align {self._alignment(llvm_type)}")
 
-    def store(self, kind: str, value: str, pointer: str, index: str | int = 0) -> None:
+    def store(self, llvm_type: str, value: str, pointer: str, index: str | int = 0) -> None:
         """Put a value into element `index` of a type in memory."""
-        place = self.at(pointer, index, kind)
-        self.do(f"store {kind} {value}, ptr {place}, align {self._alignment(kind)}")
+        place = self.at(pointer, index, llvm_type)
+        self.do(f"store {llvm_type} {value}, ptr {place}, align {self._alignment(llvm_type)}")
 
-    def _alignment(self, kind: str) -> int:
-        if kind == self.vector["f"] or kind == self.vector["i"]:
+    def _alignment(self, llvm_type: str) -> int:
+        if llvm_type == self.llvm_types["f"] or llvm_type == self.llvm_types["i"]:
             return 4 * self.width
-        return 1 if kind.endswith("x i8>") else 4
+        return 1 if llvm_type.endswith("x i8>") else 4
 
     def index(self, *terms: tuple[str | int, int]) -> str:
         """Sum of (i64 value, factor)."""
@@ -94,16 +94,16 @@ class Code:
             total = part if total == "0" else self.value(f"add i64 {total}, {part}")
         return total
 
-    def splat(self, scalar: str, kind: str = "f") -> str:
+    def splat(self, scalar: str, dtype: str = "f") -> str:
         """A scalar in all lanes."""
-        vector = self.vector[kind]
-        first = self.value(f"insertelement {vector} poison, {SCALARS[kind]} {scalar}, i64 0")
+        vector = self.llvm_types[dtype]
+        first = self.value(f"insertelement {vector} poison, {SCALAR_TYPES[dtype]} {scalar}, i64 0")
         return self.value(f"shufflevector {vector} {first}, {vector} poison, <{self.width} x i32> zeroinitializer")
 
     def fma(self, a: str, b: str, c: str) -> str:
         """a * b + c of float vectors, rounded once."""
-        kind = self.vector["f"]
-        return self.call(kind, f"llvm.fma.v{self.width}f32", (kind, a), (kind, b), (kind, c))
+        llvm_type = self.llvm_types["f"]
+        return self.call(llvm_type, f"llvm.fma.v{self.width}f32", (llvm_type, a), (llvm_type, b), (llvm_type, c))
 
     def label(self, name: str) -> None:
         """Begin a block; the one before has ended with a branch."""
@@ -135,8 +135,8 @@ class Code:
         self.do(f"br label %{label}_end")
         self.label(f"{label}_end")
         phis = [f"  %{label}_trip = phi i64 [ 0, %{before} ], [ %{label}_next, %{label}_end ]"]
-        for (kind, first), name, out in zip(carries, names, outs, strict=True):
-            phis.append(f"  {name} = phi {kind} [ {first}, %{before} ], [ {out}, %{label}_end ]")
+        for (llvm_type, first), name, out in zip(carries, names, outs, strict=True):
+            phis.append(f"  {name} = phi {llvm_type} [ {first}, %{before} ], [ {out}, %{label}_end ]")
         self.lines[place:place] = phis
         self.do(f"%{label}_next = add i64 %{label}_trip, 1")
         self.do(f"%{label}_more = icmp slt i64 %{label}_next, {trips}")
@@ -147,8 +147,8 @@ class Code:
 
     def any(self, words: str, lanes: int | None = None) -> str:
         """Whether any word of an integer vector is not 0, an i1."""
-        kind = f"<{lanes or self.width} x i32>"
-        found = self.call("i32", f"llvm.vector.reduce.or.v{lanes or self.width}i32", (kind, words))
+        llvm_type = f"<{lanes or self.width} x i32>"
+        found = self.call("i32", f"llvm.vector.reduce.or.v{lanes or self.width}i32", (llvm_type, words))
         return self.value(f"icmp ne i32 {found}, 0")
 
     def when(self, condition: str, body: Callable[[], object]) -> None:
@@ -167,7 +167,7 @@ class Code:
         return "\n".join([*lines, *self.memory, *self.lines, "  ret void", "}", ""])
 
 
-def module(functions: Sequence[Code]) -> str:
+def module(functions: Sequence[FunctionBuilder]) -> str:
     """LLVM IR of functions and of @kernel, which calls the last of them, named "inside"."""
     inside = functions[-1]
     assert inside.name == "inside"
