@@ -1,15 +1,15 @@
-"""Code of the policy: what each lane's member does with what it sees, for a block of as many members as vectors have
-lanes, two by two the + and - of a pair.
+"""Code of the policy: actions of a block of members from their observations, one member per lane.
 
-A member's weights are made where they are used: centre +- unit k. The centre is shared by all members and stays in
-cache; the noise k = 2 j + 1 is a byte j a weight. In float32, with fused products:
+A block has as many members as a vector has lanes; neighbouring lanes are the + and - members of a pair. A member's
+weights, centre +- unit k, are computed where they are used. The centre is shared by all members and stays in cache; the
+noise k = 2 j + 1 takes one byte j per weight. In float32, with fused products:
 
-hidden layers: vectors go along outputs, member by member. A pair shares its bytes; the weight of + is
-    (centre + unit) + 2 unit j, that of - is 2 centre less it: its mirror image up to a rounding.
-last layer: few outputs, so vectors go along members, each with a byte, and a unit of its sign:
-    (centre +- unit) +- 2 unit j.
+hidden layers: a vector holds several outputs of one member. The members of a pair share their bytes; the weight of + is
+    (centre + unit) + 2 unit j, and that of - is 2 centre minus that weight, its mirror image up to a rounding.
+last layer: it has few outputs, so a vector holds one output of several members, each with its own byte and with the
+    sign of its unit: (centre +- unit) +- 2 unit j.
 
-Every output is one sum in the order of the inputs, beginning with the bias, whatever the width.
+Every output is one sum in the order of the inputs, starting with the bias, whatever the width.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from workers.simd.graph import elementary
 from workers.simd.graph.folding import FoldingGraph
 
 OUTPUTS_AT_ONCE = 4
-"""Of the last layer."""
+"""Most outputs of the last layer that are computed in one loop over its inputs."""
 
 
 class View(NamedTuple):
-    """Floats of members: element (member, input) is at member * by_member + input * by_input."""
+    """Array of members' floats in memory; element (member, input) is at member * by_member + input * by_input."""
 
     pointer: str
     by_member: int
@@ -36,11 +36,11 @@ class View(NamedTuple):
 
 
 def policy_function(network: Network, *, noisy: bool) -> FunctionBuilder:
-    """`void policy(ptr x, ptr alive, ptr centre[, ptr noise, float unit], ptr hidden, ptr action)`.
+    """Function `void policy(ptr x, ptr alive, ptr centre[, ptr noise, float unit], ptr hidden, ptr action)`.
 
-    x and action are [input, lane] and [output, lane]; `alive` a word for each lane: hidden layers of neighbours who are
-    all dead are not computed. centre is as `Network.pack` makes it; noise as `noise.fill_function` does; hidden is room
-    for `network.hidden_vectors`.
+    x is [input, lane] and action [output, lane]. `alive` has a word for each lane; hidden layers are not computed for a
+    group of neighbouring lanes that are all 0. centre is an array of `Network.pack`, noise one of
+    `noise.fill_function`, and hidden is memory for `network.hidden_vectors` vectors.
     """
     width = network.width
     parameters = ["ptr noalias %x", "ptr noalias %alive", "ptr noalias %centre"]
@@ -65,7 +65,7 @@ def policy_function(network: Network, *, noisy: bool) -> FunctionBuilder:
 
 
 def _shared(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
-    """out = tanh(centre x), for some members at once."""
+    """Write out = tanh(centre x), for several members at a time."""
     floats = builder.llvm_types["f"]
     members = min(builder.width, sums_at_once(builder.width) // layer.tile)
     assert builder.width % members == 0
@@ -94,7 +94,10 @@ def _shared(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
 
 
 def _noisy(builder: FunctionBuilder, network: Network, layer: Layer, x: View, out: View) -> None:
-    """out = tanh((centre +- unit k) x), for some pairs at once. Additions are what the multipliers leave time for."""
+    """Write out = tanh((centre +- unit k) x), for several pairs at a time.
+
+    The weights of - come from an addition, because the multipliers are the bottleneck.
+    """
     floats = builder.llvm_types["f"]
     pairs = min(builder.width // 2, max(1, sums_at_once(builder.width) // (2 * layer.tile)))
     assert builder.width % (2 * pairs) == 0
@@ -105,7 +108,7 @@ def _noisy(builder: FunctionBuilder, network: Network, layer: Layer, x: View, ou
         first_pair = builder.value(f"lshr i64 {first}, 1")
 
         def member_weights(row: str | int, v: int) -> list[tuple[str, str]]:
-            """Of each pair, those of + and -."""
+            """Weights (of +, of -) of each pair for input `row` and vector `v` of the tile."""
             at = builder.index((weights, 1), (row, layer.tile), (v, 1))
             centre = builder.load(floats, "%centre", at)
             moved, doubled = (builder.value(f"fadd {floats} {centre}, {one}") for one in (unit, centre))
@@ -140,7 +143,7 @@ def _noisy(builder: FunctionBuilder, network: Network, layer: Layer, x: View, ou
 
 
 def _by_members(builder: FunctionBuilder, layer: Layer, members: int, tile: Callable[[str, str], Values]) -> None:
-    """`tile(first member, number of the tile)` of neighbours of whom one is alive."""
+    """Write `tile(first member, number of the tile)` for each group of members of which at least one is alive."""
 
     def block(number: str, _: Values) -> Values:
         first = builder.index((number, members))
@@ -153,7 +156,7 @@ def _by_members(builder: FunctionBuilder, layer: Layer, members: int, tile: Call
 
 
 def _last(builder: FunctionBuilder, network: Network, x: str, outputs: range, *, noisy: bool) -> None:
-    """action = tanh(weights x) of some outputs; vectors go along members."""
+    """Write action = tanh(weights x) for some outputs; the lanes of a vector are members."""
     floats, count = builder.llvm_types["f"], network.outputs
     singles = builder.at("%centre", network.vectors * builder.width, "float")
 
@@ -183,7 +186,7 @@ def _last(builder: FunctionBuilder, network: Network, x: str, outputs: range, *,
 
 
 def _transpose(builder: FunctionBuilder, x: View, inputs: int, to: str) -> None:
-    """to = what members give the inputs, [input, lane]; a square of as many inputs as lanes after the other."""
+    """Write the members' inputs x to `to` as [input, lane], in squares of as many inputs as lanes."""
     floats, width = builder.llvm_types["f"], builder.width
 
     def square(number: str, _: Values) -> Values:
@@ -192,7 +195,7 @@ def _transpose(builder: FunctionBuilder, x: View, inputs: int, to: str) -> None:
             for member in range(width)
         ]
         half = 1
-        while half < width:  # swap the blocks beside the diagonal, of one, two, four ... rows and columns
+        while half < width:  # swap the off-diagonal blocks of one, two, four ... rows and columns
             for row in range(width):
                 if not row & half:
                     rows[row], rows[row + half] = _swapped(builder, rows[row], rows[row + half], half)
@@ -205,7 +208,7 @@ def _transpose(builder: FunctionBuilder, x: View, inputs: int, to: str) -> None:
 
 
 def _swapped(builder: FunctionBuilder, upper: str, lower: str, half: int) -> tuple[str, str]:
-    """Two rows after the exchange of the upper's odd blocks of `half` columns with the lower's even ones."""
+    """Two rows, after exchanging the odd blocks of `half` columns of the upper with the even blocks of the lower."""
     floats, width = builder.llvm_types["f"], builder.width
     even = [lane if not lane & half else width + lane - half for lane in range(width)]
     odd = [lane + half if not lane & half else width + lane for lane in range(width)]
@@ -217,25 +220,25 @@ def _swapped(builder: FunctionBuilder, upper: str, lower: str, half: int) -> tup
 
 
 def _units(builder: FunctionBuilder) -> tuple[str, str]:
-    """unit and 2 unit in all lanes: unit k is j times the second plus the first."""
+    """Vectors of unit and of 2 unit; unit k is the first plus j times the second."""
     return builder.splat("%unit"), builder.splat(builder.value("fadd float %unit, %unit"))
 
 
 def _by_sign(builder: FunctionBuilder, value: str) -> str:
-    """Minus the value in the lanes of members whose sign is -."""
+    """Vector with the sign flipped in the lanes of - members."""
     signs = ", ".join(f"float {-1.0 if lane % 2 else 1.0}" for lane in range(builder.width))
     return builder.value(f"fmul {builder.llvm_types['f']} {value}, <{signs}>")
 
 
 def _noise(builder: FunctionBuilder, noise: str, vector: str) -> str:
-    """j of a vector of weights."""
+    """Vector of noise j, as floats, of a vector of weights."""
     llvm_type = f"<{builder.width} x i8>"
     words = builder.value(f"sext {llvm_type} {builder.load(llvm_type, noise, vector)} to {builder.llvm_types['i']}")
     return builder.value(f"sitofp {builder.llvm_types['i']} {words} to {builder.llvm_types['f']}")
 
 
 def _seen(builder: FunctionBuilder, x: View, first: str, member: int, row: str) -> str:
-    """What a member gives an input, in all lanes."""
+    """Vector with a member's value of input `row` in all lanes."""
     index = builder.index((first, x.by_member), (member * x.by_member, 1), (row, x.by_input))
     return builder.splat(builder.load("float", x.pointer, index))
 
@@ -243,7 +246,7 @@ def _seen(builder: FunctionBuilder, x: View, first: str, member: int, row: str) 
 def _put(
     builder: FunctionBuilder, layer: Layer, out: View, first: str, member: int, tile: str, sums: Sequence[str]
 ) -> None:
-    """Store tanh of a member's sums."""
+    """Store tanh of a member's sums in `out`."""
     vectors = layer.tiles * layer.tile
     for v, value in enumerate(_tanh(builder, sums)):
         place = builder.index((first, vectors), (tile, layer.tile), (member * vectors + v, 1))
@@ -251,12 +254,14 @@ def _put(
 
 
 def _any_alive(builder: FunctionBuilder, first: str, members: int) -> str:
+    """An i1 that is true if any of some members, from `first` on, is alive."""
     return builder.any(
         builder.value(f"load <{members} x i32>, ptr {builder.at('%alive', first, 'i32')}, align 4"), members
     )
 
 
 def _tanh(builder: FunctionBuilder, values: Sequence[str]) -> Values:
+    """Vectors of tanh of each vector."""
     graph = FoldingGraph()
     nodes = [graph.input("f", k) for k in range(len(values))]
     outputs = [elementary.tanh(graph, node) for node in nodes]

@@ -1,4 +1,4 @@
-"""Code of the noise, at some three numbers a nanosecond: that of `es_service.protocol.noise`, word for word."""
+"""Code of the noise generator: the words of `es_service.protocol.noise`, at about three numbers per nanosecond."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
 
 UNROLLED = 4
-"""Vectors made at once."""
+"""Number of vectors of noise that are made in one trip of the gradient's loop."""
 
 
 def _jaxpr() -> ClosedJaxpr:
-    """k of (key, coordinate)."""
+    """Jaxpr of the noise k as a function of (key, coordinate)."""
     word = jax.ShapeDtypeStruct((), jnp.uint32)
     key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
     return jax.make_jaxpr(lambda key, at: normal_integers(jnp, key, at))(key, word)
 
 
 def definition() -> str:
-    """A text that changes with the generator: what was compiled for another is not used."""
+    """Text that identifies the noise generator, so that code compiled with another generator is not used."""
     return f"{jaxpr_digest(_jaxpr())} {NORMAL_STD}"
 
 
 def noise_of(builder: FunctionBuilder, key: Values, coordinate: str, *, halved: bool) -> str:
-    """k of vectors of key words and coordinates, as integers; or j, where k = 2 j + 1."""
+    """Vector of the noise k, as integers, for vectors of key words and coordinates; if `halved`, of j in k = 2 j + 1."""
     graph, _, (output,) = trace_jaxpr(_jaxpr())
     if halved:
         output = graph.op("ashr", graph.op("isub", output, graph.i(1)), graph.i(1))
@@ -39,13 +39,13 @@ def noise_of(builder: FunctionBuilder, key: Values, coordinate: str, *, halved: 
 
 
 def load_key(builder: FunctionBuilder, keys: str, pair: str) -> Values:
-    """The words of key number `pair`, each in all lanes."""
+    """Words of key number `pair`, as vectors with the word in all lanes."""
     words = [builder.load("i32", keys, builder.index((pair, KEY_WORDS), (word, 1))) for word in range(KEY_WORDS)]
     return [builder.splat(word, "i") for word in words]
 
 
 def keys_of_members(builder: FunctionBuilder, keys: str) -> Values:
-    """The words of the keys of as many members as there are lanes, neighbours having that of their pair."""
+    """Words of the keys of as many members as there are lanes; the two members of a pair have the same key."""
     words = []
     for word in range(KEY_WORDS):
         vector = "poison"
@@ -57,15 +57,16 @@ def keys_of_members(builder: FunctionBuilder, keys: str) -> Values:
 
 
 def lanes(builder: FunctionBuilder) -> str:
-    """0, 1, 2, ... as a constant vector."""
+    """Constant vector 0, 1, 2, ..., one number per lane."""
     return f"<{', '.join(f'i32 {lane}' for lane in range(builder.width))}>"
 
 
 def fill_function(vectors: int, singles: int, width: int) -> FunctionBuilder:
-    """`void fill(ptr keys, ptr places, ptr noise)`: j of each pair of a block of members, as bytes.
+    """Function `void fill(ptr keys, ptr places, ptr noise)`, which writes the bytes j of all pairs of a block.
 
-    noise is [pair, vector, lane] of the vectors, each along coordinates, of which `places` has the first; behind it
-    [single, member] of the single coordinates, whose places follow, the members of a pair having the same.
+    noise begins with [pair, vector, lane] for the vectors of weights, whose lanes are successive coordinates from the
+    vector's entry in `places` on. [single, member] for the single weights follows; the remaining entries of `places`
+    are their coordinates, and both members of a pair have the same noise.
     """
     builder = FunctionBuilder("fill", ["ptr noalias %keys", "ptr noalias %places", "ptr noalias %noise"], width)
     bytes_ = f"<{width} x i8>"
@@ -99,10 +100,10 @@ def fill_function(vectors: int, singles: int, width: int) -> FunctionBuilder:
 
 
 def gradient_module(width: int) -> str:
-    """LLVM IR of `void kernel(ptr weights, ptr keys, i64 pairs, ptr sums, i64 groups)`.
+    """LLVM IR of `void kernel(ptr weights, ptr keys, i64 pairs, ptr sums, i64 groups)`, the sum of weighted noise.
 
-    sums, groups of UNROLLED vectors, become the sum over pairs of weight * noise, one pair after the other, in units of
-    weight x standard normal.
+    sums has groups of UNROLLED vectors. They become the sum over pairs of weight * standard normal noise; pairs are
+    added in their order.
     """
     parameters = ["ptr noalias %weights", "ptr noalias %keys", "i64 %pairs", "ptr noalias %sums", "i64 %groups"]
     builder = FunctionBuilder("inside", parameters, width)
@@ -138,5 +139,5 @@ def gradient_module(width: int) -> str:
 
 
 def _float(value: np.float32) -> str:
-    """A float32 as LLVM writes it."""
+    """A float32 in LLVM's notation."""
     return f"0x{np.float64(value).view(np.uint64):016X}"

@@ -1,4 +1,4 @@
-"""A JAX function, as a jaxpr, becomes a scalar graph: the tracer, joined with the rules of the primitives."""
+"""Translation of a jaxpr to a scalar graph, by the tracer with the rules of all primitives."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from workers.simd.graph.unsupported import refusing
 
 @refusing()
 def trace_jaxpr(closed: ClosedJaxpr) -> tuple[FoldingGraph, int, list[int]]:
-    """The graph of a function of one lane: (graph, number of input words, output nodes).
+    """Graph of a function of one lane, as (graph, number of input words, output nodes).
 
-    Each element of each array that goes in is an input of the graph, in order; each that comes out an output.
+    Each element of each input array is an input of the graph, in order, and each element of each output array an
+    output.
 
     Raises:
         UnsupportedError: the function cannot be compiled.

@@ -1,4 +1,4 @@
-"""Arithmetic and elementary functions, element by element."""
+"""Rules of arithmetic and elementary functions, which work element by element."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from workers.simd.graph.unsupported import UnsupportedError
 
 
 def _by_dtype(floats: str | None, integers: str | None, booleans: str | None = None) -> Rule:
-    """A rule that is one operation of the graph for each kind."""
+    """Rule that applies one operation of the graph for each dtype; None means that the dtype is not supported."""
 
     def rule(t: Tracer, equation: Any, *arrays: Nodes) -> Nodes:
         node_dtype = graph_dtype(dtype_in(equation))
@@ -74,7 +74,7 @@ def _sign(t: Tracer, equation: Any, x: Nodes) -> Nodes:
         raise UnsupportedError(f"sign of {dtype_in(equation)}")
 
     def sign(n: int) -> int:
-        negative = g.op("select", g.op("lt", n, g.f(0.0)), g.f(-1.0), n)  # zeros and NaN are their own sign
+        negative = g.op("select", g.op("lt", n, g.f(0.0)), g.f(-1.0), n)  # a zero or NaN is its own sign
         return g.op("select", g.op("lt", g.f(0.0), n), g.f(1.0), negative)
 
     return t.map(sign, x)
@@ -100,7 +100,7 @@ def _round(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 
 
 def _elementary(function: Callable[..., int]) -> Rule:
-    """A rule that is one of our own functions of nodes."""
+    """Rule that applies a function of `elementary.py` to float32 nodes."""
 
     def rule(t: Tracer, equation: Any, *arrays: Nodes) -> Nodes:
         if any(str(variable.aval.dtype) != "float32" for variable in equation.invars):

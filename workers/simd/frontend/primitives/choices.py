@@ -1,4 +1,4 @@
-"""Comparisons, choices between values, and conversions from one kind to another."""
+"""Rules of comparisons, choices between values, and conversions between dtypes."""
 
 from __future__ import annotations
 
@@ -41,6 +41,7 @@ def _compare(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
 
 
 def _not(t: Tracer, x: Nodes) -> Nodes:
+    """Negation of bool nodes."""
     return t.map(lambda n: t.graph.op("xor", t.graph.const("b", True), n), x)
 
 
@@ -60,7 +61,10 @@ def _extreme(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
 
 
 def extreme_of(g: Graph, name: str, dtype: str) -> Callable[[int, int], int]:
-    """The greater or the lesser of two nodes; NaN if one is. Which of two zeros is not said."""
+    """Function that gives the greater ("max") or the lesser ("min") of two nodes, or NaN if either is NaN.
+
+    Of two zeros with different signs it may give either.
+    """
     node_dtype = graph_dtype(dtype)
     if node_dtype == "b":
         return lambda a, b: g.op("or" if name == "max" else "and", a, b)
@@ -91,7 +95,7 @@ def _clamp(t: Tracer, equation: Any, low: Nodes, x: Nodes, high: Nodes) -> Nodes
 
 
 def choose(g: Graph, mask: int, if_true: int, if_false: int) -> int:
-    """One of two nodes of the same kind."""
+    """Node that chooses between two nodes of the same dtype by a bool node."""
     node_dtype = g.dtypes[if_true]
     if node_dtype != "b":
         return g.op("select" if node_dtype == "f" else "iselect", mask, if_true, if_false)
@@ -99,7 +103,7 @@ def choose(g: Graph, mask: int, if_true: int, if_false: int) -> int:
 
 
 def select(t: Tracer, dtype: str, which: Nodes, cases: Sequence[Sequence[Nodes]]) -> list[Nodes]:
-    """Arrays of one of some cases, element by element; a number below or beyond means the first or the last."""
+    """Arrays of the case that `which` names, element by element; numbers out of range name the first or last case."""
     g, is_bool, chosen = t.graph, graph_dtype(dtype) == "b", list(cases[-1])
 
     def one(mask: int, early: int, late: int) -> int:
@@ -139,7 +143,7 @@ def _convert(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 
 
 def to_float(t: Tracer, dtype: str, x: Nodes) -> Nodes:
-    """Nodes of any dtype as floats."""
+    """Nodes of any JAX dtype converted to floats."""
     match graph_dtype(dtype):
         case "b":
             return t.map(lambda n: t.graph.op("select", n, t.graph.f(1.0), t.graph.f(0.0)), x)
