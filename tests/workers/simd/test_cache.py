@@ -49,7 +49,7 @@ def test_a_damaged_or_foreign_entry_is_compiled_again_with_one_line(
     np.testing.assert_array_equal(again(X), wanted)
     said = capsys.readouterr().err.strip().splitlines()
     assert len(said) == 1
-    assert "compiling again" in said[0]
+    assert "compiling it again" in said[0]
     assert path.read_bytes() == content, "and it is kept again"
 
 

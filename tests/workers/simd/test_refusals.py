@@ -36,7 +36,7 @@ def test_a_step_that_makes_other_arrays_than_a_reset_is_refused():
         descriptor=lambda state: state[:2],
         step=lambda state, action: (jnp.zeros(3), jnp.float32(0.0), jnp.array(False)),
     )
-    with pytest.raises(TypeError, match="step returns a state of arrays .* but reset one of"):
+    with pytest.raises(TypeError, match=r"step returns a state of arrays .*, but reset one of"):
         compile_episodes(wider, spec(), np.arange(2), training=True)
 
 

@@ -29,7 +29,7 @@ def aligned(shape: tuple[int, ...]) -> Words:
 
 
 def pack(leaves: Sequence[Any], width: int) -> Words:
-    """Words of arrays [lane, ...], one array after the other. Lanes that fill up the last block repeat the last lane."""
+    """Words of arrays [lane, ...], one array after the other; the last lane is repeated to fill up the last block."""
     lanes = len(leaves[0]) if leaves else 1
     blocks = -(-lanes // width)
     columns = []

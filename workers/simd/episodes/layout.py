@@ -27,9 +27,9 @@ class Layer(NamedTuple):
 class Network(NamedTuple):
     """A policy's layers and the place of each weight in the flat vector of parameters.
 
-    The weights of hidden layers are vectors. Only the place of a vector's first lane is kept; the other lanes follow it.
-    (Lanes beyond the end of a row hold weights of the next row; they are never used.) The weights of the last layer are
-    single numbers, ordered by inputs with the biases last, and for each input by outputs.
+    The weights of hidden layers are vectors. Only the place of a vector's first lane is kept, and the other lanes
+    follow it. (Lanes beyond the end of a row hold weights of the next row; they are never used.) The weights of the
+    last layer are single numbers, ordered by inputs with the biases last, and for each input by outputs.
     """
 
     hidden: tuple[Layer, ...]

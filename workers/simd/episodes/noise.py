@@ -30,7 +30,7 @@ def definition() -> str:
 
 
 def noise_of(builder: FunctionBuilder, key: Values, coordinate: str, *, halved: bool) -> str:
-    """Vector of the noise k, as integers, for vectors of key words and coordinates; if `halved`, of j in k = 2 j + 1."""
+    """Vector of integer noise k for vectors of key words and coordinates; if `halved`, of j in k = 2 j + 1."""
     graph, _, (output,) = trace_jaxpr(_jaxpr())
     if halved:
         output = graph.op("ashr", graph.op("isub", output, graph.i(1)), graph.i(1))

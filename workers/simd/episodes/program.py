@@ -80,7 +80,7 @@ class EpisodeKernel:
         assert noise_keys_P is None or (noise_keys_P.shape[1:] == (KEY_WORDS,) and 2 * len(noise_keys_P) >= lanes)
         carries = self.begin(reset_keys_L)
         blocks = len(carries)
-        carries[-1, self.alive_word, lanes - width * (blocks - 1) :] = 0  # nobody is there
+        carries[-1, self.alive_word, lanes - width * (blocks - 1) :] = 0  # lanes without an episode
         actions = pack([action_keys_L], width)
         constants = np.concatenate([mean_O[self.inputs_O], std_O[self.inputs_O]]).astype(np.float32)
         seen_and_done = len(self.inputs_O) + self.network.outputs
