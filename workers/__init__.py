@@ -1,1 +1,1 @@
-"""What runs where the rollouts run: tasks, policy, compiled episodes. Of es_service it imports protocol and noise."""
+"""Code that runs in workers: tasks, policy and compiled episodes. Of es_service it imports only the protocol."""

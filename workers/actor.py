@@ -1,6 +1,6 @@
-"""A worker as an actor: a plain class that the Ray engine turns into one. It adds nothing to `worker.py` but transport.
+"""A worker as a plain class, which the Ray engine turns into an actor; it adds only transport to `worker.py`.
 
-The process is this actor's alone, and JAX is imported only after its environment is set. Messages are pickled `bytes`.
+The actor has a process of its own and imports JAX only after setting its environment. Messages are pickled `bytes`.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from es_service.protocol.process_environment import worker_environment
 
 
 class WorkerActor:
-    """One worker of a run. Calls come one at a time, in the order they were made."""
+    """One worker of a run. Its methods are called one at a time, in the order of the requests."""
 
     def __init__(self, spec: bytes, index: int, gpus: float = 0.0) -> None:
-        """Do nothing yet.
+        """Keep the arguments; `build` makes the worker.
 
         Args:
             spec: the pickled WorkerSpec.
             index: number of this worker within its run.
-            gpus: share of a GPU that Ray has given this actor; 0 for the CPU.
+            gpus: share of a GPU that Ray has assigned to this actor; 0 for the CPU.
         """
         self._spec, self._index, self._gpus = spec, index, gpus
         self._run_chunks: Callable[[Centre, Sequence[Chunk]], list[ChunkResult]] | None = None
@@ -34,13 +34,13 @@ class WorkerActor:
         return f"worker-{self._index}@{socket.gethostname()}"
 
     def place(self) -> WorkerPlace:
-        """Where this worker was put. The first call, answered as soon as there is a place."""
+        """Host, process and node of this worker. The engine calls this first; it returns once the actor is placed."""
         import ray
 
         return WorkerPlace(socket.gethostname(), os.getpid(), ray.get_runtime_context().get_node_id())
 
     def build(self) -> str:
-        """Import JAX with the settings every worker has, and build the run's functions; the platform's text."""
+        """Import JAX with the settings of all workers and build the run's functions; returns the platform's text."""
         environment = worker_environment(os.environ, self._gpus)
         for name in set(os.environ) - set(environment):
             del os.environ[name]
@@ -55,6 +55,6 @@ class WorkerActor:
         return platform_text(platform_info() | {"device": jax.devices()[0].device_kind})
 
     def run(self, centre: bytes, chunks: bytes) -> bytes:
-        """The pickled results of chunks around a centre."""
-        assert self._run_chunks is not None, "the engine calls build first"
+        """Run chunks around a centre; returns the pickled results."""
+        assert self._run_chunks is not None, "run was called before build"
         return pickle.dumps(self._run_chunks(pickle.loads(centre), pickle.loads(chunks)), pickle.HIGHEST_PROTOCOL)

@@ -1,4 +1,4 @@
-"""What is `brax:ant`, or `package.module:Class`? Asked of a process of its own, since finding out imports JAX.
+"""Describe a task such as `brax:ant` or `package.module:Class`, in a separate process because this imports JAX.
 
     python -m workers.describe NAME
 
@@ -16,6 +16,7 @@ from workers.simd.episodes.rollout import why_not
 
 
 def main(name: str) -> None:
+    """Print the description of a task, or the problem with it, as JSON."""
     try:
         task = describe_environment(name)
         answer = {"task": dataclasses.asdict(dataclasses.replace(task, no_simd=why_not(task)))}

@@ -1,7 +1,7 @@
-"""One episode of one member, step by step: what `xla` maps over lanes and `simd` compiles for them.
+"""One episode of one member as step functions, which `xla` maps over lanes and `simd` compiles.
 
-`look` and `move` together are a control step; the policy acts between them. A finished episode rides along masked, so
-steps after `done` never count.
+`look` and `move` together are one control step; the policy acts between them. A finished episode continues to be
+computed but is masked, so steps after `done` never count.
 """
 
 from __future__ import annotations
@@ -20,27 +20,30 @@ from workers.policy import normalise
 
 
 class Episodes(NamedTuple):
-    """What is left of an episode; of a batch of them, with leading axes as the caller's."""
+    """Results of an episode, or of a batch of episodes with the leading axes of the caller."""
 
     fitness: Any
     returns: Any
     descriptor: Any
     steps: Any
     goal_distance: Any
-    """[..., 2]: at the end and at its least."""
+    """[..., 2]: distance to the goal at the end, and the least distance during the episode."""
     shifted_sum_O: Any
-    """Sum over counted steps of (observation - statistics' mean); float32. Exact enough for one episode if that mean is
-    near the observations'; before any are known (in generation 1, or in blocks that run with an elite's statistics from
-    random weights) if their mean is below a thousand standard deviations. Of evaluations, which feed no statistics:
-    empty."""
+    """Sum over counted steps of (observation - mean of the statistics), float32; empty in evaluations, which do not
+    update the statistics.
+
+    It is accurate enough for one episode if that mean is close to the mean of the observations. Where no statistics
+    exist yet (in generation 1, or in blocks with an elite's statistics from random weights) the mean of the
+    observations must be less than a thousand of their standard deviations from 0."""
     shifted_square_sum_O: Any
+    """Sum over counted steps of (observation - mean of the statistics) squared, float32; empty in evaluations."""
     trace_T_B: Any
-    """Of evaluations: the descriptor along the episode; empty in training. Point k is where it was after
-    k / (points - 1) of its steps, or ended before."""
+    """Descriptor along an evaluation episode; empty in training. Point k is the descriptor after k / (points - 1) of
+    the episode's maximal number of steps, or at its end if it ended before."""
 
 
 class Carry(NamedTuple):
-    """An episode between two steps."""
+    """State of an episode between two steps."""
 
     state: Any
     alive: Any
@@ -51,20 +54,20 @@ class EpisodeSteps(NamedTuple):
     """An episode as pure functions of one lane."""
 
     begin: Callable[[Any], Carry]
-    """Stream key of the reset -> carry."""
+    """Function from the stream key of the reset to a carry."""
     look: Callable[[Carry, Any, Any], Any]
-    """(carry, mean_O, std_O) -> normalised observation [O]."""
+    """Function (carry, mean_O, std_O) -> normalised observation [O]."""
     move: Callable[[Carry, Any, Any, Any], Carry]
-    """(carry, mean_O, action [A], stream key of action noise) -> carry. The key matters only in training."""
+    """Function (carry, mean_O, action [A], stream key of the action noise) -> carry; only training uses the key."""
 
 
 def episode_steps(
     environment: Environment, spec: WorkerSpec, *, training: bool, inputs_O: Any = slice(None)
 ) -> EpisodeSteps:
-    """The steps of training episodes, with action noise and sums of observations, or of evaluations, with traces.
+    """Step functions of training episodes (action noise, sums of observations) or of evaluation episodes (traces).
 
     Args:
-        inputs_O: which of the environment's observations there are, for the policy and for the sums.
+        inputs_O: indices of the environment's observations that are computed, for the policy and for the sums.
     """
     action_unit = np.float32(spec.action_noise / NORMAL_STD)
     action_size = spec.policy.widths[-1]
@@ -101,14 +104,14 @@ def episode_steps(
         return action_unit * normal_integers(jnp, key, coordinates_A).astype(jnp.float32)
 
     def traced(trace_T_B: Any, steps: Any, descriptor_B: Any) -> Any:
-        """Point k and all later ones are here for now, from the step on that is k / (points - 1) of them."""
+        """Trace whose points at this step and later are set to this descriptor; later steps overwrite them."""
         reached_T = steps + 1 <= last_steps_T
         return jnp.where(reached_T[:, None], descriptor_B, trace_T_B)
 
     def move(carry: Carry, mean_O: Any, action_A: Any, action_key: Any) -> Carry:
         alive, before = carry.alive, carry.episode
         if noisy:
-            action_A = action_A + action_noise(action_key, before.steps)  # those of a living episode are its step
+            action_A = action_A + action_noise(action_key, before.steps)  # a living episode has done as many steps
         state, reward, done = environment.step(carry.state, action_A)
         distance = jnp.asarray(environment.goal_distance(state), jnp.float32)
         descriptor_B = jnp.asarray(environment.descriptor(state), jnp.float32)

@@ -1,4 +1,4 @@
-"""How fast is a task on one core? Asked of a process of its own, by `es-service bench rollouts`.
+"""Measure the speed of a task on one core, in a separate process that `es-service bench rollouts` starts.
 
     python -m workers.measure JSON      # the arguments of `measure`
 
@@ -30,7 +30,10 @@ from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.graph.unsupported import UnsupportedError
 
 STEPS, STEPS_WITH_POLICY = 50, 200
-"""Control steps of one call. With a policy each call also makes the noise of its members, as a chunk of a run does."""
+"""Control steps of one call, without and with a policy.
+
+With a policy, each call also makes the noise of its members, as a chunk of a run does.
+"""
 
 
 def measure(
@@ -42,19 +45,20 @@ def measure(
     seconds: float,
     rollout: str = "xla",
 ) -> dict:
-    """Environment steps a second of one process, after compiling.
+    """Environment steps per second of one process, without the time for compilation.
 
     Args:
-        task, options: as in a config's `task`.
-        hidden: widths of the policy.
-        policy: with a policy of its own weights for each member, noise and statistics; else random actions alone.
-        batch: episodes that step together; with a policy, both members of batch / 2 pairs.
-        seconds: to measure for.
+        task, options: name and options of the task, as in a config.
+        hidden: widths of the policy's hidden layers.
+        policy: whether to run a policy, with noise and statistics and with different weights for each member; if false,
+            actions are random.
+        batch: number of episodes that step together; with a policy they are both members of batch / 2 pairs.
+        seconds: duration of the measurement.
         rollout: what computes the steps, "xla" or "simd".
 
     Returns:
-        steps_per_second, compile_seconds (without that of resets, where there is no policy), peak_mib; or the problem,
-        where simd cannot compile the task or run here.
+        steps_per_second, compile_seconds (without a policy this excludes resets) and peak_mib; or only `problem`, if
+        simd cannot compile the task or cannot run on this processor.
     """
     size = SHIPPED[task] if task in SHIPPED else describe_environment(task)
     environment = make_environment(task, options)
@@ -66,7 +70,7 @@ def measure(
             call = _with_policy(environment, shape, task, batch, rollout)
         else:
             call = _without_policy(environment, shape, states, rollout)
-        call(0)  # the first compiles
+        call(0)  # the first call compiles
     except (UnsupportedError, NoVectorsError) as error:
         return {"problem": str(error)}
     ready = time.perf_counter()
@@ -81,6 +85,7 @@ def measure(
 
 
 def _with_policy(environment: Environment, shape: PolicyShape, task: str, batch: int, rollout: str) -> Any:
+    """Function that runs training episodes with a policy and returns the number of steps."""
     pairs = batch // 2
     spec = WorkerSpec(
         seed=0,
@@ -112,13 +117,13 @@ def _with_policy(environment: Environment, shape: PolicyShape, task: str, batch:
 
 
 def _after_reset(environment: Environment, batch: int) -> Any:
-    """States [batch, ...] to begin with."""
+    """States [batch, ...] after a reset."""
     keys = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(batch))
     return jax.block_until_ready(jax.jit(jax.vmap(environment.reset))(keys))
 
 
 def _without_policy(environment: Environment, shape: PolicyShape, states: Any, rollout: str) -> Any:
-    """STEPS control steps with random actions."""
+    """Function that runs STEPS control steps with random actions and returns the number of steps."""
     batch = len(jax.tree.leaves(states)[0])
     coordinates_A = jnp.arange(shape.widths[-1], dtype=jnp.uint32)
 
@@ -145,6 +150,7 @@ def _without_policy(environment: Environment, shape: PolicyShape, states: Any, r
 
 
 def main(arguments: str) -> None:
+    """Print the result of `measure` for arguments in JSON."""
     print(json.dumps(measure(**json.loads(arguments))))
 
 

@@ -1,8 +1,7 @@
-"""Workers as threads of a child process, most often one: chunks in, results out, each over a socket of its own. Started
-by the inline engine.
+"""Workers as threads of a child process that the inline engine starts, usually one thread per process.
 
-The parent sets the environment (one XLA thread, CPU) before this interpreter starts, so the numbers never depend on
-what else the parent has done with JAX.
+Each worker receives chunks and sends results over its own socket. The parent sets the environment (one XLA thread, CPU)
+before this interpreter starts, so the results never depend on the parent's use of JAX.
 """
 
 from __future__ import annotations
@@ -21,16 +20,18 @@ from typing import Any
 from es_service.protocol.wire import framed, receive
 
 PR_SET_PDEATHSIG = 1
+"""Linux's `prctl` option that sets the signal sent to a process when its parent dies."""
 
 
 def main(descriptor: int, parent: int) -> None:
-    """Serve until the parent closes its end.
+    """Serve workers until the parent closes its end of the socket `descriptor`.
 
-    Over the socket `descriptor`: the WorkerSpec, then a byte with the descriptor of a socket for each worker. Over a
-    worker's, in: ("centre", Centre) and ("chunks", key, attempt, [Chunk]). Out: ("broken", text), or ("up",) and then
-    ("results", key, attempt, [ChunkResult]) or ("failure", key, attempt, text).
+    The parent sends over this socket the WorkerSpec, and then for each worker one byte with the descriptor of the
+    worker's socket. A worker receives ("centre", Centre) and ("chunks", item, attempt, [Chunk]), where `item` names the
+    work item that the chunks belong to. It sends ("broken", text), or ("up",) and then for each work item
+    ("results", item, attempt, [ChunkResult]) or ("failure", item, attempt, text).
     """
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # a killed driver leaves no orphans computing
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # do not outlive a driver that was killed
     if os.getppid() != parent:
         return
     with socket.socket(fileno=descriptor) as control:
@@ -40,23 +41,25 @@ def main(descriptor: int, parent: int) -> None:
                 threading.Thread(target=_work, args=(given, run_chunks), daemon=True).start()
         except Exception:
             traceback.print_exc()
-    os._exit(0)  # without waiting for threads, which may be in the middle of a chunk
+    os._exit(0)  # do not wait for threads, which may be in the middle of a chunk
 
 
 def _descriptor(control: socket.socket) -> int | None:
-    """Of the next worker's socket; None when the parent has closed its end.
+    """File descriptor of the next worker's socket; None when the parent has closed its end.
 
     Raises:
-        OSError: there is none to be had.
+        OSError: the parent's message came without a descriptor.
     """
     byte, descriptors, _, _ = socket.recv_fds(control, 1, 1, socket.MSG_CMSG_CLOEXEC)
     if byte and not descriptors:
-        raise OSError("no file descriptor for a worker's socket")
+        raise OSError(
+            "the parent's message has no file descriptor for a worker's socket; the limit of open files may be too low"
+        )
     return descriptors[0] if descriptors else None
 
 
 def _make_run_chunks(spec: Any) -> Callable[..., Any] | str:
-    """What runs the chunks, or why there is nothing that could."""
+    """Function that runs chunks, or the traceback of the error that prevented making it."""
     try:
         from workers.worker import make_worker, run_chunks
 
@@ -66,7 +69,7 @@ def _make_run_chunks(spec: Any) -> Callable[..., Any] | str:
 
 
 def _work(descriptor: int, run_chunks: Callable[..., Any] | str) -> None:
-    """A worker until the parent closes its end. However it ends otherwise, the parent sees that and why."""
+    """Run one worker until the parent closes its end. After any other end, the parent sees that and the reason."""
     with socket.socket(fileno=descriptor) as parent:
         try:
             _serve(parent, run_chunks)
@@ -77,6 +80,7 @@ def _work(descriptor: int, run_chunks: Callable[..., Any] | str) -> None:
 
 
 def _serve(parent: socket.socket, run_chunks: Callable[..., Any] | str) -> None:
+    """Receive chunks and send their results; does not return unless the worker is broken."""
     if isinstance(run_chunks, str):
         parent.sendall(framed(("broken", run_chunks)))
         return
@@ -86,12 +90,12 @@ def _serve(parent: socket.socket, run_chunks: Callable[..., Any] | str) -> None:
         match receive(parent):
             case ("centre", centre):
                 pass
-            case ("chunks", key, attempt, chunks):
+            case ("chunks", item, attempt, chunks):
                 try:
-                    assert centre is not None, "the engine sends the centre first"
-                    answer = ("results", key, attempt, run_chunks(centre, chunks))
-                except BaseException:  # sys.exit in an environment, too
-                    answer = ("failure", key, attempt, traceback.format_exc())
+                    assert centre is not None, "chunks were received before a centre"
+                    answer = ("results", item, attempt, run_chunks(centre, chunks))
+                except BaseException:  # also sys.exit in an environment
+                    answer = ("failure", item, attempt, traceback.format_exc())
                 parent.sendall(framed(answer))
 
 

@@ -1,8 +1,8 @@
-"""Compiled batched episodes: a block of policies steps together until all are done, in constant memory.
+"""Batched episodes compiled by XLA: a block of policies steps together until all are done, in constant memory.
 
-Nothing is stacked over time. A loop carries, per episode, the state and what will be reported of it; a finished episode
-rides along masked, so steps after `done` never count. Shapes are constants of the run: XLA may give other bits for
-another batch shape.
+Nothing is stacked over time. A loop carries the state and the results of each episode. A finished episode continues to
+be computed but is masked, so steps after `done` never count. Shapes are constants of the run, because XLA may give
+different bits for another batch shape.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from workers.policy import act, split_layers
 
 
 def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
-    """Compile-once rollout of one training chunk.
+    """Rollout of one training chunk; it is compiled at its first call.
 
     Returns:
         f(centre_D, unit, mean_O, std_O, noise_keys_P_4, reset_keys_P_S_E_4, action_keys_P_S_E_4) -> Episodes with
@@ -58,7 +58,7 @@ def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Callabl
 
 
 def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
-    """Compile-once rollout of one evaluation chunk: episodes of one policy, without action noise.
+    """Rollout of one evaluation chunk, with episodes of the centre without action noise; compiled at its first call.
 
     Returns:
         f(centre_D, mean_O, std_O, reset_keys_E_4) -> Episodes with leading axis [E].
@@ -67,10 +67,12 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Calla
 
 
 def make_gradient_sum(parameters: int) -> Callable:
-    """Compile-once sum over one block: f(weights_P, noise_keys_P_4) -> [D], in weight x standard normal units.
+    """Sum of weighted noise of one block of pairs; it is compiled at its first call.
 
-    Pairs are added one after another in the order of their ids, so the float32 bits depend on nothing else. Noise is an
-    integer; it is scaled to standard normal once, at the end.
+    Returns:
+        f(weights_P, noise_keys_P_4) -> sum over pairs of weight x standard normal noise, [D]. Pairs are added one by
+        one in the order of their ids, so the float32 bits depend on nothing else. The noise is made of integers, and
+        the sum is scaled to standard normal once, at the end.
     """
     coordinates_D = np.arange(parameters, dtype=np.uint32)
 
@@ -86,9 +88,10 @@ def make_gradient_sum(parameters: int) -> Callable:
 
 
 def _make_member_episodes(environment: Environment, spec: WorkerSpec):
-    """f(parameters_M_D, mean_O, std_O, reset_keys_M_E_4, action_keys_M_E_4): a member's episodes, one after another.
+    """Function that runs all episodes of each member, one after another.
 
-    Leading axes of what comes back are [M, E].
+    Returns:
+        f(parameters_M_D, mean_O, std_O, reset_keys_M_E_4, action_keys_M_E_4) -> Episodes with leading axes [M, E].
     """
     one_each = _make_episodes(environment, spec, training=True)
 
@@ -101,9 +104,11 @@ def _make_member_episodes(environment: Environment, spec: WorkerSpec):
 
 
 def _make_episodes(environment: Environment, spec: WorkerSpec, *, training: bool):
-    """One episode per lane: f(parameters, mean_O, std_O, reset_keys_L_4[, action_keys_L_4]) -> Episodes [L].
+    """Function that runs one episode per lane.
 
-    In training every lane has its own parameters [L, D] and action noise; otherwise all share parameters [D].
+    Returns:
+        f(parameters, mean_O, std_O, reset_keys_L_4[, action_keys_L_4]) -> Episodes with leading axis [L]. In training,
+        every lane has its own parameters [L, D] and action noise; otherwise all lanes share parameters [D].
     """
     steps = episode_steps(environment, spec, training=training)
     policies = jax.vmap(lambda layers, x_O: act(jnp, layers, x_O), in_axes=(0 if training else None, 0))
@@ -114,7 +119,9 @@ def _make_episodes(environment: Environment, spec: WorkerSpec, *, training: bool
         return split_layers(spec.policy, parameters_D)
 
     def episodes(parameters, mean_O, std_O, reset_keys_L, action_keys_L=None):
-        layers = jax.vmap(split)(parameters) if training else split(parameters)  # once: inside the loop it is a copy
+        layers = (
+            jax.vmap(split)(parameters) if training else split(parameters)
+        )  # inside the loop this would copy them in every step
         keys_L = reset_keys_L if action_keys_L is None else action_keys_L
 
         def body(at: tuple[Any, Carry]) -> tuple[Any, Carry]:

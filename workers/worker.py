@@ -1,6 +1,6 @@
-"""A worker as one function: (centre, chunk) -> result. Shells around it (child process, Ray actor) add only transport.
+"""A worker as one function (centre, chunk) -> result. The child process and the Ray actor add only transport.
 
-A worker holds nothing that a restart would lose: every result is a pure function of its arguments and the spec.
+A worker has no state that a restart would lose: every result is a pure function of its arguments and the spec.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from workers.episode import Episodes
 
 
 def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
-    """Build the compiled functions of a run (compiled on first use) and return what runs its chunks."""
+    """Function (centre, chunk) -> result of a run; the functions that it uses are compiled at their first call."""
     environment = make_environment(spec.environment, spec.environment_options)
     if spec.rollout == "simd":
         from workers.simd.episodes import rollout as made_by
@@ -81,20 +81,22 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
 def run_chunks(
     run_chunk: Callable[[Centre, Chunk], ChunkResult], centre: Centre, chunks: Sequence[Chunk]
 ) -> list[ChunkResult]:
-    """What comes of chunks that travelled together; an error says in which of them it was."""
+    """Results of the chunks of one work item; a note on an exception names the chunk that raised it."""
     results = []
     for chunk in chunks:
         try:
             results.append(run_chunk(centre, chunk))
         except BaseException as error:
-            error.add_note(f"in {type(chunk).__name__} {chunk.chunk_id} of generation {chunk.generation}")
+            error.add_note(f"raised in {type(chunk).__name__} {chunk.chunk_id} of generation {chunk.generation}")
             raise
     return results
 
 
 def episode_keys(spec: WorkerSpec, generation: int, pairs_P: Any) -> Keys:
-    """Stream keys of training episodes, axes [resets or action noise, P, S, E, 4]; with common random numbers both
-    signs have the same."""
+    """Stream keys of training episodes, with axes [resets or action noise, P, S, E, 4].
+
+    With common random numbers, both members of a pair have the same keys.
+    """
     sign_S = np.zeros(2, int) if spec.common_random_numbers else np.arange(2)
     domains = (Domain.TRAINING_RESET, Domain.ACTION_NOISE)
     episode_E = np.arange(spec.episodes_per_member)
@@ -102,7 +104,11 @@ def episode_keys(spec: WorkerSpec, generation: int, pairs_P: Any) -> Keys:
 
 
 def _training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
-    """What a chunk's episodes, axes [P, S, E], say of its members: means over E, least distances, totals of steps."""
+    """Results of a training chunk's members from their episodes [P, S, E].
+
+    They are means over the episodes, except the least goal distance, which is the minimum, and the steps, which are the
+    sum.
+    """
     host = Episodes(*map(np.asarray, episodes))
 
     def mean(x_P_S_E: Any) -> Any:
@@ -120,7 +126,7 @@ def _training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
 
 
 def _evaluation_result(episodes: Episodes) -> EpisodesResult:
-    """What each episode says, axis [E], and the way of the first; copied, since JAX's memory is not ours to keep."""
+    """Results of each evaluation episode [E] and the trace of the first; arrays are copied out of JAX's memory."""
     host = Episodes(*map(np.array, episodes))
     return EpisodesResult(
         fitness=host.fitness,
@@ -134,8 +140,11 @@ def _evaluation_result(episodes: Episodes) -> EpisodesResult:
 
 
 def _moments(host: Episodes, shift_O: Any) -> Moments:
-    """Moments of all counted observations. An episode that is invalid is left out with what it saw: one whose sums,
-    fitness or descriptor are not finite; before that its observations may have been of any size."""
+    """Moments of the observations of all counted steps in valid episodes.
+
+    An episode is invalid if its sums, fitness or descriptor are not finite. All of its observations are left out,
+    because they may have been arbitrarily large before.
+    """
     size = host.shifted_sum_O.shape[-1]
     sums, squares = (x.reshape(-1, size).astype(np.float64) for x in (host.shifted_sum_O, host.shifted_square_sum_O))
     said = (sums, squares, host.fitness.reshape(-1, 1), host.descriptor.reshape(len(sums), -1))

@@ -29,8 +29,8 @@ from tests.benchmarks.simd_physics import peak
 from workers.environments import make_environment
 from workers.episode import episode_steps
 from workers.policy import initial_parameters
-from workers.simd.backend.code import Code, module
 from workers.simd.backend.emit import graph_function
+from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.target import compile_object, host_target, load_object
 from workers.simd.backend.words import aligned, words_of
 from workers.simd.episodes.kernel import compile_kernel
@@ -43,10 +43,12 @@ from workers.simd.frontend.trace import trace_jaxpr
 REPEATS = 2000
 
 
-def run_of(functions: list[Code], call: str, parameters: list[str]) -> Callable[..., float]:
+def run_of(functions: list[FunctionBuilder], call: str, parameters: list[str]) -> Callable[..., float]:
     """Seconds of one call of the last function, given its arguments; the least of five times REPEATS."""
     target = host_target()
-    inside = Code("inside", [f"ptr %{name}" for name in parameters] + ["float %unit", "i64 %times"], target.width)
+    inside = FunctionBuilder(
+        "inside", [f"ptr %{name}" for name in parameters] + ["float %unit", "i64 %times"], target.width
+    )
     inside.loop("%times", lambda *_: [inside.do(call)][:0])
     address, alive = load_object(compile_object(module([*functions, inside]), target), target)
     signature = [*[ctypes.c_void_p] * len(parameters), ctypes.c_float, ctypes.c_int64]
@@ -151,8 +153,8 @@ def read_gbytes(kib: float) -> float:
     """GB/s of reading a buffer of this size again and again, vector by vector."""
     target = host_target()
     vectors = int(kib * 1024) // (4 * target.width) // 8 * 8
-    sums = Code("read", ["ptr noalias %from", "ptr noalias %to"], target.width)
-    floats = sums.vector["f"]
+    sums = FunctionBuilder("read", ["ptr noalias %from", "ptr noalias %to"], target.width)
+    floats = sums.llvm_types["f"]
 
     def body(number: str, carried: list[str]) -> list[str]:
         loaded = [sums.load(floats, "%from", sums.index((number, 8), (k, 1))) for k in range(8)]

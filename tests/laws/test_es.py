@@ -118,13 +118,13 @@ def test_same_config_same_bits_other_seed_other_bits(finished):
     assert not np.array_equal(other.search.centres[0].centre_D, state.search.centres[0].centre_D)
 
 
-@pytest.mark.parametrize("kind", ["avx2", "four"])
-def test_vectors_of_another_width_give_the_same_run(finished, monkeypatch, kind):
+@pytest.mark.parametrize("isa", ["avx2", "four"])
+def test_vectors_of_another_width_give_the_same_run(finished, monkeypatch, isa):
     """What a processor without AVX-512 computes: everything that is kept has the same bits."""
     config, state, store, _, _ = finished
     assert config.compute.rollout == "simd"
     for module in (simd_rollout, program):
-        monkeypatch.setattr(module, "host_target", partial(target.host_target, kind))
+        monkeypatch.setattr(module, "host_target", partial(target.host_target, isa))
     again, other, _, _ = run_in_memory(config)
     assert again.generation == state.generation
     assert other.parts.keys() == store.parts.keys()

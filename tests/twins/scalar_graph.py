@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from workers.simd.graph.graph import Graph
-from workers.simd.graph.operations import DTYPES
+from workers.simd.graph.operations import NUMPY_DTYPES
 from workers.simd.graph.operations import compute as compute_operation
 from workers.simd.graph.schedule import Region, schedule
 
@@ -37,7 +37,7 @@ def evaluate(
             return np.full(words.shape[1], graph.constant(node))
         if key[0] == "input":
             word = words[key[2]]
-            return word != 0 if key[1] == "b" else word.view(DTYPES[key[1]])
+            return word != 0 if key[1] == "b" else word.view(NUMPY_DTYPES[key[1]])
         return values[node] if node in values else computed(node)  # a product that only sums take in
 
     def computed(node: int) -> np.ndarray:

@@ -9,5 +9,5 @@ from tests import helpers
 
 @pytest.fixture(params=["xla", "simd"])
 def spec(request):
-    """The tiny spec with changes, for each kind of rollout."""
+    """The tiny spec with changes, for each value of `compute.rollout`."""
     return partial(helpers.spec, rollout=request.param)

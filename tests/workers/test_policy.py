@@ -16,5 +16,5 @@ def test_initial_columns_have_their_norms_and_layers_differ():
             np.testing.assert_allclose(np.linalg.norm(weights, axis=0), norm, rtol=1e-5)
         assert not np.any(biases)
         assert not np.allclose(layers[0] / norms[0], layers[1] / norms[1])
-    other = initial_parameters(shape, "unit_columns", seed=0, member=1)
+    other = initial_parameters(shape, "unit_columns", seed=0, centre=1)
     assert not np.allclose(other, initial_parameters(shape, "unit_columns", seed=0))

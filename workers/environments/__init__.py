@@ -1,4 +1,4 @@
-"""Tasks: what each is (plain data, read by the driver) and how it is made (imported only where rollouts run)."""
+"""Tasks: their descriptions as plain data, and the functions that make them, imported only where rollouts run."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from es_service.protocol.messages import TaskSpec
 
 
 class TaskError(Exception):
-    """A task that cannot be had; the message says why."""
+    """A task does not exist or cannot be used; the message says why."""
 
 
 ANT_CLEARANCE = 0.65
-"""Half a wall and the torso's radius, less the tenth of a metre that a wall may give way."""
+"""Least distance of an ant's torso from the middle of a wall, in metres.
+
+It is half the width of a wall plus the torso's radius, minus the 0.1 m by which a wall may give way.
+"""
 
 SHIPPED: Mapping[str, TaskSpec] = {
     "point_maze": TaskSpec(
@@ -69,38 +72,42 @@ SHIPPED: Mapping[str, TaskSpec] = {
         summary="an ant is rewarded for running straight into a trap; far ahead is only behind it",
     ),
 }
-"""Our own tasks by name. A test holds each entry against what its module does."""
+"""Descriptions of the shipped tasks by name. A test compares each with the task's module."""
 
 
 @dataclass(frozen=True)
 class Environment:
     """A task as pure functions of one environment's state; rollouts vmap and compile them.
 
-    A state is any pytree of arrays. Nothing here knows of episodes, time limits, policies or statistics.
+    A state is any pytree of arrays. The functions do not depend on episodes, time limits, policies or statistics.
     """
 
     reset: Callable[[Any], Any]
-    """Stream key (uint32 [4]) -> state."""
+    """Function from a stream key (uint32 [4]) to a state."""
     observe: Callable[[Any], Any]
-    """State -> observation [O], float32."""
+    """Function from a state to an observation [O], float32."""
     step: Callable[[Any, Any], tuple[Any, Any, Any]]
-    """(state, action [A]) -> (next state, reward, done). The action may leave [-1, 1]; the task clips it."""
+    """Function (state, action [A]) -> (next state, reward, done). The task clips actions outside [-1, 1]."""
     descriptor: Callable[[Any], Any]
-    """State -> descriptor [B] of an episode that ends here."""
+    """Function from a state to the descriptor [B] of an episode that ends in it."""
     goal_distance: Callable[[Any], Any]
-    """State -> distance to the goal, NaN where the task has none."""
+    """Function from a state to the distance to the goal, NaN if the task has no goal."""
 
 
 def make_environment(name: str, options: Mapping[str, str]) -> Environment:
-    """The functions of a named task; imports its module, and with it JAX and any physics engine it needs.
+    """Functions of a task; imports its module, and with it JAX and the physics engine that it needs.
 
     Args:
-        name: one of SHIPPED, `brax:NAME`, or `package.module:Class`. Raises TaskError if that cannot be had.
+        name: a key of SHIPPED, `brax:NAME` or `package.module:Class`.
+        options: options of the task and their values.
+
+    Raises:
+        TaskError: the task does not exist or cannot be used.
     """
-    kind, colon, rest = name.partition(":")
+    prefix, colon, rest = name.partition(":")
     if not colon:
         return importlib.import_module(f"workers.environments.{name}").make(**options)
-    if kind == "brax":
+    if prefix == "brax":
         from workers.environments import brax_task
 
         return brax_task.make(rest, **options)
@@ -110,12 +117,13 @@ def make_environment(name: str, options: Mapping[str, str]) -> Environment:
 
 
 def describe_environment(name: str) -> TaskSpec:
-    """What the driver must know of `brax:NAME` or `package.module:Class`, which only its module can tell.
+    """Description of the task `brax:NAME` or `package.module:Class`, from its module; imports JAX.
 
-    Imports JAX. Raises TaskError as `make_environment`.
+    Raises:
+        TaskError: the task does not exist or cannot be used.
     """
-    kind, _, rest = name.partition(":")
-    if kind == "brax":
+    prefix, _, rest = name.partition(":")
+    if prefix == "brax":
         from workers.environments import brax_task
 
         return brax_task.describe(rest)

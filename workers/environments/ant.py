@@ -1,8 +1,8 @@
-"""The ant of AntMaze and AntTrap: Brax's, in its `spring` pipeline, with a torso that meets the floor, and walls.
+"""The ant of AntMaze and AntTrap: Brax's ant in its `spring` pipeline, with walls and a torso that touches the floor.
 
-The substep is Brax's own, `brax.spring.pipeline.step`, told of more contacts than its floor's and asked for the
-impulses it gave. A control step is ten of them. What is kept between control steps is small: where the links are, how
-they move, and what was pressed on them.
+A substep is Brax's own `brax.spring.pipeline.step`, to which contacts with walls are added and whose contact impulses
+are recorded. A control step has ten substeps. The state between control steps is small: positions and velocities of the
+links, and the sum of the contact impulses.
 """
 
 from __future__ import annotations
@@ -38,49 +38,53 @@ from workers.environments.walls import WALL_RADIUS, Segment, nearest_wall
 SUBSTEPS = 10
 SUBSTEP_S = 0.005
 STEP_S = SUBSTEPS * SUBSTEP_S
+"""Seconds of a control step."""
 JOINTS = 8
 RESET_NOISE = 0.1
-"""Half the width of the uniform noise on joint angles (radians) and joint velocities (radians per second) at reset."""
+"""Half-width of the uniform noise on joint angles (radians) and joint velocities (radians per second) at reset."""
 TORSO_RADIUS, LEG_RADIUS = 0.25, 0.08
 LEG_LENGTH = 0.4
-"""Of a lower leg along x and along y, in its own frame."""
+"""Extent of a lower leg along x and along y in its own frame, in metres."""
 LOWER_LEGS = ((2, 1, 1), (4, -1, 1), (6, -1, -1), (8, 1, -1))
-"""(link, sign of x, sign of y) of the legs in Gym's order: front left, front right, back left, back right."""
+"""(link, sign of x, sign of y) of the lower legs in Gym's order: front left, front right, back left, back right."""
 TORSO = 0
 BODIES = 14
-"""Of Gym's ant: world, torso, then (leg, aux, foot) of each leg. Only torso and feet ever touch anything."""
+"""Number of bodies of Gym's ant: world, torso, then (leg, aux, foot) of each leg. Only the torso and the feet can touch
+anything."""
 BODY_OF_LINK = {TORSO: 1, **{link: 4 + 3 * leg for leg, (link, _, _) in enumerate(LOWER_LEGS)}}
+"""Number of the body of Gym's ant for each link that can touch something."""
 FORCE_LIMIT = 1.0
+"""Bound of the contact forces in the observation of AntTrap."""
 
 
 class AntState(NamedTuple):
-    """One ant between two control steps; L = 9 links, 0 the torso, then (upper, lower) of each leg."""
+    """State of one ant between two control steps. There are L = 9 links: the torso, then (upper, lower) of each leg."""
 
     centre: Transform
     """[L] centres of mass in the world frame."""
     motion: Motion
-    """[L] their velocities."""
+    """[L] velocities of the centres of mass."""
     q: Any
     """[15] torso position, torso quaternion, joint angles."""
     qd: Any
-    """[14] their velocities."""
+    """[14] velocities of the torso and of the joints."""
     push: Motion
-    """[L] sum of contact impulses of the last control step over its seconds: torque about the centre, force, in the
-    world frame. Masses and inertias are 1, so an impulse is a change of velocity."""
+    """[L] sum of the contact impulses of the last control step divided by its duration: torque about the centre of mass
+    and force, in the world frame. Masses and inertias are 1, so an impulse is a change of velocity."""
 
 
 class Ant(NamedTuple):
-    """An ant among walls, as functions of one ant's state."""
+    """Functions of the state of one ant among walls."""
 
     system: System
     reset: Callable[[Any, tuple[float, float]], AntState]
-    """(stream key, start xy) -> state."""
+    """Function (stream key, start xy) -> state."""
     step: Callable[[AntState, Any], AntState]
-    """(state, action [8]) -> state one control step later; actions are clipped to [-1, 1] by Brax."""
+    """Function (state, action [8]) -> state one control step later; Brax clips actions to [-1, 1]."""
 
 
 def make_ant(walls: tuple[Segment, ...] = ()) -> Ant:
-    """Build the ant of a task. Walls are drawn in the model, for viewers, and met as `walls.py` says."""
+    """Build the ant of a task. The model shows the walls to viewers only; `walls.py` computes contacts with them."""
     system = load_system(walls)
 
     def reset(key: Any, start: tuple[float, float]) -> AntState:
@@ -104,7 +108,11 @@ def make_ant(walls: tuple[Segment, ...] = ()) -> Ant:
 
 
 def physics_step(system: System, state: State, action: Any, walls: tuple[Segment, ...]) -> tuple[State, Motion]:
-    """One substep of Brax, with walls: (state, impulse that contacts gave each link, [L], about its centre of mass)."""
+    """One substep of Brax with walls.
+
+    Returns:
+        (state, impulse of the contacts on each link [L], about its centre of mass)
+    """
     given = []
 
     def resolve(system: System, state: State) -> Motion:
@@ -119,7 +127,7 @@ def physics_step(system: System, state: State, action: Any, walls: tuple[Segment
 
 
 def expand(system: System, state: AntState) -> State:
-    """Brax's full state of an ant, all of it derived from the small one."""
+    """Brax's full state of an ant, derived from the small state."""
     x, xd = com.to_world(system, state.centre, state.motion)
     j, jd, a_p, a_c = kinematics.world_to_joint(system, x, xd)
     i_inv = com.inv_inertia(system, x)
@@ -131,12 +139,15 @@ def expand(system: System, state: AntState) -> State:
 
 
 def observe(state: AntState) -> Any:
-    """[27] Gym's observation: torso height and quaternion, joint angles, all velocities."""
+    """Gym's observation [27]: torso height and quaternion, joint angles, all velocities."""
     return jnp.concatenate([state.q[2:], state.qd])
 
 
 def contact_forces(state: AntState) -> Any:
-    """[84] Gym's: torque and force on each of 14 bodies, clipped to [-1, 1]; zero for bodies that touch nothing."""
+    """Gym's contact forces [84]: torque and force on each of 14 bodies, clipped to [-1, 1].
+
+    They are zero for bodies that touch nothing.
+    """
     zero_6 = jnp.zeros(6, jnp.float32)
     by_body = dict.fromkeys(range(BODIES), zero_6)
     for link, body in BODY_OF_LINK.items():
@@ -145,7 +156,7 @@ def contact_forces(state: AntState) -> Any:
 
 
 def load_system(walls: tuple[Segment, ...]) -> System:
-    """Brax's ant.xml with a torso that meets the floor, and the walls as pictures without contacts."""
+    """Brax's system of its ant.xml with a torso that touches the floor, and with walls that have no contacts."""
     elem = ElementTree.fromstring((epath.resource_path("brax") / "envs" / "assets" / "ant.xml").read_text())
     torso = elem.find(".//geom[@name='torso_geom']")
     world = elem.find("worldbody")
@@ -162,7 +173,7 @@ def load_system(walls: tuple[Segment, ...]) -> System:
 
 
 def _contacts(system: System, x: Transform, walls: tuple[Segment, ...]) -> Contact:
-    """The floor's contacts, as Brax finds them, and behind them one with a wall for each collider."""
+    """Contacts with the floor, as Brax finds them, followed by one contact with a wall for each collider."""
     floor = brax_contact.get(system, x)
     assert floor is not None
     if not walls:
@@ -177,14 +188,14 @@ def _contacts(system: System, x: Transform, walls: tuple[Segment, ...]) -> Conta
     met = jax.vmap(lambda foot_3, knee_3, radius: nearest_wall(walls, foot_3, knee_3, radius))
     contact = met(jnp.stack(feet_3), jnp.stack(knees_3), radii)
     colliders = len(links)
-    frame = jnp.zeros((colliders, 3, 3)).at[:, 0].set(contact.normal_3)  # Brax uses no more of it than the normal
+    frame = jnp.zeros((colliders, 3, 3)).at[:, 0].set(contact.normal_3)  # Brax uses only the normal
     like_floor = jax.tree.map(lambda rows: rows[:colliders], floor.replace(link_idx=None))
     wall = like_floor.replace(
         dist=contact.distance, pos=contact.position_3, frame=frame, elasticity=jnp.zeros(colliders),
         friction=jnp.ones_like(like_floor.friction),
     )  # fmt: skip
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), floor.replace(link_idx=None), wall)
-    # As with the floor, the first of the two bodies is the world, which Brax counts as link -1.
+    # As in contacts with the floor, the first of the two bodies is the world, which is link -1 in Brax.
     world, ant = floor.link_idx
     no_link = jnp.full(colliders, -1)
     return both.replace(link_idx=(jnp.concatenate([world, no_link]), jnp.concatenate([ant, jnp.array(links)])))
@@ -192,7 +203,10 @@ def _contacts(system: System, x: Transform, walls: tuple[Segment, ...]) -> Conta
 
 @contextlib.contextmanager
 def _replaced(module: Any, name: str, value: Any) -> Iterator[None]:
-    """A name of a module means something else, while one substep is traced; inside of `quietly`, so for one thread."""
+    """Context manager that replaces a name of a module while one substep is traced.
+
+    It is used inside of `quietly`, which only one thread can enter at a time.
+    """
     before = getattr(module, name)
     setattr(module, name, value)
     try:

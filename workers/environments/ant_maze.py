@@ -1,7 +1,7 @@
 """AntMaze: an ant must go round three walls to a goal 60 m away; the straight way ends in a pocket.
 
-The arena, length and descriptor of the benchmark paper (Chalumeau et al. 2022) with the inner walls, start and goal of
-the original ME-ES task (Colas et al. 2020).
+The arena, episode length and descriptor are those of the benchmark paper (Chalumeau et al. 2022); the inner walls, the
+start and the goal are those of the original ME-ES task (Colas et al. 2020).
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ from workers.environments.ant import AntState, make_ant, observe
 
 WALLS = SHIPPED["ant_maze"].walls or ()
 LOW, HIGH = SHIPPED["ant_maze"].descriptor_bounds[0]
-"""Of x and of y: the arena is a square."""
+"""Bounds of the arena in x and in y; it is a square."""
 START = (-25.0, -25.0)
 GOAL = (35.0, -25.0)
 MIDDLE, HALF = (LOW + HIGH) / 2.0, (HIGH - LOW) / 2.0
+"""Middle of the arena and half of its side; they scale positions in observations to [-1, 1]."""
 
 
 def make() -> Environment:
-    """AntMaze; it has no options."""
+    """Functions of AntMaze, which has no options."""
     ant = make_ant(WALLS)
 
     def step(state: AntState, action: Any) -> tuple[AntState, Any, Any]:

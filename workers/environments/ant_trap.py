@@ -1,7 +1,7 @@
-"""AntTrap: an ant is rewarded for running along +x, straight into a trap open on the side it comes from.
+"""AntTrap: an ant is rewarded for running along +x, straight into a trap that is open on the side of the start.
 
-Numbers of the benchmark paper (Chalumeau et al. 2022) and of the QDax environment it used: reward of Gym's ant with
-contact cost, observation with contact forces, trap 5 m wide and deep.
+The numbers are those of the benchmark paper (Chalumeau et al. 2022) and of the QDax environment that it used: the
+reward of Gym's ant with contact cost, observations with contact forces, and a trap 5 m wide and deep.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ WALLS = SHIPPED["ant_trap"].walls or ()
 DESCRIPTOR_BOUNDS = SHIPPED["ant_trap"].descriptor_bounds
 START = (0.0, 0.0)
 HEALTHY_Z = (0.2, 1.0)
+"""Range of the torso's height, in metres; the episode ends outside of it."""
 SURVIVAL_REWARD = 1.0
 CONTROL_COST, CONTACT_COST = 0.5, 5e-4
 
 
 def make() -> Environment:
-    """AntTrap; it has no options."""
+    """Functions of AntTrap, which has no options."""
     ant = make_ant(WALLS)
 
     def step(state: AntState, action: Any) -> tuple[AntState, Any, Any]:
         new = ant.step(state, action)
         forward = (new.q[0] - state.q[0]) / STEP_S
-        # The action as the motors take it: exploration noise beyond the limits moves nothing and costs nothing.
+        # The cost is that of the clipped action, as the motors apply it: noise beyond the limits has no effect or cost.
         control = CONTROL_COST * jnp.sum(jnp.clip(action, -1.0, 1.0) ** 2)
         contact = CONTACT_COST * jnp.sum(contact_forces(new) ** 2)
         done = (new.q[2] < HEALTHY_Z[0]) | (new.q[2] > HEALTHY_Z[1])

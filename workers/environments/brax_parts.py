@@ -1,6 +1,6 @@
-"""The parts of Brax we use, imported in silence: it and what it imports announce what they lack and who maintains them.
+"""The parts of Brax that are used here, imported without the messages that Brax and its dependencies print.
 
-Versions are pinned in constraints.txt, and tests hold our physics against Brax's.
+Versions are pinned in constraints.txt, and tests compare the physics of the ants with Brax's.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from typing import Any
 from workers.environments import TaskError
 
 WORKS_WITH = {"brax": "0.14.", "mujoco": "4.0.", "mujoco-mjx": "3.17."}
-"""Beginnings of the versions our physics has been held against Brax's with; each MJX release may break Brax."""
+"""Prefixes of the versions with which the physics was compared with Brax's; each MJX release may break Brax."""
 
 
 def check_versions() -> None:
-    """Raise TaskError where another version of Brax or MuJoCo is installed, or none."""
+    """Raise TaskError if Brax or MuJoCo is not installed in the supported version."""
     for package, version in WORKS_WITH.items():
         try:
             installed = metadata.version(package)
+            found = f"{package} {installed} is installed"
         except metadata.PackageNotFoundError:
-            installed = "none"
+            installed, found = "", f"{package} is not installed"
         if not installed.startswith(version):
             raise TaskError(
-                f"{package} {installed} is installed, and {package} {version}* is what works: "
-                "pip install -c constraints.txt brax mujoco mujoco-mjx"
+                f"{found}, but {package} {version}* is required: pip install -c constraints.txt brax mujoco mujoco-mjx"
             )
 
 
@@ -39,14 +39,15 @@ _ONE_THREAD = threading.RLock()
 
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """Brax says nothing in here, while it is imported, loads a model or is traced.
+    """Context manager in which Brax prints nothing while it is imported, loads a model or is traced.
 
-    One thread at a time, as what is changed for that, and what callers change of Brax in here, is the whole process's.
+    Only one thread can enter at a time, because the settings changed here, and the parts of Brax that callers replace
+    inside, belong to the whole process.
     """
     mujoco: Any = importlib.import_module("mujoco")
     with _ONE_THREAD:
         before = mujoco.get_mju_user_warning()
-        mujoco.set_mju_user_warning(lambda message: None)  # it would write them into a file where we are
+        mujoco.set_mju_user_warning(lambda message: None)  # by default, warnings go to a file in the current folder
         try:
             with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
                 warnings.simplefilter("ignore")
@@ -82,6 +83,6 @@ __all__ = [
 
 
 def load(xml: str) -> System:
-    """Brax's System of a MuJoCo model."""
+    """Brax's system of a MuJoCo model."""
     with quietly():
         return mjcf.loads(xml)

@@ -1,7 +1,7 @@
-"""Any environment of the installed Brax as a task: `brax:halfcheetah`, with a named descriptor.
+"""Environments of the installed Brax as tasks with a named descriptor, such as `brax:halfcheetah`.
 
-The environment is Brax's own, without wrappers: no automatic reset, no time limit of its own. Actions are clipped to
-[-1, 1], which is what Brax's environments take.
+The environments are Brax's own, without wrappers: they have no automatic reset and no time limit. Actions are clipped
+to [-1, 1], the range that Brax's environments expect.
 """
 
 from __future__ import annotations
@@ -21,31 +21,39 @@ with quietly():
     from brax import envs
 
 EPISODE_STEPS = 1000
-"""What Brax's own trainers use."""
+"""Default length of an episode, that of Brax's own trainers."""
 BACKENDS = ("spring", "generalized", "positional", "mjx")
+"""Backends of Brax, in the order in which they are tried."""
 FAR = 30.0
-"""Metres, or whatever the joint is measured in: bounds of a descriptor whose reach nobody declares."""
+"""Bound of descriptors whose range is not specified, in metres or in the unit of the joint."""
 JOINTS = 2
-"""That `final_joints` tells, the first of the model."""
+"""Most joints in the descriptor `final_joints`; they are the first joints of the model."""
 TOUCH = 0.005
-"""Metres above the floor that still count as touching it."""
+"""Distance from the floor, in metres, below which a foot counts as touching it."""
 
 
 class _State(NamedTuple):
+    """State of a Brax environment and of the descriptor `feet_contact`."""
+
     brax: Any
     touched_F: Any
-    """Control steps in which each foot touched the floor."""
+    """Number of control steps in which each foot touched the floor."""
     steps: Any
+    """Number of control steps."""
 
 
 def describe(name: str) -> TaskSpec:
-    """What the driver must know of Brax's environment `name`. Raises TaskError if there is none, or it does not fit."""
+    """Description of Brax's environment `name` as a task.
+
+    Raises:
+        TaskError: Brax has no such environment, or its observations are not flat.
+    """
     backends = _backends(name)
     environment = _make_brax(name, backends[0])
-    with quietly():  # Brax's own `observation_size` would run a whole reset to see
+    with quietly():  # Brax's own `observation_size` would run a whole reset
         observation = jax.eval_shape(environment.reset, jax.random.key(0)).obs
     if len(getattr(observation, "shape", ())) != 1:
-        raise TaskError(f"brax:{name} observes {observation}; only flat observations can be used")
+        raise TaskError(f"brax:{name} has observations {observation}; only one-dimensional arrays are supported")
     descriptors = _descriptors(environment.sys)
     names, bounds = next(iter(descriptors.values()))
     return TaskSpec(
@@ -64,7 +72,7 @@ def describe(name: str) -> TaskSpec:
 
 
 def make(name: str, descriptor: str | None = None, backend: str | None = None) -> Environment:
-    """The functions of Brax's environment `name`; its first descriptor and backend unless others are named."""
+    """Functions of Brax's environment `name`, with its first descriptor and backend unless others are named."""
     environment = _make_brax(name, backend or _backends(name)[0])
     system = environment.sys
     descriptor = descriptor or next(iter(_descriptors(system)))
@@ -78,7 +86,7 @@ def make(name: str, descriptor: str | None = None, backend: str | None = None) -
         return _State(state, jnp.zeros(len(feet), jnp.float32), jnp.float32(0.0))
 
     def step(state: _State, action: Any) -> tuple[_State, Any, Any]:
-        own = jax.tree.map(lambda x: x, state.brax)  # Brax writes into the metrics it is given
+        own = jax.tree.map(lambda x: x, state.brax)  # a copy, because Brax writes into the metrics of its argument
         with quietly():
             after = environment.step(own, jnp.clip(action, -1.0, 1.0))
         after = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), after, state.brax)
@@ -101,13 +109,18 @@ def make(name: str, descriptor: str | None = None, backend: str | None = None) -
 
 
 def _make_brax(name: str, backend: str) -> Any:
+    """Brax's own environment."""
     with quietly():
         return envs.get_environment(name, backend=backend)
 
 
 def _backends(name: str) -> tuple[str, ...]:
-    """The backends that Brax can build an environment with. Raises TaskError where there is none."""
-    known = sorted(set(envs._envs) - {"fast"})  # Brax has no public list of its names; that one is without physics
+    """Backends with which Brax can build an environment.
+
+    Raises:
+        TaskError: Brax has no such environment, or cannot build it with any backend.
+    """
+    known = sorted(set(envs._envs) - {"fast"})  # Brax has no public list of names; "fast" is without physics
     if name not in known:
         near = get_close_matches(name, known, n=1)
         hint = f"; did you mean brax:{near[0]}?" if near else ""
@@ -126,7 +139,7 @@ def _backends(name: str) -> tuple[str, ...]:
 
 
 def _descriptors(system: Any) -> dict[str, tuple[tuple[str, ...], Bounds]]:
-    """What can be said about an episode of this system: name -> (components, bounds). The first is the default."""
+    """Descriptors that a system supports: name -> (names of the dimensions, bounds). The first is the default."""
     found: dict[str, tuple[tuple[str, ...], Bounds]] = {}
     far = (-FAR, FAR)
     root = _root_coordinates(system)
@@ -142,25 +155,25 @@ def _descriptors(system: Any) -> dict[str, tuple[tuple[str, ...], Bounds]]:
 
 
 def _root_coordinates(system: Any) -> int:
-    """How many of the first coordinates say where a base is that moves about, and are no joints; 0 if it stays."""
-    kind = system.link_types[0]
-    if kind == "f":
-        return 7  # place and quaternion
-    return int(kind) if np.asarray(system.dof.motion.vel)[: int(kind), 0].any() else 0
+    """Number of leading coordinates that are the position of a moving base instead of joints; 0 for a fixed base."""
+    link_type = system.link_types[0]
+    if link_type == "f":
+        return 7  # position and quaternion
+    return int(link_type) if np.asarray(system.dof.motion.vel)[: int(link_type), 0].any() else 0
 
 
 def _feet(system: Any) -> list[int]:
-    """Links without children of which a part can touch the floor, in the order of the model."""
+    """Links without children that have a part that can touch the floor, in the order of the model."""
     links = range(system.num_links())
     leaves = [link for link in links if link not in system.link_parents]
-    bodies, kinds = np.asarray(system.geom_bodyid), np.asarray(system.geom_contype)
-    touchable = set((bodies[(kinds | np.asarray(system.geom_conaffinity)) != 0] - 1).tolist())
+    bodies, contact_types = np.asarray(system.geom_bodyid), np.asarray(system.geom_contype)
+    touchable = set((bodies[(contact_types | np.asarray(system.geom_conaffinity)) != 0] - 1).tolist())
     has_floor = -1 in touchable
     return [link for link in leaves if has_floor and link in touchable]
 
 
 def _touching(system: Any, x: Transform, feet: list[int]) -> Any:
-    """1.0 for each foot that touches the floor."""
+    """Array [F] that is 1.0 for each foot that touches the floor and 0.0 for others."""
     if not feet:
         return jnp.zeros(0, jnp.float32)
     with quietly():

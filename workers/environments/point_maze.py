@@ -1,8 +1,8 @@
 """PointMaze: a point in the square [-1, 1]^2 must pass two walls to reach a goal in the upper left corner.
 
-The lower wall leaves a gap on the left, the upper wall one on the right, so the reward, minus the distance to the goal,
-leads straight into a dead end. Kinematics and numbers are those of the published QDax environment (v0.3.0), quirks
-included: walls act on y only, so the point slides; wall ends are not solid.
+The lower wall leaves a gap on the left and the upper wall one on the right, so the reward, the negative distance to the
+goal, leads straight into a dead end. Kinematics and numbers are those of the published QDax environment (v0.3.0),
+including its peculiarities: walls act on y only, so the point slides along them, and the ends of walls are not solid.
 """
 
 from __future__ import annotations
@@ -17,20 +17,21 @@ from workers.environments import Environment
 GOAL = (-0.5, 0.8)
 GOAL_HALF_SIDE = 0.05
 STEP = 0.1
-"""Greatest move per axis and step."""
+"""Greatest movement along an axis in one step."""
 LOWER_WALL = (-0.50, -0.49)
-"""y of its lower and upper face; it stands on x >= LOWER_WALL_FROM_X."""
+"""y of the lower wall's lower and upper face; the wall extends over x >= LOWER_WALL_FROM_X."""
 LOWER_WALL_FROM_X = -0.5
 UPPER_WALL = (0.20, 0.21)
-"""y of its lower and upper face; it stands on x <= UPPER_WALL_TO_X."""
+"""y of the upper wall's lower and upper face; the wall extends over x <= UPPER_WALL_TO_X."""
 UPPER_WALL_TO_X = 0.5
 START_X = (-0.1, 0.1)
 START_Y = (-1.0, -0.7)
 CORNER = (0.9, -0.9)
+"""Start with the option `start="corner"`."""
 
 
 def make(start: str = "default") -> Environment:
-    """PointMaze with the published random start, or `start="corner"`: always (0.9, -0.9)."""
+    """Functions of PointMaze, with the published random start or, for `start="corner"`, the fixed start (0.9, -0.9)."""
     return Environment(_reset_corner if start == "corner" else _reset, _observe, _step, _observe, _goal_distance)
 
 
@@ -63,9 +64,12 @@ def _step(position: Any, action: Any) -> tuple[Any, Any, Any]:
 
 
 def _stopped_by_walls(old: Any, new: Any) -> Any:
-    """y of the move old -> new after the walls. The lower face decides where a wall is hit, whichever way one goes."""
+    """y at the end of the movement from old to new, stopped by the walls.
+
+    Whether a wall is hit depends on x at its lower face, for both directions of movement.
+    """
     rise = new[1] - old[1]
-    slope = (new[0] - old[0]) / jnp.where(rise == 0.0, 1.0, rise)  # without rise nothing is crossed
+    slope = (new[0] - old[0]) / jnp.where(rise == 0.0, 1.0, rise)  # a movement without rise crosses no wall
     y = new[1]
 
     below, above = LOWER_WALL

@@ -1,4 +1,4 @@
-"""A class of the user's own as a task: `package.module:Class`. This is what it must have.
+"""Classes of users as tasks, named `package.module:Class`. A class must have these attributes and methods:
 
     class Class:
         observation_size: int
@@ -12,15 +12,20 @@
         def step(self, state, action): ... # -> (state, reward, done)
         def descriptor(self, state): ...   # -> descriptor [len(descriptor_names)] of an episode that ends here
 
-and may have: `goal_distance(self, state)`; `final_fitness = True` where the last reward says how well the whole episode
-went; `options = {"name": ("default", "other")}`, keywords of its constructor, which must not change any size; where the
-descriptor is a place in the plane, `walls`, a tuple of segments ((x, y), (x, y)), and `wall_clearance`, how near to one
-nothing comes, for the map's coverage of what can be reached; `least_reward`, from which QD-scores count; a docstring,
-whose first line `es-service` shows. All methods are pure functions that JAX can trace, of one state: they are batched
-and compiled for you. `es_service.protocol.noise.uniforms(key, counters)` makes random numbers. In training, actions
-leave [-1, 1] by up to 7.95 times `policy.action_noise`, which is added after the last tanh: a task that needs a bound
-clips.
-Observations are summed in float32: in units in which they are not thousands of their standard deviations from 0.
+It may also have:
+
+- `goal_distance(self, state)`: the distance to a goal;
+- `final_fitness = True`, if the last reward measures the whole episode;
+- `options = {"name": ("default", "other")}`: keyword arguments of the constructor, which must not change any size;
+- if the descriptor is a place in the plane, `walls`, a tuple of segments ((x, y), (x, y)), and `wall_clearance`, the
+  least distance of a descriptor from a wall. The behaviour map's coverage is then relative to the reachable cells;
+- `least_reward`: the reward per step from which QD-scores are counted;
+- a docstring, whose first line `es-service` shows.
+
+All methods are pure functions of one state that JAX can trace; they are batched and compiled by the service.
+`es_service.protocol.noise.uniforms(key, counters)` makes random numbers. In training, actions may exceed [-1, 1] by up
+to 7.95 times `policy.action_noise`, which is added after the last tanh; a task that needs bounded actions must clip
+them. Observations are summed in float32, so their mean must be less than a thousand standard deviations from 0.
 """
 
 from __future__ import annotations
@@ -59,24 +64,30 @@ TABLES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("policy", "generation", "episodes", "stored_fitness", "fresh_fitness", "fresh_standard_error"),
     ),
 }
-"""Tables of a run that have columns named after the descriptor: (those, other columns that they could be taken for)."""
+"""Tables of a run with columns named after the descriptor: (patterns of these columns, other columns)."""
 
 
 def describe(path: str) -> TaskSpec:
-    """What the driver must know of a user's class. Raises TaskError if it cannot be had or misses something."""
+    """Description of a user's class as a task.
+
+    Raises:
+        TaskError: the class cannot be imported, or its attributes or methods are missing or wrong.
+    """
     task = _import(path)
     missing = [name for name in (*ATTRIBUTES, *METHODS) if not hasattr(task, name)]
     if missing:
-        raise TaskError(f"{path} has no {', '.join(missing)}; workers/environments/user_task.py says what is needed")
+        raise TaskError(
+            f"{path} has no {', '.join(missing)}; workers/environments/user_task.py lists what a task must have"
+        )
     wrong = [
-        f"{name} = {getattr(task, name)!r} is no {kind.__name__}"
-        for name, kind in ATTRIBUTES.items()
-        if not isinstance(getattr(task, name), kind)
+        f"{name} = {getattr(task, name)!r} is not of type {type_.__name__}"
+        for name, type_ in ATTRIBUTES.items()
+        if not isinstance(getattr(task, name), type_)
     ]
     options = getattr(task, "options", {})
     for name, values in options.items() if isinstance(options, dict) else [("options", options)]:
         if not isinstance(values, tuple) or not values or not all(isinstance(value, str) for value in values):
-            wrong.append(f"option {name} = {values!r} is no tuple of text, the default first")
+            wrong.append(f"option {name} = {values!r} is not a tuple of strings, the default first")
     if not wrong:
         names, bounds = len(task.descriptor_names), len(task.descriptor_bounds)
         if names != bounds or not names:
@@ -84,14 +95,14 @@ def describe(path: str) -> TaskSpec:
         wrong += _wrong_pairs(task.descriptor_bounds)
         wrong += clashes(tuple(map(str, task.descriptor_names)))
         if not _are_walls(getattr(task, "walls", None)):
-            wrong.append(f"walls = {task.walls!r} is no tuple of segments ((x, y), (x, y))")
+            wrong.append(f"walls = {task.walls!r} is not a tuple of segments ((x, y), (x, y))")
         least = getattr(task, "least_reward", None)
         numbers = {
             "wall_clearance": getattr(task, "wall_clearance", 0.0),
             "least_reward": 0.0 if least is None else least,
         }
-        wrong += [f"{name} = {x!r} is no finite number" for name, x in numbers.items() if not _are_finite((x,))]
-        sizes = {name: getattr(task, name) for name, kind in ATTRIBUTES.items() if kind is int}
+        wrong += [f"{name} = {x!r} is not a finite number" for name, x in numbers.items() if not _are_finite((x,))]
+        sizes = {name: getattr(task, name) for name, type_ in ATTRIBUTES.items() if type_ is int}
         wrong += [f"{name} = {size} is not positive" for name, size in sizes.items() if size < 1]
     if wrong:
         raise TaskError(f"{path}: {'; '.join(wrong)}")
@@ -114,32 +125,33 @@ def describe(path: str) -> TaskSpec:
 
 
 def _wrong_pairs(bounds: tuple) -> list[str]:
+    """Problems of the bounds of a descriptor."""
     return [
-        f"descriptor_bounds: {pair!r} is no pair (low, high) of finite numbers, low below high"
+        f"descriptor_bounds: {pair!r} is not a pair (low, high) of finite numbers with low < high"
         for pair in bounds
         if not (_are_finite(pair) and len(pair) == 2 and pair[0] < pair[1])
     ]
 
 
 def clashes(names: tuple[str, ...]) -> list[str]:
-    """What is wrong with names of a descriptor's dimensions: columns that a table of a run has already."""
+    """Problems of the names of a descriptor's dimensions, whose columns must not exist already in a table of a run."""
     wrong: dict[str, str] = {}
     for table, (ours, others) in TABLES.items():
-        taken = {column.casefold() for column in others}  # to SQL, and to many a reader, case makes no difference
+        taken = {column.casefold() for column in others}  # SQL does not distinguish upper and lower case
         for name in names:
             for column in (form.format(name) for form in ours):
                 if column.casefold() in taken:
                     wrong.setdefault(
                         name,
-                        f"descriptor_names: {name!r} would be the column {column} of {table}, which has one of that "
-                        "name; choose another name",
+                        f"descriptor_names: {name!r} would be the column {column} of {table}, which already has a "
+                        "column of that name; choose another name",
                     )
                 taken.add(column.casefold())
     return list(wrong.values())
 
 
 def _are_walls(walls: Any) -> bool:
-    """None, or segments between two different places."""
+    """Whether a value is None or a tuple of segments, each between two different places."""
     return walls is None or (
         isinstance(walls, tuple)
         and all(isinstance(wall, tuple) and len(wall) == 2 and wall[0] != wall[1] for wall in walls)
@@ -148,11 +160,12 @@ def _are_walls(walls: Any) -> bool:
 
 
 def _are_finite(numbers: Any) -> bool:
+    """Whether a value is a tuple of finite numbers."""
     return isinstance(numbers, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in numbers)
 
 
 def _check_shapes(path: str) -> None:
-    """Raise TaskError where the methods return other shapes than the class declares, or cannot be traced."""
+    """Raise TaskError if methods return shapes other than the class declares, or cannot be traced."""
     task = _import(path)
     try:
         environment = make(path, {name: values[0] for name, values in getattr(task, "options", {}).items()})
@@ -167,17 +180,17 @@ def _check_shapes(path: str) -> None:
             "goal_distance": (jax.eval_shape(environment.goal_distance, state).shape, ()),
         }
     except Exception as error:  # the user's code can raise anything
-        raise TaskError(f"{path} cannot be traced: {type(error).__name__}: {error}") from error
+        raise TaskError(f"{path} cannot be traced by JAX: {type(error).__name__}: {error}") from error
     wrong = [f"{what} has the shape {is_}, not {should}" for what, (is_, should) in found.items() if is_ != should]
-    kinds = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), one) for one in (state, after)]
-    if jax.tree.structure(state) != jax.tree.structure(after) or kinds[0] != kinds[1]:
-        wrong.append(f"step returns a state of other arrays than reset: {after} after {state}")
+    arrays = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), one) for one in (state, after)]
+    if jax.tree.structure(state) != jax.tree.structure(after) or arrays[0] != arrays[1]:
+        wrong.append(f"step returns a state of arrays {after}, but reset one of {state}; shapes and dtypes must agree")
     if wrong:
         raise TaskError(f"{path}: {'; '.join(wrong)}")
 
 
 def make(path: str, options: Mapping[str, str]) -> Environment:
-    """The functions of a user's class, constructed with the task's options."""
+    """Functions of a user's class, constructed with the task's options."""
     task = _import(path)(**options)
     goal_distance = getattr(task, "goal_distance", lambda state: jnp.float32(jnp.nan))
 
@@ -189,13 +202,16 @@ def make(path: str, options: Mapping[str, str]) -> Environment:
 
 
 def _import(path: str) -> Any:
+    """The class that `package.module:Class` names."""
     module, _, name = path.partition(":")
     if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # a console script does not look where it was started
+        sys.path.append(os.getcwd())  # a console script does not search the current folder
     try:
         found = importlib.import_module(module)
-    except (ImportError, ValueError, TypeError) as error:  # the latter two of a name that is none
-        raise TaskError(f"{path}: cannot import {module} ({error}); start where it is, or install it") from error
+    except (ImportError, ValueError, TypeError) as error:  # the latter two if the name is no module name
+        raise TaskError(
+            f"{path}: cannot import {module} ({error}); start in the folder that contains it, or install it"
+        ) from error
     if not hasattr(found, name):
-        raise TaskError(f"{path}: {module} has no {name}")
+        raise TaskError(f"{path}: the module {module} has no class {name}")
     return getattr(found, name)

@@ -1,9 +1,9 @@
-"""Walls for ants: upright, without tops to climb over, met by capsules and spheres in the plane.
+"""Contacts of ants with walls, which are upright and infinitely high, so that contacts are computed in the plane.
 
-A wall is a plane segment thickened by WALL_RADIUS, a collider one thickened by its own radius: a lower leg from foot to
-knee, or the torso, whose segment is a point. They touch where the two segments are closest. A contact's normal is
-horizontal and points from the wall to the collider, so that nothing lifts an ant over a wall. Each collider has one
-contact, with the wall nearest to it. Choices are made without gathers, and divisions spared, for compilers' sake.
+A wall is a segment in the plane, thickened by WALL_RADIUS. A collider is a segment thickened by its own radius: a lower
+leg from foot to knee, or the torso, whose segment is a point. They touch where the two segments are closest. The normal
+of a contact is horizontal and points from the wall to the collider, so no contact lifts an ant over a wall. Each
+collider has one contact, with the wall nearest to it. The code avoids gathers and divisions, which compile badly.
 """
 
 from __future__ import annotations
@@ -16,30 +16,33 @@ import numpy as np
 from es_service.protocol.messages import Segment
 
 WALL_RADIUS = 0.5
+"""Half the thickness of a wall, in metres."""
 TINY = 1e-9
+"""Least divisor, which avoids divisions by 0."""
 
 
 class WallContact(NamedTuple):
-    """Where a collider meets, or misses, its nearest wall."""
+    """Distance, normal and position of a collider's contact with its nearest wall."""
 
     distance: Any
-    """Between the two surfaces, metres; negative in contact."""
+    """Distance between the two surfaces in metres; negative in contact."""
     normal_3: Any
     """Horizontal unit vector from the wall to the collider."""
     position_3: Any
-    """Half-way between the surfaces, at the height of the collider's closest point."""
+    """Point half-way between the surfaces, at the height of the collider's closest point."""
 
 
 def nearest_wall(walls: tuple[Segment, ...], foot_3: Any, knee_3: Any, radius: Any) -> WallContact:
-    """The contact of one collider with the nearest of some walls.
+    """Contact of one collider with the nearest of several walls.
 
-    Two segments that do not cross are closest at an end of one of them. Where they cross, the gap is how far the foot
-    has come through, negative, and the normal points to the knee's side.
+    Two segments that do not cross are closest at an end of one of them. If they cross, the gap is minus the distance by
+    which the foot has passed the wall, and the normal points to the side of the knee.
 
     Args:
-        foot_3, knee_3: ends of the collider's axis; equal for a sphere. Of equally near pairs of points the foot's is
-            taken, then that of the wall first in the list.
-        radius: of the collider.
+        walls: ends of each wall.
+        foot_3, knee_3: ends of the collider's axis; equal for a sphere. Of equally near pairs of points the one at the
+            foot is taken, and of equally near walls the first in the list.
+        radius: radius of the collider.
     """
     ends = np.array(walls, np.float32)
     start_W_2, way_W_2 = ends[:, 0], ends[:, 1] - ends[:, 0]
@@ -48,7 +51,7 @@ def nearest_wall(walls: tuple[Segment, ...], foot_3: Any, knee_3: Any, radius: A
     leg_2 = knee_2 - foot_2
     inverse_leg = 1.0 / jnp.maximum(_dot(leg_2, leg_2), TINY)
 
-    # The four candidates of each wall: foot, knee, and the wall's two ends, each against the other segment.
+    # The four candidates of each wall: the foot, the knee and the wall's two ends, each with the other segment.
     candidates = []
     for point_2, along in ((foot_2, 0.0), (knee_2, 1.0)):
         share_W = jnp.clip(_dot(point_2 - start_W_2, way_W_2) * inverse_W, 0.0, 1.0)
@@ -58,7 +61,7 @@ def nearest_wall(walls: tuple[Segment, ...], foot_3: Any, knee_3: Any, radius: A
         candidates.append((foot_2 + share_W[:, None] * leg_2 - end_W_2, share_W))
     square_W, offset_W_2, along_W = _least([(_dot(offset, offset), offset, along) for offset, along in candidates])
 
-    # Squares of gaps decide which wall is nearest, those of feet that came through as negative numbers.
+    # The nearest wall is the one with the least square of the gap; the square is negative if the foot has passed it.
     side_foot_W, side_knee_W = _cross(way_W_2, foot_2 - start_W_2), _cross(way_W_2, knee_2 - start_W_2)
     ends_apart_W = _cross(leg_2, start_W_2 - foot_2) * _cross(leg_2, ends[:, 1] - foot_2) < 0
     crosses_W = (side_foot_W * side_knee_W < 0) & ends_apart_W
@@ -82,7 +85,7 @@ def _dot(a_2: Any, b_2: Any) -> Any:
 
 
 def _least(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
-    """Of each lane's rows the one whose first entry is least; of equal ones the first."""
+    """Row whose first entry is least, element by element; of equal ones the first row."""
     best = rows[0]
     for row in rows[1:]:
         less = row[0] < best[0]
@@ -94,5 +97,5 @@ def _least(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
 
 
 def _cross(way_2: Any, from_2: Any) -> Any:
-    """Positive to the left of the way, negative to its right."""
+    """Cross product of two vectors in the plane; positive if `from_2` is to the left of `way_2`."""
     return way_2[..., 0] * from_2[..., 1] - way_2[..., 1] * from_2[..., 0]

@@ -1,11 +1,11 @@
-"""A compiler from JAX functions of one environment to vector code for many: rollouts at the speed of the core.
+"""A compiler from JAX functions of one environment to machine code that runs many environments in vector registers.
 
-    frontend/    jaxpr -> scalar graph                 trace, tracer, primitives/, kinds, digest
-    graph/       the graph, and what simplifies it     graph, folding, loops; elementary, division; schedule; operations
-    backend/     graph -> LLVM IR -> machine code      emit, code; target; native, cache; words
-    episodes/    what is compiled with them            kernel; layout, network, noise, program; rollout
+    frontend/    jaxpr -> scalar graph                 trace, tracer, primitives/, dtypes, digest
+    graph/       the graph and its simplification      graph, folding, loops; elementary, division; schedule; operations
+    backend/     graph -> LLVM IR -> machine code      emit, function_builder; target; native, cache; words
+    episodes/    kernels and whole episodes            kernel; layout, network, noise, program; rollout
 
-A folder imports from those it needs below it: episodes from all, frontend and backend from graph, graph from none. Each
-lane of a vector is one environment. Environments stay written once, in JAX; `xla` is what this is held against. The
-README beside this file follows a step through all stages.
+`episodes` imports from all other folders, `frontend` and `backend` from `graph`, and `graph` from none. Each lane of a
+vector is one environment. Environments are written once, in JAX; tests compare this compiler with `xla`. The README
+beside this file follows an environment step through all stages.
 """

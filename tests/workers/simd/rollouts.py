@@ -1,4 +1,4 @@
-"""What tests of whole episodes begin with: processors, tasks, arguments; and an episode of each kind."""
+"""Helpers of tests of whole episodes: targets, tasks, arguments, and the episodes of simd and of xla."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from workers.simd.episodes import rollout
 
 
 def targets() -> list[Any]:
-    """Of this processor, the widest first."""
+    """Targets of this processor, the widest first."""
     found = []
-    for kind in WIDTHS:
+    for isa in WIDTHS:
         try:
-            found.append(host_target(kind))
+            found.append(host_target(isa))
         except NoVectorsError:
             continue
     return found
 
 
-def kinds() -> list[str]:
-    """Of code that this machine runs."""
-    return [target.kind for target in targets()]
+def isas() -> list[str]:
+    """Instruction sets of code that this machine can run."""
+    return [target.isa for target in targets()]
 
 
 def task_spec(task: str, **changes: Any) -> WorkerSpec:
@@ -41,7 +41,7 @@ def task_spec(task: str, **changes: Any) -> WorkerSpec:
 
 
 def arguments(worker_spec: WorkerSpec, scale: float = 1.0, generation: int = 1, sigma: float = 0.05) -> tuple[Any, ...]:
-    """Of a training rollout; the centre is a random policy, statistics not trivial."""
+    """Arguments of a training rollout, with a random policy as the centre and statistics that are not trivial."""
     shape, pairs = worker_spec.policy, np.arange(worker_spec.chunk_pairs)
     centre_D = scale * initial_parameters(shape, "unit_columns", 5)
     rng = np.random.default_rng(generation)
@@ -58,7 +58,7 @@ def arguments(worker_spec: WorkerSpec, scale: float = 1.0, generation: int = 1, 
 
 
 def both(worker_spec: WorkerSpec, *given: Any) -> tuple[Episodes, Episodes]:
-    """(simd's, xla's)."""
+    """(episodes of simd, episodes of xla) for the same arguments."""
     environment = make_environment(worker_spec.environment, {})
     ours = rollout.make_training_rollout(environment, worker_spec)(*given)
     theirs = workers.rollout.make_training_rollout(environment, worker_spec)(*given)

@@ -19,7 +19,7 @@ from tests.helpers import random_parameters, spec
 from tests.workers.simd.rollouts import arguments, both, targets, task_spec
 from workers.environments import make_environment
 from workers.episode import Episodes
-from workers.simd.backend.code import Code, module
+from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import WIDTHS, host_target
 from workers.simd.episodes import rollout
@@ -129,16 +129,16 @@ def test_inputs_that_are_always_zero_are_left_out_and_missed_by_nobody():
     np.testing.assert_allclose(ours.shifted_sum_O[..., zero_O], -10.0)
 
 
-@pytest.mark.parametrize("kind", WIDTHS)
-def test_noise_is_the_published_generator_s(kind: str, tmp_path: Path):
-    if kind not in [target.kind for target in targets()]:
-        pytest.skip(f"no {kind}")
-    target = host_target(kind)
+@pytest.mark.parametrize("isa", WIDTHS)
+def test_noise_is_the_published_generator_s(isa: str, tmp_path: Path):
+    if isa not in [target.isa for target in targets()]:
+        pytest.skip(f"no {isa}")
+    target = host_target(isa)
     pairs, singles = target.width // 2, 5
     fill = fill_function(3, singles, target.width)
-    code = Code("inside", fill.parameters, target.width)
-    code.do("call void @fill(ptr %keys, ptr %places, ptr %noise)")
-    native = load_compiled(f"noise {kind}", lambda: module([fill, code]), target, tmp_path)
+    builder = FunctionBuilder("inside", fill.parameters, target.width)
+    builder.do("call void @fill(ptr %keys, ptr %places, ptr %noise)")
+    native = load_compiled(f"noise {isa}", lambda: module([fill, builder]), target, tmp_path)
     places = np.array([0, 1000, 2**32 - 5, 0, 1, 2, 77, 2**32 - 1], np.uint32)
     for (seed, domain, generation, ids), expected in TEST_VECTORS:
         keys = stream_keys(1, Domain.SELECTION, 2, np.arange(pairs))

@@ -12,7 +12,7 @@ import pytest
 from jax import lax
 
 from tests.twins.scalar_graph import evaluate
-from tests.workers.simd.rollouts import kinds
+from tests.workers.simd.rollouts import isas
 from workers.environments import make_environment
 from workers.simd.backend import target
 from workers.simd.backend.target import host_target
@@ -56,11 +56,11 @@ def test_bits_are_the_twins_at_every_width(name: str) -> None:
         [np.ascontiguousarray(leaf.reshape(LANES, -1).T).view(np.uint32) for leaf in words_of((states, actions))]
     )
     twin = [np.asarray(value) for value in evaluate(graph, outputs, words)]
-    for kind in kinds():
-        kernel = compile_kernel(step, one_of(states), one_of(actions), target=host_target(kind))
+    for isa in isas():
+        kernel = compile_kernel(step, one_of(states), one_of(actions), target=host_target(isa))
         found = np.concatenate([leaf.reshape(LANES, -1) for leaf in words_of(kernel(states, actions))], axis=1).T
         for number, (one, other) in enumerate(zip(found, twin, strict=True)):
-            np.testing.assert_array_equal(one, other.astype(one.dtype), err_msg=f"{kind}, word {number}")
+            np.testing.assert_array_equal(one, other.astype(one.dtype), err_msg=f"{isa}, word {number}")
 
 
 def test_operations_are_the_twins_for_special_values_too() -> None:
@@ -85,8 +85,8 @@ def test_operations_are_the_twins_for_special_values_too() -> None:
     used = {graph.keys[node][0] for node in range(len(graph.keys))}
     assert set(OPERATIONS) - used <= {"fma", "bits", "int_of_float", "int_of_bool", "ult", "unbits"}
     twin = evaluate(graph, outputs, np.array([np.asarray(x).view(np.uint32) for x in arguments]))
-    for kind in kinds():
-        found = compile_kernel(function, *(one_of(x) for x in arguments), target=host_target(kind))(*arguments)
+    for isa in isas():
+        found = compile_kernel(function, *(one_of(x) for x in arguments), target=host_target(isa))(*arguments)
         for one, other in zip(found, twin, strict=True):
             np.testing.assert_array_equal(one, np.asarray(other).astype(one.dtype))
 
@@ -176,7 +176,7 @@ def test_a_narrow_processor_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(target.NoVectorsError, match="has no AVX2 and no FMA"):
         host_target()
     monkeypatch.setattr(target, "_host", lambda: (cpu, features | {"avx512f": False}))
-    assert host_target().kind == "avx2"
+    assert host_target().isa == "avx2"
     with pytest.raises(target.NoVectorsError, match="has no AVX-512"):
         host_target("avx512")
 

@@ -13,7 +13,7 @@ from es_service.protocol.messages import PolicyShape
 from es_service.protocol.noise import NORMAL_STD, Domain, normals, stream_keys
 from tests.helpers import random_parameters
 from tests.workers.simd.rollouts import targets
-from workers.simd.backend.code import Code, module
+from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import WIDTHS, Target
 from workers.simd.backend.words import aligned
@@ -31,13 +31,13 @@ def run(
     """(actions [lane, output], hidden room after them) of a block of members; of the centre for keys None."""
     noisy = keys is not None
     arguments = ["x", "alive", "centre", "keys", "places", "noise", "hidden", "action"]
-    code = Code("inside", [*(f"ptr noalias %{name}" for name in arguments), "float %unit"], network.width)
+    builder = FunctionBuilder("inside", [*(f"ptr noalias %{name}" for name in arguments), "float %unit"], network.width)
     fill = fill_function(network.vectors, len(network.places) - network.vectors, network.width)
     if noisy:
-        code.do("call void @fill(ptr %keys, ptr %places, ptr %noise)")
+        builder.do("call void @fill(ptr %keys, ptr %places, ptr %noise)")
     given = "ptr %noise, float %unit, " if noisy else ""
-    code.do(f"call void @policy(ptr %x, ptr %alive, ptr %centre, {given}ptr %hidden, ptr %action)")
-    functions = [fill, policy_function(network, noisy=noisy), code]
+    builder.do(f"call void @policy(ptr %x, ptr %alive, ptr %centre, {given}ptr %hidden, ptr %action)")
+    functions = [fill, policy_function(network, noisy=noisy), builder]
     native = load_compiled(f"policy {network.places.tolist()} {noisy}", lambda: module(functions), target, folder)
     lanes = aligned((network.inputs if not network.hidden else network.hidden[0].inputs, network.width))
     lanes.view(np.float32)[:] = x.T
@@ -63,18 +63,18 @@ def actions_of(shape: PolicyShape, parameters_D: np.ndarray, x: np.ndarray) -> n
     return values
 
 
-@pytest.mark.parametrize("kind", WIDTHS)
+@pytest.mark.parametrize("isa", WIDTHS)
 @pytest.mark.parametrize("seen", [1, 2])
 @pytest.mark.parametrize(
     "widths", [(3, 1), (2, 16, 2), (5, 64, 17), (4, 33, 48, 5), (29, 20, 8), (1, 1, 1), (7, 144, 3), (6, 40)]
 )
 def test_actions_are_those_of_members_with_their_own_weights(
-    widths: tuple[int, ...], seen: int, kind: str, tmp_path: Path
+    widths: tuple[int, ...], seen: int, isa: str, tmp_path: Path
 ):
     """Of every input, or of every second one, the others being zero."""
-    (target,) = [one for one in targets() if one.kind == kind] or [None]
+    (target,) = [one for one in targets() if one.isa == isa] or [None]
     if target is None:
-        pytest.skip(f"no {kind}")
+        pytest.skip(f"no {isa}")
     shape = PolicyShape(widths)
     centre_D = random_parameters(4, shape.parameters, 0.5)
     inputs_O = np.arange(0, widths[0], seen)

@@ -63,7 +63,7 @@ def test_a_reset_that_the_compiler_chokes_on_is_jaxs(task: type) -> None:
     name = f"{__name__}:{task.__name__}"
     assert rollout.why_not(describe_environment(name)) == ""
     worker_spec = spec(environment=name, policy=PolicyShape((2, 8, 2)), episode_steps=10)
-    simd, xla = (make_worker(spec(**vars(worker_spec) | {"rollout": kind})) for kind in ("simd", "xla"))
+    simd, xla = (make_worker(spec(**vars(worker_spec) | {"rollout": rollout_name})) for rollout_name in ("simd", "xla"))
     point = centre(random_parameters(size=worker_spec.policy.parameters))
     for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
         ours, theirs = simd(point, chunk), xla(point, chunk)

@@ -1,4 +1,4 @@
-"""From a graph to machine code: LLVM IR on vectors, compiled in process; what was compiled before is kept on disk.
+"""Translation of a graph to LLVM IR on vectors and to machine code, in this process, with a cache on disk.
 
-Needs llvmlite, and no JAX: a graph that was built by hand is compiled as well.
+This package needs llvmlite but not JAX; a graph built by hand can be compiled as well.
 """

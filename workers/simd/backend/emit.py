@@ -1,7 +1,7 @@
-"""Third stage: a graph becomes LLVM IR on vectors, of which each lane is one environment.
+"""Translation of a graph to LLVM IR on vectors, in which each lane is one environment.
 
-Words in memory are vectors of 32 bits, truth as 0 or 1. What crosses the edge of a loop lives in memory; the rest is
-LLVM's to keep in registers.
+Words in memory are vectors of 32-bit words; a bool is 0 or 1. Values that enter or leave a loop are kept in memory, and
+LLVM assigns all others to registers.
 """
 
 from __future__ import annotations
@@ -9,30 +9,30 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 
-from workers.simd.backend.code import Code, module
+from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.graph.graph import Graph
 from workers.simd.graph.operations import OPERATIONS
 from workers.simd.graph.schedule import Region, schedule
 from workers.simd.graph.unsupported import UnsupportedError, refusing
 
 MOST_SLOTS = 8192
-"""Vectors in the memory of a block, which is on the stack: half a MiB."""
+"""Most vectors in the memory of a block, half a MiB; this memory is on the stack."""
 
 
 def emit(graph: Graph, outputs: Sequence[int], inputs: int, width: int) -> str:
-    """LLVM IR of `void kernel(ptr in, ptr out, i64 blocks)` for vectors of `width`.
+    """LLVM IR of `void kernel(ptr in, ptr out, i64 blocks)` on vectors of `width` lanes.
 
-    Both arrays are [block, word, lane]; a block has one output word for each of `outputs`, and `inputs` words in.
+    Both arrays are [block, word, lane]; a block has `inputs` input words and one output word for each of `outputs`.
 
     Raises:
-        UnsupportedError: loops carry more than fits on a stack.
+        UnsupportedError: loops carry more values than fit on the stack.
     """
     block = graph_function("block", graph, outputs, [("in", inputs)], "out", width)
-    inside = Code("inside", ["ptr noalias %in", "ptr noalias %out", "i64 %blocks"], width)
+    inside = FunctionBuilder("inside", ["ptr noalias %in", "ptr noalias %out", "i64 %blocks"], width)
 
     def one(number: str, _: list[str]) -> list[str]:
-        block_in = inside.at("%in", inside.index((number, inputs)), inside.vector["i"])
-        block_out = inside.at("%out", inside.index((number, len(outputs))), inside.vector["i"])
+        block_in = inside.at("%in", inside.index((number, inputs)), inside.llvm_types["i"])
+        block_out = inside.at("%out", inside.index((number, len(outputs))), inside.llvm_types["i"])
         inside.do(f"call void @block(ptr {block_in}, ptr {block_out})")
         return []
 
@@ -44,65 +44,73 @@ def emit(graph: Graph, outputs: Sequence[int], inputs: int, width: int) -> str:
 @refusing()
 def graph_function(
     name: str, graph: Graph, outputs: Sequence[int], sources: Sequence[tuple[str, int]], out: str, width: int
-) -> Code:
-    """`void name(ptr ...)`: a graph as a function of memory.
+) -> FunctionBuilder:
+    """Function `void name(ptr ...)` that computes a graph from words in memory.
 
     Args:
-        sources: (pointer, words that come from there), in the order of the graph's inputs. A pointer may come twice.
-        out: pointer to where the words of `outputs` go; if it is a source as well, they take the place of what came
-            from there: all is read before anything is written.
+        sources: (pointer, number of words read there), in the order of the graph's inputs. A pointer may occur twice.
+        out: pointer to the words of `outputs`. If it is a source as well, they overwrite the words read there; all
+            words are read before any is written.
 
     Raises:
-        UnsupportedError: loops carry more than fits on a stack.
+        UnsupportedError: loops carry more values than fit on the stack.
     """
     pointers = list(dict.fromkeys([*(pointer for pointer, _ in sources), out]))
-    code = Code(name, [f"ptr noalias %{pointer}" for pointer in pointers], width)
-    places: list[tuple[str, int]] = []
+    builder = FunctionBuilder(name, [f"ptr noalias %{pointer}" for pointer in pointers], width)
+    input_addresses: list[tuple[str, int]] = []
     used = dict.fromkeys(pointers, 0)
     for pointer, words in sources:
-        places += [(f"%{pointer}", used[pointer] + word) for word in range(words)]
+        input_addresses += [(f"%{pointer}", used[pointer] + word) for word in range(words)]
         used[pointer] += words
-    writer = _Writer(code, graph, outputs, places)
+    writer = _Writer(builder, graph, outputs, input_addresses)
     writer.compute_all()
     stored = [writer.in_memory(node) for node in outputs]
-    for word, (kind, value) in enumerate(stored):
-        code.store(kind, value, f"%{out}", word)
-    return code
+    for word, (llvm_type, value) in enumerate(stored):
+        builder.store(llvm_type, value, f"%{out}", word)
+    return builder
 
 
-def inline(code: Code, graph: Graph, outputs: Sequence[int], given: Mapping[int, str]) -> list[str]:
-    """Write a graph without loops into a function: names of its outputs, where those of its inputs are given."""
-    writer = _Writer(code, graph, outputs, [])
+def inline(builder: FunctionBuilder, graph: Graph, outputs: Sequence[int], given: Mapping[int, str]) -> list[str]:
+    """Add the instructions of a graph without loops to a function; returns the names of the outputs' values.
+
+    `given` has the names of the inputs' values, by node.
+    """
+    writer = _Writer(builder, graph, outputs, [])
     writer.values.update(given)
     writer.compute_all()
     return [writer.value(node) for node in outputs]
 
 
 class _Writer:
-    """Writes the instructions of a graph into a function."""
+    """Writer of a graph's instructions into a function."""
 
-    def __init__(self, code: Code, graph: Graph, outputs: Sequence[int], places: Sequence[tuple[str, int]]) -> None:
-        self.code, self.graph, self.places = code, graph, places
-        self.words = {kind.upper(): vector for kind, vector in code.vector.items()}
-        self.words |= {"N": f"v{code.width}f32", "M": f"v{code.width}i32"}
+    def __init__(
+        self, builder: FunctionBuilder, graph: Graph, outputs: Sequence[int], input_addresses: Sequence[tuple[str, int]]
+    ) -> None:
+        self.builder, self.graph, self.input_addresses = builder, graph, input_addresses
+        """Pointer and word of each input of the graph."""
+        self.words = {dtype.upper(): llvm_type for dtype, llvm_type in builder.llvm_types.items()}
+        self.words |= {"N": f"v{builder.width}f32", "M": f"v{builder.width}i32"}
         self.schedule = schedule(graph, outputs)
         self.slots: dict[int, int] = {}
-        """Node -> its place in the memory of the block: carries, and what loops look at."""
+        """Slots in the memory of the block, by node: of carries and of values that loops read."""
         self.slot_count = 0
         self.memory = "%slots"
         self.values: dict[int, str] = {}
-        """Node -> its name in the present block; what is loaded once stays known."""
+        """Names of values in the current block, by node; a loaded value is reused."""
 
     def compute_all(self) -> None:
-        """All instructions, in order."""
+        """Write all instructions, in order."""
         self.region(self.schedule.region)
         if self.slot_count > MOST_SLOTS:
-            raise UnsupportedError(f"{self.slot_count:,} values that loops carry and look at; {MOST_SLOTS:,} fit")
+            raise UnsupportedError(
+                f"loops carry and read {self.slot_count:,} values; simd supports at most {MOST_SLOTS:,}"
+            )
         if self.slot_count:
-            self.code.memory.append(f"  {self.memory} = alloca [{self.slot_count} x {self.words['I']}], align 64")
+            self.builder.memory.append(f"  {self.memory} = alloca [{self.slot_count} x {self.words['I']}], align 64")
 
     def region(self, region: Region) -> None:
-        """Straight code, and the loops in it."""
+        """Write straight code and the loops in it."""
         for step in region.steps:
             if isinstance(step, Region):
                 self.loop(step)
@@ -112,7 +120,7 @@ class _Writer:
                     self.store(step, step)
 
     def loop(self, region: Region) -> None:
-        """A loop of some trips; its carries lie in slots, from the first trip to what comes after."""
+        """Write a loop; its carries are in slots from the first trip until after the loop."""
         loop, carried = region.loop, region.carried
         assert loop is not None
         for k in carried:
@@ -124,11 +132,11 @@ class _Writer:
             self.values = {}
             self.region(region)
             values = [(loop.carries[k], self.in_memory(loop.outs[k])) for k in carried]
-            for carry, (kind, value) in values:
-                self.code.store(kind, value, self.memory, self.slots[carry])
+            for carry, (llvm_type, value) in values:
+                self.builder.store(llvm_type, value, self.memory, self.slots[carry])
             return []
 
-        self.code.loop(loop.trips, trip)
+        self.builder.loop(loop.trips, trip)
         self.values = before
 
     def compute(self, node: int) -> None:
@@ -141,7 +149,7 @@ class _Writer:
         self.values[node] = self.operation(name, values)
 
     def fused_values(self, node: int) -> list[str]:
-        """Arguments of the fused operation that a sum or difference becomes."""
+        """Names of the arguments of the fused operation that replaces a sum or difference."""
         name, product = self.graph.keys[node][0], self.schedule.fused[node]
         first, second = self.graph.arguments(node)
         factors = [self.value(a) for a in self.graph.arguments(product)]
@@ -153,48 +161,48 @@ class _Writer:
         return [*factors, other]
 
     def operation(self, name: str, values: Sequence[str]) -> str:
-        """Name of an operation's value."""
-        operation, vector = OPERATIONS[name], self.code.vector
+        """Write an operation on named values and return the name of its value."""
+        operation, llvm_types = OPERATIONS[name], self.builder.llvm_types
         text = operation.llvm.format(*values, **self.words)
         if not text.startswith("llvm."):
-            return self.code.value(text)
-        typed = [(vector[kind], value) for kind, value in zip(operation.takes, values, strict=True)]
-        return self.code.call(vector[operation.gives], text, *typed)
+            return self.builder.value(text)
+        typed = [(llvm_types[dtype], value) for dtype, value in zip(operation.takes, values, strict=True)]
+        return self.builder.call(llvm_types[operation.gives], text, *typed)
 
     def value(self, node: int) -> str:
-        """Name of a node's value, which is loaded where it lies in memory."""
+        """Name of a node's value, which is loaded if it is in memory."""
         key = self.graph.keys[node]
         if key[0] == "const":
             return self.constant(key[1], key[2])
         if node not in self.values:
-            pointer, index = self.places[key[2]] if key[0] == "input" else (self.memory, self.slots[node])
-            self.values[node] = self.load(self.graph.kinds[node], pointer, index)
+            pointer, index = self.input_addresses[key[2]] if key[0] == "input" else (self.memory, self.slots[node])
+            self.values[node] = self.load(self.graph.dtypes[node], pointer, index)
         return self.values[node]
 
-    def constant(self, kind: str, bits: int) -> str:
-        """The same number in all lanes."""
-        if kind == "f":
+    def constant(self, dtype: str, bits: int) -> str:
+        """LLVM constant with the same number in all lanes."""
+        if dtype == "f":
             number = struct.unpack("<f", struct.pack("<i", bits))[0]
             return f"splat (float 0x{struct.pack('>d', number).hex().upper()})"
-        return f"splat (i32 {bits})" if kind == "i" else f"splat (i1 {str(bool(bits)).lower()})"
+        return f"splat (i32 {bits})" if dtype == "i" else f"splat (i1 {str(bool(bits)).lower()})"
 
-    def load(self, kind: str, pointer: str, index: int) -> str:
-        """Name of what lies in a place."""
-        stored = self.code.vector["i" if kind == "b" else kind]
-        loaded = self.code.load(stored, pointer, index)
-        return loaded if kind != "b" else self.code.value(f"icmp ne {stored} {loaded}, zeroinitializer")
+    def load(self, dtype: str, pointer: str, index: int) -> str:
+        """Load a value of a dtype from memory and return its name."""
+        stored = self.builder.llvm_types["i" if dtype == "b" else dtype]
+        loaded = self.builder.load(stored, pointer, index)
+        return loaded if dtype != "b" else self.builder.value(f"icmp ne {stored} {loaded}, zeroinitializer")
 
     def in_memory(self, node: int) -> tuple[str, str]:
-        """(type, name) of a node's value as it is stored."""
-        kind, value = self.graph.kinds[node], self.value(node)
-        if kind != "b":
-            return self.code.vector[kind], value
-        return self.words["I"], self.code.value(f"zext {self.words['B']} {value} to {self.words['I']}")
+        """(LLVM type, name) of a node's value in the form in which it is stored."""
+        dtype, value = self.graph.dtypes[node], self.value(node)
+        if dtype != "b":
+            return self.builder.llvm_types[dtype], value
+        return self.words["I"], self.builder.value(f"zext {self.words['B']} {value} to {self.words['I']}")
 
     def store(self, node: int, home: int) -> None:
-        """Put a node's value into the slot of a node, a new one if that has none."""
-        kind, value = self.in_memory(node)
+        """Store a node's value in the slot of the node `home`, which gets a new slot if it has none."""
+        llvm_type, value = self.in_memory(node)
         if home not in self.slots:
             self.slots[home] = self.slot_count
             self.slot_count += 1
-        self.code.store(kind, value, self.memory, self.slots[home])
+        self.builder.store(llvm_type, value, self.memory, self.slots[home])

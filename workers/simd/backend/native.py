@@ -1,4 +1,4 @@
-"""LLVM IR becomes a function that can be called; what was compiled before is taken from the cache."""
+"""Compilation of LLVM IR to machine code in memory; code that was compiled before comes from the cache."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from workers.simd.backend.target import Target, compile_object, compiler_version
 OWN_VERSION = hashlib.sha256(
     b"".join(path.read_bytes() for path in sorted(Path(__file__).parents[1].rglob("*.py")))
 ).hexdigest()
-"""Of this compiler: a hash of its source, of all folders, as it was imported."""
+"""Version of this compiler: a hash of all its source files at the time of import."""
 
 
 class Native(NamedTuple):
-    """Machine code in memory."""
+    """Machine code of a kernel in memory."""
 
     address: int
-    """Of `kernel`."""
+    """Address of the function `kernel`."""
     alive: object
-    """Must stay alive as long as the code is used."""
+    """Object that must stay alive as long as the code is used."""
     code_bytes: int
     cached: bool
-    """Whether it was compiled before."""
+    """Whether the code came from the cache."""
 
 
 def load_compiled(name: str, text: Callable[[], str], target: Target, folder: Path | None = None) -> Native:
-    """Machine code of LLVM IR.
+    """Compile LLVM IR, or load the machine code from the cache.
 
     Args:
-        name: tells what it computes, in full: what has the same name is not compiled again.
-        text: makes the IR; called only where the code is not in the cache.
-        folder: of compiled kernels; the user's cache if None.
+        name: complete description of what the code computes; code with the same name is not compiled again.
+        text: function that gives the IR; called only if the code is not in the cache.
+        target: processor and instruction set.
+        folder: folder of the cache; the user's cache if None.
     """
     folder = folder or cache.cache_folder()
     versions = f"{target} {compiler_version()} {OWN_VERSION}"

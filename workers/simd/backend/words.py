@@ -1,4 +1,4 @@
-"""Arrays of lanes as the words that kernels read and write: [block, word, lane]."""
+"""Conversion between arrays [lane, ...] and the words [block, word, lane] that kernels read and write."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 Words = NDArray[np.uint32]
-"""[block, word, lane]: floats and integers by their bits, truth as 0 or 1."""
+"""Array [block, word, lane] of the bits of floats and integers; a bool is 0 or 1."""
 ALIGNMENT = 64
+"""Alignment of arrays of words, in bytes."""
 
 
 def words_of(aval: Any) -> int:
-    """Words of one lane of an array."""
+    """Number of words of one lane of an array."""
     return math.prod(aval.shape)
 
 
 def aligned(shape: tuple[int, ...]) -> Words:
-    """An empty array of words that vectors can be read from."""
+    """Uninitialised array of words with the alignment that vectors need."""
     size = 4 * math.prod(shape)
     memory = np.empty(size + ALIGNMENT, np.uint8)
     start = -memory.ctypes.data % ALIGNMENT
@@ -28,7 +29,7 @@ def aligned(shape: tuple[int, ...]) -> Words:
 
 
 def pack(leaves: Sequence[Any], width: int) -> Words:
-    """Arrays [lane, ...] as words, one array after the other; lanes that fill the last block repeat the last."""
+    """Words of arrays [lane, ...], one array after the other; the last lane is repeated to fill up the last block."""
     lanes = len(leaves[0]) if leaves else 1
     blocks = -(-lanes // width)
     columns = []
@@ -44,12 +45,12 @@ def pack(leaves: Sequence[Any], width: int) -> Words:
 
 
 def filled(rows: NDArray, count: int) -> NDArray:
-    """As many rows, those that are missing being the last one."""
+    """Array of `count` rows; missing rows repeat the last one."""
     return rows if len(rows) == count else rows[np.minimum(np.arange(count), len(rows) - 1)]
 
 
 def unpack(words: Words, avals: Sequence[Any], lanes: int) -> list[NDArray]:
-    """Copies of the arrays [lane, ...] that words are, with the shapes and types of one lane's."""
+    """Arrays [lane, ...] of words, as copies; `avals` are the shapes and dtypes of one lane."""
     rows = words.transpose(0, 2, 1).copy().reshape(len(words) * words.shape[2], words.shape[1])[:lanes]
     found, end = [], 0
     for aval in avals:

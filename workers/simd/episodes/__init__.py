@@ -1,1 +1,1 @@
-"""What the other folders serve: functions of many environments at once, and whole episodes with policy and noise."""
+"""Compiled functions of many environments at once, and compiled whole episodes with policy and noise."""

@@ -1,4 +1,4 @@
-"""A JAX function of one environment, compiled for many: the stages together, and what was compiled before kept."""
+"""Compilation of a JAX function of one environment to a kernel for many, through all stages, with a cache."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ from workers.simd.graph.operations import OPERATIONS
 
 
 class Facts(NamedTuple):
-    """What compiling took and gave."""
+    """Facts about the compilation of a kernel."""
 
     jaxpr_s: float
     """Seconds of JAX's own tracing, which xla needs as well."""
     computed: int
-    """Scalar operations that are left after folding, loops' bodies once; 0 from the cache."""
+    """Number of scalar operations after folding, with each loop body counted once; 0 if the code was cached."""
     code_bytes: int
     cached: bool
+    """Whether the code came from the cache."""
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """A compiled function. Calls may run at the same time in several threads: they hold no lock and no state."""
+    """A compiled function. Several threads may call it at the same time: calls hold no lock and keep no state."""
 
     target: Target
     in_tree: Any
@@ -48,17 +49,19 @@ class Kernel:
 
     @property
     def words_in(self) -> int:
-        """Words of a lane that go in: all elements of all leaves."""
+        """Number of input words of a lane: all elements of all leaves."""
         return sum(map(words_of, self.in_avals))
 
     @property
     def words_out(self) -> int:
-        """Words of a lane that come out."""
+        """Number of output words of a lane."""
         return sum(map(words_of, self.out_avals))
 
     def run(self, words: Words, out: Words) -> None:
-        """Compute [block, words_in, width] -> [block, words_out, width]; both aligned to 64 bytes, as `aligned` makes
-        them. Releases the GIL."""
+        """Compute `out` [block, words_out, width] from `words` [block, words_in, width].
+
+        Both must be aligned to 64 bytes, as `aligned` makes them. The call releases the GIL.
+        """
         blocks = len(words)
         assert words.shape == (blocks, self.words_in, self.target.width), words.shape
         assert out.shape == (blocks, self.words_out, self.target.width), out.shape
@@ -71,9 +74,9 @@ class Kernel:
         self._function(words.ctypes.data, out.ctypes.data, blocks)
 
     def __call__(self, *arguments: Any) -> Any:
-        """The function of pytrees whose leaves have one more axis in front, of lanes; NumPy arrays come back."""
+        """Apply the function to pytrees whose leaves have a leading axis of lanes; returns NumPy arrays."""
         leaves, tree = jax.tree.flatten(arguments)
-        assert tree == self.in_tree, f"{tree} is not what was compiled for: {self.in_tree}"
+        assert tree == self.in_tree, f"the arguments are {tree}, but the kernel was compiled for {self.in_tree}"
         lanes = len(leaves[0]) if leaves else 1
         for leaf, aval in zip(leaves, self.in_avals, strict=True):
             array = np.asarray(leaf)
@@ -91,13 +94,14 @@ def compile_kernel(
     """Compile a pure JAX function of one environment.
 
     Args:
+        function: the function of one environment.
         arguments: pytrees of arrays or ShapeDtypeStructs, without the axis of lanes.
-        target: what for; this machine's widest vectors if None.
-        folder: of compiled kernels; the user's cache if None.
+        target: processor and instruction set; the widest vectors of this machine if None.
+        folder: folder of the cache; the user's cache if None.
 
     Raises:
-        UnsupportedError: the function has something that cannot be compiled. NoVectorsError: the processor has no
-            AVX2 or FMA.
+        UnsupportedError: the function contains something that cannot be compiled.
+        NoVectorsError: the processor has no AVX2 or FMA.
     """
     target = target or host_target()
     started = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Where the weights of a policy are, for the code that network.py makes."""
+"""Layout of a policy's weights in memory, for the code that `network.py` makes."""
 
 from __future__ import annotations
 
@@ -12,52 +12,55 @@ from workers.simd.backend.words import aligned
 
 
 class Layer(NamedTuple):
-    """Where a hidden layer's weights are: by tiles of outputs, in each by inputs (and last the biases), in each by
-    outputs."""
+    """Layout of a hidden layer's weights: tiles of outputs, in each the inputs and then the biases, in each outputs."""
 
     inputs: int
     outputs: int
     tiles: int
+    """Number of tiles."""
     tile: int
-    """Vectors of outputs that are summed at once."""
+    """Vectors of outputs in a tile, which are summed at the same time."""
     first: int
-    """Number of its first vector of weights."""
+    """Number of the layer's first vector of weights."""
 
 
 class Network(NamedTuple):
-    """A policy's layers, and the place of each weight in the flat vector of parameters.
+    """A policy's layers and the place of each weight in the flat vector of parameters.
 
-    Weights are vectors of the hidden layers, of which only the first lane's place is given, the others following it
-    (what a vector has beyond a row's end belongs to the next and is never looked at), and single weights of the last
-    layer, by inputs (and last the biases), in each by outputs.
+    The weights of hidden layers are vectors. Only the place of a vector's first lane is kept, and the other lanes
+    follow it. (Lanes beyond the end of a row hold weights of the next row; they are never used.) The weights of the
+    last layer are single numbers, ordered by inputs with the biases last, and for each input by outputs.
     """
 
     hidden: tuple[Layer, ...]
     inputs: int
-    """Of the last layer."""
+    """Inputs of the last layer."""
     outputs: int
+    """Outputs of the last layer."""
     vectors: int
+    """Number of vectors of weights of all hidden layers."""
     places: NDArray[np.uint32]
-    """Of the vectors, then of the single weights."""
+    """Places in the flat vector of parameters: of the vectors, then of the single weights."""
     width: int
+    """Lanes of a vector."""
 
     @property
     def hidden_vectors(self) -> int:
-        """Vectors that the outputs of two layers take, of as many members as there are lanes."""
+        """Number of vectors that hold the outputs of two layers, for as many members as there are lanes."""
         return 2 * self.width * max((layer.tiles * layer.tile for layer in self.hidden), default=0)
 
     @property
     def rows(self) -> int:
-        """Vectors that all weights take."""
+        """Number of vectors that hold all weights."""
         return self.vectors - -(len(self.places) - self.vectors) // self.width
 
     @property
     def noise_bytes(self) -> int:
-        """Bytes of the noise of a block of members."""
+        """Number of bytes of the noise of a block of members."""
         return self.width // 2 * self.vectors * self.width + (len(self.places) - self.vectors) * self.width
 
     def pack(self, parameters_D: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The vectors of weights, then the single ones, [rows, width]."""
+        """Array [rows, width] of the vectors of weights, followed by the single weights."""
         padded_D = np.concatenate([parameters_D, np.zeros(self.width, np.float32)])
         of_vectors, single = self.places[: self.vectors], self.places[self.vectors :]
         weights = aligned((self.rows, self.width)).view(np.float32)
@@ -67,7 +70,10 @@ class Network(NamedTuple):
 
 
 def sums_at_once(width: int) -> int:
-    """Vectors of sums that fit into registers beside what is added to them: 32 of 512 bits, or 16 of 256."""
+    """Number of vectors of sums that fit into registers together with their operands.
+
+    There are 32 registers of 512 bits, or 16 of 256 bits.
+    """
     return 16 if width == 16 else 8
 
 
@@ -75,10 +81,12 @@ def plan(shape: PolicyShape, inputs_O: NDArray[np.intp], width: int) -> Network:
     """Lay out a policy's weights.
 
     Args:
-        inputs_O: the inputs of the first layer that are not always zero.
+        shape: widths of the policy's layers.
+        inputs_O: inputs of the first layer that are computed; others are always zero.
+        width: lanes of a vector.
     """
     layers, places, coordinate = [], [], 0
-    most = sums_at_once(width) // 4  # tiles are powers of 2, so that as many members as fit divide the width
+    most = sums_at_once(width) // 4  # tiles are powers of 2, so that the number of members that fit divides the width
     rows, (*hidden, (inputs, outputs)) = inputs_O.tolist(), shape.layers
     for given, wanted in hidden:
         vectors = -(-wanted // width)

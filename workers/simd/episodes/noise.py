@@ -1,4 +1,4 @@
-"""Code of the noise, at some three numbers a nanosecond: that of `es_service.protocol.noise`, word for word."""
+"""Code of the noise generator: the words of `es_service.protocol.noise`, at about three numbers per nanosecond."""
 
 from __future__ import annotations
 
@@ -8,132 +8,136 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, normal_integers
-from workers.simd.backend.code import Code, Values, module
 from workers.simd.backend.emit import inline
+from workers.simd.backend.function_builder import FunctionBuilder, Values, module
 from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
 
 UNROLLED = 4
-"""Vectors made at once."""
+"""Number of vectors of noise that are made in one trip of the gradient's loop."""
 
 
 def _jaxpr() -> ClosedJaxpr:
-    """k of (key, coordinate)."""
+    """Jaxpr of the noise k as a function of (key, coordinate)."""
     word = jax.ShapeDtypeStruct((), jnp.uint32)
     key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
     return jax.make_jaxpr(lambda key, at: normal_integers(jnp, key, at))(key, word)
 
 
 def definition() -> str:
-    """A text that changes with the generator: what was compiled for another is not used."""
+    """Text that identifies the noise generator, so that code compiled with another generator is not used."""
     return f"{jaxpr_digest(_jaxpr())} {NORMAL_STD}"
 
 
-def noise_of(code: Code, key: Values, coordinate: str, *, halved: bool) -> str:
-    """k of vectors of key words and coordinates, as integers; or j, where k = 2 j + 1."""
+def noise_of(builder: FunctionBuilder, key: Values, coordinate: str, *, halved: bool) -> str:
+    """Vector of integer noise k for vectors of key words and coordinates; if `halved`, of j in k = 2 j + 1."""
     graph, _, (output,) = trace_jaxpr(_jaxpr())
     if halved:
         output = graph.op("ashr", graph.op("isub", output, graph.i(1)), graph.i(1))
     given = {graph.input("i", place): name for place, name in enumerate([*key, coordinate])}
-    return inline(code, graph, [output], given)[0]
+    return inline(builder, graph, [output], given)[0]
 
 
-def load_key(code: Code, keys: str, pair: str) -> Values:
-    """The words of key number `pair`, each in all lanes."""
-    words = [code.load("i32", keys, code.index((pair, KEY_WORDS), (word, 1))) for word in range(KEY_WORDS)]
-    return [code.splat(word, "i") for word in words]
+def load_key(builder: FunctionBuilder, keys: str, pair: str) -> Values:
+    """Words of key number `pair`, as vectors with the word in all lanes."""
+    words = [builder.load("i32", keys, builder.index((pair, KEY_WORDS), (word, 1))) for word in range(KEY_WORDS)]
+    return [builder.splat(word, "i") for word in words]
 
 
-def keys_of_members(code: Code, keys: str) -> Values:
-    """The words of the keys of as many members as there are lanes, neighbours having that of their pair."""
+def keys_of_members(builder: FunctionBuilder, keys: str) -> Values:
+    """Words of the keys of as many members as there are lanes; the two members of a pair have the same key."""
     words = []
     for word in range(KEY_WORDS):
         vector = "poison"
-        for lane in range(code.width):
-            one = code.load("i32", keys, lane // 2 * KEY_WORDS + word)
-            vector = code.value(f"insertelement {code.vector['i']} {vector}, i32 {one}, i64 {lane}")
+        for lane in range(builder.width):
+            one = builder.load("i32", keys, lane // 2 * KEY_WORDS + word)
+            vector = builder.value(f"insertelement {builder.llvm_types['i']} {vector}, i32 {one}, i64 {lane}")
         words.append(vector)
     return words
 
 
-def lanes(code: Code) -> str:
-    """0, 1, 2, ... as a constant vector."""
-    return f"<{', '.join(f'i32 {lane}' for lane in range(code.width))}>"
+def lanes(builder: FunctionBuilder) -> str:
+    """Constant vector 0, 1, 2, ..., one number per lane."""
+    return f"<{', '.join(f'i32 {lane}' for lane in range(builder.width))}>"
 
 
-def fill_function(vectors: int, singles: int, width: int) -> Code:
-    """`void fill(ptr keys, ptr places, ptr noise)`: j of each pair of a block of members, as bytes.
+def fill_function(vectors: int, singles: int, width: int) -> FunctionBuilder:
+    """Function `void fill(ptr keys, ptr places, ptr noise)`, which writes the bytes j of all pairs of a block.
 
-    noise is [pair, vector, lane] of the vectors, each along coordinates, of which `places` has the first; behind it
-    [single, member] of the single coordinates, whose places follow, the members of a pair having the same.
+    noise begins with [pair, vector, lane] for the vectors of weights, whose lanes are successive coordinates from the
+    vector's entry in `places` on. [single, member] for the single weights follows; the remaining entries of `places`
+    are their coordinates, and both members of a pair have the same noise.
     """
-    code = Code("fill", ["ptr noalias %keys", "ptr noalias %places", "ptr noalias %noise"], width)
+    builder = FunctionBuilder("fill", ["ptr noalias %keys", "ptr noalias %places", "ptr noalias %noise"], width)
     bytes_ = f"<{width} x i8>"
 
     def pair(number: str, _: Values) -> Values:
-        key = load_key(code, "%keys", number)
+        key = load_key(builder, "%keys", number)
 
         def vector(at: str, _: Values) -> Values:
-            start = code.splat(code.load("i32", "%places", at), "i")
-            coordinate = code.value(f"add {code.vector['i']} {start}, {lanes(code)}")
-            keep(noise_of(code, key, coordinate, halved=True), code.index((number, vectors), (at, 1)))
+            start = builder.splat(builder.load("i32", "%places", at), "i")
+            coordinate = builder.value(f"add {builder.llvm_types['i']} {start}, {lanes(builder)}")
+            keep(noise_of(builder, key, coordinate, halved=True), builder.index((number, vectors), (at, 1)))
             return []
 
-        code.loop(vectors, vector)
+        builder.loop(vectors, vector)
         return []
 
     def keep(j: str, at: str) -> None:
-        code.store(bytes_, code.value(f"trunc {code.vector['i']} {j} to {bytes_}"), "%noise", at)
+        builder.store(bytes_, builder.value(f"trunc {builder.llvm_types['i']} {j} to {bytes_}"), "%noise", at)
 
     if vectors:
-        code.loop(width // 2, pair)
-    key = keys_of_members(code, "%keys")
+        builder.loop(width // 2, pair)
+    key = keys_of_members(builder, "%keys")
 
     def single(number: str, _: Values) -> Values:
-        coordinate = code.splat(code.load("i32", "%places", code.index((number, 1), (vectors, 1))), "i")
-        keep(noise_of(code, key, coordinate, halved=True), code.index((number, 1), (width // 2 * vectors, 1)))
+        coordinate = builder.splat(builder.load("i32", "%places", builder.index((number, 1), (vectors, 1))), "i")
+        keep(noise_of(builder, key, coordinate, halved=True), builder.index((number, 1), (width // 2 * vectors, 1)))
         return []
 
-    code.loop(singles, single)
-    return code
+    builder.loop(singles, single)
+    return builder
 
 
 def gradient_module(width: int) -> str:
-    """LLVM IR of `void kernel(ptr weights, ptr keys, i64 pairs, ptr sums, i64 groups)`.
+    """LLVM IR of `void kernel(ptr weights, ptr keys, i64 pairs, ptr sums, i64 groups)`, the sum of weighted noise.
 
-    sums, groups of UNROLLED vectors, become the sum over pairs of weight * noise, one pair after the other, in units of
-    weight x standard normal.
+    sums has groups of UNROLLED vectors. They become the sum over pairs of weight * standard normal noise; pairs are
+    added in their order.
     """
     parameters = ["ptr noalias %weights", "ptr noalias %keys", "i64 %pairs", "ptr noalias %sums", "i64 %groups"]
-    code = Code("inside", parameters, width)
-    floats = code.vector["f"]
+    builder = FunctionBuilder("inside", parameters, width)
+    floats = builder.llvm_types["f"]
 
     def group(number: str, _: Values) -> Values:
-        first = code.value(f"trunc i64 {code.index((number, UNROLLED * width))} to i32")
-        start = code.value(f"add {code.vector['i']} {code.splat(first, 'i')}, {lanes(code)}")
+        first = builder.value(f"trunc i64 {builder.index((number, UNROLLED * width))} to i32")
+        start = builder.value(f"add {builder.llvm_types['i']} {builder.splat(first, 'i')}, {lanes(builder)}")
         coordinates = [
-            code.value(f"add {code.vector['i']} {start}, splat (i32 {vector * width})") for vector in range(UNROLLED)
+            builder.value(f"add {builder.llvm_types['i']} {start}, splat (i32 {vector * width})")
+            for vector in range(UNROLLED)
         ]
 
         def add(pair: str, sums: Values) -> Values:
-            key = load_key(code, "%keys", pair)
-            weight = code.splat(code.load("float", "%weights", pair))
+            key = load_key(builder, "%keys", pair)
+            weight = builder.splat(builder.load("float", "%weights", pair))
             found = []
             for coordinate, one in zip(coordinates, sums, strict=True):
-                k = noise_of(code, key, coordinate, halved=False)
-                found.append(code.fma(weight, code.value(f"sitofp {code.vector['i']} {k} to {floats}"), one))
+                k = noise_of(builder, key, coordinate, halved=False)
+                found.append(
+                    builder.fma(weight, builder.value(f"sitofp {builder.llvm_types['i']} {k} to {floats}"), one)
+                )
             return found
 
-        scale = code.splat(_float(np.float32(1.0 / NORMAL_STD)))
-        for vector, one in enumerate(code.loop("%pairs", add, [(floats, "zeroinitializer")] * UNROLLED)):
-            scaled = code.value(f"fmul {floats} {one}, {scale}")
-            code.store(floats, scaled, "%sums", code.index((number, UNROLLED), (vector, 1)))
+        scale = builder.splat(_float(np.float32(1.0 / NORMAL_STD)))
+        for vector, one in enumerate(builder.loop("%pairs", add, [(floats, "zeroinitializer")] * UNROLLED)):
+            scaled = builder.value(f"fmul {floats} {one}, {scale}")
+            builder.store(floats, scaled, "%sums", builder.index((number, UNROLLED), (vector, 1)))
         return []
 
-    code.loop("%groups", group)
-    return module([code])
+    builder.loop("%groups", group)
+    return module([builder])
 
 
 def _float(value: np.float32) -> str:
-    """A float32 as LLVM writes it."""
+    """A float32 in LLVM's notation."""
     return f"0x{np.float64(value).view(np.uint64):016X}"

@@ -1,7 +1,7 @@
-"""Whole episodes as one kernel: reset to end, observation, policy, physics and sums, a block of lanes after the other.
+"""Kernels of whole episodes: observation, policy, physics and sums from reset to end, one block of lanes at a time.
 
-Both members of a pair are neighbouring lanes. What a block needs stays in the cache of its core: the noise of its pairs
-(a byte a parameter), the centre, and what its episodes carry.
+The members of a pair are neighbouring lanes. The data of a block fits in the cache of a core: the noise of its pairs
+(one byte per parameter), the centre, and the state of its episodes.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from workers.environments import Environment
 from workers.episode import Carry, Episodes, EpisodeSteps, episode_steps
-from workers.simd.backend.code import Code, Values, module
 from workers.simd.backend.emit import graph_function
+from workers.simd.backend.function_builder import FunctionBuilder, Values, module
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import Target, host_target
 from workers.simd.backend.words import ALIGNMENT, aligned, filled, pack, unpack, words_of
@@ -37,18 +37,21 @@ from workers.simd.graph.unsupported import UnsupportedError
 
 @dataclass(frozen=True)
 class EpisodeKernel:
-    """Compiled episodes: of both members of pairs, with noise; or of the centre, without."""
+    """Compiled episodes, either training episodes of both members of pairs or evaluation episodes of the centre."""
 
     training: bool
     spec: WorkerSpec
     inputs_O: np.ndarray
-    """Inputs of the policy that are computed."""
+    """Indices of the observations that are computed, as inputs of the policy."""
     network: Network
     begin: Callable[[np.ndarray], np.ndarray]
-    """Reset keys [lane, 4] -> words of carries [block, word, lane]."""
+    """Function from reset keys [lane, 4] to words of carries [block, word, lane]."""
     alive_word: int
+    """Index of the word of a carry that says whether the episode is alive."""
     episode_avals: Episodes
+    """Shapes and dtypes of an episode's result."""
     episode_words: int
+    """Number of words of an episode's result."""
     _call: Callable[..., None]
     _alive: Any
 
@@ -62,15 +65,22 @@ class EpisodeKernel:
         reset_keys_L: np.ndarray,
         action_keys_L: np.ndarray,
     ) -> Episodes:
-        """Episodes [L] of NumPy arrays; weights as `network.pack` makes them."""
+        """Run the episodes of all lanes, [L]; returns NumPy arrays.
+
+        Args:
+            weights: the centre, packed by `network.pack`.
+            unit: sigma / NORMAL_STD.
+            noise_keys_P: keys of the pairs' noise; None for evaluations.
+            reset_keys_L, action_keys_L: stream keys of each lane's reset and action noise.
+        """
         width, lanes = self.network.width, len(reset_keys_L)
-        # What native code reads beyond an array's end would be somebody's numbers, without a word.
+        # Native code would read beyond the end of a shorter array without an error.
         assert (noise_keys_P is not None) == self.training
         assert action_keys_L.shape == reset_keys_L.shape == (lanes, KEY_WORDS)
         assert noise_keys_P is None or (noise_keys_P.shape[1:] == (KEY_WORDS,) and 2 * len(noise_keys_P) >= lanes)
         carries = self.begin(reset_keys_L)
         blocks = len(carries)
-        carries[-1, self.alive_word, lanes - width * (blocks - 1) :] = 0  # nobody is there
+        carries[-1, self.alive_word, lanes - width * (blocks - 1) :] = 0  # lanes without an episode
         actions = pack([action_keys_L], width)
         constants = np.concatenate([mean_O[self.inputs_O], std_O[self.inputs_O]]).astype(np.float32)
         seen_and_done = len(self.inputs_O) + self.network.outputs
@@ -89,7 +99,7 @@ class EpisodeKernel:
         assert weights.shape == (self.network.rows, width)
         pointers = [array.ctypes.data for array in arrays]
         self._call(*pointers, np.float32(unit), blocks, self.spec.episode_steps)
-        # An episode's words are the last of a carry's.
+        # The result of an episode is the last part of a carry.
         found = Episodes(*unpack(carries[:, -self.episode_words :], self.episode_avals, lanes))
         if not self.training or len(self.inputs_O) == self.spec.policy.widths[0]:
             return found
@@ -107,23 +117,30 @@ def compile_episodes(
     target: Target | None = None,
     folder: Path | None = None,
 ) -> EpisodeKernel:
-    """Compile a run's episodes.
+    """Compile the episodes of a run.
+
+    Args:
+        inputs_O: indices of the observations that are computed; others are always zero.
+        training: training episodes, or else evaluation episodes.
+        target: processor and instruction set; the widest vectors of this machine if None.
+        folder: folder of the cache; the user's cache if None.
 
     Raises:
-        UnsupportedError: a step of the environment cannot be compiled. NoVectorsError: this processor cannot run it.
+        UnsupportedError: a step of the environment cannot be compiled.
+        NoVectorsError: this processor lacks the vector instructions.
     """
     target = target or host_target()
-    written = write_episodes(environment, spec, inputs_O, target.width, training=training)
-    native = load_compiled(written.name, written.text, target, folder)
+    program = write_episodes(environment, spec, inputs_O, target.width, training=training)
+    native = load_compiled(program.name, program.text, target, folder)
     signature = [*[ctypes.c_void_p] * 8, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
-    carry = written.carry
+    carry = program.carry
     return EpisodeKernel(
         training=training,
         spec=spec,
         inputs_O=inputs_O,
-        network=written.network,
-        begin=_begin(written.steps, target, folder),
-        alive_word=written.alive_word,
+        network=program.network,
+        begin=_begin(program.steps, target, folder),
+        alive_word=program.alive_word,
         episode_avals=carry.episode,
         episode_words=sum(map(words_of, carry.episode)),
         _call=ctypes.CFUNCTYPE(None, *signature)(native.address),
@@ -131,27 +148,28 @@ def compile_episodes(
     )
 
 
-class Written(NamedTuple):
-    """Episodes before they go to LLVM."""
+class EpisodeProgram(NamedTuple):
+    """The program of a run's episodes, before LLVM compiles it."""
 
     steps: EpisodeSteps
     carry: Carry
-    """Shapes of what an episode carries."""
+    """Shapes and dtypes of the state of an episode."""
     alive_word: int
+    """Index of the word of a carry that says whether the episode is alive."""
     network: Network
     name: str
-    """Tells what the text computes, in full."""
+    """Complete description of what the IR computes."""
     text: Callable[[], str]
-    """LLVM IR, made when it is called. Raises UnsupportedError."""
+    """Function that makes the LLVM IR. Raises UnsupportedError."""
 
 
 def write_episodes(
     environment: Environment, spec: WorkerSpec, inputs_O: np.ndarray, width: int, *, training: bool
-) -> Written:
-    """All of `compile_episodes` but LLVM's part, and without asking what this processor can.
+) -> EpisodeProgram:
+    """Program of a run's episodes for vectors of `width` lanes, for any processor; `compile_episodes` compiles it.
 
     Raises:
-        UnsupportedError: as `compile_episodes`, here or when the text is made.
+        UnsupportedError: a step of the environment cannot be compiled. `text` of the result may raise it as well.
     """
     steps = episode_steps(environment, spec, training=training, inputs_O=inputs_O)
     network = plan(spec.policy, inputs_O, width)
@@ -164,7 +182,9 @@ def write_episodes(
     )
     leaves = jax.tree.leaves(carry)
     if [(aval.shape, aval.dtype) for aval in move.out_avals] != [(aval.shape, aval.dtype) for aval in leaves]:
-        raise TypeError(f"a step makes other arrays than a reset: {move.out_avals} after {leaves}")
+        raise TypeError(
+            f"step returns a state of arrays {move.out_avals}, but reset one of {leaves}; shapes and dtypes must agree"
+        )
     alive_word = sum(words_of(aval) for aval in jax.tree.leaves(carry.state))
     words = sum(map(words_of, leaves))
 
@@ -173,12 +193,15 @@ def write_episodes(
 
     digests = f"{definition()} {jaxpr_digest(look)} {jaxpr_digest(move)}"
     name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {training}"
-    return Written(steps, carry, alive_word, network, name, text)
+    return EpisodeProgram(steps, carry, alive_word, network, name, text)
 
 
 def _begin(steps: EpisodeSteps, target: Target, folder: Path | None) -> Callable[[np.ndarray], np.ndarray]:
-    """Resets, compiled; or by JAX, where they cannot be, as those of Brax's own environments: few beside the steps, but
-    their bits are those of XLA on one kind of processor."""
+    """Function that resets environments, compiled by simd if possible and otherwise by JAX.
+
+    Resets of Brax's own environments, for example, cannot be compiled by simd. Resets are few compared with steps, but
+    the bits of those that JAX compiles may differ between processors.
+    """
     key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
     try:
         kernel: Kernel = compile_kernel(steps.begin, key, target=target, folder=folder)
@@ -198,7 +221,7 @@ def _begin(steps: EpisodeSteps, target: Target, folder: Path | None) -> Callable
 def _module(
     look: ClosedJaxpr, move: ClosedJaxpr, network: Network, inputs: int, words: int, alive_word: int, *, training: bool
 ) -> str:
-    """LLVM IR of
+    """LLVM IR of whole episodes, the function
 
     void kernel(ptr carries, ptr action_keys, ptr constants, ptr centre, ptr keys, ptr places, ptr noise, ptr room,
                 float unit, i64 blocks, i64 steps)
@@ -215,33 +238,33 @@ def _module(
     fill_code = fill_function(network.vectors, len(network.places) - network.vectors, width)
 
     pointers = ["carries", "action_keys", "constants", "centre", "keys", "places", "noise", "room"]
-    code = Code(
+    builder = FunctionBuilder(
         "inside", [*(f"ptr noalias %{name}" for name in pointers), "float %unit", "i64 %blocks", "i64 %steps"], width
     )
-    vector = code.vector["i"]
-    seen, action = "%room", code.at("%room", inputs, vector)
-    hidden = code.at("%room", inputs + actions, vector)
+    vector = builder.llvm_types["i"]
+    seen, action = "%room", builder.at("%room", inputs, vector)
+    hidden = builder.at("%room", inputs + actions, vector)
 
     def block(number: str, _: Values) -> Values:
-        carry = code.at("%carries", code.index((number, words)), vector)
-        action_key = code.at("%action_keys", code.index((number, KEY_WORDS)), vector)
-        alive = code.at(carry, alive_word, vector)
+        carry = builder.at("%carries", builder.index((number, words)), vector)
+        action_key = builder.at("%action_keys", builder.index((number, KEY_WORDS)), vector)
+        alive = builder.at(carry, alive_word, vector)
         if training:
-            keys = code.at("%keys", code.index((number, KEY_WORDS * width // 2)), "i32")
-            code.do(f"call void @fill(ptr {keys}, ptr %places, ptr %noise)")
+            keys = builder.at("%keys", builder.index((number, KEY_WORDS * width // 2)), "i32")
+            builder.do(f"call void @fill(ptr {keys}, ptr %places, ptr %noise)")
 
         def step(_: str, __: Values) -> Values:
-            code.do(f"call void @look(ptr {carry}, ptr %constants, ptr {seen})")
+            builder.do(f"call void @look(ptr {carry}, ptr %constants, ptr {seen})")
             noise = "ptr %noise, float %unit, " if training else ""
-            code.do(f"call void @policy(ptr {seen}, ptr {alive}, ptr %centre, {noise}ptr {hidden}, ptr {action})")
-            code.do(f"call void @move(ptr {carry}, ptr %constants, ptr {action}, ptr {action_key})")
+            builder.do(f"call void @policy(ptr {seen}, ptr {alive}, ptr %centre, {noise}ptr {hidden}, ptr {action})")
+            builder.do(f"call void @move(ptr {carry}, ptr %constants, ptr {action}, ptr {action_key})")
             return []
 
         def all_done() -> str:
-            return code.value(f"xor i1 {code.any(code.load(vector, alive))}, true")
+            return builder.value(f"xor i1 {builder.any(builder.load(vector, alive))}, true")
 
-        code.loop("%steps", step, until=all_done)
+        builder.loop("%steps", step, until=all_done)
         return []
 
-    code.loop("%blocks", block)
-    return module([look_code, move_code, policy_code, *([fill_code] if training else []), code])
+    builder.loop("%blocks", block)
+    return module([look_code, move_code, policy_code, *([fill_code] if training else []), builder])

@@ -1,4 +1,4 @@
-"""What a worker computes with simd, beside `workers.rollout`: the same functions, and why a task may not have them."""
+"""The functions of `workers.rollout` compiled with simd, and the check whether simd supports a task."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from workers.simd.graph.unsupported import UnsupportedError
 
 
 def why_not(task: TaskSpec) -> str:
-    """Why simd cannot run a task's episodes; empty if it can.
+    """Reason why simd cannot run a task's episodes; empty if it can.
 
-    Goes through all that compiling their steps does but LLVM's part, with the task's default options; of training,
-    since evaluations have nothing besides that could be refused. A reset is no reason: JAX computes those that cannot
-    be compiled.
+    This compiles the steps of training episodes to LLVM IR, with the task's default options. Evaluation episodes
+    contain nothing else that may be unsupported. A reset is never a reason, because JAX computes those that simd cannot
+    compile.
     """
     options = {name: values[0] for name, values in task.options.items()}
     spec = WorkerSpec(
@@ -51,13 +51,13 @@ def why_not(task: TaskSpec) -> str:
         write_episodes(environment, spec, inputs_O, WIDTHS["avx2"], training=True).text()
     except UnsupportedError as error:
         return str(error)
-    except Exception as error:  # whatever is wrong with the compiler, xla is there
+    except Exception as error:  # also after a fault of the compiler, xla can run the task
         return f"{type(error).__name__}: {error}"
     return ""
 
 
 def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
-    """As `workers.rollout.make_training_rollout`."""
+    """Rollout of one training chunk, with the interface of `workers.rollout.make_training_rollout`."""
     kernels = _Kernels(environment, spec, training=True)
 
     def rollout(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
@@ -78,7 +78,7 @@ def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Callabl
 
 
 def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
-    """As `workers.rollout.make_evaluation_rollout`."""
+    """Rollout of one evaluation chunk, with the interface of `workers.rollout.make_evaluation_rollout`."""
     kernels = _Kernels(environment, spec, training=False)
 
     def rollout(centre_D, mean_O, std_O, reset_keys_E):
@@ -89,7 +89,10 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Calla
 
 
 class _Kernels:
-    """Kernels of a run: one that leaves out what is always zero, and one with all inputs, should statistics want it."""
+    """Kernels of a run: one that omits inputs that are always zero, and one with all inputs.
+
+    The second is used when the statistics have a mean other than 0 for such an input.
+    """
 
     def __init__(self, environment: Environment, spec: WorkerSpec, *, training: bool) -> None:
         self._environment, self._spec, self._training = environment, spec, training
@@ -100,28 +103,30 @@ class _Kernels:
         self._lock = threading.Lock()
         self._packed: tuple[bool, np.ndarray, np.ndarray] | None = None
 
-    def _kernel(self, short: bool) -> EpisodeKernel:
-        with self._lock:  # threads share it
-            if short not in self._compiled:
-                inputs_O = np.flatnonzero(~self._zero_O) if short else np.arange(self._zero_O.size)
+    def _kernel(self, omit_zero_inputs: bool) -> EpisodeKernel:
+        with self._lock:  # threads share the kernels
+            if omit_zero_inputs not in self._compiled:
+                inputs_O = np.flatnonzero(~self._zero_O) if omit_zero_inputs else np.arange(self._zero_O.size)
                 try:
                     kernel = compile_episodes(self._environment, self._spec, inputs_O, training=self._training)
-                except UnsupportedError as error:  # with options that nobody asked about before
-                    raise UnsupportedError(f"{error}. compute.rollout=xla runs it") from error
-                self._compiled[short] = kernel
-        return self._compiled[short]
+                except UnsupportedError as error:  # `why_not` checks the default options only
+                    raise UnsupportedError(
+                        f"simd cannot compile {self._spec.environment}: {error}; set compute.rollout to xla"
+                    ) from error
+                self._compiled[omit_zero_inputs] = kernel
+        return self._compiled[omit_zero_inputs]
 
     def for_centre(self, centre_D: np.ndarray, mean_O: np.ndarray) -> tuple[EpisodeKernel, np.ndarray]:
-        """(kernel, packed weights), those of the last centre being kept."""
-        short = not mean_O[self._zero_O].any()  # (0 - mean) / std is 0 then, and adds nothing
-        kernel, last = self._kernel(short), self._packed
-        if last is None or last[0] != short or not np.array_equal(last[1], centre_D):
-            last = self._packed = (short, centre_D.copy(), kernel.network.pack(centre_D))
+        """(kernel, packed weights) of a centre; the packed weights of the last centre are reused."""
+        omit_zero_inputs = not mean_O[self._zero_O].any()  # then (0 - mean) / std is 0 and contributes nothing
+        kernel, last = self._kernel(omit_zero_inputs), self._packed
+        if last is None or last[0] != omit_zero_inputs or not np.array_equal(last[1], centre_D):
+            last = self._packed = (omit_zero_inputs, centre_D.copy(), kernel.network.pack(centre_D))
         return kernel, last[2]
 
 
 def make_gradient_sum(parameters: int, target: Target | None = None) -> Callable:
-    """As `workers.rollout.make_gradient_sum`."""
+    """Sum of weighted noise, with the interface of `workers.rollout.make_gradient_sum`."""
     target = target or host_target()
     native = load_compiled(f"gradient {definition()}", lambda: gradient_module(target.width), target)
     signature = [*[ctypes.c_void_p] * 2, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64]
@@ -142,7 +147,7 @@ def make_gradient_sum(parameters: int, target: Target | None = None) -> Callable
 
 
 def always_zero(environment: Environment) -> np.ndarray:
-    """Which observations are 0 whatever the state, [O]."""
+    """Array [O] that is true for observations that are 0 in every state."""
     state = jax.eval_shape(environment.reset, jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32))
     graph, _, outputs = trace_jaxpr(jax.make_jaxpr(environment.observe)(state))
     return np.array([graph.constant(node) == 0.0 for node in outputs])

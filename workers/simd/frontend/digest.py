@@ -1,4 +1,4 @@
-"""What names a jaxpr: kernels are kept on disk under what they compute."""
+"""Hashes of jaxprs, by which compiled kernels are found in the cache on disk."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from workers.simd.graph.unsupported import refusing
 
 @refusing()
 def jaxpr_digest(closed: ClosedJaxpr) -> str:
-    """A hash of everything a jaxpr computes: its equations, their parameters and its constants; not names of variables.
+    """Hash of everything that a jaxpr computes: its equations, their parameters and its constants.
+
+    Names of variables do not change it.
 
     Raises:
-        UnsupportedError: a parameter or constant has no text that is the same in every process.
+        UnsupportedError: the text of a parameter or constant is not the same in every process.
     """
     digests: dict[int, str] = {}
 
@@ -57,9 +59,9 @@ def jaxpr_digest(closed: ClosedJaxpr) -> str:
             array = np.asarray(value)
             return f"{array.dtype}{array.shape}{hashlib.sha256(array.tobytes()).hexdigest()}"
         if callable(value):
-            return ""  # rules for derivatives
+            return ""  # a rule for derivatives, which kernels do not use
         if " at 0x" in (text := repr(value)):
-            raise ValueError(text)
+            raise ValueError(f"a parameter whose text contains an address and differs between processes: {text}")
         return text
 
     return of_closed(closed)

@@ -1,4 +1,4 @@
-"""A JAX function, as a jaxpr, becomes a scalar graph: the tracer, joined with the rules of the primitives."""
+"""Translation of a jaxpr to a scalar graph, by the tracer with the rules of all primitives."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from workers.simd.frontend.kinds import kind_of
+from workers.simd.frontend.dtypes import graph_dtype
 from workers.simd.frontend.primitives import PRIMITIVES
 from workers.simd.frontend.tracer import Tracer
 from workers.simd.graph.folding import FoldingGraph
@@ -16,9 +16,10 @@ from workers.simd.graph.unsupported import refusing
 
 @refusing()
 def trace_jaxpr(closed: ClosedJaxpr) -> tuple[FoldingGraph, int, list[int]]:
-    """The graph of a function of one lane: (graph, number of input words, output nodes).
+    """Graph of a function of one lane, as (graph, number of input words, output nodes).
 
-    Each element of each array that goes in is an input of the graph, in order; each that comes out an output.
+    Each element of each input array is an input of the graph, in order, and each element of each output array an
+    output.
 
     Raises:
         UnsupportedError: the function cannot be compiled.
@@ -27,8 +28,8 @@ def trace_jaxpr(closed: ClosedJaxpr) -> tuple[FoldingGraph, int, list[int]]:
     words = itertools.count()
     inputs = []
     for variable in closed.jaxpr.invars:
-        kind = kind_of(variable.aval.dtype)
-        nodes = [graph.input(kind, next(words)) for _ in range(int(np.prod(variable.aval.shape)))]
+        node_dtype = graph_dtype(variable.aval.dtype)
+        nodes = [graph.input(node_dtype, next(words)) for _ in range(int(np.prod(variable.aval.shape)))]
         inputs.append(np.array(nodes, np.int64).reshape(variable.aval.shape))
     outputs = Tracer(graph, PRIMITIVES).closed(closed, inputs)
     return graph, next(words), [node for nodes in outputs for node in nodes.reshape(-1).tolist()]

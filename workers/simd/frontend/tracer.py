@@ -1,7 +1,7 @@
-"""Jaxprs evaluated over nodes: each array is replaced by an array of nodes.
+"""Evaluation of jaxprs on nodes: each array is replaced by an array of node numbers.
 
-What only moves values about (slices, gathers, transposes) happens here and now, to the numbers of the nodes, and costs
-the kernel nothing; arithmetic makes nodes.
+Operations that only move values (slices, gathers, transposes) are done while tracing, on the node numbers, and cost the
+kernel nothing. Arithmetic adds nodes.
 """
 
 from __future__ import annotations
@@ -14,32 +14,32 @@ from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from numpy.typing import NDArray
 
-from workers.simd.frontend.kinds import check_bytes, kind_of
+from workers.simd.frontend.dtypes import check_bytes, graph_dtype
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.loops import build_loop
 from workers.simd.graph.unsupported import UnsupportedError, refusing
 
 Nodes = NDArray[np.int64]
-"""Numbers of nodes, in the shape of the array they stand for."""
+"""Node numbers, in the shape of the array that they represent."""
 Rule = Callable[..., Any]
-"""What a primitive means for arrays of nodes: f(tracer, equation, *arrays) -> an array, or a list of them."""
+"""Rule of a primitive for arrays of nodes: f(tracer, equation, *arrays) -> an array, or a list of arrays."""
 GRAPH_LIMIT = 2_000_000
-"""Nodes; what needs more would not be compiled in useful time."""
+"""Most nodes of a graph; a greater one would take too long to compile."""
 
 
 class Tracer:
-    """Evaluates jaxprs by the rules of their primitives, and has what rules need to make nodes."""
+    """Evaluator of jaxprs by the rules of their primitives; its methods make the nodes for these rules."""
 
     def __init__(self, graph: FoldingGraph, rules: Mapping[str, Rule]) -> None:
         self.graph, self.rules = graph, rules
 
     def closed(self, closed: ClosedJaxpr, inputs: Sequence[Nodes]) -> list[Nodes]:
-        """Outputs of a jaxpr with its constants."""
+        """Outputs of a jaxpr that comes with its constants."""
         constants = [self.constants(np.asarray(value)) for value in closed.consts]
         return self.jaxpr(closed.jaxpr, constants, inputs)
 
     def jaxpr(self, jaxpr: Jaxpr, constants: Sequence[Nodes], inputs: Sequence[Nodes]) -> list[Nodes]:
-        """Outputs of a jaxpr."""
+        """Outputs of a jaxpr for given constants and inputs."""
         values: dict[Any, Nodes] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
         def read(atom: Any) -> Nodes:
@@ -57,7 +57,7 @@ class Tracer:
                 if len(self.graph.keys) > GRAPH_LIMIT:
                     raise UnsupportedError(f"more than {GRAPH_LIMIT:,} operations")
             except UnsupportedError as error:
-                # What is inside of a library's function may not know from where it was called; the call does.
+                # An equation inside of a library's function may have no source line; the calling equation has one.
                 where = source_info_util.summarize(equation.source_info)
                 if where and ", from " not in str(error):
                     raise UnsupportedError(f"{error}, from {where}") from None
@@ -67,37 +67,37 @@ class Tracer:
             for variable, nodes in zip(equation.outvars, outputs, strict=True):
                 aval: Any = variable.aval
                 assert nodes.shape == aval.shape, (equation.primitive.name, nodes.shape, aval)
-                kinds = {self.graph.kinds[node] for node in nodes.reshape(-1).tolist()}
-                assert kinds <= {kind_of(aval.dtype)}, (equation.primitive.name, kinds, aval)
+                dtypes = {self.graph.dtypes[node] for node in nodes.reshape(-1).tolist()}
+                assert dtypes <= {graph_dtype(aval.dtype)}, (equation.primitive.name, dtypes, aval)
                 values[variable] = nodes
         return [read(atom) for atom in jaxpr.outvars]
 
     def constants(self, numbers: Any) -> Nodes:
-        """Nodes of an array of numbers."""
+        """Nodes of constants, for an array of numbers."""
         array = np.asarray(numbers)
-        kind = kind_of(array.dtype)
-        made = self.graph.i if kind == "i" else lambda value: self.graph.const(kind, value)
+        node_dtype = graph_dtype(array.dtype)
+        made = self.graph.i if node_dtype == "i" else lambda value: self.graph.const(node_dtype, value)
         return np.array([made(value) for value in array.reshape(-1).tolist()], np.int64).reshape(array.shape)
 
     def values(self, nodes: Nodes) -> NDArray | None:
-        """What an array of nodes holds, if all are constants."""
+        """Values of an array of nodes if all of them are constants, else None."""
         found = [self.graph.constant(node) for node in nodes.reshape(-1).tolist()]
         if any(value is None for value in found):
             return None
         return np.array(found).reshape(nodes.shape)
 
     def map(self, function: Callable[..., int], *arrays: Nodes) -> Nodes:
-        """A function of nodes, element by element; shapes are equal or ()."""
+        """Array of a function's results for each element of the arrays, whose shapes are equal or ()."""
         shape = np.broadcast_shapes(*(array.shape for array in arrays))
         flat = [np.broadcast_to(array, shape).reshape(-1).tolist() for array in arrays]
         return np.array([function(*nodes) for nodes in zip(*flat, strict=True)], np.int64).reshape(shape)
 
     def ops(self, name: str, *arrays: Nodes) -> Nodes:
-        """An operation, element by element."""
+        """Array of an operation's results, element by element."""
         return self.map(lambda *nodes: self.graph.op(name, *nodes), *arrays)
 
     def keep_loop(self, trips: int, body: Callable[[list[Nodes]], list[Nodes]], carry: list[Nodes]) -> list[Nodes]:
-        """`carry` after some trips through `body`, which does not ask which trip it is."""
+        """Values of `carry` after `trips` trips through `body`, which does not depend on the number of the trip."""
         shapes = [nodes.shape for nodes in carry]
         ends = np.cumsum([nodes.size for nodes in carry], dtype=np.int64)
 

@@ -1,4 +1,5 @@
-"""A graph of scalar operations: what it is made of, how it folds, how its loops shrink, in which order it is computed.
+"""Graphs of scalar operations: the operations, constant folding, reduction of loops, and the order of computation.
 
-Needs NumPy and nothing else. The front end builds graphs and the back end writes them as code; neither knows the other.
+This package needs only NumPy. The front end builds graphs and the back end translates them to code; neither imports the
+other.
 """

@@ -1,4 +1,4 @@
-"""Remainders of floats, quotients and remainders of integers, made of the graph's operations."""
+"""Remainders of floats and quotients and remainders of integers, built from the graph's operations."""
 
 from __future__ import annotations
 
@@ -8,20 +8,22 @@ from workers.simd.graph.elementary import with_sign_of
 from workers.simd.graph.graph import Graph
 
 QUOTIENT_LIMIT = 2.0**48
-"""Of |x / y| in `remainder`; beyond it, it is NaN."""
+"""Greatest |x / y| for which `remainder` gives a number; it gives NaN for greater ones."""
 DIVISOR_LIMIT = 1e-30
-"""Of |y| in `remainder`, so that no remainder on the way is a denormal number; NaN for less."""
+"""Least |y| for which `remainder` gives a number, so that no intermediate remainder is a denormal number; it gives NaN
+for smaller ones."""
 
 
 def remainder(g: Graph, x: int, y: int) -> int:
-    """x less as many whole y as fit, with the sign of x: C's fmod, to the bit. x where |x| < |y|.
+    """Remainder of x / y with the sign of x, with the same bits as C's fmod; it is x where |x| < |y|.
 
-    NaN where fmod is, for y = 0 or an infinite x, and where |x / y| > 2^48 or |y| < 1e-30 otherwise.
+    The result is NaN where that of fmod is (y = 0 or an infinite x), and otherwise where |x / y| > 2^48 or |y| < 1e-30.
     """
     rest = size = g.op("abs", x)
     step = g.op("abs", y)
-    # What a rounded quotient leaves of a number is a float, so each trip is exact. The first leaves at most 2^-24 of x
-    # or 3/4 of y, whichever is more, and so the second at most 3/4 of y, above zero or below.
+    # The difference between a number and a rounded quotient times the divisor is a float, so each trip is exact. After
+    # the first trip at most the greater of 2^-24 |x| and 3/4 |y| remains, and after the second at most 3/4 |y|, with
+    # either sign.
     for _ in range(2):
         times = g.op("round", g.op("div", rest, step))
         rest = g.op("fma", g.op("neg", times), step, rest)
@@ -32,13 +34,16 @@ def remainder(g: Graph, x: int, y: int) -> int:
 
 
 def whole_quotient(g: Graph, a: int, b: int, dtype: str) -> int:
-    """a / b of integers, rounded towards zero as in JAX: a / 0 has all bits set, the least integer / -1 is itself."""
+    """Quotient a / b of integers, rounded towards zero as in JAX.
+
+    a / 0 has all bits set, and the least integer divided by -1 is itself.
+    """
     found = g.op("sdiv" if dtype == "int32" else "udiv", a, _safe_divisor(g, a, b, dtype))
     return found if _is_constant_but_zero(g, b) else g.op("iselect", g.op("ieq", b, g.i(0)), g.i(-1), found)
 
 
 def whole_remainder(g: Graph, a: int, b: int, dtype: str) -> int:
-    """What `whole_quotient` leaves of a; all of it where b is 0."""
+    """Remainder a - b * (a / b) of integers, with the quotient rounded towards zero; it is a where b is 0."""
     found = g.op("srem" if dtype == "int32" else "urem", a, _safe_divisor(g, a, b, dtype))
     return found if _is_constant_but_zero(g, b) else g.op("iselect", g.op("ieq", b, g.i(0)), a, found)
 
@@ -49,7 +54,10 @@ def _is_constant_but_zero(g: Graph, node: int) -> bool:
 
 
 def _safe_divisor(g: Graph, a: int, b: int, dtype: str) -> int:
-    """b, but 1 where processors would stop: for 0, and for the least integer by -1, which 1 divides alike."""
+    """The divisor b, replaced by 1 where the processor would raise an exception.
+
+    That is where b is 0, and where the least integer is divided by -1; dividing it by 1 gives the same result.
+    """
     if _is_constant_but_zero(g, b) and (dtype != "int32" or g.constant(b) != -1):
         return b
     stops = g.op("ieq", b, g.i(0))

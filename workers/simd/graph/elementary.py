@@ -1,7 +1,8 @@
-"""Elementary functions made of the graph's operations, so that their bits depend on no library and no machine.
+"""Elementary functions built from the graph's operations, so that their bits depend on no library and no machine.
 
-Polynomials are weighted minimax fits, rounded to float32. Errors are in units in the last place (ulp) against float64,
-and tests hold each function to what its docstring says. NaN gives NaN. Denormal numbers are zeros, in and out.
+The polynomials are weighted minimax fits whose coefficients are rounded to float32. Errors are stated in units in the
+last place (ulp) relative to float64, and tests check the statement of each docstring. NaN gives NaN. Denormal arguments
+and results count as zero.
 """
 
 from __future__ import annotations
@@ -12,33 +13,40 @@ from collections.abc import Sequence
 from workers.simd.graph.graph import Graph
 
 SIN = (-0.16666655242443085, 0.008332177996635437, -0.0001951729936990887)
-"""(sin x - x) / x^3 in x^2, |x| <= pi/4."""
+"""Coefficients of (sin x - x) / x^3 as a polynomial in x^2, for |x| <= pi/4."""
 COS = (0.04166664555668831, -0.001388736767694354, 2.4438451873720624e-05)
-"""(cos x - 1 + x^2 / 2) / x^4 in x^2, |x| <= pi/4."""
+"""Coefficients of (cos x - 1 + x^2 / 2) / x^4 as a polynomial in x^2, for |x| <= pi/4."""
 ATAN = (-0.33333152532577515, 0.19993773102760315, -0.14211055636405945, 0.10666004568338394, -0.07552213966846466,
         0.04321185126900673, -0.016367923468351364, 0.0029206909239292145)  # fmt: skip
-"""(atan x - x) / x^3 in x^2, |x| <= 1."""
+"""Coefficients of (atan x - x) / x^3 as a polynomial in x^2, for |x| <= 1."""
 ASIN = (0.16666753590106964, 0.07495241612195969, 0.04547709971666336, 0.024147599935531616, 0.042218565940856934)
-"""(asin x - x) / x^3 in x^2, |x| <= 1/2."""
+"""Coefficients of (asin x - x) / x^3 as a polynomial in x^2, for |x| <= 1/2."""
 EXPM1 = (0.5, 0.1666654348373413, 0.04166628047823906, 0.00836657639592886, 0.0013946436811238527)
-"""(e^x - 1 - x) / x^2 in x, |x| <= log(2) / 2."""
+"""Coefficients of (e^x - 1 - x) / x^2 as a polynomial in x, for |x| <= log(2) / 2."""
 LOG1P = (0.3333333134651184, -0.2500081956386566, 0.20001226663589478, -0.16623356938362122, 0.14201757311820984,
          -0.13160182535648346, 0.1276157647371292, -0.07634496688842773)  # fmt: skip
-"""(log(1 + x) - x + x^2 / 2) / x^3 in x, sqrt(1/2) <= 1 + x <= sqrt(2)."""
+"""Coefficients of (log(1 + x) - x + x^2 / 2) / x^3 as a polynomial in x, for sqrt(1/2) <= 1 + x <= sqrt(2)."""
 TANH = ((1.0, 0.13383980095386505, 0.0034989959094673395, 2.066126216959674e-05, 1.3419821698335e-08),
         (1.0, 0.4671730101108551, 0.025890206918120384, 0.00032910381560213864, 7.804729307281377e-07))  # fmt: skip
-"""(tanh x) / x as a fraction in x^2, |x| <= 9, beyond which tanh is 1 but for a last bit."""
+"""Coefficients (numerator, denominator) of (tanh x) / x as a rational function of x^2, for |x| <= 9.
+
+For greater |x|, |tanh x| differs from 1 by at most the last bit.
+"""
 ROUNDER = 1.5 * 2**23
-"""x + ROUNDER - ROUNDER is x rounded to a whole number, and the lowest bits of x + ROUNDER are that number."""
+"""Number whose addition rounds to integers.
+
+x + ROUNDER - ROUNDER is x rounded to a whole number, and the lowest bits of x + ROUNDER are that number.
+"""
 HALF_PI = (1.5707963705062866, -4.371139000186241e-08, -1.7151245100058784e-15)
-"""pi / 2 as a sum of floats."""
+"""Floats whose sum is pi / 2."""
 LOG_2 = (0.693359375, -0.00021219444170128554)
-"""log 2 as a sum of floats, the first of few bits."""
+"""Floats whose sum is log 2; the first has few significant bits."""
 ANGLE_LIMIT = 1e6
-"""Of sin, cos and tan; beyond it they are NaN."""
+"""Greatest |x| for which sin, cos and tan give numbers; they give NaN for greater ones."""
 
 
 def _horner(g: Graph, x: int, coefficients: Sequence[float]) -> int:
+    """Value at x of the polynomial with these coefficients, the constant first."""
     total = g.f(coefficients[-1])
     for coefficient in reversed(coefficients[:-1]):
         total = g.op("fma", total, x, g.f(coefficient))
@@ -46,23 +54,24 @@ def _horner(g: Graph, x: int, coefficients: Sequence[float]) -> int:
 
 
 def _clipped(g: Graph, x: int, most: float) -> int:
-    """x between -most and most; NaN stays."""
+    """x clipped to [-most, most]; NaN stays NaN."""
     x = g.op("select", g.op("lt", g.f(most), x), g.f(most), x)
     return g.op("select", g.op("lt", x, g.f(-most)), g.f(-most), x)
 
 
 def with_sign_of(g: Graph, size: int, sign: int) -> int:
-    """|size| with the sign bit of another."""
+    """|size| with the sign bit of `sign`."""
     magnitude = g.op("iand", g.op("bits", size), g.i(0x7FFFFFFF))
     return g.op("unbits", g.op("ior", magnitude, g.op("iand", g.op("bits", sign), g.i(0x80000000))))
 
 
 def _nan_where_nan(g: Graph, x: int, y: int) -> int:
+    """y, or NaN where x is NaN."""
     return g.op("select", g.op("ne", x, x), x, y)
 
 
 def _quarter_turn(g: Graph, x: int) -> tuple[int, int, int]:
-    """(sine, cosine) of what is left of x after whole quarter turns, and an integer whose low bits count those."""
+    """(sine, cosine, turns) of x reduced by whole quarter turns; the low bits of `turns` count the quarter turns."""
     turns = g.op("fma", x, g.f(2.0 / math.pi), g.f(ROUNDER))
     whole = g.op("neg", g.op("sub", turns, g.f(ROUNDER)))
     rest = x
@@ -76,7 +85,7 @@ def _quarter_turn(g: Graph, x: int) -> tuple[int, int, int]:
 
 
 def _turned(g: Graph, even: int, odd: int, quarters: int, sign_from: int) -> int:
-    """`even` or `odd`, as the quarters are; negative where the second bit of `sign_from` is set."""
+    """`even` or `odd` by the parity of `quarters`; the sign is flipped where the second bit of `sign_from` is set."""
     is_even = g.op("ieq", g.op("iand", quarters, g.i(1)), g.i(0))
     chosen = g.op("select", is_even, even, odd)
     sign = g.op("shl", g.op("iand", sign_from, g.i(2)), g.i(30))
@@ -84,24 +93,28 @@ def _turned(g: Graph, even: int, odd: int, quarters: int, sign_from: int) -> int
 
 
 def sin(g: Graph, x: int) -> int:
-    """Within 2 ulp, or 1e-7 near zeros, for |x| <= 100; an absolute error of 1e-7 up to 10^5. NaN beyond 10^6."""
+    """Sine of x.
+
+    For |x| <= 100 the error is within 2 ulp, or 1e-7 near the zeros; up to 10^5 the absolute error is within 1e-7.
+    Beyond 10^6 the result is NaN.
+    """
     sine, cosine, quarters = _quarter_turn(g, x)
     return _turned(g, sine, cosine, quarters, quarters)
 
 
 def cos(g: Graph, x: int) -> int:
-    """As sin."""
+    """Cosine of x, with the errors and limits of `sin`."""
     sine, cosine, quarters = _quarter_turn(g, x)
     return _turned(g, cosine, sine, quarters, g.op("iadd", quarters, g.i(1)))
 
 
 def tan(g: Graph, x: int) -> int:
-    """sin / cos: within 5 ulp for |x| <= 100."""
+    """Tangent of x as sin x / cos x, within 5 ulp for |x| <= 100."""
     return g.op("div", sin(g, x), cos(g, x))
 
 
 def atan2(g: Graph, y: int, x: int) -> int:
-    """Within 3 ulp. Zeros and infinities have signs and quadrants as in IEEE 754."""
+    """Angle of the point (x, y), within 3 ulp. Zeros and infinities have the signs and quadrants of IEEE 754."""
     size_x, size_y = g.op("abs", x), g.op("abs", y)
     steep = g.op("lt", size_x, size_y)
     less, more = g.op("select", steep, size_x, size_y), g.op("select", steep, size_y, size_x)
@@ -117,12 +130,15 @@ def atan2(g: Graph, y: int, x: int) -> int:
 
 
 def atan(g: Graph, x: int) -> int:
-    """Within 3 ulp."""
+    """Arc tangent of x, within 3 ulp."""
     return atan2(g, x, g.f(1.0))
 
 
 def _asin_parts(g: Graph, x: int) -> tuple[int, int, int]:
-    """(whether |x| > 1/2, asin of the small argument, |x|): sqrt((1 - |x|) / 2) takes the place of a great |x|."""
+    """(whether |x| > 1/2, arc sine of the reduced argument, |x|).
+
+    The reduced argument is |x| itself, or sqrt((1 - |x|) / 2) where |x| > 1/2.
+    """
     size = g.op("abs", x)
     great = g.op("lt", g.f(0.5), size)
     half_rest = g.op("fma", size, g.f(-0.5), g.f(0.5))
@@ -132,14 +148,14 @@ def _asin_parts(g: Graph, x: int) -> tuple[int, int, int]:
 
 
 def asin(g: Graph, x: int) -> int:
-    """Within 3 ulp; NaN beyond [-1, 1]."""
+    """Arc sine of x, within 3 ulp; NaN outside [-1, 1]."""
     great, small, _ = _asin_parts(g, x)
     angle = g.op("select", great, g.op("fma", g.f(-2.0), small, g.f(math.pi / 2)), small)
     return _nan_where_nan(g, angle, with_sign_of(g, angle, x))
 
 
 def acos(g: Graph, x: int) -> int:
-    """Within 3 ulp; NaN beyond [-1, 1]."""
+    """Arc cosine of x, within 3 ulp; NaN outside [-1, 1]."""
     great, small, _ = _asin_parts(g, x)
     double = g.op("add", small, small)
     negative = g.op("lt", x, g.f(0.0))
@@ -149,7 +165,7 @@ def acos(g: Graph, x: int) -> int:
 
 
 def _exp_parts(g: Graph, x: int) -> tuple[int, int]:
-    """(e^rest - 1, an integer whose low bits are k), where x = k log 2 + rest."""
+    """(e^rest - 1, an integer whose low bits are k) for the decomposition x = k log 2 + rest."""
     powers = g.op("fma", x, g.f(1.0 / math.log(2.0)), g.f(ROUNDER))
     whole = g.op("neg", g.op("sub", powers, g.f(ROUNDER)))
     rest = g.op("fma", whole, g.f(LOG_2[1]), g.op("fma", whole, g.f(LOG_2[0]), x))
@@ -157,19 +173,19 @@ def _exp_parts(g: Graph, x: int) -> tuple[int, int]:
 
 
 def _times_half_power(g: Graph, x: int, powers: int) -> int:
-    """x 2^(k - 1), for k from -125 to 128 and x near 1; 1/2 spares the greatest powers from overflow."""
+    """x 2^(k - 1), for k from -125 to 128 and x near 1. The factor 1/2 keeps the greatest powers from overflowing."""
     return g.op("unbits", g.op("iadd", g.op("bits", x), g.op("shl", g.op("isub", powers, g.i(1)), g.i(23))))
 
 
 def exp(g: Graph, x: int) -> int:
-    """Within 2 ulp; infinite from 88.7228 on, 0 below -86.6."""
+    """e^x, within 2 ulp; infinite from 88.7228 on, 0 below -86.6."""
     less_one, powers = _exp_parts(g, x)
     half = _times_half_power(g, g.op("add", less_one, g.f(1.0)), powers)
     return _within_range(g, x, g.op("add", half, half), g.f(0.0))
 
 
 def expm1(g: Graph, x: int) -> int:
-    """Within 3 ulp; infinite from 88.7228 on, -1 below -86.6."""
+    """e^x - 1, within 3 ulp; infinite from 88.7228 on, -1 below -86.6."""
     less_one, powers = _exp_parts(g, x)
     half_power = _times_half_power(g, g.f(1.0), powers)
     half = g.op("fma", half_power, less_one, g.op("sub", half_power, g.f(0.5)))
@@ -177,6 +193,7 @@ def expm1(g: Graph, x: int) -> int:
 
 
 def _within_range(g: Graph, x: int, y: int, below: int) -> int:
+    """y, replaced by `below` for x < -86.6, by infinity where e^x overflows, and by NaN where x is NaN."""
     y = g.op("select", g.op("lt", x, g.f(-86.6)), below, y)
     y = g.op("select", g.op("lt", g.f(88.72283), x), g.f(math.inf), y)
     return _nan_where_nan(g, x, y)
@@ -194,7 +211,7 @@ def exp2(g: Graph, x: int) -> int:
 
 
 def log(g: Graph, x: int) -> int:
-    """Within 2 ulp; -inf at 0, NaN below."""
+    """Natural logarithm of x, within 2 ulp; -inf at 0, NaN below."""
     bits = g.op("bits", x)
     power = g.op("ashr", g.op("isub", bits, g.i(0x3F3504F3)), g.i(23))  # 0x3F3504F3 are the bits of sqrt(1/2)
     mantissa = g.op("unbits", g.op("isub", bits, g.op("shl", power, g.i(23))))
@@ -210,7 +227,7 @@ def log(g: Graph, x: int) -> int:
 
 
 def log1p(g: Graph, x: int) -> int:
-    """Within 3 ulp; -inf at -1, NaN below."""
+    """log(1 + x), within 3 ulp; -inf at -1, NaN below."""
     one_more = g.op("add", x, g.f(1.0))
     lost = g.op("sub", x, g.op("sub", one_more, g.f(1.0)))
     found = g.op("add", log(g, one_more), g.op("div", lost, one_more))
@@ -220,7 +237,10 @@ def log1p(g: Graph, x: int) -> int:
 
 
 def tanh(g: Graph, x: int) -> int:
-    """Within 6 ulp, half of them in the fraction's two roundings; never beyond 1. As good as XLA's, and cheap."""
+    """Hyperbolic tangent of x, within 6 ulp and within [-1, 1].
+
+    Half of the error comes from the two roundings of the fraction. It is as accurate as that of XLA, and cheap.
+    """
     bounded = _clipped(g, x, 9.0)
     square = g.op("mul", bounded, bounded)
     above, below = (_horner(g, square, coefficients) for coefficients in TANH)
@@ -233,12 +253,12 @@ def logistic(g: Graph, x: int) -> int:
 
 
 def rsqrt(g: Graph, x: int) -> int:
-    """1 / sqrt(x), both rounded: within 2 ulp."""
+    """1 / sqrt(x), within 2 ulp: the root and the quotient are rounded separately."""
     return g.op("div", g.f(1.0), g.op("sqrt", x))
 
 
 def whole_power(g: Graph, x: int, exponent: int) -> int:
-    """x to a whole number, by squaring: within as many ulp as the exponent."""
+    """x to a whole power, by squaring; the error in ulp is at most |exponent|."""
     if exponent < 0:
         return g.op("div", g.f(1.0), whole_power(g, x, -exponent))
     found, square = g.f(1.0), x
@@ -252,9 +272,12 @@ def whole_power(g: Graph, x: int, exponent: int) -> int:
 
 
 def pow(g: Graph, x: int, y: int) -> int:
-    """x^y. By squaring for a constant whole y up to 64 in size, sqrt for 1/2; else e^(y log x), within
-    3 + 2 |y log x| ulp. NaN where x is negative, -inf too, unless y is whole, and infinities count as even; zeros count
-    as +0."""
+    """x^y.
+
+    A constant whole y with |y| <= 64 is computed by squaring, y = 1/2 by sqrt, and every other y as e^(y log x), within
+    3 + 2 |y log x| ulp. The result is NaN where x is negative (-inf included) and y is not whole; an infinite y counts
+    as even. A zero x counts as +0.
+    """
     exponent = g.constant(y)
     if exponent is not None and float(exponent).is_integer() and abs(exponent) <= 64:
         return whole_power(g, x, int(exponent))
@@ -272,7 +295,7 @@ def pow(g: Graph, x: int, y: int) -> int:
 
 
 def round_half_away(g: Graph, x: int) -> int:
-    """The nearest whole number, halves away from zero. Exact."""
+    """Nearest whole number to x, exactly; halves are rounded away from zero."""
     size = g.op("abs", x)
     below = g.op("floor", size)
     goes_up = g.op("le", g.f(0.5), g.op("sub", size, below))
@@ -280,7 +303,7 @@ def round_half_away(g: Graph, x: int) -> int:
 
 
 def int_of_float(g: Graph, x: int) -> int:
-    """Rounded towards zero, as JAX: what does not fit becomes the nearest integer that does, NaN becomes 0."""
+    """x converted to int32 as JAX does: rounded towards zero and clipped to the range of int32; NaN becomes 0."""
     fits = g.op("lt", g.op("abs", x), g.f(2.0**31))
     converted = g.op("int_of_float", g.op("select", fits, x, g.f(0.0)))
     great = g.op("iselect", g.op("lt", x, g.f(0.0)), g.i(-(2**31)), g.i(2**31 - 1))

@@ -1,20 +1,21 @@
-"""A graph that simplifies while it is built: what is made of constants is a constant, and identities apply at once.
+"""A graph that simplifies while it is built: operations on constants become constants, and identities are applied.
 
-With NaN, infinities and signed zeros in mind, they are of three sorts:
+With regard to NaN, infinities and signed zeros, there are three classes of identities:
 
-* exact for every value: x * 1, x / 1, x / 2^k = x * 2^-k, x - 0, x + (-0), -0 - x, -(-x), |-x|, ||x||,
-  a + (-b) = a - b, a - (-b) = a + b, (-a) * b = -(a * b), (-a) * (-b) = a * b, choices between equal things or by
-  constants, x < x (false for NaN too), logic with constants.
-* exact but for the sign of a zero: x + 0 = x, x - (-0) = x, -(a - b) = b - a but of two products, (-a) - b = -(a + b),
-  |sqrt x| = sqrt x. Only division by that zero, atan2 (whose angle is then off by 2 pi) and bit tricks could tell.
-* exact for finite values, but for the sign of a zero: x * 0 = 0. Brax's constant joint frames are full of it: without
-  it an ant has twice as many operations. Where a factor is infinite or NaN, JAX has NaN and the graph 0; but the factor
-  itself stays what it was on every other way through the graph; what hangs on that product alone does not see it.
-  `is_finite` is computed, never assumed.
+* Exact for every value: x * 1, x / 1, x / 2^k = x * 2^-k, x - 0, x + (-0), -0 - x, -(-x), |-x|, ||x||,
+  a + (-b) = a - b, a - (-b) = a + b, (-a) * b = -(a * b), (-a) * (-b) = a * b, a choice between equal nodes or by a
+  constant, x < x (false for NaN as well), logic with constants.
+* Exact except for the sign of a zero: x + 0 = x, x - (-0) = x, -(a - b) = b - a unless a and b are both products,
+  (-a) - b = -(a + b), |sqrt x| = sqrt x. Only a division by that zero, atan2 (whose angle then differs by 2 pi) and
+  operations on bits can show the difference.
+* Exact for finite values except for the sign of a zero: x * 0 = 0. Brax's constant joint frames contain many such
+  products; without this identity an ant has twice as many operations. Where a factor is infinite or NaN, JAX computes
+  NaN and the graph 0. The factor keeps its value in every other expression; only what depends on this product alone
+  differs. `is_finite` is computed, never assumed.
 
-Not done: 0 / x, x / x, x - x, x == x (NaN matters there), reassociation, approximations.
+Not applied: 0 / x, x / x, x - x, x == x (all of them differ for NaN), reassociation, approximations.
 
-A rule is f(graph, arguments, their values where constant) -> a simpler node of the same value, or None.
+A rule is f(graph, arguments, their values where constant) -> a simpler node with the same value, or None.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ from workers.simd.graph.operations import OPERATIONS, compute
 
 
 class FoldingGraph(Graph):
-    """What everything that traces builds: `op` may give a simpler node of the same value."""
+    """A graph whose `op` may return a simpler node with the same value; tracing builds this graph."""
 
     def build(self, name: str, arguments: tuple[int, ...]) -> int:
-        """The node of an operation that was not asked for before, or of what it comes to."""
+        """Node of an operation that does not exist yet, or of a constant or simpler operation with the same value."""
         values = [self.constant(a) for a in arguments]
         if all(value is not None for value in values):
             return self.const(OPERATIONS[name].gives, compute(name, values))
@@ -41,7 +42,7 @@ class FoldingGraph(Graph):
         return super().build(name, arguments) if folded is None else folded
 
     def negated(self, node: int) -> int | None:
-        """What a node is the negative of, or None."""
+        """The node whose negative this node is, or None if it is no negation."""
         key = self.keys[node]
         return key[1] if key[0] == "neg" else None
 
@@ -113,7 +114,7 @@ def _fold_neg(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int 
     if key[0] == "neg":
         return key[1]
     if key[0] != "sub" or all(g.keys[one][0] == "mul" for one in key[1:]):
-        return None  # of two products a difference takes in the second, so that p - q and q - p round differently
+        return None  # a difference of two products is fused with the second, so p - q and q - p round differently
     return g.op("sub", key[2], key[1])
 
 
@@ -136,8 +137,8 @@ def _fold_select(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> i
         return a if values[0] else b
     key = g.keys[mask]
     for one, other in ((key[1], key[2]), (key[2], key[1])) if key[0] == "xor" else ():
-        if _is(g.constant(one), True):  # a negation
-            return g.op("iselect" if g.kinds[a] == "i" else "select", other, b, a)
+        if _is(g.constant(one), True):  # the mask is the negation of `other`
+            return g.op("iselect" if g.dtypes[a] == "i" else "select", other, b, a)
     return None
 
 
@@ -164,7 +165,7 @@ def _fold_xor(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int 
 
 
 def _fold_by_zero(g: FoldingGraph, args: tuple[int, ...], values: list[Any]) -> int | None:
-    """x + 0, x - 0, x | 0, x ^ 0, x << 0 of integers."""
+    """The integer x for x + 0, x - 0, x | 0, x ^ 0 and shifts by 0."""
     return args[0] if _is(values[1], 0) else None
 
 
@@ -195,4 +196,4 @@ RULES: dict[str, Rule] = {
     "lshr": _fold_by_zero,
     "ashr": _fold_by_zero,
 }
-"""Operation -> rule."""
+"""Folding rules by the name of their operation."""

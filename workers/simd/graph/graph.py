@@ -1,10 +1,10 @@
-"""A graph of scalar operations. Nodes are numbers, in an order in which they can be computed.
+"""Graphs of scalar operations. Nodes are numbered in an order in which they can be computed.
 
-Equal expressions are one node (hash-consing); a + b and b + a are two, because of the rule in `schedule.py`. The graph
-that simplifies while it is built is in `folding.py`.
+Equal expressions are one node (hash-consing). a + b and b + a are two nodes, because the rule of fusing in
+`schedule.py` depends on the order of the arguments. The graph that simplifies while it is built is in `folding.py`.
 
-A loop is a `Loop`: its carries are nodes ("carry") that its body hangs on, its results nodes ("result") that what comes
-after hangs on. What hangs on no carry lies outside by itself.
+A loop is a `Loop`. Its carries are nodes ("carry") on which its body depends, and its results are nodes ("result") on
+which the code after the loop depends. A node that depends on no carry lies outside of the loop.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.graph.operations import DTYPES, OPERATIONS
+from workers.simd.graph.operations import NUMPY_DTYPES, OPERATIONS
 
 Key = tuple
 
 
 @dataclass
 class Loop:
-    """Repeated `trips` times, at least once: carry k starts as inits[k], and is outs[k] at the end of each trip."""
+    """A loop of `trips` trips, at least one: carry k starts as inits[k] and becomes outs[k] at the end of each trip."""
 
     number: int
     trips: int
@@ -33,50 +33,53 @@ class Loop:
 
 
 class Graph:
-    """Append-only; `keys[node]` is what a node is: (operation, *argument nodes), or
+    """An append-only graph. `keys[node]` defines a node: (operation, *argument nodes), or one of
 
-    ("const", kind, bits), ("input", kind, position), ("carry", kind, loop, position), ("result", kind, loop, position).
+    ("const", dtype, bits), ("input", dtype, position),
+    ("carry", dtype, loop, position), ("result", dtype, loop, position).
+
+    A dtype is "f" (float32), "i" (32-bit integer) or "b" (bool).
     """
 
     def __init__(self) -> None:
         self.keys: list[Key] = []
-        self.kinds: list[str] = []
+        self.dtypes: list[str] = []
         self.loops: list[Loop] = []
         self._known: dict[Key, int] = {}
 
-    def const(self, kind: str, value: float | int | bool) -> int:
-        """A constant."""
-        array = np.asarray(value, DTYPES[kind])
-        bits = int(array.view(np.int32)) if kind == "f" else int(array)
-        return self._node(("const", kind, bits), kind)
+    def const(self, dtype: str, value: float | int | bool) -> int:
+        """Node of a constant."""
+        array = np.asarray(value, NUMPY_DTYPES[dtype])
+        bits = int(array.view(np.int32)) if dtype == "f" else int(array)
+        return self._node(("const", dtype, bits), dtype)
 
     def f(self, value: float) -> int:
-        """A float32 constant."""
+        """Node of a float32 constant."""
         return self.const("f", value)
 
     def i(self, value: int) -> int:
-        """An integer constant; numbers of 2^31 and more are those of the same bits."""
+        """Node of an integer constant; a number from 2^31 on stands for the int32 with the same bits."""
         return self.const("i", (value + 2**31) % 2**32 - 2**31)
 
-    def input(self, kind: str, position: int) -> int:
-        """The kernel's input word at a position."""
-        return self._node(("input", kind, position), kind)
+    def input(self, dtype: str, position: int) -> int:
+        """Node of the kernel's input word at a position."""
+        return self._node(("input", dtype, position), dtype)
 
     def constant(self, node: int) -> Any:
-        """The value of a constant node, a NumPy scalar; else None."""
+        """Value of a constant node as a NumPy scalar; None for other nodes."""
         key = self.keys[node]
         if key[0] != "const":
             return None
-        array = np.array(key[2], np.int32 if key[1] == "f" else DTYPES[key[1]])
+        array = np.array(key[2], np.int32 if key[1] == "f" else NUMPY_DTYPES[key[1]])
         return array.view(np.float32)[()] if key[1] == "f" else array[()]
 
     def arguments(self, node: int) -> tuple[int, ...]:
-        """Nodes that an operation is applied to; nothing for other nodes."""
+        """Argument nodes of an operation; empty for nodes that are no operations."""
         key = self.keys[node]
         return key[1:] if key[0] in OPERATIONS else ()
 
     def needs(self, node: int) -> tuple[int, ...]:
-        """Nodes that a node cannot do without: a result its carry, a carry its start and its end."""
+        """Nodes on which a node depends directly: a result on its carry, a carry on its start and its end."""
         key = self.keys[node]
         match key[0]:
             case "result":
@@ -87,54 +90,54 @@ class Graph:
         return self.arguments(node)
 
     def loop(self, trips: int, inits: list[int]) -> Loop:
-        """Open a loop; its body is whatever is then built on its carries. Close it with `close`."""
+        """Open a loop whose body is what is then built from its carries; `close` ends it."""
         number = len(self.loops)
-        kinds = [self.kinds[node] for node in inits]
-        carries = [self._node(("carry", kind, number, k), kind) for k, kind in enumerate(kinds)]
+        dtypes = [self.dtypes[node] for node in inits]
+        carries = [self._node(("carry", dtype, number, k), dtype) for k, dtype in enumerate(dtypes)]
         self.loops.append(Loop(number, trips, list(inits), carries))
         return self.loops[-1]
 
     def close(self, loop: Loop, outs: list[int]) -> list[int]:
-        """Give a loop its ends; returns its results."""
+        """Set the nodes that the carries become at the end of a trip; returns the loop's results."""
         loop.outs = list(outs)
         for k, out in enumerate(outs):
-            assert self.kinds[out] == self.kinds[loop.carries[k]], "a loop carries values of one kind"
-        kinds = [self.kinds[node] for node in outs]
-        loop.results = [self._node(("result", kind, loop.number, k), kind) for k, kind in enumerate(kinds)]
+            assert self.dtypes[out] == self.dtypes[loop.carries[k]], "a loop carries values of one dtype"
+        dtypes = [self.dtypes[node] for node in outs]
+        loop.results = [self._node(("result", dtype, loop.number, k), dtype) for k, dtype in enumerate(dtypes)]
         return loop.results
 
     def op(self, name: str, *arguments: int) -> int:
-        """The node of an operation on nodes."""
+        """Node of an operation on nodes."""
         operation = OPERATIONS[name]
         if operation.commutes and arguments[0] > arguments[1]:
             arguments = (arguments[1], arguments[0])
         known = self._known.get((name, *arguments))
         if known is not None:
             return known
-        assert "".join(self.kinds[a] for a in arguments) == operation.takes, (name, arguments)
+        assert "".join(self.dtypes[a] for a in arguments) == operation.takes, (name, arguments)
         node = self._known[(name, *arguments)] = self.build(name, arguments)
         return node
 
     def build(self, name: str, arguments: tuple[int, ...]) -> int:
-        """The node of an operation that was not asked for before. For `op` alone."""
+        """Node of an operation that does not exist yet; only `op` calls this."""
         return self._node((name, *arguments), OPERATIONS[name].gives)
 
-    def _node(self, key: Key, kind: str) -> int:
+    def _node(self, key: Key, dtype: str) -> int:
         known = self._known.get(key)
         if known is None:
             known = self._known[key] = len(self.keys)
             self.keys.append(key)
-            self.kinds.append(kind)
+            self.dtypes.append(dtype)
         return known
 
 
 def live(graph: Graph, outputs: Iterable[int]) -> set[int]:
-    """Nodes that outputs hang on. A loop's carry is among them only where somebody needs it."""
+    """Nodes on which outputs depend. A loop's carry is among them only if it is needed."""
     return reached(outputs, graph.needs)
 
 
 def reached(starts: Iterable[int], needs: Callable[[int], Iterable[int]]) -> set[int]:
-    """Nodes that some nodes hang on, themselves among them."""
+    """All nodes that can be reached from `starts` through `needs`, including `starts`."""
     found: set[int] = set()
     waiting = list(starts)
     while waiting:
@@ -146,17 +149,17 @@ def reached(starts: Iterable[int], needs: Callable[[int], Iterable[int]]) -> set
 
 
 def depending(graph: Graph, loop: Loop) -> set[int]:
-    """Nodes of a loop's body: what is made of its carries, but for its results and what comes after."""
+    """Nodes of a loop's body: all nodes that depend on its carries, except its results and what depends on those."""
     found = set(loop.carries)
     size = 0
-    while len(found) != size:  # an inner loop's carries come before their ends: look again
+    while len(found) != size:  # the carries of an inner loop have lower numbers than their ends, so repeat
         size = len(found)
         for node in range(min(found, default=0), len(graph.keys)):
             if node not in found and not found.isdisjoint(graph.needs(node)):
                 key = graph.keys[node]
                 if key[0] != "result" or key[2] != loop.number:
                     found.add(node)
-        # A loop is inside with all its carries, or not at all.
+        # An inner loop is inside with all of its carries or with none.
         numbers = {graph.keys[node][2] for node in found if graph.keys[node][0] == "carry"}
         found.update(carry for number in numbers for carry in graph.loops[number].carries)
     return found

@@ -1,10 +1,11 @@
-"""Loops carry the least they can. Brax's state is some 600 numbers, most of them functions of the others.
+"""Reduction of loops to the carries they need. Brax's state has about 600 numbers, most of them functions of others.
 
-A carry is not needed where it stays what it was, and where its end is made of other carries' ends. Then it is
+A carry is not needed if it never changes, or if its end is a function of the ends of other carries. In the second case
+it is
 
-* *derived*, if its start is made in the same way of their starts (hash-consing shows it): computed from those at the
-  start of each trip, as before at the end;
-* *late*, if no trip looks at it: computed from the others' results, once.
+* *derived*, if its start is the same function of their starts (hash-consing shows this): it is computed from the other
+  carries at the start of each trip instead of at its end;
+* *late*, if no trip reads it: it is computed once, from the results of the other carries.
 """
 
 from __future__ import annotations
@@ -16,16 +17,19 @@ from workers.simd.graph.unsupported import UnsupportedError
 
 Body = Callable[[list[int]], list[int]]
 UNROLLED_OPERATIONS = 2000
-"""A loop whose trips have no more than this many operations in all becomes straight code. Operations that hang on its
-carries count: how many others there are depends on what else was built before, and rounding would, too."""
+"""Most operations, over all trips, of a loop that becomes straight code.
+
+Only operations that depend on the carries are counted. The number of others depends on what was built before, and
+rounding would then depend on it as well.
+"""
 MOST_STRAIGHT_TRIPS = 64
-"""Of a loop that can only be straight code, because its trips look at their numbers."""
+"""Most trips of a loop that must become straight code because its body depends on the number of the trip."""
 
 
 def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> list[int]:
-    """Results of repeating `body` (carries -> their ends): a Loop with as few carries as will do, or straight code.
+    """Results of repeating `body`, which maps carries to their ends, as a Loop with few carries or as straight code.
 
-    `body` is called again for another set of carries, and must build the same for the same.
+    `body` is called again with other carries, and must build the same expressions from the same nodes.
     """
     loop = graph.loop(trips, list(inits))
     try:
@@ -33,7 +37,7 @@ def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> li
     except UnsupportedError:
         if trips > MOST_STRAIGHT_TRIPS:
             raise
-        return _straight(trips, body, inits)  # where the number of the trip is an index, it has to be a constant
+        return _straight(trips, body, inits)  # if the number of the trip is an index, it must be a constant
     inside = depending(graph, loop)
     if trips * max(1, sum(bool(graph.arguments(node)) for node in inside)) <= UNROLLED_OPERATIONS:
         return _straight(trips, body, inits)
@@ -41,20 +45,20 @@ def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> li
     if len(kept) == len(inits):
         return graph.close(loop, outs)
 
-    # The same body again, on the carries that are kept and what is derived from them.
-    short = graph.loop(trips, [inits[k] for k in kept])
-    # Of carries with one end, the start that `_sort` compared with counts.
-    starts = {outs[k]: carry for k, carry in zip(kept, short.carries, strict=True) if k in firsts}
+    # Build the same body again, from the carries that are kept and the values derived from them.
+    reduced = graph.loop(trips, [inits[k] for k in kept])
+    # Where several carries have the same end, use the start that `_sort` compared with.
+    starts = {outs[k]: carry for k, carry in zip(kept, reduced.carries, strict=True) if k in firsts}
     carries = list(inits)
-    for k, carry in zip(kept, short.carries, strict=True):
+    for k, carry in zip(kept, reduced.carries, strict=True):
         carries[k] = carry
     for k in derived:
         carries[k] = substitute(graph, outs[k], starts)
     for k in late:
-        carries[k] = inits[k]  # nothing looks at it
+        carries[k] = inits[k]  # no trip reads it
     new_outs = body(carries)
-    results = graph.close(short, [new_outs[k] for k in kept])
-    found = list(inits)  # what is constant stays
+    results = graph.close(reduced, [new_outs[k] for k in kept])
+    found = list(inits)  # carries that never change
     for k, result in zip(kept, results, strict=True):
         found[k] = result
     ends = dict(zip((outs[k] for k in kept), results, strict=True))
@@ -64,6 +68,7 @@ def build_loop(graph: Graph, trips: int, body: Body, inits: Sequence[int]) -> li
 
 
 def _straight(trips: int, body: Body, inits: Sequence[int]) -> list[int]:
+    """Results of repeating `body` as straight code."""
     nodes = list(inits)
     for _ in range(trips):
         nodes = body(nodes)
@@ -73,18 +78,19 @@ def _straight(trips: int, body: Body, inits: Sequence[int]) -> list[int]:
 def _sort(
     graph: Graph, loop: Loop, outs: Sequence[int], inside: set[int]
 ) -> tuple[list[int], list[int], list[int], list[int]]:
-    """Positions of carries: (kept, derived, late, those whose start stands for all with the same end).
+    """Positions of carries as (kept, derived, late, firsts).
 
-    What is in none of the first three stays what it was.
+    A carry that is in none of the first three lists never changes. `firsts` has, for each end, the one carry whose
+    start represents all carries with that end.
     """
     inits, carries = loop.inits, loop.carries
     candidates = [k for k, out in enumerate(outs) if out != carries[k]]
     used = live(graph, outs)
     first_with: dict[int, int] = {}
-    for k in sorted(candidates, key=lambda k: carries[k] not in used):  # what trips look at comes first
+    for k in sorted(candidates, key=lambda k: carries[k] not in used):  # carries that trips read come first
         first_with.setdefault(outs[k], k)
     made_of_ends = {k for k in candidates if _made_of(graph, outs[k], set(first_with), inside)}
-    # A late carry is computed from others, also where it did not start so: its start says nothing about what it is.
+    # A late carry is computed from others even if its start is no such function, so its start is not compared with.
     starts = {out: inits[k] for out, k in first_with.items() if carries[k] in used or k not in made_of_ends}
     kept, derived, late = [], [], []
     for k in candidates:
@@ -101,10 +107,10 @@ def _sort(
 
 
 def _made_of(graph: Graph, node: int, ends: set[int], inside: set[int]) -> bool:
-    """Whether a node inside a loop is made of other ends and of what is outside, by operations alone."""
+    """Whether a node inside a loop is computed from other ends and from nodes outside, by operations alone."""
     waiting, seen = list(graph.arguments(node)), set()
     if node in inside and not waiting:
-        return False  # another carry, or an inner loop's result
+        return False  # another carry, or the result of an inner loop
     while waiting:
         one = waiting.pop()
         if one in seen or one not in inside or one in ends:
@@ -117,7 +123,7 @@ def _made_of(graph: Graph, node: int, ends: set[int], inside: set[int]) -> bool:
 
 
 def substitute(graph: Graph, node: int, replaced: Mapping[int, int], *, itself: bool = True) -> int:
-    """The same operations on other nodes: those in `replaced`, but for the node itself if not `itself`."""
+    """A node rebuilt with the nodes in `replaced` exchanged; the node itself is exchanged only if `itself` is true."""
     copies = dict(replaced)
     if not itself:
         copies.pop(node, None)

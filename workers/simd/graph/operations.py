@@ -1,9 +1,9 @@
-"""The operations that a scalar graph is made of: what each takes, gives and means, and how LLVM writes it.
+"""The operations of scalar graphs: their argument and result dtypes, their meaning in NumPy and their LLVM instruction.
 
-Three kinds of values: "f" float32, "i" 32 bits (signed or not is the operation's affair), "b" truth. Every operation is
-one instruction of a vector unit, or nearly; all of them give the same bits on every machine and at every width. There
-is no approximate division or root here, no tangent and no exponential: `elementary.py` makes those of these. Vector
-units do not divide integers, so LLVM does it lane by lane, but for constant divisors.
+There are three dtypes: "f" is float32, "i" a 32-bit integer (each operation decides whether it is signed) and "b" bool.
+Every operation is one vector instruction, or nearly, and gives the same bits on every machine and at every width.
+Division and roots are not approximated. Tangents, exponentials and the like are built from these operations in
+`elementary.py`. Vector units do not divide integers, so LLVM divides lane by lane, except by constants.
 """
 
 from __future__ import annotations
@@ -15,23 +15,24 @@ import numpy as np
 
 
 class Operation(NamedTuple):
-    """One row of OPERATIONS."""
+    """An operation of scalar graphs; a row of OPERATIONS."""
 
     takes: str
-    """Kinds of the arguments."""
+    """Dtypes of the arguments, one letter each."""
     gives: str
-    """Kind of the result."""
+    """Dtype of the result."""
     meaning: Callable[..., Any]
-    """In NumPy: folds constants, and is the twin that tests hold machine code against."""
+    """The operation in NumPy, which folds constants and which tests compare the machine code with."""
     llvm: str
-    """Its instruction: {0}, {1}, {2} are arguments; {F}, {I}, {B} the vector types. Or the intrinsic that it calls,
-    with {N} or {M}, the suffixes of those on floats and on integers."""
+    """The LLVM instruction, in which {0}, {1}, {2} are the arguments and {F}, {I}, {B} the vector types; or the name of
+    the intrinsic to call, in which {N} and {M} are the type suffixes for floats and integers."""
     commutes: bool = False
-    """Whether its arguments may change places. Not those of a sum of floats: of two products the second is fused."""
+    """Whether the arguments may be exchanged. Those of a sum of floats may not, because of two products the second is
+    fused."""
 
 
 def _fused(a: Any, b: Any, c: Any) -> Any:
-    """a * b + c, rounded once: the product is exact in 64 bits; the sum is rounded to odd there before it is to 24."""
+    """a * b + c, rounded once: in float64 the product is exact and the sum is rounded to odd, then to float32."""
     product = np.asarray(a, np.float64) * np.asarray(b, np.float64)
     c = np.asarray(c, np.float64)
     total = product + c
@@ -44,18 +45,22 @@ def _fused(a: Any, b: Any, c: Any) -> Any:
 
 
 def _unsigned(x: Any) -> Any:
+    """Integers as uint32 with the same bits."""
     return np.asarray(x, np.int32).view(np.uint32)
 
 
 def _bits(x: Any) -> Any:
+    """Bits of floats as int32."""
     return np.asarray(x, np.float32).view(np.int32)
 
 
 def _truncated_quotient(a: Any, b: Any) -> Any:
+    """Quotient of integers, rounded towards zero."""
     return (a - np.fmod(a, b)) // b
 
 
 def _float(x: Any) -> Any:
+    """Floats with the bits of integers."""
     return np.asarray(x, np.int32).view(np.float32)
 
 
@@ -71,7 +76,7 @@ OPERATIONS: dict[str, Operation] = {
     "floor": Operation("f", "f", np.floor, "llvm.floor.{N}"),
     "ceil": Operation("f", "f", np.ceil, "llvm.ceil.{N}"),
     "round": Operation("f", "f", np.rint, "llvm.roundeven.{N}"),
-    # Comparisons with NaN are false, but for `ne`.
+    # Comparisons with NaN are false, except `ne`.
     "eq": Operation("ff", "b", np.equal, "fcmp oeq {F} {0}, {1}", commutes=True),
     "ne": Operation("ff", "b", np.not_equal, "fcmp une {F} {0}, {1}", commutes=True),
     "lt": Operation("ff", "b", np.less, "fcmp olt {F} {0}, {1}"),
@@ -83,12 +88,12 @@ OPERATIONS: dict[str, Operation] = {
     "iand": Operation("ii", "i", np.bitwise_and, "and {I} {0}, {1}", commutes=True),
     "ior": Operation("ii", "i", np.bitwise_or, "or {I} {0}, {1}", commutes=True),
     "ixor": Operation("ii", "i", np.bitwise_xor, "xor {I} {0}, {1}", commutes=True),
-    # Never by 0, nor the least integer by -1; division.py sees to that.
+    # Integers are never divided by 0, nor the least integer by -1; division.py ensures this.
     "sdiv": Operation("ii", "i", _truncated_quotient, "sdiv {I} {0}, {1}"),
     "srem": Operation("ii", "i", np.fmod, "srem {I} {0}, {1}"),
     "udiv": Operation("ii", "i", lambda a, b: (_unsigned(a) // _unsigned(b)).view(np.int32), "udiv {I} {0}, {1}"),
     "urem": Operation("ii", "i", lambda a, b: (_unsigned(a) % _unsigned(b)).view(np.int32), "urem {I} {0}, {1}"),
-    # Shifts are by 0 to 31; primitives see to that.
+    # Shifts are by 0 to 31; the rules of the primitives ensure this.
     "shl": Operation("ii", "i", np.left_shift, "shl {I} {0}, {1}"),
     "lshr": Operation("ii", "i", lambda a, b: (_unsigned(a) >> _unsigned(b)).view(np.int32), "lshr {I} {0}, {1}"),
     "ashr": Operation("ii", "i", np.right_shift, "ashr {I} {0}, {1}"),
@@ -98,7 +103,7 @@ OPERATIONS: dict[str, Operation] = {
     "ult": Operation("ii", "b", lambda a, b: _unsigned(a) < _unsigned(b), "icmp ult {I} {0}, {1}"),
     "float_of_int": Operation("i", "f", lambda a: np.asarray(a).astype(np.float32), "sitofp {I} {0} to {F}"),
     "float_of_uint": Operation("i", "f", lambda a: _unsigned(a).astype(np.float32), "uitofp {I} {0} to {F}"),
-    # Of whole numbers that fit; primitives see to that.
+    # The argument is in the range of int32; elementary.py ensures this.
     "int_of_float": Operation("f", "i", lambda a: np.asarray(a).astype(np.int32), "fptosi {F} {0} to {I}"),
     "bits": Operation("f", "i", _bits, "bitcast {F} {0} to {I}"),
     "unbits": Operation("i", "f", _float, "bitcast {I} {0} to {F}"),
@@ -109,25 +114,25 @@ OPERATIONS: dict[str, Operation] = {
     "select": Operation("bff", "f", np.where, "select {B} {0}, {F} {1}, {F} {2}"),
     "iselect": Operation("bii", "i", np.where, "select {B} {0}, {I} {1}, {I} {2}"),
 }
-"""Name -> operation. Products and sums stay apart until `schedule.py` fuses them by its rule."""
+"""Operations by name. Products and sums are separate nodes; `schedule.py` fuses them by its rule."""
 
-DTYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtype(bool)}
-"""Kind -> how NumPy holds it."""
+NUMPY_DTYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtype(bool)}
+"""NumPy's dtype for each dtype of a graph."""
 BIT_MOVES = {"unbits", "bits", "neg", "abs", "select"}
-"""Operations that take floats as they are. All others see zeros for denormal numbers, and give zeros for them."""
+"""Operations that pass floats through unchanged. All others replace denormal arguments and results by zeros."""
 SMALLEST_NORMAL = np.finfo(np.float32).tiny
 
 
 def compute(name: str, arguments: Sequence[Any]) -> Any:
-    """An operation in NumPy, as kernels do it."""
+    """Result of an operation, computed in NumPy with the same bits as in kernels."""
     operation = OPERATIONS[name]
     if name not in BIT_MOVES:
-        arguments = [_flushed(x) if kind == "f" else x for kind, x in zip(operation.takes, arguments, strict=True)]
+        arguments = [_flushed(x) if dtype == "f" else x for dtype, x in zip(operation.takes, arguments, strict=True)]
     with np.errstate(all="ignore"):
-        found = np.asarray(operation.meaning(*arguments), DTYPES[operation.gives])
+        found = np.asarray(operation.meaning(*arguments), NUMPY_DTYPES[operation.gives])
     return _flushed(found) if operation.gives == "f" and name not in BIT_MOVES else found
 
 
 def _flushed(x: Any) -> Any:
-    """Denormal numbers as zeros of their sign."""
+    """Floats with denormal numbers replaced by zeros of the same sign."""
     return np.where(np.abs(x) < SMALLEST_NORMAL, np.copysign(np.float32(0.0), x), x)

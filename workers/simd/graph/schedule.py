@@ -1,8 +1,9 @@
-"""In which order a graph is computed, what inside of which loop, and which products are fused with their sums.
+"""The order in which a graph is computed, the loop of each node, and the products that are fused with their sums.
 
-Fusing goes by the expression alone. A sum or difference of floats takes in a product that it is made of, of two the
-second, whoever else uses that product; on its own a product is computed only where something else needs it. So an
-expression has the same bits in every kernel that contains it, whatever else that kernel computes.
+Fusing depends on the expression alone. A sum or difference of floats is fused with a product among its arguments, or
+with the second if both are products, no matter what else uses that product. The product is also computed separately
+only if something other than sums needs it. So an expression has the same bits in every kernel that contains it,
+whatever else that kernel computes.
 """
 
 from __future__ import annotations
@@ -16,27 +17,27 @@ from workers.simd.graph.graph import Graph, Loop, depending, live, reached
 
 @dataclass
 class Region:
-    """Straight code with loops in it: the whole kernel, or the body of a loop."""
+    """Straight code with loops in it: a whole kernel or the body of a loop."""
 
     loop: Loop | None
     carried: list[int] = field(default_factory=list)
-    """Positions of the loop's carries that somebody needs."""
+    """Positions of the loop's carries that are needed."""
     steps: list[int | Region] = field(default_factory=list)
-    """Nodes to compute, and loops to run, in this order; products that only sums take in are not among them."""
+    """Nodes to compute and loops to run, in this order; products that are only fused with sums are not included."""
     wanted_inside: set[int] = field(default_factory=set)
-    """Nodes computed here that a loop in here looks at."""
+    """Nodes computed in this region that a loop in this region reads."""
 
 
 class Schedule(NamedTuple):
-    """How a graph is computed."""
+    """The order of a graph's operations and the products that are fused."""
 
     region: Region
     fused: dict[int, int]
-    """Sum or difference -> the product it takes in: both become one operation, rounded once."""
+    """Sum or difference -> the product it is fused with; both become one operation, which is rounded once."""
 
 
 def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
-    """Each node is computed as late as can be, before what first needs it."""
+    """Schedule of a graph in which each node is computed as late as possible, just before its first use."""
     alive = live(graph, outputs)
     numbers = sorted({graph.keys[node][2] for node in alive if graph.keys[node][0] == "carry"})
     bodies = {number: depending(graph, graph.loops[number]) & alive for number in numbers}
@@ -46,7 +47,7 @@ def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
     fused = _fused(graph, alive, home)
 
     def needs(node: int) -> tuple[int, ...]:
-        """As `graph.needs`, with the factors in the place of a product that is taken in."""
+        """As `graph.needs`, but with a fused product replaced by its factors."""
         product = fused.get(node)
         if product is None:
             return graph.needs(node)
@@ -58,6 +59,7 @@ def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
     outside = {number: _outside(graph.loops[number], bodies[number] & needed, needed, needs) for number in numbers}
 
     def build(number: int | None, targets: Sequence[int]) -> Region:
+        """Region of the loop with a number, or of the whole kernel if None, that computes the targets."""
         region = Region(None if number is None else graph.loops[number])
         if region.loop is not None:
             region.carried = [k for k, carry in enumerate(region.loop.carries) if carry in needed]
@@ -90,22 +92,23 @@ def schedule(graph: Graph, outputs: Sequence[int]) -> Schedule:
 
 
 def _is_made(graph: Graph, node: int) -> bool:
+    """Whether a node is computed by an instruction or a loop."""
     return graph.keys[node][0] not in ("const", "input", "carry")
 
 
 def _outside(loop: Loop, body: set[int], needed: set[int], needs: Callable[[int], tuple[int, ...]]) -> list[int]:
-    """Nodes outside of a loop that it, or a loop inside of it, looks at or starts from."""
+    """Nodes outside of a loop that the loop or a loop inside it reads or starts from."""
     found = {one for node in body for one in needs(node)}
     found.update(loop.inits[k] for k, carry in enumerate(loop.carries) if carry in needed)
     return sorted(found - body)
 
 
 def _fused(graph: Graph, nodes: Collection[int], home: Mapping[int, int | None]) -> dict[int, int]:
-    """Sums and differences that take in a product -> that product.
+    """Sums and differences that are fused with a product -> that product.
 
-    Not a product from outside of the loop that the sum is in: it is computed once, not in every trip. (What is in a
-    loop is what hangs on its carries, and so goes by the expression, too.) And not where both arguments are the same:
-    what is subtracted from itself leaves nothing.
+    A product from outside of the loop that contains the sum is not fused: it is computed once and not in every trip.
+    (A node is in a loop if it depends on the loop's carries, so this depends on the expression alone as well.) A sum
+    whose arguments are the same node is not fused either, so that x - x is 0.
     """
     found = {}
     for node in nodes:

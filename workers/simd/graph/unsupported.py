@@ -1,4 +1,4 @@
-"""The one error of this compiler that is not a fault: what it cannot compile, xla computes."""
+"""The error for functions that this compiler does not support; xla computes them instead."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from collections.abc import Iterator
 
 
 class UnsupportedError(Exception):
-    """The function uses what this compiler cannot compile; the message names it and where it comes from."""
+    """A function cannot be compiled; the message names the unsupported part and where it comes from."""
 
 
 @contextlib.contextmanager
 def refusing() -> Iterator[None]:
-    """Whatever goes wrong in here is an UnsupportedError: no rule foresees everything that JAX can trace.
+    """Context manager that turns exceptions into UnsupportedError, since no rule foresees all that JAX can trace.
 
-    Only for what depends on the function alone. Who may fall back to JAX must do so on every worker, or on none.
+    It is only for code whose success depends on the compiled function alone: either every worker falls back to JAX or
+    none does.
     """
     try:
         yield

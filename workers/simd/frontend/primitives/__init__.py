@@ -1,8 +1,8 @@
-"""What each of JAX's primitives means for arrays of nodes. To support another one, add a rule to a module and a test.
+"""Rules of JAX's primitives for arrays of nodes. To support another primitive, add a rule to a module, and a test.
 
-A rule is `f(tracer, equation, *arrays of nodes) -> array of nodes`, or a list where the primitive has several outputs.
-`equation` has the primitive's parameters and the types of what goes in and out. A rule raises UnsupportedError for what
-it cannot do.
+A rule is `f(tracer, equation, *arrays of nodes) -> array of nodes`, or a list of arrays if the primitive has several
+outputs. `equation` has the primitive's parameters and the types of its inputs and outputs. A rule raises
+UnsupportedError for cases that it does not support.
 """
 
 from workers.simd.frontend.primitives import arithmetic, choices, control, reductions, structure

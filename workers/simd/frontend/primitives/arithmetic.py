@@ -1,4 +1,4 @@
-"""Arithmetic and elementary functions, element by element."""
+"""Rules of arithmetic and elementary functions, which work element by element."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 from jax import lax
 
-from workers.simd.frontend.kinds import dtype_in, kind_of
+from workers.simd.frontend.dtypes import dtype_in, graph_dtype
 from workers.simd.frontend.primitives.registry import PRIMITIVES, primitive
 from workers.simd.frontend.tracer import Nodes, Rule, Tracer
 from workers.simd.graph import division, elementary
 from workers.simd.graph.unsupported import UnsupportedError
 
 
-def _by_kind(floats: str | None, integers: str | None, booleans: str | None = None) -> Rule:
-    """A rule that is one operation of the graph for each kind."""
+def _by_dtype(floats: str | None, integers: str | None, booleans: str | None = None) -> Rule:
+    """Rule that applies one operation of the graph for each dtype; None means that the dtype is not supported."""
 
     def rule(t: Tracer, equation: Any, *arrays: Nodes) -> Nodes:
-        kind = kind_of(dtype_in(equation))
-        name = {"f": floats, "i": integers, "b": booleans}[kind]
+        node_dtype = graph_dtype(dtype_in(equation))
+        name = {"f": floats, "i": integers, "b": booleans}[node_dtype]
         if name is None:
             raise UnsupportedError(f"{equation.primitive.name} of {dtype_in(equation)}")
         return t.ops(name, *arrays)
@@ -28,22 +28,22 @@ def _by_kind(floats: str | None, integers: str | None, booleans: str | None = No
     return rule
 
 
-PRIMITIVES["add"] = _by_kind("add", "iadd")
-PRIMITIVES["sub"] = _by_kind("sub", "isub")
-PRIMITIVES["mul"] = _by_kind("mul", "imul")
-PRIMITIVES["sqrt"] = _by_kind("sqrt", None)
-PRIMITIVES["floor"] = _by_kind("floor", None)
-PRIMITIVES["ceil"] = _by_kind("ceil", None)
-PRIMITIVES["and"] = _by_kind(None, "iand", "and")
-PRIMITIVES["or"] = _by_kind(None, "ior", "or")
-PRIMITIVES["xor"] = _by_kind(None, "ixor", "xor")
-PRIMITIVES["population_count"] = _by_kind(None, "popcount")
+PRIMITIVES["add"] = _by_dtype("add", "iadd")
+PRIMITIVES["sub"] = _by_dtype("sub", "isub")
+PRIMITIVES["mul"] = _by_dtype("mul", "imul")
+PRIMITIVES["sqrt"] = _by_dtype("sqrt", None)
+PRIMITIVES["floor"] = _by_dtype("floor", None)
+PRIMITIVES["ceil"] = _by_dtype("ceil", None)
+PRIMITIVES["and"] = _by_dtype(None, "iand", "and")
+PRIMITIVES["or"] = _by_dtype(None, "ior", "or")
+PRIMITIVES["xor"] = _by_dtype(None, "ixor", "xor")
+PRIMITIVES["population_count"] = _by_dtype(None, "popcount")
 
 
 @primitive("div", "rem")
 def _divide(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
     is_quotient, dtype = equation.primitive.name == "div", dtype_in(equation)
-    if kind_of(dtype) == "f":
+    if graph_dtype(dtype) == "f":
         return t.ops("div", a, b) if is_quotient else t.map(lambda x, y: division.remainder(t.graph, x, y), a, b)
     divide = division.whole_quotient if is_quotient else division.whole_remainder
     return t.map(lambda x, y: divide(t.graph, x, y, dtype), a, b)
@@ -51,12 +51,12 @@ def _divide(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
 
 @primitive("neg")
 def _neg(t: Tracer, equation: Any, x: Nodes) -> Nodes:
-    return t.ops("neg", x) if kind_of(dtype_in(equation)) == "f" else t.ops("isub", t.constants(np.int32(0)), x)
+    return t.ops("neg", x) if graph_dtype(dtype_in(equation)) == "f" else t.ops("isub", t.constants(np.int32(0)), x)
 
 
 @primitive("abs")
 def _abs(t: Tracer, equation: Any, x: Nodes) -> Nodes:
-    if kind_of(dtype_in(equation)) == "f":
+    if graph_dtype(dtype_in(equation)) == "f":
         return t.ops("abs", x)
     return t.map(
         lambda n: t.graph.op("iselect", t.graph.op("slt", n, t.graph.i(0)), t.graph.op("isub", t.graph.i(0), n), n), x
@@ -70,11 +70,11 @@ def _sign(t: Tracer, equation: Any, x: Nodes) -> Nodes:
         zero = t.constants(np.int32(0))
         above, below = t.ops("slt", zero, x), t.ops("slt", x, zero)
         return t.ops("isub", t.ops("int_of_bool", above), t.ops("int_of_bool", below))
-    if kind_of(dtype_in(equation)) != "f":
+    if graph_dtype(dtype_in(equation)) != "f":
         raise UnsupportedError(f"sign of {dtype_in(equation)}")
 
     def sign(n: int) -> int:
-        negative = g.op("select", g.op("lt", n, g.f(0.0)), g.f(-1.0), n)  # zeros and NaN are their own sign
+        negative = g.op("select", g.op("lt", n, g.f(0.0)), g.f(-1.0), n)  # a zero or NaN is its own sign
         return g.op("select", g.op("lt", g.f(0.0), n), g.f(1.0), negative)
 
     return t.map(sign, x)
@@ -82,12 +82,12 @@ def _sign(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 
 @primitive("square")
 def _square(t: Tracer, equation: Any, x: Nodes) -> Nodes:
-    return t.ops("mul" if kind_of(dtype_in(equation)) == "f" else "imul", x, x)
+    return t.ops("mul" if graph_dtype(dtype_in(equation)) == "f" else "imul", x, x)
 
 
 @primitive("integer_pow")
 def _integer_pow(t: Tracer, equation: Any, x: Nodes) -> Nodes:
-    if kind_of(dtype_in(equation)) != "f":
+    if graph_dtype(dtype_in(equation)) != "f":
         raise UnsupportedError(f"integer_pow of {dtype_in(equation)}")
     return t.map(lambda n: elementary.whole_power(t.graph, n, equation.params["y"]), x)
 
@@ -100,7 +100,7 @@ def _round(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 
 
 def _elementary(function: Callable[..., int]) -> Rule:
-    """A rule that is one of our own functions of nodes."""
+    """Rule that applies a function of `elementary.py` to float32 nodes."""
 
     def rule(t: Tracer, equation: Any, *arrays: Nodes) -> Nodes:
         if any(str(variable.aval.dtype) != "float32" for variable in equation.invars):

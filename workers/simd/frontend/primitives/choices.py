@@ -1,4 +1,4 @@
-"""Comparisons, choices between values, and conversions from one kind to another."""
+"""Rules of comparisons, choices between values, and conversions between dtypes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.frontend.kinds import dtype_in, kind_of
+from workers.simd.frontend.dtypes import dtype_in, graph_dtype
 from workers.simd.frontend.primitives.registry import primitive
 from workers.simd.frontend.tracer import Nodes, Tracer
 from workers.simd.graph import elementary
@@ -20,11 +20,11 @@ def _compare(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
     name, dtype = equation.primitive.name, dtype_in(equation)
     if name in ("gt", "ge"):
         name, a, b = {"gt": "lt", "ge": "le"}[name], b, a
-    kind = kind_of(dtype)
-    if kind == "f":
+    node_dtype = graph_dtype(dtype)
+    if node_dtype == "f":
         return t.ops(name, a, b)
     less = "slt" if dtype == "int32" else "ult"
-    if kind == "b":
+    if node_dtype == "b":
         if name not in ("eq", "ne"):
             raise UnsupportedError(f"{name} of bool")
         different = t.ops("xor", a, b)
@@ -41,12 +41,13 @@ def _compare(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
 
 
 def _not(t: Tracer, x: Nodes) -> Nodes:
+    """Negation of bool nodes."""
     return t.map(lambda n: t.graph.op("xor", t.graph.const("b", True), n), x)
 
 
 @primitive("not")
 def _not_primitive(t: Tracer, equation: Any, x: Nodes) -> Nodes:
-    return _not(t, x) if kind_of(dtype_in(equation)) == "b" else t.ops("ixor", x, t.constants(np.int32(-1)))
+    return _not(t, x) if graph_dtype(dtype_in(equation)) == "b" else t.ops("ixor", x, t.constants(np.int32(-1)))
 
 
 @primitive("is_finite")
@@ -60,11 +61,14 @@ def _extreme(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
 
 
 def extreme_of(g: Graph, name: str, dtype: str) -> Callable[[int, int], int]:
-    """The greater or the lesser of two nodes; NaN if one is. Which of two zeros is not said."""
-    kind = kind_of(dtype)
-    if kind == "b":
+    """Function that gives the greater ("max") or the lesser ("min") of two nodes, or NaN if either is NaN.
+
+    Of two zeros with different signs it may give either.
+    """
+    node_dtype = graph_dtype(dtype)
+    if node_dtype == "b":
         return lambda a, b: g.op("or" if name == "max" else "and", a, b)
-    if kind == "i":
+    if node_dtype == "i":
         less = "slt" if dtype == "int32" else "ult"
         return lambda a, b: g.op("iselect", g.op(less, a, b), *((b, a) if name == "max" else (a, b)))
 
@@ -91,22 +95,22 @@ def _clamp(t: Tracer, equation: Any, low: Nodes, x: Nodes, high: Nodes) -> Nodes
 
 
 def choose(g: Graph, mask: int, if_true: int, if_false: int) -> int:
-    """One of two nodes of the same kind."""
-    kind = g.kinds[if_true]
-    if kind != "b":
-        return g.op("select" if kind == "f" else "iselect", mask, if_true, if_false)
+    """Node that chooses between two nodes of the same dtype by a bool node."""
+    node_dtype = g.dtypes[if_true]
+    if node_dtype != "b":
+        return g.op("select" if node_dtype == "f" else "iselect", mask, if_true, if_false)
     return g.op("or", g.op("and", mask, if_true), g.op("and", g.op("xor", g.const("b", True), mask), if_false))
 
 
 def select(t: Tracer, dtype: str, which: Nodes, cases: Sequence[Sequence[Nodes]]) -> list[Nodes]:
-    """Arrays of one of some cases, element by element; a number below or beyond means the first or the last."""
-    g, is_truth, chosen = t.graph, kind_of(dtype) == "b", list(cases[-1])
+    """Arrays of the case that `which` names, element by element; numbers out of range name the first or last case."""
+    g, is_bool, chosen = t.graph, graph_dtype(dtype) == "b", list(cases[-1])
 
     def one(mask: int, early: int, late: int) -> int:
-        return choose(g, mask, late, early) if is_truth else choose(g, mask, early, late)
+        return choose(g, mask, late, early) if is_bool else choose(g, mask, early, late)
 
     for number, case in reversed(list(enumerate(cases[:-1]))):
-        mask = which if is_truth else t.map(lambda n, end=number + 1: g.op("slt", n, g.i(end)), which)
+        mask = which if is_bool else t.map(lambda n, end=number + 1: g.op("slt", n, g.i(end)), which)
         chosen = [t.map(one, mask, early, late) for early, late in zip(case, chosen, strict=True)]
     return chosen
 
@@ -120,9 +124,9 @@ def _select_n(t: Tracer, equation: Any, which: Nodes, *cases: Nodes) -> list[Nod
 def _convert(t: Tracer, equation: Any, x: Nodes) -> Nodes:
     g = t.graph
     source, target = dtype_in(equation), str(equation.params["new_dtype"])
-    if target == "uint8" and kind_of(source) == "i":
+    if target == "uint8" and graph_dtype(source) == "i":
         return t.ops("iand", x, t.constants(np.int32(255)))
-    match kind_of(source), kind_of(target):
+    match graph_dtype(source), graph_dtype(target):
         case same, also if same == also:
             return x
         case "b", "i":
@@ -139,8 +143,8 @@ def _convert(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 
 
 def to_float(t: Tracer, dtype: str, x: Nodes) -> Nodes:
-    """Nodes of any dtype as floats."""
-    match kind_of(dtype):
+    """Nodes of any JAX dtype converted to floats."""
+    match graph_dtype(dtype):
         case "b":
             return t.map(lambda n: t.graph.op("select", n, t.graph.f(1.0), t.graph.f(0.0)), x)
         case "i":
@@ -150,7 +154,7 @@ def to_float(t: Tracer, dtype: str, x: Nodes) -> Nodes:
 
 @primitive("bitcast_convert_type")
 def _bitcast(t: Tracer, equation: Any, x: Nodes) -> Nodes:
-    match kind_of(dtype_in(equation)), kind_of(equation.params["new_dtype"]):
+    match graph_dtype(dtype_in(equation)), graph_dtype(equation.params["new_dtype"]):
         case "f", "i":
             return t.ops("bits", x)
         case "i", "f":

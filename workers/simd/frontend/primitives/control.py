@@ -1,4 +1,4 @@
-"""Calls, branches and loops."""
+"""Rules of calls, branches and loops."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.frontend.kinds import dtype_in
+from workers.simd.frontend.dtypes import dtype_in
 from workers.simd.frontend.primitives.choices import select
 from workers.simd.frontend.primitives.registry import primitive
 from workers.simd.frontend.tracer import Nodes, Tracer
 from workers.simd.graph.unsupported import UnsupportedError
 
 MOST_TRIPS = 10_000
-"""Of loops that become straight code."""
+"""Most trips of a while loop, or of a scan with inputs or outputs per step; both become straight code."""
 
 
 @primitive("jit", "custom_jvp_call", "custom_vjp_call", "remat2")
@@ -24,16 +24,16 @@ def _call(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
 
 @primitive("platform_index")
 def _platform_index(t: Tracer, equation: Any) -> Nodes:
-    """Which branch is for CPUs: the first that names them, or that names no platform."""
+    """Number of the branch for CPUs: the first branch that names them or that names no platform."""
     for number, platforms in enumerate(equation.params["platforms"]):
         if platforms is None or "cpu" in platforms:
             return t.constants(np.int32(number))
-    raise UnsupportedError("a choice by platform without CPUs")
+    raise UnsupportedError("a choice by platform without a branch for CPUs")
 
 
 @primitive("cond")
 def _cond(t: Tracer, equation: Any, which: Nodes, *arrays: Nodes) -> list[Nodes]:
-    """A constant choice takes its branch; else all are computed and the results chosen from."""
+    """Results of the chosen branch. If the choice is no constant, all branches are computed and then chosen from."""
     branches = equation.params["branches"]
     value = t.values(which)
     if value is not None:
@@ -43,7 +43,7 @@ def _cond(t: Tracer, equation: Any, which: Nodes, *arrays: Nodes) -> list[Nodes]
 
 @primitive("scan")
 def _scan(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
-    """Kept as a loop where nothing is read or written step by step, and it is long; else straight code."""
+    """Results of a scan: a loop if it is long and has no inputs or outputs per step, else straight code."""
     params = equation.params
     constants, carries, length = params["num_consts"], params["num_carry"], params["length"]
     shared, carry, rows = (
@@ -55,7 +55,9 @@ def _scan(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
     if not rows and len(equation.outvars) == carries and length > 0:
         return t.keep_loop(length, lambda carry: t.closed(body, [*shared, *carry]), carry)
     if length > MOST_TRIPS:
-        raise UnsupportedError(f"a scan of {length:,} steps that reads or writes at each")
+        raise UnsupportedError(
+            f"a scan of {length:,} steps with inputs or outputs per step; at most {MOST_TRIPS:,} steps are supported"
+        )
     stacked: list[list[Nodes]] = [[] for _ in range(len(equation.outvars) - carries)]
     order = reversed(range(length)) if params["reverse"] else range(length)
     for trip in order:
@@ -72,7 +74,7 @@ def _scan(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
 
 @primitive("while")
 def _while(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
-    """Only loops whose end is known while tracing; they become straight code."""
+    """Results of a while loop as straight code; the number of trips must be known while tracing."""
     params = equation.params
     in_condition, in_body = params["cond_nconsts"], params["body_nconsts"]
     for_condition, for_body = arrays[:in_condition], arrays[in_condition : in_condition + in_body]
@@ -85,4 +87,4 @@ def _while(t: Tracer, equation: Any, *arrays: Nodes) -> list[Nodes]:
         if not value:
             return carry
         carry = t.closed(params["body_jaxpr"], [*for_body, *carry])
-    raise UnsupportedError(f"a while loop of more than {MOST_TRIPS:,} trips")
+    raise UnsupportedError(f"a while loop of more than {MOST_TRIPS:,} trips, the most that is supported")

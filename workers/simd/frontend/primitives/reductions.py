@@ -1,4 +1,4 @@
-"""Sums, products and other combinations along axes: one after another, in the order of the elements."""
+"""Rules of sums, products and other combinations along axes, which combine elements one by one in their order."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from workers.simd.frontend.kinds import dtype_in, kind_of
+from workers.simd.frontend.dtypes import dtype_in, graph_dtype
 from workers.simd.frontend.primitives.choices import choose, extreme_of, to_float
 from workers.simd.frontend.primitives.registry import PRIMITIVES, primitive
 from workers.simd.frontend.tracer import Nodes, Rule, Tracer
@@ -16,7 +16,7 @@ from workers.simd.graph.unsupported import UnsupportedError
 
 
 def _reduce(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Rule:
-    """A rule that combines the elements along axes, one after another in their order."""
+    """Rule that combines the elements along axes one by one in their order."""
 
     def rule(t: Tracer, equation: Any, x: Nodes) -> Nodes:
         axes = tuple(int(axis) for axis in equation.params["axes"])
@@ -36,27 +36,31 @@ def _reduce(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Rule
 
 
 def _of_nothing(t: Tracer, equation: Any) -> int:
-    """What a reduction of no elements gives."""
-    name, kind = equation.primitive.name, kind_of(dtype_in(equation))
+    """Node of the result of a reduction of no elements."""
+    name, node_dtype = equation.primitive.name, graph_dtype(dtype_in(equation))
     neutral = {"reduce_sum": 0, "reduce_prod": 1, "reduce_and": True, "reduce_or": False}
-    if kind == "f":
+    if node_dtype == "f":
         neutral |= {"reduce_max": -np.inf, "reduce_min": np.inf}
     if name not in neutral:
-        raise UnsupportedError(f"{name} of no {dtype_in(equation)}")
-    return t.graph.const(kind, neutral[name])
+        raise UnsupportedError(f"{name} of an empty array of {dtype_in(equation)}")
+    return t.graph.const(node_dtype, neutral[name])
 
 
 def _numbers(name: str) -> Callable[[Tracer, Any], Callable[[int, int], int]]:
+    """Combination of floats or integers by an operation, as an argument of `_reduce`."""
+
     def combine(t: Tracer, equation: Any) -> Callable[[int, int], int]:
-        own = name if kind_of(dtype_in(equation)) == "f" else f"i{name}"
+        own = name if graph_dtype(dtype_in(equation)) == "f" else f"i{name}"
         return lambda a, b: t.graph.op(own, a, b)
 
     return combine
 
 
 def _logic(name: str) -> Callable[[Tracer, Any], Callable[[int, int], int]]:
+    """Combination of bools by an operation, as an argument of `_reduce`."""
+
     def combine(t: Tracer, equation: Any) -> Callable[[int, int], int]:
-        if kind_of(dtype_in(equation)) != "b":
+        if graph_dtype(dtype_in(equation)) != "b":
             raise UnsupportedError(f"{equation.primitive.name} of {dtype_in(equation)}")
         return lambda a, b: t.graph.op(name, a, b)
 
@@ -73,11 +77,13 @@ PRIMITIVES["reduce_or"] = _reduce(_logic("or"))
 
 @primitive("argmin", "argmax")
 def _arg_extreme(t: Tracer, equation: Any, x: Nodes) -> Nodes:
-    """The first extreme; the first NaN, if there is one."""
+    """Index of the first extreme, or of the first NaN if there is one."""
     g = t.graph
     (axis,) = equation.params["axes"]
     if str(equation.params["index_dtype"]) != "int32":
-        raise UnsupportedError(f"{equation.primitive.name} as {equation.params['index_dtype']}")
+        raise UnsupportedError(
+            f"{equation.primitive.name} with indices of type {equation.params['index_dtype']}; simd supports int32"
+        )
     goes_ahead = _beats(g, equation.primitive.name, dtype_in(equation))
     rows = np.moveaxis(x, axis, -1)
     found = []
@@ -92,16 +98,16 @@ def _arg_extreme(t: Tracer, equation: Any, x: Nodes) -> Nodes:
 
 
 def _beats(g: Graph, name: str, dtype: str) -> Callable[[int, int], int]:
-    """Whether a node is more extreme than the best before it."""
-    kind = kind_of(dtype)
-    less = {"f": "lt", "i": "slt" if dtype == "int32" else "ult"}.get(kind)
+    """Function that tells whether a node is more extreme than the best before it, as a bool node."""
+    node_dtype = graph_dtype(dtype)
+    less = {"f": "lt", "i": "slt" if dtype == "int32" else "ult"}.get(node_dtype)
 
     def beats(node: int, best: int) -> int:
         low, high = (node, best) if name == "argmin" else (best, node)
         if less is None:
             return g.op("and", g.op("xor", g.const("b", True), low), high)
         ahead = g.op(less, low, high)
-        if kind == "f":
+        if node_dtype == "f":
             ahead = g.op("or", ahead, g.op("and", g.op("ne", node, node), g.op("eq", best, best)))
         return ahead
 
@@ -109,6 +115,8 @@ def _beats(g: Graph, name: str, dtype: str) -> Callable[[int, int], int]:
 
 
 def _cumulate(combine: Callable[[Tracer, Any], Callable[[int, int], int]]) -> Rule:
+    """Rule that combines each element along an axis with all elements before it, one by one."""
+
     def rule(t: Tracer, equation: Any, x: Nodes) -> Nodes:
         function = combine(t, equation)
         rows = np.moveaxis(x, equation.params["axis"], 0)
@@ -132,9 +140,9 @@ PRIMITIVES["cummin"] = _cumulate(lambda t, equation: extreme_of(t.graph, "min", 
 
 @primitive("dot_general")
 def _dot_general(t: Tracer, equation: Any, a: Nodes, b: Nodes) -> Nodes:
-    """Sums of products in the order of the contracted axes, whatever precision was asked for: always float32."""
+    """Sums of products in the order of the contracted axes, in float32 whatever precision is requested."""
     if str(equation.outvars[0].aval.dtype) != "float32":
-        raise UnsupportedError(f"dot_general to {equation.outvars[0].aval.dtype}")
+        raise UnsupportedError(f"dot_general with results of type {equation.outvars[0].aval.dtype}, not float32")
     a, b = (to_float(t, dtype_in(equation, k), operand) for k, operand in enumerate((a, b)))
     (contract_a, contract_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
     free_a = [axis for axis in range(a.ndim) if axis not in (*contract_a, *batch_a)]

@@ -1,4 +1,4 @@
-"""The table of primitives, into which modules enter their rules."""
+"""The table of primitives, in which the modules of this package register their rules."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Callable
 from workers.simd.frontend.tracer import Rule
 
 PRIMITIVES: dict[str, Rule] = {}
-"""Name of JAX's primitive -> its rule."""
+"""Rules by the name of JAX's primitive."""
 
 
 def primitive(*names: str) -> Callable[[Rule], Rule]:
-    """Enter a rule under the names of primitives."""
+    """Decorator that registers a rule under the names of primitives."""
 
     def enter(rule: Rule) -> Rule:
         PRIMITIVES.update(dict.fromkeys(names, rule))

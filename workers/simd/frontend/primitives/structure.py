@@ -1,4 +1,4 @@
-"""Primitives that only move values about: nothing of them is left in the graph."""
+"""Rules of primitives that only move values; they add nothing to the graph."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jax import lax
 
-from workers.simd.frontend.kinds import kind_of
+from workers.simd.frontend.dtypes import graph_dtype
 from workers.simd.frontend.primitives.registry import primitive
 from workers.simd.frontend.tracer import Nodes, Tracer
 from workers.simd.graph.unsupported import UnsupportedError
@@ -84,7 +84,7 @@ def _pad(t: Tracer, equation: Any, x: Nodes, value: Nodes) -> Nodes:
 
 
 def _indices(t: Tracer, equation: Any, indices: Nodes, source: str) -> np.ndarray:
-    """Indices as numbers; they must be constants."""
+    """Values of indices, which must be constants."""
     values = t.values(indices)
     if values is None:
         raise UnsupportedError(f"{equation.primitive.name} with indices that depend on the state")
@@ -107,6 +107,7 @@ def _dynamic_update_slice(t: Tracer, equation: Any, x: Nodes, update: Nodes, *st
 
 
 def _dynamic_starts(t: Tracer, equation: Any, x: Nodes, sizes: Any, starts: Any, first: int) -> list[int]:
+    """Start of a window along each axis, moved so that the window lies inside of x."""
     at = []
     for axis, start in enumerate(starts):
         value = int(_indices(t, equation, start, str(equation.invars[first + axis].aval.dtype)))
@@ -136,8 +137,10 @@ def _gather(t: Tracer, equation: Any, x: Nodes, indices: Nodes) -> Nodes:
 
 
 def _window(x: Nodes, corner: dict[int, int], sizes: Any, mode: Any) -> tuple[slice, ...] | None:
-    """The part of x that begins at a corner (axis -> index, 0 for others); what is not wholly inside is moved there, or
-    is None, as the mode says."""
+    """The window of x that begins at a corner (axis -> index, 0 for other axes).
+
+    A window that does not lie wholly inside of x is moved inside; with the mode FILL_OR_DROP, None is returned instead.
+    """
     at = np.array([corner.get(axis, 0) for axis in range(x.ndim)], np.int64)
     most = np.array(x.shape, np.int64) - np.array(sizes, np.int64)
     if ((at < 0) | (at > most)).any() and mode == lax.GatherScatterMode.FILL_OR_DROP:
@@ -147,7 +150,10 @@ def _window(x: Nodes, corner: dict[int, int], sizes: Any, mode: Any) -> tuple[sl
 
 
 def _fill(t: Tracer, equation: Any) -> int:
-    """What a gather from outside gives: the value it names, or NaN, the least int32, the greatest uint32, true."""
+    """Node of the value that a gather gives outside of its operand.
+
+    It is the primitive's fill value, or by dtype NaN, the least int32, the greatest uint32 or true.
+    """
     dtype, value = np.dtype(equation.outvars[0].aval.dtype), equation.params["fill_value"]
     if value is None:
         value = {"float32": np.nan, "int32": -(2**31), "uint32": 2**32 - 1, "bool": True}[str(dtype)]
@@ -156,12 +162,15 @@ def _fill(t: Tracer, equation: Any) -> int:
 
 @primitive("scatter", "scatter-add", "scatter-mul")
 def _scatter(t: Tracer, equation: Any, x: Nodes, indices: Nodes, updates: Nodes) -> Nodes:
-    """Updates outside are dropped, negative indices among them; or moved inside, where the mode says so."""
+    """Operand with updates at indices.
+
+    Updates outside of the operand, also by negative indices, are dropped or, depending on the mode, moved inside.
+    """
     numbers, mode = equation.params["dimension_numbers"], equation.params["mode"]
     starts = _indices(t, equation, indices, str(equation.invars[1].aval.dtype))
-    float_kind = kind_of(equation.invars[0].aval.dtype) == "f"
+    is_float = graph_dtype(equation.invars[0].aval.dtype) == "f"
     name = {"scatter": None, "scatter-add": "add", "scatter-mul": "mul"}[equation.primitive.name]
-    name = name if float_kind or name is None else f"i{name}"
+    name = name if is_float or name is None else f"i{name}"
     window_axes = list(numbers.update_window_dims)
     batch_axes = [axis for axis in range(updates.ndim) if axis not in window_axes]
     rows = np.transpose(updates, [*batch_axes, *window_axes])

@@ -1,4 +1,4 @@
-"""JAX's types, and the kinds of nodes that stand for values of them."""
+"""The JAX dtypes that are supported, and the dtypes of the graph nodes that represent them."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from typing import Any
 from workers.simd.graph.unsupported import UnsupportedError
 
 
-def kind_of(dtype: Any) -> str:
-    """Kind of node that holds values of a dtype. Raises UnsupportedError for any but float32, int32, uint32 and bool.
+def graph_dtype(dtype: Any) -> str:
+    """Dtype of the graph nodes that represent values of a JAX dtype: "f", "i" or "b".
 
-    And uint8, in which JAX counts bits: `check_bytes` sees that it is only converted and moved.
+    float32, int32, uint32 and bool are supported. uint8, which JAX uses to count bits, is accepted as well;
+    `check_bytes` ensures that it is only converted and moved.
+
+    Raises:
+        UnsupportedError: the dtype is any other.
     """
     match str(dtype):
         case "float32":
@@ -19,21 +23,21 @@ def kind_of(dtype: Any) -> str:
             return "i"
         case "bool":
             return "b"
-    raise UnsupportedError(f"values of type {dtype}: only float32, int32, uint32 and bool are compiled")
+    raise UnsupportedError(f"values of type {dtype}: simd supports float32, int32, uint32 and bool")
 
 
 BYTES = {"convert_element_type", "population_count", "broadcast_in_dim", "reshape", "squeeze", "slice", "transpose",
          "concatenate", "stack", "copy", "jit"}  # fmt: skip
-"""Primitives that may have uint8 in or out: nothing in them wraps around."""
+"""Primitives that may have uint8 inputs or outputs, because none of them can overflow."""
 
 
 def check_bytes(equation: Any) -> None:
-    """Raise UnsupportedError for arithmetic of uint8."""
+    """Raise UnsupportedError if an equation computes with uint8."""
     dtypes = {str(atom.aval.dtype) for atom in (*equation.invars, *equation.outvars)}
     if "uint8" in dtypes and equation.primitive.name not in BYTES:
         raise UnsupportedError(f"{equation.primitive.name} of uint8")
 
 
 def dtype_in(equation: Any, position: int = 0) -> str:
-    """Name of the dtype of one of an equation's inputs."""
+    """Name of the JAX dtype of one input of an equation."""
     return str(equation.invars[position].aval.dtype)

@@ -1,0 +1,189 @@
+"""Builder of the LLVM IR of functions on vectors, used by the emitter of graphs and by code written by hand.
+
+    void kernel(...)        the function called from outside; it rounds to nearest and treats denormal numbers as zeros
+    void anything(...)      functions that kernels call
+
+Floating-point instructions carry no fast-math flags. Nothing is reassociated, and only `fma` is fused, so the bits of a
+lane do not depend on the width of the vectors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+MXCSR = 0x9FC0
+"""Value of the processor's floating-point control register in kernels: round to nearest, no traps, and denormal results
+and operands count as zeros. XLA computes in the same mode, and denormal numbers would make a kernel five times slower.
+"""
+SCALAR_TYPES = {"f": "float", "i": "i32", "b": "i1"}
+"""LLVM type of one value for each dtype of a graph."""
+
+KERNEL = """\
+define void @kernel({parameters}) #0 {{
+entry:
+  %before = alloca i32
+  %during = alloca i32
+  call void @llvm.x86.sse.stmxcsr(ptr %before)
+  store i32 {mxcsr}, ptr %during
+  call void @llvm.x86.sse.ldmxcsr(ptr %during)
+  call void @inside({arguments})
+  call void @llvm.x86.sse.ldmxcsr(ptr %before)
+  ret void
+}}
+
+declare void @llvm.x86.sse.stmxcsr(ptr)
+declare void @llvm.x86.sse.ldmxcsr(ptr)
+{declarations}
+
+attributes #0 = {{ nounwind "prefer-vector-width"="512" "min-legal-vector-width"="{bits}" }}
+"""
+
+Values = list[str]
+"""Names of values in LLVM IR."""
+
+
+class FunctionBuilder:
+    """Builder of the text of one LLVM function, line by line. Its methods return the names of values."""
+
+    def __init__(self, name: str, parameters: Sequence[str], width: int) -> None:
+        """Begin the function `void @name(parameters)` on vectors of `width` lanes; a parameter is "type %name"."""
+        self.name, self.parameters, self.width = name, list(parameters), width
+        self.llvm_types = {dtype: f"<{width} x {scalar}>" for dtype, scalar in SCALAR_TYPES.items()}
+        """LLVM type of a vector for each dtype of a graph."""
+        self.lines: list[str] = []
+        self.memory: list[str] = []
+        """Lines that reserve memory on the stack; they come first in the function."""
+        self.declarations: set[str] = set()
+        self._label = "entry"
+        self._names = 0
+
+    def do(self, instruction: str) -> None:
+        """Add an instruction that has no value."""
+        self.lines.append(f"  {instruction}")
+
+    def value(self, instruction: str) -> str:
+        """Add an instruction and return the name of its value."""
+        self._names += 1
+        self.lines.append(f"  %v{self._names} = {instruction}")
+        return f"%v{self._names}"
+
+    def call(self, llvm_type: str, intrinsic: str, *arguments: tuple[str, str]) -> str:
+        """Call an intrinsic that returns `llvm_type`, with (type, value) arguments, and declare it."""
+        self.declarations.add(f"declare {llvm_type} @{intrinsic}({', '.join(type_ for type_, _ in arguments)})")
+        return self.value(f"call {llvm_type} @{intrinsic}({', '.join(map(' '.join, arguments))})")
+
+    def at(self, pointer: str, index: str | int, llvm_type: str) -> str:
+        """Pointer to element `index` of an array of a type."""
+        return self.value(f"getelementptr {llvm_type}, ptr {pointer}, i64 {index}")
+
+    def load(self, llvm_type: str, pointer: str, index: str | int = 0) -> str:
+        """Load element `index` of an array of a type; vectors of 32-bit words are aligned."""
+        place = self.at(pointer, index, llvm_type)
+        return self.value(f"load {llvm_type}, ptr {place}, align {self._alignment(llvm_type)}")
+
+    def store(self, llvm_type: str, value: str, pointer: str, index: str | int = 0) -> None:
+        """Store a value as element `index` of an array of a type."""
+        place = self.at(pointer, index, llvm_type)
+        self.do(f"store {llvm_type} {value}, ptr {place}, align {self._alignment(llvm_type)}")
+
+    def _alignment(self, llvm_type: str) -> int:
+        """Alignment of a type in memory, in bytes."""
+        if llvm_type == self.llvm_types["f"] or llvm_type == self.llvm_types["i"]:
+            return 4 * self.width
+        return 1 if llvm_type.endswith("x i8>") else 4
+
+    def index(self, *terms: tuple[str | int, int]) -> str:
+        """Sum of products (i64 value, factor)."""
+        total = "0"
+        for value, factor in terms:
+            part = str(value) if factor == 1 else self.value(f"mul i64 {value}, {factor}")
+            total = part if total == "0" else self.value(f"add i64 {total}, {part}")
+        return total
+
+    def splat(self, scalar: str, dtype: str = "f") -> str:
+        """Vector with a scalar in all lanes."""
+        vector = self.llvm_types[dtype]
+        first = self.value(f"insertelement {vector} poison, {SCALAR_TYPES[dtype]} {scalar}, i64 0")
+        return self.value(f"shufflevector {vector} {first}, {vector} poison, <{self.width} x i32> zeroinitializer")
+
+    def fma(self, a: str, b: str, c: str) -> str:
+        """Value of a * b + c of float vectors, rounded once."""
+        llvm_type = self.llvm_types["f"]
+        return self.call(llvm_type, f"llvm.fma.v{self.width}f32", (llvm_type, a), (llvm_type, b), (llvm_type, c))
+
+    def label(self, name: str) -> None:
+        """Begin a basic block; the previous one must have ended with a branch."""
+        self.lines.append(f"{name}:")
+        self._label = name
+
+    def loop(
+        self,
+        trips: str | int,
+        body: Callable[[str, Values], Iterable[str]],
+        carries: Sequence[tuple[str, str]] = (),
+        until: Callable[[], str] | None = None,
+    ) -> Values:
+        """Repeat a body at least once; returns the carried values after the last trip.
+
+        Args:
+            trips: number of trips.
+            body: function (number of the trip, carried values) -> carried values of the next trip.
+            carries: (type, first value) of each carried value.
+            until: function that gives an i1 at the end of each trip, which ends the loop early if it is true.
+        """
+        self._names += 1
+        label, before = f"loop{self._names}", self._label
+        self.do(f"br label %{label}")
+        self.label(label)
+        place = len(self.lines)
+        names = [f"%{label}_c{k}" for k in range(len(carries))]
+        outs = list(body(f"%{label}_trip", names))
+        stop = until() if until else "false"
+        self.do(f"br label %{label}_end")
+        self.label(f"{label}_end")
+        phis = [f"  %{label}_trip = phi i64 [ 0, %{before} ], [ %{label}_next, %{label}_end ]"]
+        for (llvm_type, first), name, out in zip(carries, names, outs, strict=True):
+            phis.append(f"  {name} = phi {llvm_type} [ {first}, %{before} ], [ {out}, %{label}_end ]")
+        self.lines[place:place] = phis
+        self.do(f"%{label}_next = add i64 %{label}_trip, 1")
+        self.do(f"%{label}_more = icmp slt i64 %{label}_next, {trips}")
+        self.do(f"%{label}_again = select i1 {stop}, i1 false, i1 %{label}_more")
+        self.do(f"br i1 %{label}_again, label %{label}, label %{label}_after")
+        self.label(f"{label}_after")
+        return outs
+
+    def any(self, words: str, lanes: int | None = None) -> str:
+        """An i1 that is true if any word of an integer vector is not 0."""
+        llvm_type = f"<{lanes or self.width} x i32>"
+        found = self.call("i32", f"llvm.vector.reduce.or.v{lanes or self.width}i32", (llvm_type, words))
+        return self.value(f"icmp ne i32 {found}, 0")
+
+    def when(self, condition: str, body: Callable[[], object]) -> None:
+        """Run the instructions that `body` adds only if an i1 is true."""
+        self._names += 1
+        label = f"when{self._names}"
+        self.do(f"br i1 {condition}, label %{label}, label %{label}_after")
+        self.label(label)
+        body()
+        self.do(f"br label %{label}_after")
+        self.label(f"{label}_after")
+
+    def text(self) -> str:
+        """LLVM IR of the finished function."""
+        lines = [f"define internal void @{self.name}({', '.join(self.parameters)}) noinline #0 {{", "entry:"]
+        return "\n".join([*lines, *self.memory, *self.lines, "  ret void", "}", ""])
+
+
+def module(functions: Sequence[FunctionBuilder]) -> str:
+    """LLVM IR of functions and of @kernel, which calls the last function; that one must be named "inside"."""
+    inside = functions[-1]
+    assert inside.name == "inside"
+    parameters = [parameter.replace(" noalias", "") for parameter in inside.parameters]
+    frame = KERNEL.format(
+        parameters=", ".join(parameters),
+        arguments=", ".join(parameters),
+        mxcsr=MXCSR,
+        declarations="\n".join(sorted(set().union(*(function.declarations for function in functions)))),
+        bits=32 * inside.width,
+    )
+    return "\n".join([*(function.text() for function in functions), frame])
