@@ -87,10 +87,12 @@ class _Writer:
     def __init__(
         self, builder: FunctionBuilder, graph: Graph, outputs: Sequence[int], input_addresses: Sequence[tuple[str, int]]
     ) -> None:
-        self.builder, self.graph, self.input_addresses = builder, graph, input_addresses
-        """Pointer and word of each input of the graph."""
+        self.builder, self.graph = builder, graph
+        self.input_addresses = input_addresses
+        """(pointer, word) of each input of the graph."""
         self.words = {dtype.upper(): llvm_type for dtype, llvm_type in builder.llvm_types.items()}
         self.words |= {"N": f"v{builder.width}f32", "M": f"v{builder.width}i32"}
+        """Types and suffixes that replace {F}, {I}, {B}, {N} and {M} in the instructions of OPERATIONS."""
         self.schedule = schedule(graph, outputs)
         self.slots: dict[int, int] = {}
         """Slots in the memory of the block, by node: of carries and of values that loops read."""
