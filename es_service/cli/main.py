@@ -178,14 +178,14 @@ def list_() -> None:
 @app.command()
 def evaluate(
     folder: RunArgument,
-    best: Annotated[bool, typer.Option("--best", help="The best centre; so too if nothing is named.")] = False,
+    best: Annotated[bool, typer.Option("--best", help="The best centre (default).")] = False,
     centre: Annotated[bool, typer.Option("--centre", help="The newest centre.")] = False,
     cell: Annotated[
         list[str] | None, typer.Option("--cell", metavar="I,J", help="A cell's elite; may be given several times.")
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="Every elite of the map.")] = False,
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="Fresh episodes of each.")] = 100,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Which fresh episodes.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the fresh episodes.")] = 0,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Also write the rows to this CSV file.")] = None,
 ) -> None:

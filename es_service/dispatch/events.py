@@ -46,8 +46,8 @@ class Limits:
     """Wait before replacing the second, third ... loss without a success between: restart_backoff_s, doubling up to
     max_backoff_s. The first replacement is immediate; losses during a wait share it (a node that died, say)."""
     max_start_failures: int = 3
-    """This many tries in a row to start workers that failed, and none up meanwhile: the environment is broken. All that
-    were started before the first of them was lost are one try, however many are lost and when."""
+    """This many consecutive attempts to start workers that failed, and none up meanwhile: the environment is broken.
+    All workers that were started before the first of them was lost are one attempt."""
     no_worker_timeout_s: float = 300.0
     """Longest time with items waiting and no worker up; longer than `start_deadline_s` to be of any use."""
     names: Mapping[str, str] = field(default_factory=dict)

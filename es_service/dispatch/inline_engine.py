@@ -32,7 +32,7 @@ from es_service.protocol.wire import BUFFER_BYTES, Channel, framed
 PIECE_S = 0.1
 """Longest wait for the next piece of a message that has begun to come."""
 LAST_WORDS_BYTES = 2000
-"""Told of what a lost child had written; read are no more, either, since it may have been writing for days."""
+"""At most this many bytes of a lost worker's output are read and reported: it may have been writing for days."""
 
 
 def inline_engine(

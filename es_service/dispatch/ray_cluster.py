@@ -115,9 +115,9 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
             if address is None:
                 raise EvaluationError(f"Ray does not start on this machine: {error}", ways_out=ways_out) from error
             raise EvaluationError(
-                f"no Ray cluster at {address} took us in: {error}. Check the address, that RAY_AUTH_TOKEN is the "
-                f"cluster's (with RAY_AUTH_MODE=token), and that it has this Ray ({ray.__version__}) and this Python "
-                f"({platform.python_version()})",
+                f"could not connect to a Ray cluster at {address}: {error}. Check the address, that RAY_AUTH_TOKEN is "
+                f"the cluster's (with RAY_AUTH_MODE=token), and that it has this Ray ({ray.__version__}) and this "
+                f"Python ({platform.python_version()})",
                 field="compute.address",
                 value=address,
                 ways_out=ways_out,

@@ -207,7 +207,7 @@ def _lose(
         wait_s = min(s.limits.max_backoff_s, s.limits.restart_backoff_s * 2**doublings) if doublings >= 0 else 0.0
         s = s._replace(losses_in_a_row=s.losses_in_a_row + 1, start_at_s=now + wait_s)
     if starting and s.start_failures >= s.limits.max_start_failures and not s.up and not s.draining:
-        return _fail(s, out, f"{s.start_failures} tries in a row brought no worker up; last loss: {s.last_loss}")
+        return _fail(s, out, f"no worker started in {s.start_failures} consecutive attempts; last loss: {s.last_loss}")
     if running is not None and charge:
         return _charge(s, out, running, f"it took worker {worker} with it: {reason}")
     return s

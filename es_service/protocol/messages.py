@@ -47,12 +47,12 @@ class TaskSpec:
     """Where the task's option `descriptor` chooses: name -> (descriptor_names, descriptor_bounds)."""
     walls: tuple[Segment, ...] | None = None
     """Where the descriptor is a place in the plane: all walls there, so that it is known which places can be reached;
-    None where nobody says."""
+    None where it is not specified."""
     wall_clearance: float = 0.0
     """How near the middle of a wall no descriptor can come."""
     least_reward: float | None = None
     """What a QD-score counts from, per step: about the least mean reward of an episode. Not always a bound: short
-    episodes of AntTrap can be below. None where nobody says."""
+    episodes of AntTrap can be below. None where it is not specified."""
     no_simd: str = ""
     """Why simd cannot compile its episodes; empty where it can."""
 

@@ -62,7 +62,7 @@ def _mix64(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def _mix(x: int) -> int:
-    """The same of one word, as a whole number: NumPy takes longer to begin than this to end."""
+    """The same of one word, in Python integers; avoids the overhead of NumPy calls."""
     x = (x ^ (x >> 30)) * int(_MIX_1) & _MASK
     x = (x ^ (x >> 27)) * int(_MIX_2) & _MASK
     return x ^ (x >> 31)

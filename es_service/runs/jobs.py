@@ -184,6 +184,6 @@ def _explained(address: str, job: str | None = None) -> Iterator[None]:
             raise EvaluationError(f"there is no job {job} on {address}", field="job", value=job) from error
         first = text.partition("\n")[0]
         raise EvaluationError(
-            f"the cluster at {address} did not do it: {first}. Check the address, that its dashboard runs there, and "
+            f"the Ray job request to {address} failed: {first}. Check the address, that its dashboard runs there, and "
             "that RAY_AUTH_TOKEN is the cluster's (with RAY_AUTH_MODE=token)"
         ) from error

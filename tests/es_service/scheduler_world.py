@@ -314,7 +314,7 @@ class World:
         if message.startswith("work item"):
             self.seen["poison"] += 1
             assert any(str(item_id) in message for item_id in worn_out)
-        elif "tries in a row" in message:
+        elif "consecutive attempts" in message:
             self.seen["start failures"] += 1
             assert self.start_failures == self.limits.max_start_failures
             assert not self.up

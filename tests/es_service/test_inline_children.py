@@ -90,7 +90,7 @@ def test_children_that_cannot_be_started_are_lost_workers_and_leave_nothing_behi
     monkeypatch.setattr(subprocess, "Popen", no_more)
     with (
         inline_engine(SPEC, Limits(workers=1, restart_backoff_s=0.0)) as engine,
-        pytest.raises(EvaluationError, match=r"(?s)3 tries in a row.*cannot be started.*Too many open files"),
+        pytest.raises(EvaluationError, match=r"(?s)3 consecutive attempts.*cannot be started.*Too many open files"),
     ):
         engine.evaluate(FIRST, CHUNKS)
     assert footprint() == before

@@ -58,7 +58,7 @@ def test_a_relative_folder_is_refused():
 
 
 def test_where_nothing_answers_the_error_says_what_to_check():
-    with pytest.raises(EvaluationError, match=r"the cluster at http://127\.0\.0\.1:1 did not do it: .*RAY_AUTH_TOKEN"):
+    with pytest.raises(EvaluationError, match=r"the Ray job request to http://127\.0\.0\.1:1 failed: .*RAY_AUTH_TOKEN"):
         jobs.list_jobs("http://127.0.0.1:1")
 
 
@@ -123,7 +123,7 @@ def test_a_start_that_is_another_folder_on_the_head_is_refused(tmp_path, start, 
     set_ = [] if in_file else [f"search.init_from={start}"]
     with pytest.raises(ConfigError, match=rf"search\.init_from: {start} must be absolute"):
         cli_jobs.submit(file, "http://127.0.0.1:1", "/runs/x", set_=set_)
-    with pytest.raises(EvaluationError, match="did not do it"):  # past this check: nothing answers there
+    with pytest.raises(EvaluationError, match="the Ray job request to"):  # past this check: nothing answers there
         cli_jobs.submit(file, "http://127.0.0.1:1", "/runs/x", set_=["search.init_from=/runs/a"])
 
 

@@ -69,7 +69,7 @@ def test_a_broken_environment_is_reported_soon():
     assert (state.failed, next_deadline(state)) == (None, 1.2)
     state, _ = step(state, Tick(), 1.2)
     state, commands = step(state, WorkerLost(3, "ImportError: brax"), 1.3)
-    message = "3 tries in a row brought no worker up; last loss: worker 3: ImportError: brax"
+    message = "no worker started in 3 consecutive attempts; last loss: worker 3: ImportError: brax"
     assert commands == [Fail(message), StopWorker(4, "the run failed")]
     assert (state.failed, state.lost_workers) == (message, 4)
 
@@ -91,7 +91,7 @@ def test_workers_that_are_lost_together_before_they_come_up_are_one_try_however_
         now += LIMITS.max_backoff_s  # less than start_deadline_s
         state, _ = step(state, Tick(), now)
     assert state.failed is not None
-    assert state.failed.startswith("3 tries in a row")
+    assert state.failed.startswith("no worker started in 3 consecutive attempts")
 
 
 def test_a_place_gives_a_worker_all_its_time_to_come_up():

@@ -128,7 +128,7 @@ def test_a_run_that_began_inline_goes_on_with_ray_where_home_cannot_be_written(t
 
 def test_workers_that_raise_while_starting_stop_the_run_with_their_error():
     with (
-        pytest.raises(EvaluationError, match=r"3 tries in a row brought no worker up(.|\n)*no_such_task"),
+        pytest.raises(EvaluationError, match=r"no worker started in 3 consecutive attempts(.|\n)*no_such_task"),
         ray_engine(spec(environment="no_such_task"), Limits(1, restart_backoff_s=0.0), actor=WorkerActor) as engine,
     ):
         engine.evaluate(centre(random_parameters()), [TrainingChunk(1, 0)])
@@ -155,7 +155,7 @@ def test_a_cluster_without_room_is_named_with_what_it_has(monkeypatch):
 
 
 def test_a_wrong_address_is_named_with_the_way_out():
-    with pytest.raises(EvaluationError, match=r"no Ray cluster at 127\.0\.0\.1:1 ") as error:
+    with pytest.raises(EvaluationError, match=r"could not connect to a Ray cluster at 127\.0\.0\.1:1") as error:
         ray_engine(spec(), Limits(1), actor=WorkerActor, address="127.0.0.1:1")
     assert error_message(error.value).endswith(" resume RUN --engine inline")
 

@@ -28,7 +28,9 @@ def import_factory(path: str) -> Callable[[RunConfig], object]:
         found = getattr(importlib.import_module(module), name, None)
     except Exception as error:  # the user's code can raise anything
         kind = type(error).__name__
-        raise ConfigError(f"cannot import {module} ({kind}: {error}); start where it is, or install it") from error
+        raise ConfigError(
+            f"cannot import {module} ({kind}: {error}); start in the folder that contains it, or install it"
+        ) from error
     if not callable(found):
         raise ConfigError(f"{module} has no function {name!r}; es_service/search/algorithms/own.py says what is needed")
     return found
