@@ -24,13 +24,13 @@ from es_service.config.resolution import (
     LEFT_OPEN,
     centre_problems,
     engine_problems,
-    folder_problems,
     policy_problems,
     resolve,
     rollout_problems,
     shape_problems,
     task_problems,
 )
+from es_service.config.start import folder_problems
 from es_service.config.yaml_text import parse_value, read_yaml_file, show
 from es_service.errors import ConfigError, Problem
 from es_service.protocol.messages import TaskSpec

@@ -11,7 +11,7 @@ import numpy as np
 from es_service.config.changes import START_KEYS, changed_constants, does_not_fit, start_afresh
 from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.model import RunConfig, policy_shape
-from es_service.config.resolution import start_of
+from es_service.config.start import start_of
 from es_service.config.tasks import task_of
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, Problem
