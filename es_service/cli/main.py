@@ -41,6 +41,7 @@ from es_service.cli.tables.progress import show_progress
 from es_service.cli.tables.status import follow_status, print_status, print_summary
 from es_service.config.loading import left_out
 from es_service.config.resolution import config_warnings
+from es_service.config.shipped import shipped_text
 from es_service.config.tasks import TASKS, no_vectors, task_of
 from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError
 from es_service.loop.history import Row
@@ -169,9 +170,17 @@ def digest_(
     print(f"{digest.digest_of(found)}{'  mixed' if mixed else ''}")
 
 
+@app.command(name="config")
+def config_(
+    name: Annotated[str, typer.Argument(help="Name of a shipped config, as `list` shows it.", show_default=False)],
+) -> None:
+    """Print a shipped config, to be kept as a file and edited."""
+    print(shipped_text(name), end="")
+
+
 @app.command(name="list")
 def list_() -> None:
-    """Show tasks, algorithms and presets."""
+    """Show tasks, algorithms, presets and shipped configs."""
     print_catalogue(console, TASKS)
 
 

@@ -16,7 +16,7 @@ from es_service.errors import ServiceError
 console = Console()
 errors = Console(stderr=True)
 
-ConfigArgument = Annotated[Path, typer.Argument(help="YAML config; see configs/.", show_default=False)]
+ConfigArgument = Annotated[Path, typer.Argument(help="YAML file, or the name of a shipped config.", show_default=False)]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a run.", show_default=False)]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one key, e.g. search.sigma=0.05.")

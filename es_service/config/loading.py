@@ -30,13 +30,14 @@ from es_service.config.resolution import (
     shape_problems,
     task_problems,
 )
+from es_service.config.shipped import config_file
 from es_service.config.start import folder_problems
 from es_service.config.yaml_text import parse_value, read_yaml_file, show
 from es_service.errors import ConfigError, Problem
 from es_service.protocol.messages import TaskSpec
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
-"""Where a config comes from: the path of a YAML file, or what such a file would contain."""
+"""Where a config comes from: the path of a YAML file, the name of a shipped one, or what such a file would contain."""
 
 
 def load_config(
@@ -51,7 +52,7 @@ def load_config(
     """The config of a new run.
 
     Args:
-        source: a YAML file, or a nested mapping like one.
+        source: a YAML file, the name of a shipped config, or a nested mapping like one.
         overrides: "search.sigma=0.05" and the like, values in YAML, of which a later one wins; or values by key. Where
             they name another task, options of the source's own task are left out (`left_out` says which).
         tasks: what `task.environment` may name.
@@ -68,7 +69,7 @@ def load_config(
 def left_out(source: Source, overrides: Overrides) -> list[str]:
     """The options that `load_config` leaves out of a config because the overrides want another task than it has, which
     gets its own default options. `source` and `overrides` as they were accepted by `load_config`."""
-    mapping = source if isinstance(source, Mapping) else read_yaml_file(os.fspath(source))[0]
+    mapping = source if isinstance(source, Mapping) else read_yaml_file(config_file(source))[0]
     return foreign_options(sort_keys(mapping)[0], parse_overrides(overrides)[0])
 
 
@@ -105,8 +106,8 @@ def _load(
     if isinstance(source, Mapping):
         name, mapping, problems = "config", source, []
     else:
-        mapping, problems = read_yaml_file(os.fspath(source))
         name = os.fspath(source)
+        mapping, problems = read_yaml_file(config_file(name))
     values, unusable, more = sort_keys(mapping)
     problems += more
     wanted, more = parse_overrides(overrides)

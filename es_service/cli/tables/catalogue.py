@@ -1,4 +1,4 @@
-"""What there is to choose from: tasks, algorithms, presets."""
+"""What there is to choose from: tasks, algorithms, presets, shipped configs."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from es_service.config.presets import PRESETS, preset_table
+from es_service.config.shipped import shipped_configs
 from es_service.config.yaml_text import show
 from es_service.protocol.messages import TaskSpec
 from es_service.search.algorithms import ALGORITHMS
 
 
 def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> None:
-    """Tables of tasks, algorithms, and of the keys on which presets differ."""
+    """Tables of tasks, algorithms, the keys on which presets differ, and shipped configs."""
     tasks = _table("tasks (task.environment)")
     for task in known_tasks.values():
         tasks.add_row(task.name, _about(task))
@@ -36,6 +37,11 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
     for row in preset_table():
         presets.add_row(row.key, *(_value(getattr(row, name)) for name in PRESETS))
     console.print(presets)
+
+    configs = _table("configs (es-service run NAME, es-service config NAME)")
+    for name, file in shipped_configs().items():
+        configs.add_row(name, file.read_text().splitlines()[0].lstrip("# "))
+    console.print(configs)
 
 
 def _table(title: str) -> Table:

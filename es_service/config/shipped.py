@@ -1,0 +1,37 @@
+"""The configs that come with the package, by name: the folder `configs` of a clone, or data of an installed package."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from es_service.config.problems import did_you_mean, nearest
+from es_service.errors import ConfigError, Problem
+
+PACKAGE = Path(__file__).parents[1]
+PLACES = (PACKAGE.parent / "configs", PACKAGE / "shipped_configs")
+"""A clone's and an installed package's; the first that is there counts."""
+
+
+def shipped_configs() -> dict[str, Path]:
+    """File of each shipped config by its name, such as `point_maze_me_es`, in alphabetical order."""
+    place = next((place for place in PLACES if (place / "point_maze_me_es.yaml").is_file()), None)
+    return {} if place is None else {file.stem: file for file in sorted(place.glob("*.yaml"))}
+
+
+def config_file(source: str | os.PathLike[str]) -> Path:
+    """The file that a user means by a path, or by the name of a shipped config where no such file exists."""
+    path = Path(source)
+    if path.exists() or path.name != os.fspath(source):
+        return path
+    return shipped_configs().get(path.name.removesuffix(".yaml"), path)
+
+
+def shipped_text(name: str) -> str:
+    """The text of a shipped config. Raises ConfigError for another name."""
+    known = shipped_configs()
+    if name not in known:
+        hint = did_you_mean(name, known) or f"; there are {', '.join(known)}"
+        problem = Problem(f"no shipped config has this name{hint}", "config", name, suggestion=nearest(name, known))
+        raise ConfigError.listing(f"{name}: 1 problem", [problem])
+    return known[name].read_text()

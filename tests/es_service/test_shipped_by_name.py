@@ -1,0 +1,85 @@
+"""Shipped configs are there by name, also for whoever has no clone."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from es_service import load_config
+from es_service.cli.main import app
+from es_service.config.shipped import config_file, shipped_configs, shipped_text
+from es_service.errors import ConfigError
+
+ROOT = Path(__file__).parents[2]
+NAMES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
+
+
+def test_a_name_is_taken_where_no_such_file_exists(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert list(shipped_configs()) == NAMES
+    assert load_config("point_maze_me_es") == load_config(ROOT / "configs" / "point_maze_me_es.yaml")
+    assert config_file("point_maze_me_es.yaml") == ROOT / "configs" / "point_maze_me_es.yaml"
+    assert config_file("configs/point_maze_me_es.yaml") == Path("configs/point_maze_me_es.yaml"), "a path is a path"
+    Path("point_maze_me_es").write_text("search: {}")
+    assert config_file("point_maze_me_es") == Path("point_maze_me_es")
+    with pytest.raises(ConfigError, match="no such file"):
+        load_config("point_maze_none")
+
+
+def test_a_shipped_config_is_printed_to_be_edited(tmp_path):
+    shown = CliRunner().invoke(app, ["config", "point_maze_es"])
+    assert (shown.exit_code, shown.stdout) == (0, (ROOT / "configs" / "point_maze_es.yaml").read_text())
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(shown.stdout)
+    assert load_config(mine) == load_config("point_maze_es")
+    with pytest.raises(ConfigError, match="no shipped config has this name; did you mean point_maze_es"):
+        shipped_text("point_maze_ess")
+    listed = CliRunner().invoke(app, ["list"], env={"COLUMNS": "200"}).stdout
+    assert all(name in listed for name in NAMES)
+
+
+def test_every_package_is_installed():
+    packages = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    found = {
+        ".".join(path.parent.relative_to(ROOT).parts)
+        for root in ("es_service", "workers")
+        for path in (ROOT / root).rglob("__init__.py")
+    }
+    assert set(packages) == found | {"es_service.shipped_configs"}
+    assert len(packages) == len(set(packages))
+
+
+@pytest.mark.slow
+def test_whoever_has_no_clone_runs_a_shipped_config_from_another_folder(tmp_path):
+    """In a fresh installation of the package beside the dependencies at hand."""
+    source, place, elsewhere = tmp_path / "source", tmp_path / "installed", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for name in ("es_service", "workers", "configs"):  # a copy: building leaves files beside the sources
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source / name)
+    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", place, source]
+    subprocess.run(install, check=True, capture_output=True)
+    code = f"import sys; sys.path.insert(0, {str(place)!r}); from es_service.__main__ import main; main()"
+
+    def es(*words: str) -> str:
+        environment = os.environ | {"PYTHONSAFEPATH": "1"}
+        command = [sys.executable, "-c", code, *words]
+        done = subprocess.run(command, cwd=elsewhere, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert es("config", "point_maze_me_es") == (ROOT / "configs" / "point_maze_me_es.yaml").read_text()
+    where = f"import sys; sys.path.insert(0, {str(place)!r}); import es_service; print(es_service.__file__)"
+    found = subprocess.run([sys.executable, "-c", where], capture_output=True, text=True, check=True, cwd=elsewhere)
+    assert found.stdout.startswith(str(place))
+    small = ["--set", "budget.generations=1", "--engine", "inline", "--workers", "1"]
+    es("run", "point_maze_es", "--out", "run", *small)
+    assert "1 of 1" in es("status", "run")
