@@ -32,11 +32,6 @@ NEWEST = 2**62
 """Stands for the newest generation."""
 
 
-def digest(folder: Path) -> str:
-    """Of the run in `folder` as it is now: equal for two runs exactly if all of `digest_parts` are equal."""
-    return digest_of(digest_parts(folder))
-
-
 def digest_of(parts: Mapping[str, str]) -> str:
     """The digest of a run whose `digest_parts` are these."""
     lines = (f"{name}\0{sha256}\n" for name, sha256 in sorted(parts.items()))

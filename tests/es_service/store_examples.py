@@ -9,6 +9,7 @@ import numpy as np
 
 from es_service.loop.history import Column
 from es_service.store import upkeep as store_upkeep
+from es_service.store.digest import digest_of, digest_parts
 from es_service.store.folder import DATABASE
 from es_service.store.reader import read_history, read_parts, reading
 from es_service.store.schema import Damaged
@@ -174,3 +175,8 @@ def verify_run(folder: Path) -> list[str]:
             return list(verify(connection, folder / DATABASE).problems)
         except Damaged as damage:
             return [str(damage)]
+
+
+def digest(folder):
+    """The digest of what the tables contain, without the checks of `checked_parts`."""
+    return digest_of(digest_parts(folder))

@@ -10,13 +10,14 @@ from es_service.api import open_run
 from es_service.errors import StoreError
 from es_service.store import schema as store_schema
 from es_service.store.codec import encode_part
-from es_service.store.digest import arrays_sha256, checked_parts, digest, digest_at, digest_of, digest_parts
+from es_service.store.digest import arrays_sha256, checked_parts, digest_at, digest_of, digest_parts
 from es_service.store.reader import read_generation
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     COLUMNS,
     advance,
     create,
+    digest,
     finished,
     flip_bit,
     history_row,

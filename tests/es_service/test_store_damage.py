@@ -11,7 +11,7 @@ import pytest
 
 from es_service.errors import StoreError
 from es_service.store.codec import encode_part
-from es_service.store.digest import digest, digest_parts
+from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation, read_history, read_parts, read_platforms
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
@@ -21,6 +21,7 @@ from tests.es_service.store_examples import (
     assert_sound,
     copy_at_every_commit,
     create,
+    digest,
     finished,
     flip_bit,
     history_row,

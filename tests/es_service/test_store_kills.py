@@ -11,7 +11,6 @@ import pytest
 from es_service.errors import StoreError
 from es_service.store import reader as store_reader
 from es_service.store import writer as store
-from es_service.store.digest import digest
 from es_service.store.reader import read_generation, read_history
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
@@ -21,6 +20,7 @@ from tests.es_service.store_examples import (
     assert_sound,
     copy_at_every_commit,
     create,
+    digest,
     finished,
     state_at,
 )
