@@ -37,11 +37,12 @@ class WayOut:
     """With install: the extra of this package that is needed."""
 
     def call(self) -> str:
-        """The Python call."""
+        """The Python call; of an installation, the command, which no call stands for."""
         settings = repr(dict(self.settings)) if self.settings else ""
         match self.action:
             case "install":
-                return f"pip install -c constraints.txt -e '.[{self.extra}]', in a clone of es-service"
+                # No package index has es-service itself.
+                return f"in a clone of es-service: pip install -c constraints.txt -e '.[{self.extra}]'"
             case "run":
                 config = f"load_config(config, {settings})" if settings else "config"
                 return f"run({config}, {self.out!r})" if self.out else f"run({config})"

@@ -42,7 +42,7 @@ def way_command(way: WayOut) -> str:
     folder = way.run or "RUN"
     match way.action:
         case "install":
-            return install_command(way.extra or "")
+            return way.call()
         case "watch":
             return command("status", folder, "--follow")
         case "run":
@@ -54,11 +54,6 @@ def error_message(error: ServiceError) -> str:
     """What an error says, and its ways out as commands, a line each."""
     ways = [f"  to {way.purpose}: {way_command(way)}" for way in error.ways_out]
     return "\n".join([error.sentence, *ways])
-
-
-def install_command(extra: str) -> str:
-    """How to get what an extra of this package names; no package index has es-service itself, so from a clone."""
-    return f"in a clone of es-service: {shlex.join(['pip', 'install', '-c', 'constraints.txt', '-e', f'.[{extra}]'])}"
 
 
 def _program() -> list[str]:

@@ -1,5 +1,5 @@
-"""The command line: `es-service run | resume | fork | status | digest | list | evaluate | export | submit | jobs | logs
-| stop | bench | doctor`.
+"""The command line: `es-service run | resume | fork | status | digest | config | list | evaluate | export | submit |
+jobs | logs | stop | bench | doctor`.
 
 Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by SIGINT or SIGTERM.
 """

@@ -59,8 +59,9 @@ def fork_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> Ru
     if not isinstance(overrides, str | Mapping):
         overrides = list(overrides)  # it is gone through twice
     wanted = parse_overrides(overrides)[0]
-    started = {"search.fitness_weight_start"} if "search.algorithm" in wanted else set()
-    if idle := [key for key in START_KEYS if key in wanted and key not in started]:
+    searched = origin.constants["search.algorithm"]
+    begins_anew = {"search.fitness_weight_start"} if wanted.get("search.algorithm", searched) != searched else set()
+    if idle := [key for key in START_KEYS if key in wanted and key not in begins_anew]:
         raise _refused(
             origin,
             "a fork has its state and all its settings, so these would change nothing",

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pandas as pd
 import pytest
 
-from es_service.cli.commands import error_message, install_command
+from es_service.cli.commands import error_message
 from es_service.errors import ConfigError, WayOut
 from es_service.runs import export
 
@@ -26,7 +26,8 @@ def test_an_export_without_its_package_says_how_to_get_it(tmp_path, monkeypatch,
         export.export(run, to, tmp_path)
     assert (error.value.field, error.value.value) == ("to", to)
     assert error.value.way_out == WayOut("install", "install it", extra=to)
-    assert error_message(error.value).endswith(f"  to install it: {install_command(to)}")
+    command = f"pip install -c constraints.txt -e '.[{to}]'"
+    assert error_message(error.value).endswith(f"  to install it: in a clone of es-service: {command}")
     assert to in EXTRAS
 
 

@@ -74,6 +74,8 @@ def test_searches_with_the_same_state_may_follow_one_another(tmp_path, algorithm
     moved = int(rows.loc[5, "centre"])
     for index in {0, 1, 2} - {moved}:
         assert (after[f"centre_{index}"]["centre_D"] == before[f"centre_{index}"]["centre_D"]).all()
+    with pytest.raises(ConfigError, match="would change nothing"):
+        lineage.fork_config(parent.folder, [f"search.algorithm={other}", "search.fitness_weight_start=0.75"])
     with pytest.raises(ConfigError) as refused:
         api.resume(parent.folder, [f"search.algorithm={algorithm}"])
     assert refused.value.way_out is not None
@@ -322,18 +324,18 @@ def test_init_from_the_best_centre_or_a_cell_s_elite(tmp_path):
     for which, wanted in (("best", "best"), (",".join(map(str, place)), place)):
         setting = {"search.init_from": f"{origin.folder}:{which}", "budget.generations": 1}
         child = api.run(api.load_config(mapping, setting), tmp_path / f"from_{which}").run
-        policy, parts = origin.policy(wanted), child.parts()[1]
+        assert child.generation == 1
+        policy = origin.policy(wanted)
         kept = api.run(api.load_config(mapping, setting | {"budget.generations": None, "budget.target_fitness": -1e9}),
                        tmp_path / f"at_{which}").run.parts()[1]  # fmt: skip
         for index in range(child.constants["search.centres"]):
             assert (kept[f"centre_{index}"]["centre_D"] == policy.parameters_D).all()
         observed = kept["observations"]
-        if observed["count"]:
-            np.testing.assert_array_equal(observed["mean_O"].astype(np.float32), policy.observation_mean_O)
-            std_O = np.sqrt(observed["m2_O"] / observed["count"])
-            np.testing.assert_allclose(std_O, policy.observation_std_O, rtol=1e-6)
+        assert observed["count"] > 0
+        np.testing.assert_array_equal(observed["mean_O"].astype(np.float32), policy.observation_mean_O)
+        std_O = np.sqrt(observed["m2_O"] / observed["count"])
+        np.testing.assert_allclose(std_O, policy.observation_std_O, rtol=1e-6)
         assert child.config["search"]["init_from"] == f"{origin.folder}:{which}"
-        assert parts["best"]["generation"] in (0, 1)
     with pytest.raises(NotInRunError, match="cell 9,9 is not in the map"):
         api.run(api.load_config(mapping, {"search.init_from": f"{origin.folder}:9,9"}), tmp_path / "none")
     assert not (tmp_path / "none").exists()
