@@ -47,7 +47,7 @@ def submit(
 
 def _require_absolute_start(config: Path, wanted: list[str]) -> None:
     """Raise a ConfigError for a `search.init_from` that would mean another folder here than on the cluster's head."""
-    in_file = read_yaml_file(config_file(config))[0].get("search")
+    in_file = read_yaml_file(config_file(config)).get("search")
     named = {"search.init_from": in_file.get("init_from")} if isinstance(in_file, dict) else {}
     start = (named | parse_overrides(wanted)[0]).get("search.init_from")
     if isinstance(start, str) and not start.startswith("/"):

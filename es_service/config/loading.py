@@ -69,7 +69,7 @@ def load_config(
 def left_out(source: Source, overrides: Overrides) -> list[str]:
     """The options that `load_config` leaves out of a config because the overrides want another task than it has, which
     gets its own default options. `source` and `overrides` as they were accepted by `load_config`."""
-    mapping = source if isinstance(source, Mapping) else read_yaml_file(config_file(source))[0]
+    mapping = source if isinstance(source, Mapping) else read_yaml_file(config_file(source))
     return foreign_options(sort_keys(mapping)[0], parse_overrides(overrides)[0])
 
 
@@ -104,12 +104,11 @@ def _load(
     resolved: bool,
 ) -> RunConfig:
     if isinstance(source, Mapping):
-        name, mapping, problems = "config", source, []
+        name, mapping = "config", source
     else:
         name = os.fspath(source)
-        mapping, problems = read_yaml_file(config_file(name))
-    values, unusable, more = sort_keys(mapping)
-    problems += more
+        mapping = read_yaml_file(config_file(name))
+    values, unusable, problems = sort_keys(mapping)
     wanted, more = parse_overrides(overrides)
     problems += more
     if resolved:

@@ -57,7 +57,7 @@ class Run:
         file = self.folder / CONFIG
         if not file.exists():
             return self.config
-        recorded = read_yaml_file(file)[0]
+        recorded = read_yaml_file(file)
         budget, compute = (recorded.get(section, self.config[section]) for section in ("budget", "compute"))
         if isinstance(compute, Mapping):
             compute = {**compute, **{key: self.config["compute"][key] for key in COMPUTE_CONSTANTS}}

@@ -220,7 +220,8 @@ def test_dumped_values_read_back(value):
 
 
 def test_resolved_yaml_is_plain_yaml_for_other_readers():
-    assert yaml.safe_load(load().resolved_yaml())["search"]["sigma"] == 0.02
+    for sigma in (0.02, 1e-5, 1e22):
+        assert yaml.safe_load(load(MINIMAL, f"search.sigma={sigma}").resolved_yaml())["search"]["sigma"] == sigma
 
 
 def test_worker_spec_says_what_the_config_says():
