@@ -19,6 +19,7 @@ from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, StoreError, WayOut
+from es_service.logs import in_run
 from es_service.loop.budget import REACHED, limits_of, raised
 from es_service.loop.history import history_columns
 from es_service.protocol.messages import TaskSpec
@@ -127,7 +128,7 @@ def _go_on(
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Open a run, make sure that the config for this session is its own, and work."""
-    with RunStore.open(folder, hook=hook) as store:
+    with RunStore.open(folder, hook=hook) as store, in_run(store.meta.run_id):
         # What opening has repaired stays so, whatever is refused now. Told once: `work` tells what is there later.
         for notice in store.notices:
             on_notice(notice)
@@ -238,5 +239,5 @@ def _create_and_work(
         columns=history_columns(task, config.map.enabled),
         parent=parent,
     )
-    with RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=hook) as store:
+    with RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=hook) as store, in_run(meta.run_id):
         return work(config, store, on_generation, on_notice)

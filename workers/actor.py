@@ -14,6 +14,7 @@ from functools import partial
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import Centre, Chunk, ChunkResult, WorkerPlace
 from es_service.protocol.process_environment import worker_environment
+from workers.xla_cache import xla_cache_settings
 
 
 class WorkerActor:
@@ -44,7 +45,7 @@ class WorkerActor:
         environment = worker_environment(os.environ, self._gpus)
         for name in set(os.environ) - set(environment):
             del os.environ[name]
-        os.environ.update(environment)
+        os.environ.update(environment | xla_cache_settings())
         from workers.worker import make_worker, run_chunks
 
         self._run_chunks = partial(run_chunks, make_worker(pickle.loads(self._spec)))

@@ -18,6 +18,7 @@ from functools import partial
 from typing import Any
 
 from es_service.protocol.wire import framed, receive
+from workers.xla_cache import xla_cache_settings
 
 PR_SET_PDEATHSIG = 1
 """Linux's `prctl` option that sets the signal sent to a process when its parent dies."""
@@ -60,6 +61,7 @@ def _descriptor(control: socket.socket) -> int | None:
 
 def _make_run_chunks(spec: Any) -> Callable[..., Any] | str:
     """Function that runs chunks, or the traceback of the error that prevented making it."""
+    os.environ.update(xla_cache_settings())
     try:
         from workers.worker import make_worker, run_chunks
 

@@ -24,6 +24,7 @@ from es_service.cli.options import (
     AddressOption,
     ConfigArgument,
     EngineOption,
+    LogLevelOption,
     OutOption,
     RunArgument,
     SeedOption,
@@ -81,6 +82,7 @@ def run(
     workers: WorkersOption = None,
     engine: EngineOption = None,
     address: AddressOption = None,
+    log_level: LogLevelOption = None,
     or_resume: Annotated[
         bool, typer.Option("--or-resume", help="Go on with the run if --out holds it already.")
     ] = False,
@@ -107,6 +109,7 @@ def resume(
     workers: WorkersOption = None,
     engine: EngineOption = None,
     address: AddressOption = None,
+    log_level: LogLevelOption = None,
 ) -> None:
     """Go on with a run; only budget, engine, workers and time limits may change."""
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
@@ -124,6 +127,7 @@ def fork(
     workers: WorkersOption = None,
     engine: EngineOption = None,
     address: AddressOption = None,
+    log_level: LogLevelOption = None,
 ) -> None:
     """Start a new run from another run's state, with changed settings."""
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
@@ -197,6 +201,7 @@ def evaluate(
     seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the fresh episodes.")] = 0,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Also write the rows to this CSV file.")] = None,
+    log_level: LogLevelOption = None,
 ) -> None:
     """Run fresh episodes of what a run has found, beside what it believed of it."""
     from es_service.cli.tables.evaluations import csv_file, print_evaluations

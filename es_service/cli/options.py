@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -12,6 +13,7 @@ from rich.console import Console
 from es_service.cli.commands import assignments, error_message
 from es_service.config.compute import ENGINE_IMPLIES
 from es_service.errors import ServiceError
+from es_service.logs import FORMAT
 
 console = Console()
 errors = Console(stderr=True)
@@ -27,6 +29,34 @@ WorkersOption = Annotated[int | None, typer.Option("--workers", help="Worker pro
 EngineOption = Annotated[str | None, typer.Option("--engine", help="What runs the workers: inline or ray.")]
 AddressOption = Annotated[
     str | None, typer.Option("--address", help="Ray cluster to join: HOST:PORT, or auto. Implies --engine ray.")
+]
+
+
+class _NoteHandler(logging.Handler):
+    """Prints a log record on stderr, above a live table if there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print_note(self.format(record))
+
+
+def _print_log(level: str | None) -> None:
+    """Print the log records of es_service from a level on; none without a level."""
+    if level is not None:
+        handler = _NoteHandler(level.upper())
+        handler.setFormatter(logging.Formatter(FORMAT))
+        log = logging.getLogger("es_service")
+        log.addHandler(handler)
+        log.setLevel(level.upper())
+
+
+LogLevelOption = Annotated[
+    Literal["debug", "info", "warning", "error"] | None,
+    typer.Option(
+        "--log-level",
+        callback=_print_log,
+        help="Print log records from this level up on stderr.",
+        show_default=False,
+    ),
 ]
 
 

@@ -7,6 +7,7 @@ introduces them to each other and puts the results in order.
 from __future__ import annotations
 
 import itertools
+import logging
 import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
@@ -17,8 +18,10 @@ from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, told_last_words, usual_chunk_s
 from es_service.errors import EvaluationError, Interrupted
+from es_service.logs import logger
 from es_service.protocol.messages import Centre, Chunk, ChunkResult, DispatchCounts, WorkItemId
 
+_LOG = logger(__name__)
 POLL_S = 0.1
 """Longest wait before a request to stop is noticed."""
 
@@ -199,9 +202,9 @@ class Engine(Generic[AnyTransport]):
         """Feed the scheduler and do as it says; whether it accepted a result."""
         self._state, commands = step(self._state, event, time.monotonic())
         if commands or not isinstance(event, events.Tick):
-            self._log(event)
+            self._tell(event)
         for command in commands:
-            self._log(command)
+            self._tell(command)
             match command:
                 case events.StartWorker(worker):
                     self.transport.start(worker)
@@ -213,3 +216,9 @@ class Engine(Generic[AnyTransport]):
         if self._state.failed is not None:
             raise EvaluationError(self._state.failed)
         return any(isinstance(command, events.Deliver) for command in commands)
+
+    def _tell(self, entry: events.Event | events.Command) -> None:
+        """Write an event or a command to the dispatch log and to `logging`, faults and losses at level INFO."""
+        self._log(entry)
+        is_rare = isinstance(entry, events.WorkerUp | events.WorkerLost | events.Failure | events.StopWorker)
+        _LOG.log(logging.INFO if is_rare else logging.DEBUG, "%s", entry)

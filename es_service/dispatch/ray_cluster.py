@@ -23,7 +23,9 @@ from typing import Any
 
 from es_service.config.compute import ENGINE_IMPLIES
 from es_service.errors import EvaluationError, Interrupted, WayOut
+from es_service.logs import logger
 
+_LOG = logger(__name__)
 OBJECT_STORE_BYTES = 200 * 2**20
 """Shared memory of a local Ray: a few centres and gradient blocks. Ray would take a third of the machine's."""
 CONNECT_S = 5.0
@@ -123,6 +125,7 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
                 ways_out=ways_out,
             ) from error
     _let_print(ray, False)
+    _LOG.info("joined a Ray cluster (%s), Ray %s", address or "one of our own on this machine", ray.__version__)
     return ray
 
 

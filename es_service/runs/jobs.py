@@ -7,6 +7,7 @@ forgets its jobs with their cluster, and nothing is lost: the same submission to
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import shlex
 import tempfile
@@ -24,9 +25,6 @@ from es_service.errors import ConfigError, EvaluationError, ServiceError, WayOut
 
 FOLDER = "es_service_run"
 """Key of a job's metadata: the run folder."""
-POLL_S = 1.0
-FOLLOWED_PER_S = 250_000
-"""Characters of a log that following it may ask for in a second: the cluster sends all of it whenever it is asked."""
 ENDED = ("SUCCEEDED", "FAILED", "STOPPED")
 STOP_S = 15.0
 """Longest wait for a stopped job to end; Ray kills it after three seconds."""
@@ -101,22 +99,19 @@ def _state(client: Any, job: str, address: str) -> str:
 def logs(job: str, address: str, *, follow: bool = False) -> Iterator[str]:
     """What a job has printed, in pieces; with `follow`, until it ends. Raises EvaluationError as `state`."""
     client = _client(address)
-    if not follow:
-        with _explained(address, job):
+    with _explained(address, job):
+        if not follow:
             yield client.get_job_logs(job)
-        return
-    printed, due_s = 0, time.monotonic()
-    while True:
-        ended = _state(client, job, address) in ENDED  # asked first, so that nothing printed after is missed
-        if ended or time.monotonic() >= due_s:
-            with _explained(address, job):
-                text = client.get_job_logs(job)
-            yield text[printed:]
-            printed = len(text)
-            due_s = time.monotonic() + printed / FOLLOWED_PER_S
-        if ended:
             return
-        time.sleep(POLL_S)
+        client.get_job_status(job)  # raises for a job that does not exist, which following would wait for
+        pieces = client.tail_job_logs(job)
+
+        async def next_piece() -> str | None:
+            return await anext(pieces, None)
+
+        with asyncio.Runner() as runner:  # Ray follows a log asynchronously only
+            while (piece := runner.run(next_piece())) is not None:
+                yield piece
 
 
 def stop(job: str, address: str) -> str:
@@ -154,8 +149,9 @@ def _client(address: str) -> Any:
                 WayOut("run", "run on the cluster without a job", settings={"compute.address": "HOST:PORT"}),
             ],
         ) from error
-    for name in ("ray.dashboard.modules.dashboard_sdk", "ray._private.runtime_env.packaging"):
-        logging.getLogger(name).setLevel(logging.WARNING)  # they would tell of each upload
+    for name in ("job.sdk", "dashboard_sdk"):
+        logging.getLogger(f"ray.dashboard.modules.{name}").setLevel(logging.WARNING)  # else a line for each request
+    logging.getLogger("ray._private.runtime_env.packaging").setLevel(logging.WARNING)
     with _explained(address):
         return JobSubmissionClient(address)
 

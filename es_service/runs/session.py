@@ -16,6 +16,7 @@ from es_service.dispatch.engine import Engine
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError, WayOut
+from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.parts import Arrays, moments_from_arrays
 from es_service.protocol.machine import computed_on, is_mixed, platform_info
@@ -28,6 +29,7 @@ from es_service.store.writer import RunStore
 from workers.actor import WorkerActor
 from workers.policy import initial_parameters
 
+_LOG = logger(__name__)
 LIMIT_NAMES = {
     "start_deadline_s": "half of compute.no_worker_timeout_s",
     "first_deadline_s": "compute.compile_timeout_s",
@@ -56,10 +58,14 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
     task = task_of(config)
     told = 0
 
+    def tell(notice: str) -> None:
+        _LOG.warning(notice)
+        on_notice(notice)
+
     def tell_notices() -> None:
         nonlocal told
         for notice in store.notices[told:]:
-            on_notice(notice)
+            tell(notice)
         told = len(store.notices)
 
     tell_notices()
@@ -71,6 +77,14 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
         algorithm=ALGORITHMS[config.search.algorithm](config),
         initial=lambda: _initial(config, store),
         task=task,
+    )
+    in_generation(0 if store.generation is None else store.generation + 1)
+    _LOG.info(
+        "working on %s: engine %s, %d workers, rollout %s",
+        store.folder,
+        config.compute.engine,
+        worker_count(config),
+        config.compute.rollout,
     )
     with (
         _naming_the_run(store.folder),
@@ -84,10 +98,19 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
             tell_notices()
             if lost := row["lost_workers"]:
                 who = "a worker" if lost == 1 else f"{lost} workers"
-                on_notice(f"generation {row['generation']}: lost {who}; {engine.last_loss}")
+                tell(f"generation {row['generation']}: lost {who}; {engine.last_loss}")
             on_generation(row)
+            _LOG.info(
+                "centre fitness %.6g, best %.6g, env steps %d, steps/s %.3g",
+                row["centre_fitness_mean"],
+                row["best_fitness"],
+                row["env_steps"],
+                row["steps_per_second"],
+            )
+            in_generation(row["generation"] + 1)
 
-        _, reason = driver.run(search, engine, _OnPlatforms(store, engine, on_notice), state, after_generation)
+        _, reason = driver.run(search, engine, _OnPlatforms(store, engine, tell), state, after_generation)
+        _LOG.info("the session ends: %s", reason)
     return Outcome(open_run(store.folder), reason)
 
 

@@ -8,10 +8,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from es_service.logs import logger
 from es_service.store.folder import COPY, DATABASE, is_disk_full
 from es_service.store.repair import make_copy
 from es_service.store.schema import Damaged
 
+_LOG = logger(__name__)
 LOCAL_COPY_INTERVAL_S = 180.0
 NETWORK_COPY_INTERVAL_S = 10.0
 COPY_TIME_FRACTION = 0.02
@@ -99,6 +101,7 @@ class Upkeep:
             self._notice(f"could not refresh {COPY}; the former one, if any, stays", error)
         self._copied_at = time.monotonic()
         self._copy_seconds = self._copied_at - start
+        _LOG.debug("%s: copying took %.3f s", self._folder / COPY, self._copy_seconds)
 
     def _notice(self, what: str, error: Exception) -> None:
         full = not isinstance(error, Damaged) and is_disk_full(error, self._folder)

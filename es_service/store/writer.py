@@ -19,6 +19,7 @@ from typing import Any, Self
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
+from es_service.logs import logger
 from es_service.store.beginning import Beginning, load_start
 from es_service.store.codec import (
     Part,
@@ -42,6 +43,7 @@ from es_service.store.verify import rows_in_force
 
 Values = Mapping[str, int | float | None]
 """One history row by column name; NaN or None for no value."""
+_LOG = logger(__name__)
 NOTHING = Beginning()
 """The beginning of an ordinary run."""
 
@@ -190,6 +192,7 @@ class RunStore:
             self._kept.setdefault(part, {})[at] = sha256
         self._doubled = list(old)
         self._hook("after_commit")
+        _LOG.debug("stored generation %d: %d parts", generation, len(payloads))
         self.upkeep.after_commit(sum(map(len, payloads.values())) + 4 * PAGE_BYTES)
 
     def last_history(self) -> dict[str, int | float] | None:

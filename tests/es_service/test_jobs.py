@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import AsyncIterator
 from types import SimpleNamespace
 
 import pytest
@@ -65,9 +66,8 @@ def test_where_nothing_answers_the_error_says_what_to_check():
 class Cluster:
     """Ray's client, for a job that ends after a while, and a clock that only sleeping moves."""
 
-    def __init__(self, monkeypatch, ends_s: float, per_s: int = 0) -> None:
-        self.now_s, self.ends_s, self.per_s = 0.0, ends_s, per_s
-        self.clients = self.sent = 0
+    def __init__(self, monkeypatch, ends_s: float) -> None:
+        self.now_s, self.ends_s, self.clients = 0.0, ends_s, 0
         clock = SimpleNamespace(monotonic=lambda: self.now_s, sleep=self.sleep)
         monkeypatch.setattr(jobs, "time", clock)
         monkeypatch.setattr(jobs, "_client", self.client)
@@ -82,27 +82,21 @@ class Cluster:
     def get_job_status(self, job: str) -> SimpleNamespace:
         return SimpleNamespace(value="RUNNING" if self.now_s < self.ends_s else "STOPPED")
 
-    def get_job_logs(self, job: str) -> str:
-        text = "".join(f"{line:9}\n" for line in range(int(self.now_s * self.per_s) // 10))
-        self.sent += len(text)
-        return text
-
     def stop_job(self, job: str) -> None:
         pass
 
-
-def test_following_a_long_log_does_not_send_all_of_it_every_second(monkeypatch):
-    cluster = Cluster(monkeypatch, ends_s=100.0, per_s=20_000)
-    pieces = list(jobs.logs("job", "http://head:8265", follow=True))
-    assert cluster.now_s == 100.0
-    assert "".join(pieces) == cluster.get_job_logs("job")
-    assert len(pieces) > 20
-    assert cluster.sent <= 100.0 * jobs.FOLLOWED_PER_S
+    async def tail_job_logs(self, job: str) -> AsyncIterator[str]:
+        for piece in ("one\n", "two\n"):
+            yield piece
+        raise RuntimeError("the connection closed")
 
 
-def test_a_short_log_is_followed_every_second(monkeypatch):
-    Cluster(monkeypatch, ends_s=10.0, per_s=10)
-    assert len(list(jobs.logs("job", "http://head:8265", follow=True))) == 11
+def test_a_log_is_followed_piece_by_piece_and_a_lost_connection_is_told(monkeypatch):
+    Cluster(monkeypatch, ends_s=10.0)
+    pieces = jobs.logs("job", "http://head:8265", follow=True)
+    assert [next(pieces), next(pieces)] == ["one\n", "two\n"]
+    with pytest.raises(EvaluationError, match="request to http://head:8265 failed: the connection closed"):
+        next(pieces)
 
 
 def test_a_job_is_stopped_and_waited_for_over_one_connection(monkeypatch):

@@ -178,6 +178,7 @@ def test_a_job_is_submitted_followed_stopped_and_goes_on_in_another_cluster(tmp_
         assert f"es-service resume {run}" in printed
         for arguments, message in (
             (("logs", "es-nothing"), "there is no job es-nothing on"),
+            (("logs", "es-nothing", "--follow"), "there is no job es-nothing on"),
             (("stop", "es-nothing"), "there is no job es-nothing on"),
             (("submit", config, "--out", "runs/x"), "the run folder runs/x must be absolute"),
         ):
@@ -206,6 +207,10 @@ def test_a_job_is_submitted_followed_stopped_and_goes_on_in_another_cluster(tmp_
         job = submit(hosts, "--set", f"budget.generations={reached + 20}")
         code, printed = es(hosts, "logs", job, "--follow")
         assert code == 0, printed
+        assert printed.count("Running entrypoint") == 1, "nothing is sent twice"
+        assert f"es-service digest {run}" in printed, "the end of the log is there too"
+        assert "WebSocket" not in printed
+        assert printed.endswith(f"{job} succeeded\n")
         print(f"head lost: {time.time() - lost_at:.1f} s to the end of the run in a new cluster")
     assert digest_parts(run) == inline_digest(tmp_path / "inline", CONFIG, reached + 20)
 

@@ -1,0 +1,45 @@
+"""Where XLA keeps compiled rollouts on disk, so that only the first worker process of a machine compiles them.
+
+Only processes with a worker's environment use it: with another number of threads XLA compiles other code, and JAX's
+key for an entry does not contain that number.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from pathlib import Path
+
+from workers.simd.backend.cache import cache_folder
+
+MOST_BYTES = 200 * 2**20
+"""Size above which JAX removes the least recently used entries."""
+
+
+def xla_cache_settings() -> dict[str, str]:
+    """Environment variables that make JAX use the cache, if set before it is imported; none where there is no folder
+    that belongs to this user alone."""
+    kernels = cache_folder()
+    if kernels is None:
+        return {}
+    folder = kernels.with_name("xla") / _processor()
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        seen = folder.stat()
+    except OSError:
+        return {}
+    if seen.st_uid != os.geteuid() or stat.S_IMODE(seen.st_mode) & 0o022:
+        return {}  # somebody else could put code there
+    return {
+        "JAX_COMPILATION_CACHE_DIR": str(folder),
+        "JAX_COMPILATION_CACHE_MAX_SIZE": str(MOST_BYTES),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
+    }
+
+
+def _processor() -> str:
+    """A name for processors that run the same machine code: JAX's key does not contain what this one can do."""
+    lines = Path("/proc/cpuinfo").read_text().split("\n\n", 1)[0].splitlines()
+    features = [line for line in lines if line.startswith(("vendor_id", "cpu family", "model\t", "flags"))]
+    return hashlib.sha256("\n".join(features).encode()).hexdigest()[:16]
