@@ -72,7 +72,7 @@ def measure(
             call = _without_policy(environment, shape, states, rollout)
         call(0)  # the first call compiles
     except (UnsupportedError, NoVectorsError) as error:
-        return {"problem": str(error.__cause__ or error)}  # the cause says it without advice for a run
+        return {"problem": str(error.__cause__ or error)}  # the message of the cause contains no advice about runs
     ready = time.perf_counter()
     steps = calls = 0
     while (now := time.perf_counter()) - ready < seconds or calls == 0:

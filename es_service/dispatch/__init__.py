@@ -1,1 +1,1 @@
-"""Work items to workers and back: a scheduler that is a pure state machine, and the engines that feed it."""
+"""Sending work items to workers and receiving their results: the scheduler, a pure state machine, and the engines."""

@@ -1,9 +1,9 @@
-"""Who gets which work item, and by when it must have answered.
+"""Assignment of work items to workers, and the deadlines of these items. `scheduler.step` uses it.
 
-A part of `scheduler.step`. Idle workers come first, then those that have room for another item behind the one they run.
-A work item that raised waits for another worker rather than go back to the same one, as long as another is up: a broken
-worker that raises at once must not use up the attempts of good items. The clock of a work item starts when its worker
-begins it; one that compiles, or whose usual duration is not known, has longer.
+Idle workers are served first, then workers that can take another item behind the one they run. A work item that failed
+on a worker is not assigned to that worker again while another worker is up: otherwise a broken worker that fails at
+once would use up the attempts of good items. The time of a work item counts from when its worker begins it. A longer
+limit applies if the worker must compile for it, or if its usual duration is not known yet.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from es_service.dispatch.scheduler_state import SchedulerState, Slot, Worker, us
 
 
 def assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
-    """Give queued items to workers with room, idle ones first; changes the containers of `s`, which are this step's."""
+    """Assign queued items to workers that can take more, idle workers first; this changes the containers of `s`."""
     retries = s.retries
     for load in range(s.limits.in_flight):
         if not s.queue:
@@ -37,7 +37,7 @@ def assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
 
 
 def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worker:
-    """The worker with the clock of its first slot started, and how long that may take."""
+    """The worker with the start time and the deadline of its first slot."""
     if not worker.slots:
         return worker._replace(deadline_s=math.inf)
     item, limits = worker.slots[0].item, state.limits
@@ -50,7 +50,7 @@ def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worke
 
 
 def _next_for(state: SchedulerState, worker: int) -> int | None:
-    """Index of the first queued item that a worker may have."""
+    """Index in the queue of the first item that may be assigned to a worker, or None."""
     for index, item_id in enumerate(state.queue):
         if state.items[item_id].last_holder != worker or len(state.up) == 1:
             return index

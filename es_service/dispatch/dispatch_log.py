@@ -1,7 +1,7 @@
-"""The dispatch log: everything a run's scheduler was told and has ordered, for finding out what happened in a night.
+"""The dispatch log: all events and commands of a run's scheduler, for finding out afterwards what happened.
 
-One JSON object per line in `dispatch.jsonl` of the run folder, appended by every session of the run. Written with
-`compute.dispatch_log: true` only; a short generation makes about a hundred lines.
+It is the file `dispatch.jsonl` in the run folder, with one JSON object per line, to which every session of the run
+appends. It is written only with `compute.dispatch_log: true`; a short generation adds about a hundred lines.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ FILE = "dispatch.jsonl"
 
 @dataclass(frozen=True)
 class Session:
-    """A driver has begun to work on the run."""
+    """Log entry: a driver has started to work on the run."""
 
     after_generation: int | None
-    """Newest committed generation; None before the first."""
+    """Newest committed generation; None if there is none."""
     host: str
     pid: int
 
 
 @dataclass(frozen=True)
 class Committed:
-    """A generation is safe in the store."""
+    """Log entry: a generation has been committed to the store."""
 
     generation: int
 
@@ -43,14 +43,17 @@ Log = Callable[[Event | Command | Session | Committed], None]
 
 
 def no_log(entry: Event | Command | Session | Committed) -> None:
-    """Keep nothing."""
+    """Log that keeps nothing."""
 
 
 @contextmanager
 def dispatch_log(folder: Path, after_generation: int | None, *, enabled: bool) -> Iterator[Log]:
-    """A log that appends to the run folder's file, beginning with a `Session`; or one that keeps nothing.
+    """Context manager with a log that appends to the run folder's file, or one that keeps nothing if not `enabled`.
 
-    Raises StoreError, here or when it is told something, if that cannot be written.
+    The first entry is a `Session`.
+
+    Raises:
+        StoreError: the file cannot be opened, or an entry cannot be written, which the log itself raises.
     """
     if not enabled:
         yield no_log
@@ -72,11 +75,11 @@ def dispatch_log(folder: Path, after_generation: int | None, *, enabled: bool) -
             append(json.dumps(line, default=_plain).encode())
 
         if file.tell():
-            append(b"")  # ends a line that a full disk or a kill cut short
+            append(b"")  # end a line that a full disk or a killed process may have left incomplete
         write(Session(after_generation, socket.gethostname(), os.getpid()))
         yield write
 
 
 def _plain(value: Any) -> Any:
-    """What JSON has no form for: a work item is its id."""
+    """Text of a value that JSON cannot represent; a work item is represented by its id."""
     return value.id if isinstance(value, WorkItem) else str(value)

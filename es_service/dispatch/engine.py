@@ -1,7 +1,7 @@
-"""The engine: carries scheduler commands to workers and their messages back, over whatever transport.
+"""The engine: carries out the scheduler's commands on workers and passes the workers' messages to the scheduler.
 
-Dispatch station, between the driver and a transport. The scheduler decides, the transport moves bytes; this loop only
-introduces them to each other and puts the results in order.
+It stands between the driver and a transport. The scheduler decides what to do, and the transport sends and receives;
+the engine connects the two and puts the results in order.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from es_service.protocol.messages import Centre, Chunk, ChunkResult, DispatchCou
 
 _LOG = logger(__name__)
 POLL_S = 0.1
-"""Longest wait before a request to stop is noticed."""
+"""Longest time in seconds until a request to stop is noticed."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A worker has run the chunks of a work item: the event `Result` with what it stands for."""
+    """Message that a worker has run the chunks of a work item: the event `Result` with the results."""
 
     worker: int
     item_id: Hashable
@@ -39,50 +39,50 @@ class Answer:
 Message = (
     events.Placed | events.WorkerUp | events.WorkerLost | events.Failure | events.Drain | events.SetWorkers | Answer
 )
-"""What a transport reports: the scheduler's own events, and answers."""
+"""Messages of a transport: events of the scheduler, and answers."""
 
 
 class Transport(Protocol):
-    """Workers somewhere, by id. Called from one thread; no call waits for what a worker is doing.
+    """Interface to workers, which have ids. It is used from one thread, and no call waits for the work of a worker.
 
-    No call raises because of a worker: whatever goes wrong with one, starting it included, is a `WorkerLost`.
+    No call raises because of a worker: any problem with a worker, also at its start, is reported as `WorkerLost`.
     """
 
     def start(self, worker: int) -> None:
-        """Begin to start a worker; `WorkerUp` or `WorkerLost` follows, and before that, if it has to wait for a place,
-        `Placed`."""
+        """Begin to start a worker. `WorkerUp` or `WorkerLost` follows; `Placed` comes first if the worker must wait for
+        a place."""
         ...
 
     def kill(self, worker: int) -> str:
-        """Kill a worker for good and free what it held; nothing happens if it is gone. What its process wrote last,
-        where that is at hand; else an empty text.
+        """Kill a worker and free its resources, and return the last output of its process.
 
-        Messages of a killed worker may still be received (that it is lost, too): the scheduler has forgotten it and
-        drops them, so a transport need not look for them.
+        The text is empty if the output is not available. Nothing happens if the worker is gone already. Messages of a
+        killed worker may still be received, including `WorkerLost`; the scheduler ignores them.
         """
         ...
 
     def send(self, worker: int, centre: Centre, item_id: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
-        """Have a worker that is up run the chunks around the centre, behind those it was sent before."""
+        """Send chunks and their centre to a worker that is up; it runs them after those that it was sent before."""
         ...
 
     def platforms(self) -> frozenset[str]:
-        """`machine.platform_text` of each kind of worker that has come up; of none that is this process's own."""
+        """`machine.platform_text` of each kind of worker that has come up; empty if workers share this machine and its
+        packages."""
         ...
 
     def silent(self) -> tuple[int, ...]:
-        """Workers without a place yet, and those that may have been gone when they were sent what they should run."""
+        """Workers that have no place yet, and workers that may have been gone before they received their work item."""
         ...
 
     def receive(self, timeout_s: float) -> Message | None:
-        """The next message, each worker's in order; None if none comes in `timeout_s` (0: if none is there).
+        """The next message, or None if none arrives within `timeout_s` seconds; messages of one worker are in order.
 
-        A worker reported lost is gone for good: no `kill` need follow.
+        A worker that is reported lost is gone: `kill` is not needed.
         """
         ...
 
     def close(self) -> None:
-        """Kill all workers and wait for them to end; those in a cluster that was joined end soon after."""
+        """Kill all workers and wait until they have ended; in a cluster that was joined they end shortly afterwards."""
         ...
 
 
@@ -90,8 +90,16 @@ AnyTransport = TypeVar("AnyTransport", bound=Transport)
 
 
 def item_sizes(chunks: int, workers: int, chunk_s: float | None, item_s: float) -> list[int]:
-    """How many neighbouring chunks make each item: about as many as take `item_s`, one while `chunk_s`, what one takes,
-    is not known; equal numbers, and of items as many for each worker."""
+    """Number of chunks in each work item.
+
+    A work item takes about `item_s` seconds, sizes differ by at most one, and each worker gets equally many items.
+
+    Args:
+        chunks: number of chunks to divide.
+        workers: number of workers.
+        chunk_s: seconds that one chunk takes; None if unknown, which makes one chunk per work item.
+        item_s: seconds that a work item should take.
+    """
     most = 1 if chunk_s is None else max(1, int(item_s / max(chunk_s, 1e-9)))
     rounds = -(-chunks // (most * workers))
     count = min(chunks, rounds * workers)
@@ -99,7 +107,7 @@ def item_sizes(chunks: int, workers: int, chunk_s: float | None, item_s: float) 
 
 
 class Engine(Generic[AnyTransport]):
-    """An Evaluator. Use as a context manager: leaving it closes it, and the workers hold nothing."""
+    """Evaluator that runs chunks on the workers of a transport. As a context manager, it closes itself at the end."""
 
     def __init__(
         self,
@@ -108,12 +116,14 @@ class Engine(Generic[AnyTransport]):
         should_stop: Callable[[], int | None] = lambda: None,
         log: Log = no_log,
     ) -> None:
-        """Start `limits.workers` workers; if that raises, as the log may, the transport is closed.
+        """Start `limits.workers` workers. If this raises, which the log can cause, the transport is closed.
 
         Args:
-            transport: belongs to the engine from now on, which closes it.
-            should_stop: asked at least every POLL_S while waiting; a signal number makes `evaluate` raise Interrupted.
-            log: told every event and every command, in the order in which they happen.
+            transport: the workers. The engine owns the transport and closes it.
+            limits: number of workers, deadlines and numbers of attempts.
+            should_stop: called at least every POLL_S seconds while waiting. If it returns a signal number, `evaluate`
+                raises Interrupted.
+            log: called with every event and every command, in their order.
         """
         self.transport = transport
         self._should_stop = should_stop
@@ -131,30 +141,32 @@ class Engine(Generic[AnyTransport]):
 
     @property
     def last_loss(self) -> str:
-        """Which worker was lost last, and why."""
+        """Text that names the worker lost last, and the reason."""
         return self._state.last_loss
 
     @property
     def platforms(self) -> frozenset[str]:
-        """Kinds of workers so far; see `Transport.platforms`."""
+        """Platforms of the workers so far; see `Transport.platforms`."""
         return self.transport.platforms()
 
     @property
     def counts(self) -> DispatchCounts:
-        """Faults survived so far."""
+        """Numbers of workers and of faults so far."""
         state = self._state
         return DispatchCounts(retries=state.retries, lost_workers=state.lost_workers, workers=state.wanted)
 
     def evaluate(self, centre: Centre, chunks: Sequence[Chunk]) -> list[ChunkResult]:
-        """Results in the order of `chunks`, however many workers there are and whatever happens to them.
+        """Results of chunks, all of one kind, around a centre, in the order of `chunks`.
+
+        They do not depend on the number of workers or on faults. After an exception, only `close` may be called.
 
         Raises:
-            EvaluationError: a chunk that fails everywhere, workers that do not start. Interrupted: asked to stop.
-                After either, `close` is all that is left to do.
+            EvaluationError: a work item failed in all its attempts, or no worker starts.
+            Interrupted: a stop was requested.
         """
         while (message := self.transport.receive(0.0)) is not None:
-            # A worker known to be lost gets no chunk. One lost unseen, as idle actors are, may: that is blamed on a
-            # chunk once, since all the others are then asked first.
+            # A worker that is known to be lost gets no chunk. One whose loss is not known yet, such as an idle actor,
+            # may get one. Only one work item is charged for that, since all other workers are then asked first.
             self._handle(message)
         self._phase += 1
         parts = self._parts(chunks)
@@ -166,12 +178,12 @@ class Engine(Generic[AnyTransport]):
             wait_s = min(POLL_S, max(0.0, next_deadline(self._state) - time.monotonic()))
             if (message := self.transport.receive(wait_s)) is not None:
                 self._handle(message)
-            else:  # only now: a late look at the clock must not kill workers whose answers were waiting
+            else:  # check deadlines only if no message waits, or a late check would kill workers that have answered
                 self._step(events.Tick(self.transport.silent()))
         return [result for item_id, _ in parts for result in self._results.pop(item_id)]
 
     def close(self) -> None:
-        """Kill all workers and wait for them to end; those in a cluster that was joined end soon after."""
+        """Kill all workers and wait until they have ended; in a cluster that was joined they end shortly afterwards."""
         self.transport.close()
 
     def __enter__(self) -> Self:
@@ -181,7 +193,7 @@ class Engine(Generic[AnyTransport]):
         self.close()
 
     def _parts(self, chunks: Sequence[Chunk]) -> list[tuple[WorkItemId, Sequence[Chunk]]]:
-        """Chunks, all of one kind, as they are to travel. What is known of their duration never changes a result."""
+        """Work items of chunks, all of one kind. Their sizes depend on measured durations, but results do not."""
         if not chunks:
             return []
         kind, limits = type(chunks[0]).__name__, self._state.limits
@@ -199,7 +211,7 @@ class Engine(Generic[AnyTransport]):
             self._results[message.item_id] = message.results
 
     def _step(self, event: events.Event) -> bool:
-        """Feed the scheduler and do as it says; whether it accepted a result."""
+        """Pass an event to the scheduler and carry out its commands; returns whether it accepted a result."""
         self._state, commands = step(self._state, event, time.monotonic())
         if commands or not isinstance(event, events.Tick):
             self._tell(event)

@@ -1,4 +1,4 @@
-"""What the scheduler and its engines say to each other: work items, limits, events in, commands out."""
+"""Data exchanged between the scheduler and an engine: work items, limits, events to the scheduler and its commands."""
 
 from __future__ import annotations
 
@@ -8,53 +8,56 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class WorkItem:
-    """What travels to a worker and back: chunks of one kind. Two items with the same id must have the same result."""
+    """Chunks of one kind that are sent to a worker together. Items with the same id must have the same result."""
 
     id: Hashable
     kind: str
-    """Tasks of one kind compile together and take about equally long, each in proportion to its size."""
+    """Work items of one kind use the same compiled functions, and take times in proportion to their sizes."""
     size: int = 1
-    """Chunks in it."""
+    """Number of chunks."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How work is handed out and faults are handled: config data. Raises ValueError for a count below 1."""
+    """Settings for the assignment of work and the handling of faults. Raises ValueError for a count below 1."""
 
     workers: int
-    """Workers wanted at the start; `SetWorkers` changes it."""
+    """Workers wanted at the start; `SetWorkers` changes this number."""
     in_flight: int = 2
-    """Tasks assigned to one worker at a time: the one it runs and those prefetched behind it."""
+    """Work items assigned to one worker at a time: the one that it runs, and those that wait behind it."""
     item_s: float = 0.03
-    """Chunks that take less travel together, as many as take this long: with Ray a message costs two milliseconds of a
-    core. What a lost worker had in hand, and what others wait for in the end, remain little."""
+    """Time that a work item should take. Shorter chunks are sent together, because with Ray a message costs two
+    milliseconds of a core. It is short, so that little work is lost with a worker or waited for at the end."""
     max_attempts: int = 4
-    """A work item that raised, or lost the worker running it, this often is poison. Keep above
-    `max_failures_in_a_row`, so that a single broken worker is replaced before its item is blamed."""
+    """Number of faults of one work item after which the run fails. A fault is an exception, or the loss of the worker
+    that ran the item. It should be above `max_failures_in_a_row`, so that a single broken worker is replaced first."""
     start_deadline_s: float = 120.0
-    """For a worker to come up, counted anew once it has a place."""
+    """Longest time in which a worker must come up, counted again from when it has a place."""
     first_deadline_s: float = 600.0
-    """For the first item of a kind on a worker, which compiles, and for any item while no duration is known; or what
-    later ones may take, if that is longer."""
+    """Longest time for a worker's first item of a kind, which includes compiling, and for any item while its usual
+    duration is not known. If the limit for later items is longer, that limit applies."""
     min_deadline_s: float = 30.0
+    """Lower bound of the limit for later items."""
     deadline_factor: float = 5.0
     """Later items may take max(min_deadline_s, deadline_factor x size x median of recent durations of their kind)."""
     max_failures_in_a_row: int = 3
-    """A worker that raises this often in a row is killed and replaced."""
+    """Number of consecutive exceptions after which a worker is killed and replaced."""
     restart_backoff_s: float = 1.0
+    """Wait before the second of consecutive losses is replaced; it doubles with each further loss until a result is
+    delivered. The first loss is replaced at once, and losses during a wait share it, such as all those of a node."""
     max_backoff_s: float = 60.0
-    """Wait before replacing the second, third ... loss without a success between: restart_backoff_s, doubling up to
-    max_backoff_s. The first replacement is immediate; losses during a wait share it (a node that died, say)."""
+    """Upper bound of this wait."""
     max_start_failures: int = 3
-    """This many consecutive attempts to start workers that failed, and none up meanwhile: the environment is broken.
-    All workers that were started before the first of them was lost are one attempt."""
+    """Number of consecutive failed attempts to start workers, with no worker up, after which the run fails. All workers
+    that were started before the first of them was lost count as one attempt."""
     no_worker_timeout_s: float = 300.0
-    """Longest time with items waiting and no worker up; longer than `start_deadline_s` to be of any use."""
+    """Longest time in which work items wait and no worker is up. It only has an effect if it is longer than
+    `start_deadline_s`."""
     names: Mapping[str, str] = field(default_factory=dict)
-    """What messages call a limit, so that a user knows what to change: field -> name; others are called as they are."""
+    """Field -> its name in messages, by which a user can change it; other fields keep their own names."""
 
     def name_of(self, limit: str) -> str:
-        """What messages call a field of this class."""
+        """Name of a field in messages."""
         return self.names.get(limit, limit)
 
     def __post_init__(self) -> None:
@@ -63,43 +66,44 @@ class Limits:
                 raise ValueError(f"{name} ({getattr(self, name)}) must be at least 1")
 
 
-# Events: what an engine reports.
+# Events, which an engine reports.
 
 
 @dataclass(frozen=True)
 class Submit:
-    """New items, to be assigned in this order. Raises ValueError for an id that still waits."""
+    """New work items, to be assigned in this order. `step` raises ValueError if an id has not been delivered yet."""
 
     items: tuple[WorkItem, ...]
 
 
 @dataclass(frozen=True)
 class Placed:
-    """The worker, which had to wait for a place, has one and can begin to come up."""
+    """A worker that waited for a place has one and begins to come up."""
 
     worker: int
 
 
 @dataclass(frozen=True)
 class WorkerUp:
-    """The worker can take items."""
+    """A worker has come up and can be assigned work items."""
 
     worker: int
 
 
 @dataclass(frozen=True)
 class WorkerLost:
-    """The worker is gone, whether it ever came up or not."""
+    """A worker is gone, whether it had come up or not."""
 
     worker: int
     reason: str
     bystander: bool = False
-    """Whether it was lost with another, or before it had what it was sent: then that is not to blame."""
+    """Whether it was lost together with another worker, or before it received its work item; the item is then not
+    charged with the loss."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """The worker answered; the engine holds the result until this step says `Deliver` or says nothing."""
+    """A worker has answered a work item. The engine keeps the result if the step commands `Deliver`, else drops it."""
 
     worker: int
     item_id: Hashable
@@ -108,7 +112,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Failure:
-    """The item raised; the worker lives."""
+    """A work item raised an exception; the worker is still alive."""
 
     worker: int
     item_id: Hashable
@@ -118,23 +122,23 @@ class Failure:
 
 @dataclass(frozen=True)
 class Tick:
-    """Time has passed."""
+    """Time has passed, so deadlines are checked."""
 
     silent: tuple[int, ...] = ()
-    """Workers without a place yet, and those that may have been gone already when they were sent what they should be
-    doing: if they do not answer in time, neither they nor what they were sent is to blame."""
+    """Workers that have no place yet, and workers that may have been gone before they received their work item. If one
+    misses a deadline, its work item is not charged; a worker that has no place does not count as lost."""
 
 
 @dataclass(frozen=True)
 class Drain:
-    """The worker gets no new item, finishes those it has, and is stopped; it is replaced now, without blame."""
+    """A worker is to finish its work items, get no others and then be stopped. It is replaced now; this is no fault."""
 
     worker: int
 
 
 @dataclass(frozen=True)
 class SetWorkers:
-    """Change the wanted number of workers; shrinking drains the newest. Raises ValueError below 1."""
+    """The wanted number of workers changes; if it shrinks, the newest are drained. `step` raises ValueError below 1."""
 
     workers: int
 
@@ -142,19 +146,19 @@ class SetWorkers:
 Event = Submit | Placed | WorkerUp | WorkerLost | Result | Failure | Tick | Drain | SetWorkers
 
 
-# Commands: what an engine must do, in the order given.
+# Commands, which an engine must carry out in the order given.
 
 
 @dataclass(frozen=True)
 class StartWorker:
-    """Start a worker under this id; ids increase and are never used again."""
+    """Start a worker with this id; ids increase and are never used again."""
 
     worker: int
 
 
 @dataclass(frozen=True)
 class StopWorker:
-    """Kill the worker. Reporting it lost afterwards is allowed and changes nothing."""
+    """Kill a worker. It may be reported lost afterwards, which has no effect."""
 
     worker: int
     reason: str
@@ -162,7 +166,7 @@ class StopWorker:
 
 @dataclass(frozen=True)
 class Assign:
-    """Send the item to the worker, behind those it has. `attempt` is 1 + the faults charged to the item so far."""
+    """Send a work item to a worker, behind those it has. `attempt` is 1 + the number of the item's faults so far."""
 
     worker: int
     item_id: Hashable
@@ -171,14 +175,14 @@ class Assign:
 
 @dataclass(frozen=True)
 class Deliver:
-    """Accept the result just reported; once per submitted item."""
+    """Accept the result that was just reported; this happens once for each submitted item."""
 
     item_id: Hashable
 
 
 @dataclass(frozen=True)
 class Fail:
-    """The run stops with this error; only `StopWorker` follows, one for every worker left."""
+    """Stop the run with this error message; only `StopWorker` follows, for each remaining worker."""
 
     message: str
 
@@ -187,5 +191,5 @@ Command = StartWorker | StopWorker | Assign | Deliver | Fail
 
 
 def with_last_words(reason: str, last_words: str) -> str:
-    """The reason of a loss, with what the process wrote before it was killed, if anything."""
-    return f"{reason}; its process had written:\n{last_words}" if last_words else reason
+    """The reason of a loss, followed by the last output of the process if there is any."""
+    return f"{reason}; the last output of its process:\n{last_words}" if last_words else reason

@@ -1,8 +1,8 @@
-"""The inline engine: workers are child processes of this one, or threads of one child, talked to over sockets.
+"""The inline engine: workers are child processes of this process, or threads of one child, connected by sockets.
 
-Children are started by exec with fixed settings (one XLA thread, CPU), never forked, so whatever the caller has done
-with JAX changes nothing; that is why threads are not this process's own. There are no threads here either: sockets are
-polled, and neither a child that is stopped in mid-message nor one that does not read can block anybody.
+Children are started by exec with fixed settings (one XLA thread, CPU) and never forked, so the caller's use of JAX has
+no effect on them. For the same reason, workers are never threads of this process. The engine itself has no threads
+either: it polls the sockets, so a child that stops in the middle of a message or does not read cannot block it.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from es_service.protocol.process_environment import child_environment
 from es_service.protocol.wire import BUFFER_BYTES, Channel, framed
 
 PIECE_S = 0.1
-"""Longest wait for the next piece of a message that has begun to come."""
+"""Longest wait in seconds for the next part of a message whose beginning has been received."""
 LAST_WORDS_BYTES = 2000
-"""At most this many bytes of a lost worker's output are read and reported: it may have been writing for days."""
+"""At most this many bytes of a lost worker's output are read and reported, since it may have been writing for days."""
 
 
 def inline_engine(
@@ -43,37 +43,44 @@ def inline_engine(
     threads: bool = False,
     log: Log = no_log,
 ) -> Engine[ChildProcesses]:
-    """An Evaluator on this machine, its `limits.workers` workers starting.
+    """Engine with `limits.workers` workers on this machine, which are starting.
 
     Args:
-        threads: of one child, instead of a child each: less memory, and one that is lost takes the others with it.
+        spec: constants of the run.
+        limits: number of workers, deadlines and numbers of attempts.
+        should_stop: as in `Engine`.
+        threads: whether workers are threads of one child instead of a child each. They take less memory, but if one
+            worker is lost, all are lost.
+        log: as in `Engine`.
     """
     return Engine(ChildProcesses(spec, threads=threads), limits, should_stop, log)
 
 
 @dataclass(eq=False)
 class _Child:
-    """One process, of one worker or of all."""
+    """A child process of one worker, or of all workers if they are threads."""
 
     process: subprocess.Popen[bytes]
     log: IO[bytes]
-    """What it wrote to stdout and stderr."""
+    """File with the child's output on stdout and stderr."""
     control: socket.socket
-    """Over which it is given the sockets of its workers."""
+    """Socket over which the child receives the sockets of its workers."""
 
 
 @dataclass(eq=False)
 class _Worker:
+    """A worker that is not known to be lost."""
+
     child: _Child
     channel: Channel
     centre: Centre | None = None
-    """The one it was sent last."""
+    """Centre that it was sent last."""
     unanswered: int = 0
-    """Tasks that it was sent and has not answered."""
+    """Number of work items that it was sent and has not answered."""
 
 
 class ChildProcesses:
-    """A Transport whose workers are child processes, or threads of one."""
+    """Transport whose workers are child processes, or threads of one child process."""
 
     def __init__(self, spec: WorkerSpec, *, threads: bool = False) -> None:
         self._spec, self._threads = framed(spec), threads
@@ -84,18 +91,18 @@ class ChildProcesses:
         self._centre: tuple[Centre | None, bytes] = None, b""
 
     def process_ids(self) -> dict[int, int]:
-        """Worker id -> process id of the children not known to be dead; for diagnosis and for tests that kill them."""
+        """Worker id -> process id, for the workers that are not known to be lost; for diagnosis and tests."""
         return {number: worker.child.process.pid for number, worker in self._workers.items()}
 
     def start(self, worker: int) -> None:
-        """Start a child and tell it the constants of the run; or have the one that there is start a thread."""
+        """Start a child and send it the constants of the run; or have the existing child start another thread."""
         with ExitStack() as undo:
             try:
                 ours, theirs = map(undo.enter_context, _socket_pair())
                 running = next(iter(self._workers.values()), None) if self._threads else None
                 child = running.child if running is not None else _start_child(self._spec, undo)
                 socket.send_fds(child.control, [b"w"], [theirs.fileno()])
-            except OSError as error:  # no process, no file descriptor or no disk space to be had; or it has just ended
+            except OSError as error:  # no more processes, file descriptors or disk space, or the child has just ended
                 self._ready.append(WorkerLost(worker, f"worker {worker} cannot be started: {error}"))
                 return
             undo.pop_all()
@@ -103,17 +110,20 @@ class ChildProcesses:
         self._add(worker, child, ours)
 
     def kill(self, worker: int) -> str:
-        """Kill a worker's child, wait for it and free its descriptors; its other workers are lost. Its last words."""
+        """Kill a worker's child, wait for its end and free its resources; other workers of this child are then lost.
+
+        Returns the child's last output.
+        """
         if worker not in self._workers:
             return ""
         child = self._forget(worker)
-        return self._lose(child, f"worker {worker}, a thread of the same process, had to be killed", bystanders=True)
+        return self._lose(child, f"worker {worker}, a thread of the same process, was killed", bystanders=True)
 
     def send(self, worker: int, centre: Centre, item_id: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
-        """Send the chunks, behind the centre if the worker does not know it."""
+        """Send the chunks, after the centre if the worker does not have it yet."""
         to = self._workers.get(worker)
         if to is None:
-            return  # lost with another thread of its child; that is on its way to the scheduler
+            return  # lost with another thread of its child, which `receive` is going to report
         if self._centre[0] is not centre:
             self._centre = centre, framed(("centre", centre))
         frames = [framed(("chunks", item_id, attempt, chunks))]
@@ -125,32 +135,32 @@ class ChildProcesses:
         self._watch(to.channel)
 
     def platforms(self) -> frozenset[str]:
-        """None: children have this process's machine and packages."""
+        """Empty, since children share this machine and its packages."""
         return frozenset()
 
     def silent(self) -> tuple[int, ...]:
-        """None: sockets tell at once that a child is gone."""
+        """Empty, since sockets show at once that a child is gone."""
         return ()
 
     def receive(self, timeout_s: float) -> Message | None:
-        """The next message of any worker; a child that closed a socket is killed before it is reported lost."""
+        """The next message of any worker. A child that closed a socket is killed before its loss is reported."""
         until = time.monotonic() + timeout_s
         while not self._ready:
             wait_s = max(0.0, until - time.monotonic())
             is_coming = False
             for descriptor, events in self._poll.poll(wait_s * 1000.0):
-                if descriptor in self._by_descriptor:  # else lost a moment ago, with another
+                if descriptor in self._by_descriptor:  # else it has just been lost together with another worker
                     is_coming |= self._serve(self._by_descriptor[descriptor], events)
-            if is_coming:  # a large message comes in pieces, and counts as there with the first
+            if is_coming:  # a large message arrives in parts; once the first is here, wait for the others
                 until = max(until, time.monotonic() + PIECE_S)
             elif not wait_s and not self._ready:
                 return None
         return self._ready.popleft()
 
     def close(self) -> None:
-        """Kill all children and wait for them."""
+        """Kill all children and wait until they have ended."""
         for worker in self._workers.values():
-            worker.child.process.kill()  # all at once: each takes a while to give its memory back
+            worker.child.process.kill()  # kill all before waiting, since each takes some time to free its memory
         for worker in list(self._workers):
             self.kill(worker)
 
@@ -163,7 +173,7 @@ class ChildProcesses:
         self._poll.modify(channel, select.POLLIN | (select.POLLOUT if channel.is_full else 0))
 
     def _serve(self, number: int, events: int) -> bool:
-        """Write what waits for a worker, read what it says; whether it is in the middle of a message."""
+        """Send bytes that wait for a worker and read its messages; returns whether a message is incomplete."""
         worker = self._workers[number]
         if events & select.POLLOUT:
             worker.channel.flush()
@@ -176,7 +186,7 @@ class ChildProcesses:
         return worker.channel.is_halfway
 
     def _hear(self, number: int) -> str | None:
-        """Read what a worker has said. If that was the end of it: what was wrong, "" if it does not say."""
+        """Read a worker's messages. Returns None, or if the worker is lost, the reason or "" if it is not known."""
         try:
             worker = self._workers[number]
             messages, is_open = worker.channel.receive()
@@ -193,10 +203,10 @@ class ChildProcesses:
                     case ("broken", text):
                         return text
                     case _:
-                        return f"it said {said!r}"
-        except Interrupted:  # a signal's handler may raise it anywhere
+                        return f"it sent an unknown message: {said!r}"
+        except Interrupted:  # a signal handler can raise this anywhere
             raise
-        except Exception:  # of its class, if what it said is not what was written
+        except Exception:  # a damaged message can raise any exception when it is unpickled
             return traceback.format_exc()
         return None if is_open else ""
 
@@ -208,11 +218,10 @@ class ChildProcesses:
         return worker.child
 
     def _lose(self, child: _Child, reason: str = "", *, bystanders: bool = False) -> str:
-        """Kill a child for good, and report those of its workers lost that are not forgotten, after what they said. Its
-        last words.
+        """Kill a child and report the loss of its remaining workers, after their messages; returns its last output.
 
-        One that had nothing in hand is a bystander: the scheduler may send it what another of the child had, before it
-        comes to its loss.
+        A worker that had no work item is a bystander: before the scheduler learns of its loss, it may send it a work
+        item of another worker of this child.
         """
         lost = {number: worker for number, worker in self._workers.items() if worker.child is child}
         for number in lost:
@@ -230,7 +239,7 @@ class ChildProcesses:
 
 
 def _end(child: _Child) -> tuple[str, str]:
-    """Kill a child; how it ended, and what it wrote last."""
+    """Kill a child; returns how it ended and its last output."""
     child.process.kill()
     code = child.process.wait()
     child.control.close()
@@ -241,7 +250,7 @@ def _end(child: _Child) -> tuple[str, str]:
 
 
 def _start_child(spec: bytes, undo: ExitStack) -> _Child:
-    """A process that knows its constants; `undo` ends it again, should anything else fail."""
+    """A new process that has been sent the constants of the run; closing `undo` ends it."""
     undo.enter_context(log := tempfile.TemporaryFile())  # noqa: SIM115
     ours, theirs = _socket_pair()
     undo.enter_context(ours)
@@ -258,12 +267,12 @@ def _start_child(spec: bytes, undo: ExitStack) -> _Child:
     undo.callback(process.wait)
     undo.callback(process.kill)
     ours.sendall(spec)
-    ours.setblocking(False)  # a child that does not take its workers' sockets is none that can be started
+    ours.setblocking(False)  # if the child does not take its workers' sockets, they cannot be started
     return _Child(process, log, ours)
 
 
 def _socket_pair() -> tuple[socket.socket, socket.socket]:
-    """Sockets that wait, whatever the default, and hold much."""
+    """Pair of blocking sockets with large send buffers."""
     pair = socket.socketpair()
     for end in pair:
         end.setblocking(True)

@@ -1,6 +1,6 @@
-"""Joining a Ray cluster or starting one, and watching who belongs to it.
+"""Joining or starting a Ray cluster, and watching its nodes.
 
-Nothing of the caller's changes: signal handlers and environment are as before once a call returns.
+After each call, the caller's signal handlers and environment variables are the same as before.
 """
 
 from __future__ import annotations
@@ -27,34 +27,38 @@ from es_service.logs import logger
 
 _LOG = logger(__name__)
 OBJECT_STORE_BYTES = 200 * 2**20
-"""Shared memory of a local Ray: a few centres and gradient blocks. Ray would take a third of the machine's."""
+"""Shared memory of a local Ray, for a few centres and gradient blocks. Ray would take a third of the machine's memory.
+"""
 CONNECT_S = 5.0
-"""Longest wait for the port of a cluster to answer; Ray itself would try for more than a minute."""
+"""Longest time in seconds to connect to the port of a cluster; Ray itself would try for more than a minute."""
 MEMBERSHIP_S = 1.0
-"""Time between two looks at the nodes of a cluster."""
+"""Seconds between two queries for the nodes of a cluster."""
 SILENCE_S = 20.0
-"""A cluster that has not answered for so long has lost its head. Ray would end this process after a minute."""
+"""Seconds without an answer after which a cluster is considered lost. Ray would end this process after a minute."""
 PAUSE_S = 5.0
-"""Between two questions of whether the cluster answers, after which its silence is counted anew."""
+"""If `Watch.latest` was not called for this many seconds, the time without an answer is counted from the next call."""
 TOKEN = secrets.token_hex(32)
-"""For every Ray that this process starts: Ray reads the token of a process only once, and else writes one into HOME."""
+"""Authentication token of every Ray that this process starts, since Ray reads the token of a process only once.
+Without it, Ray would write a token into the home folder."""
 SETTINGS = {
-    "RAY_USAGE_STATS_ENABLED": "0",  # nothing phones home
+    "RAY_USAGE_STATS_ENABLED": "0",  # send no usage statistics
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # actors without a GPU hide the GPUs themselves
 }
+"""Environment variables of all processes that Ray starts."""
 LOCAL_SETTINGS = {
-    "RAY_task_events_report_interval_ms": "0",  # a record of each call for a dashboard that is not there
+    "RAY_task_events_report_interval_ms": "0",  # record no calls, since there is no dashboard to show them
     "RAY_enable_metrics_collection": "0",
 }
-"""Further ones for a Ray of our own; without them its own bookkeeping takes a tenth of a small generation."""
+"""More environment variables for a Ray of our own. Without them, Ray's records take a tenth of a small generation."""
 WITHOUT_RAY = WayOut(
-    "resume", "go on on this machine without Ray", settings={"compute.engine": "inline", **ENGINE_IMPLIES["inline"]}
+    "resume", "continue on this machine without Ray", settings={"compute.engine": "inline", **ENGINE_IMPLIES["inline"]}
 )
+"""Suggestion for errors of Ray."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """What one worker needs of a node."""
+    """CPUs and GPUs of a node that one worker needs."""
 
     cpus: int = 1
     gpus: float = 0.0
@@ -71,19 +75,25 @@ class Membership:
     """The nodes of a cluster at one moment."""
 
     room: int
-    """Workers that the nodes which are alive, and stay, could hold together."""
+    """Number of workers for which the nodes that are alive and not leaving have room."""
     leaving: frozenset[str]
-    """Ids of the nodes that are about to go and want no more work."""
+    """Ids of the nodes that are being drained."""
     alive: frozenset[str]
-    """Ids of the nodes that are there, those about to go among them."""
+    """Ids of the nodes that are alive, including those that are being drained."""
 
 
 def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
-    """The `ray` module, in a cluster: that at `address`, or with None a new one here that counts `cpus` CPUs.
+    """The `ray` module, connected to a cluster.
+
+    Args:
+        address: "HOST:PORT" of the cluster, "auto" for the one on this machine, or None to start one here.
+        claim: what one worker needs; a new cluster has GPUs only if a worker needs them.
+        cpus: number of CPUs of a new cluster.
 
     Raises:
-        EvaluationError: Ray is missing, in use by this process already, does not start, or no cluster takes us in.
-        Interrupted: SIGTERM arrived meanwhile.
+        EvaluationError: Ray is not installed, is used by this process already, or cannot be started, or the connection
+            to the cluster failed.
+        Interrupted: SIGTERM arrived during the call.
     """
     ways_out = [WITHOUT_RAY]
     options: dict[str, Any] = {"address": address}
@@ -92,7 +102,7 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
         options = {
             "address": "local",
             "num_cpus": cpus,
-            "num_gpus": None if claim.gpus else 0,  # None: as many as Ray finds
+            "num_gpus": None if claim.gpus else 0,  # None means all GPUs that Ray finds
             "include_dashboard": False,
             "object_store_memory": OBJECT_STORE_BYTES,
         }
@@ -101,25 +111,26 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
         try:
             import ray
         except ImportError as error:
-            raise EvaluationError(f"Ray cannot be imported ({error}); install it", ways_out=ways_out) from error
+            text = f"Ray cannot be imported ({error}); install the package `ray`"
+            raise EvaluationError(text, ways_out=ways_out) from error
         if ray.is_initialized():
-            raise EvaluationError("this process uses Ray already; call ray.shutdown() first", ways_out=ways_out)
+            raise EvaluationError("this process already uses Ray; call ray.shutdown() first", ways_out=ways_out)
         try:
             if address not in (None, "auto"):
                 _knock(address)
             ray.init(**options, logging_level=logging.ERROR, log_to_driver=False)
-        except SystemExit as stop:  # Ray's handler of SIGTERM, which takes the place of ours, exits with its number
+        except SystemExit as stop:  # Ray replaces the handler of SIGTERM by one that exits with the signal's number
             ray.shutdown()
             if stop.code != signal.SIGTERM:
                 raise
             raise Interrupted(signal.SIGTERM) from stop
-        except Exception as error:  # Ray raises many kinds: ConnectionError, RuntimeError, ValueError, TimeoutError ...
+        except Exception as error:  # of many classes: ConnectionError, RuntimeError, ValueError, TimeoutError ...
             if address is None:
-                raise EvaluationError(f"Ray does not start on this machine: {error}", ways_out=ways_out) from error
+                raise EvaluationError(f"could not start Ray on this machine: {error}", ways_out=ways_out) from error
             raise EvaluationError(
-                f"could not connect to a Ray cluster at {address}: {error}. Check the address, that RAY_AUTH_TOKEN is "
-                f"the cluster's (with RAY_AUTH_MODE=token), and that it has this Ray ({ray.__version__}) and this "
-                f"Python ({platform.python_version()})",
+                f"could not connect to a Ray cluster at {address}: {error}. Check the address. Check also that "
+                "RAY_AUTH_TOKEN is the token of the cluster (with RAY_AUTH_MODE=token), and that the cluster uses the "
+                f"same versions of Ray ({ray.__version__}) and Python ({platform.python_version()})",
                 field="compute.address",
                 value=address,
                 ways_out=ways_out,
@@ -130,10 +141,10 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
 
 
 def disconnect(ray: ModuleType, *, forget: bool = False) -> None:
-    """Leave the cluster; one of our own ends.
+    """Leave the cluster. A cluster that `connect` started ends.
 
     Args:
-        forget: delete the folder in which a Ray of our own kept its logs, which Ray itself never does.
+        forget: whether to delete the folder of this cluster's logs, which Ray itself never deletes.
     """
     _let_print(ray, True)
     folder = _session_folder(ray) if forget else None
@@ -143,12 +154,12 @@ def disconnect(ray: ModuleType, *, forget: bool = False) -> None:
         shutil.rmtree(folder, ignore_errors=True)
         latest = folder.with_name("session_latest")
         with contextlib.suppress(OSError):
-            if not latest.exists():  # Ray puts no other link in the place of one that leads nowhere
+            if not latest.exists():  # Ray does not replace a link whose target is missing
                 latest.unlink()
 
 
 def look(ray: ModuleType, claim: Claim) -> Membership:
-    """Who belongs to the cluster now. Blocks for as long as its head does not answer."""
+    """The nodes of the cluster now. This blocks until the head node answers."""
     leaving = frozenset(_draining(ray))
     alive = {node["NodeID"]: node["Resources"] for node in ray.nodes() if node["Alive"]}
     room = sum(_room(resources, claim) for node, resources in alive.items() if node not in leaving)
@@ -156,15 +167,15 @@ def look(ray: ModuleType, claim: Claim) -> Membership:
 
 
 def demand(ray: ModuleType, claim: Claim) -> str:
-    """What workers need, and what there is."""
+    """Text on what each worker needs and what the cluster has."""
     return (
-        f"Each needs {claim}; the cluster has {_resources(ray.cluster_resources())} in all, free are "
-        f"{_resources(ray.available_resources())}"
+        f"Each worker needs {claim}; the cluster has {_resources(ray.cluster_resources())} in total and "
+        f"{_resources(ray.available_resources())} free"
     )
 
 
 class Watch:
-    """Looks at the cluster again and again in a thread of its own, since a look may block."""
+    """Regular queries for the nodes of a cluster, in a separate thread because a query may block."""
 
     def __init__(self, ray: ModuleType, claim: Claim) -> None:
         self._ray, self._claim = ray, claim
@@ -174,35 +185,35 @@ class Watch:
         threading.Thread(target=self._run, daemon=True, name="cluster-watch").start()
 
     def latest(self) -> Membership:
-        """What was seen last. Raises EvaluationError if that was more than SILENCE_S ago."""
+        """The latest answer. Raises EvaluationError if there was none for more than SILENCE_S seconds."""
         now = time.monotonic()
-        if now - self._asked_s > PAUSE_S:  # this process was stopped, or busy: no silence of the cluster's
+        if now - self._asked_s > PAUSE_S:  # this process was stopped or busy, so the cluster may have answered
             self._answered_s = now
         self._asked_s = now
         silent_s = now - self._answered_s
         if silent_s > SILENCE_S:
             raise EvaluationError(
-                f"the Ray cluster has not answered for {silent_s:.0f} s: its head node is gone or out of reach. "
-                "Start a cluster again and resume there, or on this machine alone",
+                f"the Ray cluster has not answered for {silent_s:.0f} s; its head node has ended or cannot be reached. "
+                "Start a cluster again and resume the run there, or resume it on this machine alone",
                 ways_out=[WITHOUT_RAY],
             )
         return self._latest
 
     def close(self) -> None:
-        """Look no more."""
+        """End the queries."""
         self._end.set()
 
     def _run(self) -> None:
         while not self._end.wait(MEMBERSHIP_S):
-            with contextlib.suppress(Exception):  # of many kinds, all of them meaning: no answer
+            with contextlib.suppress(Exception):  # any exception means that there is no answer
                 self._latest = look(self._ray, self._claim)
                 self._answered_s = time.monotonic()
 
 
 def _room(resources: dict[str, float], claim: Claim) -> int:
-    """Workers that a node with these resources can hold."""
+    """Number of workers for which a node with these resources has room."""
     by_cpu = int(resources.get("CPU", 0.0) / claim.cpus)
-    # Ray does not split one worker's share over two GPUs.
+    # Ray does not divide the share of one worker between two GPUs.
     by_gpu = int(resources.get("GPU", 0.0)) * int(1 / claim.gpus) if 0 < claim.gpus < 1 else by_cpu
     if claim.gpus >= 1:
         by_gpu = int(resources.get("GPU", 0.0) / claim.gpus)
@@ -210,31 +221,38 @@ def _room(resources: dict[str, float], claim: Claim) -> int:
 
 
 def _resources(amounts: dict[str, float]) -> str:
-    """The resources that matter here, as a user would name them."""
+    """Text with the numbers of CPUs and GPUs."""
     return ", ".join(f"{amounts.get(name, 0.0):g} {name}" for name in ("CPU", "GPU"))
 
 
 def _draining(ray: ModuleType) -> dict[str, int]:
-    """Ids of nodes being drained. Ray has no public way to ask; if this one goes, a drained node is lost later."""
+    """Ids of the nodes that are being drained, as keys.
+
+    Ray has no public function for this. If a version of Ray lacks this one, the workers of a drained node are lost when
+    the node ends.
+    """
     with contextlib.suppress(AttributeError):
         return ray._private.state.state.get_draining_nodes()
     return {}
 
 
 def _session_folder(ray: ModuleType) -> Path | None:
-    """Where Ray keeps logs and sockets of this session. It has no public way to ask; if this one goes, they stay."""
+    """Folder of Ray's logs and sockets of this session, or None.
+
+    Ray has no public function for this. If a version of Ray lacks this one, the folder is not deleted.
+    """
     with contextlib.suppress(AttributeError):
         return Path(ray._private.worker._global_node.get_session_dir_path())
     return None
 
 
 def _let_print(ray: ModuleType, allowed: bool) -> None:
-    """Whether Ray may print on our stdout: each loss of a worker, at length, which we report ourselves."""
+    """Set whether Ray may print to our stdout. It prints a long text for each lost worker, which is reported anyway."""
     ray._private.worker._worker_logs_enabled = allowed
 
 
 def _knock(address: str) -> None:
-    """Raise OSError or ValueError unless something listens at HOST:PORT."""
+    """Raise ValueError if the address is not HOST:PORT, and OSError if nothing listens there."""
     host, colon, port = address.rpartition(":")
     if not colon or not port.isdigit():
         raise ValueError(f"{address!r} is neither HOST:PORT nor auto")
@@ -243,7 +261,7 @@ def _knock(address: str) -> None:
 
 @contextlib.contextmanager
 def _signal_handlers_kept() -> Iterator[None]:
-    """Ray replaces the SIGTERM handler; put back what was there. Elsewhere than in the main thread it cannot."""
+    """Context manager that restores the signal handlers that Ray replaces; Ray can do so only in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -257,13 +275,13 @@ def _signal_handlers_kept() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _environment_kept(settings: dict[str, str]) -> Iterator[None]:
-    """Environment variables for the processes that Ray starts; afterwards ours are as before."""
+    """Context manager that sets environment variables for processes that Ray starts, and restores ours at its end."""
     before = dict(os.environ)
     os.environ.update(settings)
     try:
         yield
     finally:
-        # Nothing but what differs, since threads of Ray's may be reading the rest.
+        # Restore only the variables that differ, because threads of Ray may be reading the others.
         for name in os.environ.keys() - before.keys():
             del os.environ[name]
         for name, value in before.items():

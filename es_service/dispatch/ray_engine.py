@@ -1,10 +1,10 @@
 """The Ray engine: workers are actors, on this machine or on a cluster.
 
-Ray starts processes and moves messages. Retries, deadlines and replacements are the scheduler's: actors are never
-restarted by Ray and calls are never repeated by it, so each fault is seen here once, as what it was.
+Ray starts processes and moves messages. The scheduler decides on retries, deadlines and replacements: Ray never
+restarts actors and never repeats calls, so each fault is reported here exactly once.
 
-Messages are pickled here, into one `bytes` each: Ray then has a single small object to move, and a centre that fits
-into a call needs no shared memory. Both together halve what Ray adds to a generation of short chunks.
+Each message is pickled here into one `bytes`, so that Ray moves a single small object, and a centre that fits into a
+call needs no shared memory. Together this halves the time that Ray adds to a generation of short chunks.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from es_service.errors import EvaluationError
 from es_service.protocol.messages import Centre, Chunk, WorkerPlace, WorkerSpec
 
 IN_CALL_BYTES = 64 * 2**10
-"""A centre up to this size travels with every call; a larger one is stored once and fetched once per node."""
+"""Largest size in bytes of a centre that is sent with every call; a larger one is stored, and fetched once per node."""
 
 
 def ray_engine(
@@ -41,24 +41,25 @@ def ray_engine(
     elastic: bool = False,
     log: Log = no_log,
 ) -> Engine[Actors]:
-    """An Evaluator whose workers are Ray actors, starting.
+    """Engine whose workers are Ray actors, which are starting.
 
     Args:
-        actor: the worker's class, with the methods of `workers.actor.WorkerActor`.
-        address: a cluster's "HOST:PORT", or "auto" for the one on this machine; None starts a Ray of our own here,
-            whatever other Ray or RAY_ADDRESS there may be, and ends it with the engine.
+        actor: class of a worker, with the methods of `workers.actor.WorkerActor`.
+        address: "HOST:PORT" of a cluster, or "auto" for the one on this machine. None starts a Ray of our own here,
+            regardless of any other Ray and of RAY_ADDRESS, and ends it with the engine.
         claim: what one worker needs of a node.
-        elastic: as many workers as there is room for, instead of `limits.workers`; in a cluster, also when it changes.
+        elastic: whether to run as many workers as there is room for, also when that changes, not `limits.workers`.
 
     Raises:
-        EvaluationError: Ray is missing, does not start, has no room for a worker on this machine, or no cluster answers
-            at the address. Interrupted: SIGTERM arrived meanwhile.
+        EvaluationError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
+        Interrupted: SIGTERM arrived during the call.
     """
     ray = connect(address, claim, limits.workers if elastic else limits.workers * claim.cpus)
     try:
         room = look(ray, claim).room
-        if address is None and not room:  # nor will there ever be
-            raise EvaluationError(f"this machine has no place for a worker. {demand(ray, claim)}")
+        if address is None and not room:  # there will never be room
+            text = f"this machine has no room for a worker. {demand(ray, claim)}. Lower compute.worker_resources."
+            raise EvaluationError(text)
         if elastic:
             limits = replace(limits, workers=max(1, room))
         watch = None if address is None else Watch(ray, claim)
@@ -71,17 +72,17 @@ def ray_engine(
 
 @dataclass(frozen=True)
 class _Call:
-    """What a result still to come is the answer to."""
+    """A call of an actor that has not been answered yet."""
 
     worker: int
     what: str
-    """place, build or run."""
+    """Method that was called: place, build or run."""
     item_id: Hashable = None
     attempt: int = 0
 
 
 class Actors:
-    """A Transport whose workers are Ray actors."""
+    """Transport whose workers are Ray actors."""
 
     def __init__(
         self,
@@ -93,12 +94,12 @@ class Actors:
         room: int | None,
         limits: Limits,
     ) -> None:
-        """Start nobody yet.
+        """Make a transport without workers.
 
         Args:
-            watch: of the cluster that was joined; None in a Ray of our own, whose one node is this machine.
-            room: workers to ask for as the cluster is now; from then on follow its room. None: never ask.
-            limits: how long to wait for the first place.
+            watch: watch of the cluster that was joined; None in a Ray of our own, whose only node is this machine.
+            room: number of workers for which there is room now; changes become `SetWorkers`. None: no `SetWorkers`.
+            limits: limits that contain the longest wait for the first place.
         """
         self._ray = ray
         self._spec, self._claim, self._limits = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim, limits
@@ -117,21 +118,21 @@ class Actors:
         self._drained: set[int] = set()
         self._has_lost = False
         self._nodes: frozenset[str] = frozenset()
-        """All that were alive at some time."""
+        """Nodes that have been alive at some time."""
         self._to_ask: set[int] = set()
-        """Workers to be asked for their place again before they are sent anything, since another was lost."""
+        """Workers that must be asked for their place again before the next chunks, because another worker was lost."""
         self._inbox: deque[Message] = deque()
         self._centre: tuple[Centre, Any] | None = None
-        # Ray itself would wait for ever: a cluster may have to grow, or others there to end. The scheduler counts as
-        # long from later on, so that it is said here, where it is known what is free.
+        # Ray would wait for ever. The scheduler's time with the same limit starts later, so the error is raised here,
+        # where it can name the resources that are free in the cluster.
         self._placed_by_s = time.monotonic() + limits.no_worker_timeout_s
 
     def places(self) -> dict[int, WorkerPlace]:
-        """Worker id -> where it is, of those that have a place."""
+        """Worker id -> place, for the workers that have one."""
         return dict(self._places)
 
     def start(self, worker: int) -> None:
-        """Ask Ray for an actor; it is up once it has a place and has built its functions."""
+        """Ask Ray for an actor. It is up when it has a place and has built its functions."""
         try:
             handle = self._class.remote(self._spec, worker, self._claim.gpus)
             self._handles[worker] = handle
@@ -141,7 +142,7 @@ class Actors:
             self._lose(worker, f"cannot be started: {error}")
 
     def kill(self, worker: int) -> str:
-        """Kill an actor's process and drop whatever it still owes. What it wrote is on its node, in Ray's logs."""
+        """Kill an actor and ignore its unanswered calls. Returns "", since its output is in Ray's logs on its node."""
         self._has_lost = True
         for ref in [ref for ref, call in self._calls.items() if call.worker == worker]:
             del self._calls[ref]
@@ -154,14 +155,13 @@ class Actors:
         return ""
 
     def send(self, worker: int, centre: Centre, item_id: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
-        """Call the actor. A centre is stored once, however many calls share it, and dropped with the next one.
+        """Call the actor. A large centre is stored once for all calls that share it, until the next centre.
 
-        That an idle actor is gone shows only when it is called. So after a loss, which may have been that of a node,
-        each other actor is asked for its place ahead of its next chunks: if it is gone too, it has not begun them, and
-        they are not to blame; if it answers, they are, should it die of them.
+        The loss of an idle actor shows only when it is called. So after a loss, perhaps of a node, each other actor is
+        asked for its place before its next chunks, which are charged with its loss only if it has answered that call.
         """
         if worker not in self._handles:
-            return  # lost a moment ago, when it was sent other chunks; that is on its way to the scheduler
+            return  # it has just been lost when it was sent other chunks, which `receive` is going to report
         try:
             if self._centre is None or self._centre[0] is not centre:
                 pickled = pickle.dumps(centre, pickle.HIGHEST_PROTOCOL)
@@ -176,18 +176,18 @@ class Actors:
         self._calls[ref] = _Call(worker, "run", item_id, attempt)
 
     def platforms(self) -> frozenset[str]:
-        """What each kind of actor that has come up said of its packages and processor."""
+        """`machine.platform_text` of each kind of actor that has come up."""
         return frozenset(self._platforms)
 
     def silent(self) -> tuple[int, ...]:
-        """Workers that have not answered where they are."""
+        """Workers that have not answered the call for their place."""
         return tuple(worker for worker, what in self._owed_first().items() if what == "place")
 
     def receive(self, timeout_s: float) -> Message | None:
         """The next message.
 
         Raises:
-            EvaluationError: no actor has said for too long where it is, or the cluster does not answer any more.
+            EvaluationError: no actor got a place in time, or the cluster does not answer any more.
         """
         if self._watch is not None:
             self._follow(self._watch)
@@ -203,22 +203,22 @@ class Actors:
                 break
             if (message := self._message(ready[0])) is not None:
                 return message
-            timeout_s = 0.0  # that was where a worker still is; None would say that no answer waits behind it
+            timeout_s = 0.0  # a worker confirmed its place; another answer may be waiting, so do not return None
         if not self._places and time.monotonic() > self._placed_by_s:
             time_s = f"{self._limits.no_worker_timeout_s:g} s ({self._limits.name_of('no_worker_timeout_s')})"
-            if self._watch is None:  # which has a place for each: their processes do not start, or very slowly
-                raise EvaluationError(f"no worker's process answered in {time_s}. {demand(self._ray, self._claim)}")
+            if self._watch is None:  # there is a place for each worker, so the processes do not start or are very slow
+                raise EvaluationError(f"no worker's process answered within {time_s}. {demand(self._ray, self._claim)}")
             raise EvaluationError(
-                f"no worker was given a place in {time_s}. {demand(self._ray, self._claim)}. Add nodes, or stop what "
-                "else runs there."
+                f"no worker got a place in the cluster within {time_s}. {demand(self._ray, self._claim)}. Add nodes to "
+                "the cluster, or stop other programs that use it."
             )
         return None
 
     def close(self) -> None:
-        """Kill all actors and leave the cluster, where they end seconds later; a Ray of our own has then ended."""
+        """Kill all actors, which end within seconds in a cluster that was joined; a Ray of our own has then ended."""
         if self._watch is not None:
             self._watch.close()
-        # Nobody reads the logs of a session of our own in which all went well: workers came up, and none was lost.
+        # The logs of a Ray of our own are not needed if workers got places and none was lost.
         forget = self._watch is None and bool(self._places) and not self._has_lost
         for worker in list(self._handles):
             self.kill(worker)
@@ -230,7 +230,7 @@ class Actors:
         call, errors = self._calls[ref], self._ray.exceptions
         try:
             value = self._ray.get(ref)
-        except errors.RayTaskError as error:  # it raised, and lives
+        except errors.RayTaskError as error:  # the call raised an exception, and the actor is alive
             if call.what != "run":
                 return self._lost(call.worker, _text(error))
             del self._calls[ref]
@@ -244,20 +244,20 @@ class Actors:
         if call.what == "build":
             self._platforms.add(value)
             return WorkerUp(call.worker)
-        is_known = call.worker in self._places  # it was asked again, whether it is still there
+        is_known = call.worker in self._places  # then it was asked again, to find out whether it is alive
         self._places[call.worker] = WorkerPlace(*value)
         self._placed_by_s = float("inf")
         return None if is_known else Placed(call.worker)
 
     def _follow(self, watch: Watch) -> None:
-        """Report what has changed in the cluster: drains and losses first, so that a smaller number sends nobody else
-        away. Ray itself tells of an idle actor's end only when it is called."""
+        """Report changes of the cluster. Drained and lost workers come before a smaller number of workers, which would
+        otherwise drain others. Ray itself reports the end of an idle actor only when it is called."""
         now = watch.latest()
         for worker, place in self._places.items():
             if place.node in now.leaving and worker not in self._drained:
                 self._drained.add(worker)
                 self._inbox.append(Drain(worker))
-        if now.alive:  # else the look has shown nothing, for somebody answered it
+        if now.alive:  # an empty answer is no information, since the head node that gave it is alive
             gone = self._nodes - now.alive
             self._nodes |= now.alive
             for worker in [worker for worker, place in self._places.items() if place.node in gone]:
@@ -267,7 +267,7 @@ class Actors:
             self._inbox.append(SetWorkers(now.room))
 
     def _owed_first(self) -> dict[int, str]:
-        """Worker -> the first call that it has not answered: place, build or run."""
+        """Worker id -> method of its first unanswered call: place, build or run."""
         first: dict[int, str] = {}
         for call in self._calls.values():
             first.setdefault(call.worker, call.what)
@@ -283,7 +283,7 @@ class Actors:
 
 
 def _reason(error: Exception) -> str:
-    """What a fault of an actor means, on one line."""
+    """Cause of an actor's fault, on one line."""
     first = _text(error).strip().partition("\n")[0]
     known = {
         "OutOfMemoryError": "its node ran out of memory and Ray killed it",
@@ -295,5 +295,5 @@ def _reason(error: Exception) -> str:
 
 
 def _text(error: Exception) -> str:
-    """What an error says, without the colours that Ray gives it whoever may read it."""
+    """Text of an error without the colour codes that Ray adds."""
     return re.sub(r"\x1b\[[0-9;]*m", "", str(error))

@@ -1,24 +1,30 @@
-"""Who runs which work item, when to give up on a worker, when to give up altogether: a pure state machine.
+"""The scheduler: a pure state machine that replaces lost workers, repeats lost work, and decides when the run fails.
 
 It stands between the driver's work items and the engines that own the workers. `step(state, event, now)` returns the
-next state and the commands the engine must carry out, in order. No I/O, no clock, no randomness, no threads: the same
-arguments give the same answer, and a published state never changes, so a simulation can try every interleaving.
+next state and the commands that the engine must carry out, in order. It uses no I/O, clock, random numbers or threads:
+the same arguments give the same result, and a returned state never changes, so a simulation can try every interleaving.
 
-An engine starts with `initial_state(limits)` of scheduler_state.py and a `Tick`, feeds every message of its workers as
-an event, and sends a `Tick` whenever `next_deadline(state)` has come. It must feed the messages that already wait
-*before* a late `Tick`: otherwise a driver that was busy elsewhere would kill workers whose answers it had not read.
+An engine starts with `initial_state(limits)` of scheduler_state.py and a `Tick`, passes on every message of its workers
+as an event, and sends a `Tick` whenever the time `next_deadline(state)` has come. It must pass on all waiting messages
+*before* a late `Tick`: otherwise a driver that was busy would kill workers whose answers it had not read yet.
 
-Choices. A result is a pure function of its id, so any result of a known worker for an id that still waits is accepted,
-even of a superseded attempt; a stopped worker is forgotten at once, so what it still says is dropped and counted. Only
-the item a worker was running is charged with its loss; one prefetched behind it goes back with its attempt unused. So
-does one sent to a worker that was gone already, if the transport says so: a machine that dies under many workers is one
-fault, however many of them are tried before all are known to be gone. A worker lost while draining is nobody's fault.
-One that was given no place in time is started anew, since one that hangs before it can say where it is looks the same,
-but counts as no loss. Workers that are lost before they come up show a broken environment only if others, started after
-the first of them was lost, are lost, too. Which worker gets which item, and by when it must answer: assignment.py.
+Rules:
 
-Cost: each step makes shallow copies of the containers (C speed, a few microseconds for a thousand entries) and changes
-only the records touched.
+* A result is a pure function of its work item, so any result from a known worker for an undelivered item is accepted,
+  even from an earlier attempt. A stopped worker is forgotten at once, and its later messages are ignored and counted.
+* Only the item that a worker was running is charged with the loss of the worker. An item that waited behind it keeps
+  its attempts, and so does an item sent to a worker that was gone already, if the transport reports this. Thus the loss
+  of a machine with many workers is one fault, however many of them are tried before all are known to be gone.
+* The loss of a draining worker is no fault.
+* A worker that gets no place in time is replaced, because it may have failed before it could report its place. It does
+  not count as lost.
+* Workers that are lost before they come up count as a failed attempt to start workers. They count as another failed
+  attempt only if they were started after the first of them was lost.
+
+assignment.py decides which worker gets which item, and sets the deadlines of items.
+
+Cost: each step makes shallow copies of the containers, which takes a few microseconds for a thousand entries, and
+changes only the records that it must.
 """
 
 from __future__ import annotations
@@ -48,20 +54,21 @@ from es_service.dispatch.events import (
 from es_service.dispatch.scheduler_state import SchedulerState, Waiting, Worker, find_slot, holds, next_deadline
 
 RECENT_DURATIONS = 31
-"""Durations per kind of item that the running median is taken over."""
+"""Number of durations per kind of work item from which the running median is computed."""
 
 
 def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerState, list[Command]]:
-    """The next state and what the engine must do about `event`.
+    """The next state, and the commands that the engine must carry out.
 
     Args:
-        now: seconds of a clock that never goes back; any origin.
+        now: time in seconds of a monotonic clock with any origin.
+
     Raises:
-        ValueError: for a `Submit` of an id that still waits, or `SetWorkers` below 1.
+        ValueError: a submitted id has not been delivered yet, or `SetWorkers` asks for less than 1 worker.
     """
     if state.failed is not None or (isinstance(event, Tick) and now < next_deadline(state)):
         return state, []
-    # The containers of `s` belong to this step alone until it returns; only they are changed in place.
+    # Only the containers of `s` are changed in place, since no other state shares them before this step returns.
     s = state._replace(
         starting=state.starting.copy(),
         up=state.up.copy(),
@@ -93,7 +100,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
             _drain(s, out, worker)
         case SetWorkers(wanted):
             if wanted < 1:
-                raise ValueError(f"SetWorkers({wanted}): at least one worker is needed")
+                raise ValueError(f"SetWorkers({wanted}): the number of workers must be at least 1")
             s = s._replace(wanted=wanted)
             for worker in sorted([*s.starting, *s.up])[wanted:]:
                 _drain(s, out, worker)
@@ -109,7 +116,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
 def _submit(s: SchedulerState, items: tuple[WorkItem, ...]) -> None:
     for item in items:
         if item.id in s.items:
-            raise ValueError(f"work item {item.id} was submitted twice")
+            raise ValueError(f"work item {item.id} was submitted again before it was delivered")
         s.items[item.id] = Waiting(item)
         s.queue.append(item.id)
 
@@ -131,7 +138,7 @@ def _result(
     if index is not None:
         item = record.slots[index].item
         kind = item.kind
-        # How long an answer out of order took is not known, nor whether its kind was compiled before.
+        # For an answer out of order, neither its duration nor whether it included compiling is known.
         if index == 0 and kind in record.warm:
             duration_s = (now - record.started_s) / item.size
             s.durations_s[kind] = (*s.durations_s.get(kind, ()), duration_s)[-RECENT_DURATIONS:]
@@ -150,19 +157,19 @@ def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) 
     record = record._replace(failures_in_a_row=record.failures_in_a_row + 1)
     _close_slot(s, out, worker, record, index, now)
     if worker in s.up and record.failures_in_a_row >= s.limits.max_failures_in_a_row:
-        reason = f"{record.failures_in_a_row} work items in a row raised; the last: {event.message}"
+        reason = f"{record.failures_in_a_row} consecutive work items raised exceptions; the last: {event.message}"
         out.append(StopWorker(worker, reason))
-        # What it began a moment ago is not to blame.
+        # The item that it has just begun is not charged.
         s = _lose(s, out, worker, reason, now, charge=False)
     waiting = s.items.get(item_id)
     if waiting is None or waiting.holder != worker:
         return s._replace(duplicates=s.duplicates + 1)
     _requeue(s, worker, item_id)
-    return _charge(s, out, item_id, f"it raised on worker {worker}: {event.message}")
+    return _charge(s, out, item_id, f"it raised an exception on worker {worker}: {event.message}")
 
 
 def _close_slot(s: SchedulerState, out: list[Command], worker: int, record: Worker, index: int, now: float) -> None:
-    """Store the worker without that slot, start the clock of the next one; a drained worker is stopped."""
+    """Store the worker without a slot, whose successor begins now; stop a draining worker that has no slot left."""
     record = record._replace(slots=record.slots[:index] + record.slots[index + 1 :])
     if index == 0:
         record = begin_first_slot(s, record, now)
@@ -185,7 +192,14 @@ def _lose(
     fault: bool = True,
     charge: bool = True,
 ) -> SchedulerState:
-    """Forget a worker, put its items back at the front, plan its replacement; unknown workers change nothing."""
+    """Forget a worker, put its items back at the front of the queue and plan its replacement.
+
+    An unknown worker changes nothing.
+
+    Args:
+        fault: whether the loss is a fault, which is counted and may delay the replacement.
+        charge: whether the work item that the worker was running is charged with the fault.
+    """
     starting = s.starting.pop(worker, None) is not None
     record = s.up.pop(worker, None) or s.draining.pop(worker, None)
     if not starting and record is None:
@@ -202,14 +216,14 @@ def _lose(
         s = s._replace(start_failures=0)
     elif starting and worker >= s.tried:
         s = s._replace(start_failures=s.start_failures + 1, tried=s.next_worker)
-    if now >= s.start_at_s:  # else a replacement already waits, and this one with it
+    if now >= s.start_at_s:  # else this replacement waits together with an earlier one
         doublings = min(s.losses_in_a_row - 1, 30)
         wait_s = min(s.limits.max_backoff_s, s.limits.restart_backoff_s * 2**doublings) if doublings >= 0 else 0.0
         s = s._replace(losses_in_a_row=s.losses_in_a_row + 1, start_at_s=now + wait_s)
     if starting and s.start_failures >= s.limits.max_start_failures and not s.up and not s.draining:
         return _fail(s, out, f"no worker started in {s.start_failures} consecutive attempts; last loss: {s.last_loss}")
     if running is not None and charge:
-        return _charge(s, out, running, f"it took worker {worker} with it: {reason}")
+        return _charge(s, out, running, f"worker {worker} was lost while running it: {reason}")
     return s
 
 
@@ -219,7 +233,7 @@ def _requeue(s: SchedulerState, worker: int, item_id: Hashable) -> None:
 
 
 def _charge(s: SchedulerState, out: list[Command], item_id: Hashable, message: str) -> SchedulerState:
-    """One fault more for this item; too many fail the run."""
+    """Add a fault to a work item; if it now has `max_attempts` faults, the run fails."""
     waiting = s.items[item_id] = s.items[item_id]._replace(faults=s.items[item_id].faults + 1)
     if waiting.faults < s.limits.max_attempts:
         return s
@@ -233,15 +247,15 @@ def _fail(s: SchedulerState, out: list[Command], message: str) -> SchedulerState
 
 
 def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int, ...]) -> SchedulerState:
-    """Stop every worker whose deadline has passed; fail if no worker was up for too long."""
+    """Stop every worker whose deadline has passed; the run fails if no worker was up for too long."""
     limits = s.limits
-    reason = f"did not come up in {_plain(limits.start_deadline_s)} s ({limits.name_of('start_deadline_s')})"
+    reason = f"did not come up within {_plain(limits.start_deadline_s)} s ({limits.name_of('start_deadline_s')})"
     late = {worker: reason for worker, at in s.starting.items() if now >= at}
     for worker, record in (*s.up.items(), *s.draining.items()):
         if now >= record.deadline_s:
             limit_s = record.deadline_s - record.started_s
             item_id, name = record.slots[0].item.id, limits.name_of(record.limit)
-            late[worker] = f"no answer to work item {item_id} in {_plain(limit_s)} s ({name})"
+            late[worker] = f"no answer to work item {item_id} within {_plain(limit_s)} s ({name})"
     for worker, reason in late.items():
         if s.failed is None:
             out.append(StopWorker(worker, reason))
@@ -251,13 +265,13 @@ def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int
     if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + limits.no_worker_timeout_s:
         for_s = f"{_plain(limits.no_worker_timeout_s)} s ({limits.name_of('no_worker_timeout_s')})"
         return _fail(
-            s, out, f"{len(s.items)} work items wait and no worker was up for {for_s}; last loss: {s.last_loss}"
+            s, out, f"no worker was up for {for_s} while {len(s.items)} work items waited; last loss: {s.last_loss}"
         )
     return s
 
 
 def _plain(seconds: float) -> str:
-    """Three digits at most matter to a reader; no exponent does."""
+    """A number of seconds with at most three significant digits, or as a whole number from 100 on; no exponent."""
     return f"{seconds:.0f}" if seconds >= 100.0 else f"{seconds:.3g}"
 
 

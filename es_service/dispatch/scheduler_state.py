@@ -1,6 +1,6 @@
-"""What the scheduler remembers, and what follows from it without an event.
+"""State of the scheduler, and functions of the state alone.
 
-Dispatch station, the data of `scheduler.step`. The records are frozen and shared between states.
+It is the data of `scheduler.step`. The records are immutable and shared between states.
 """
 
 from __future__ import annotations
@@ -20,86 +20,97 @@ class Waiting(NamedTuple):
     item: WorkItem
     faults: int = 0
     holder: int | None = None
-    """The worker it is assigned to; None while it is in the queue."""
+    """The worker that the item is assigned to; None while it is in the queue."""
     last_holder: int | None = None
-    """The worker it came back from; None before that."""
+    """The worker that last had the item without delivering it; None if there was none."""
 
 
 class Slot(NamedTuple):
+    """A work item that was sent to a worker, with the number of the attempt."""
+
     item: WorkItem
     attempt: int
 
 
 class Worker(NamedTuple):
-    """A worker that came up. `slots` is what it has not answered yet, in the order sent; it runs the first."""
+    """A worker that has come up."""
 
     slots: tuple[Slot, ...] = ()
+    """Work items that it has not answered yet, in the order in which they were sent; it runs the first."""
     started_s: float = 0.0
-    """When it began the first slot."""
+    """Time at which it began the first slot."""
     deadline_s: float = math.inf
-    """When it must have answered the first slot."""
+    """Time by which it must answer the first slot."""
     limit: str = ""
-    """Field of the limits that this comes from."""
+    """Field of `Limits` that determines this deadline."""
     warm: frozenset[str] = frozenset()
-    """Kinds it has finished a work item of, hence compiled."""
+    """Kinds of which it has finished a work item, so that it need not compile for them again."""
     failures_in_a_row: int = 0
+    """Consecutive work items that raised an exception."""
 
 
 class SchedulerState(NamedTuple):
-    """Everything the scheduler remembers. Treat the containers as read-only; times are in the seconds of `now`."""
+    """Complete state of the scheduler. Its containers must not be changed; times are in seconds, as `now` of `step`."""
 
     limits: Limits
     wanted: int
+    """Number of workers that should run."""
     starting: dict[int, float]
-    """Deadline of each worker that has not come up yet."""
+    """Worker that has not come up yet -> time by which it must."""
     up: dict[int, Worker]
+    """Workers that can be assigned work items."""
     draining: dict[int, Worker]
+    """Workers that finish their work items and get no others."""
     items: dict[Hashable, Waiting]
+    """Work items that have not been delivered, by id."""
     queue: deque[Hashable]
-    """Keys to assign, next first."""
+    """Ids of the work items to assign; the next one is first."""
     durations_s: dict[str, tuple[float, ...]]
-    """Recent durations of a chunk per kind, without those that include compiling."""
+    """Kind -> recent durations of one chunk, without those that may include compiling."""
     next_worker: int = 0
+    """Id of the next worker to start."""
     start_at_s: float = -math.inf
-    """No worker is started before this."""
+    """Time before which no worker is started."""
     losses_in_a_row: int = 0
+    """Losses since the last delivered result, where losses that share a wait count once."""
     start_failures: int = 0
-    """Tries in a row to start workers that failed."""
+    """Consecutive failed attempts to start workers."""
     tried: int = 0
-    """Workers below this had been started when the last such failure was counted: they are part of it."""
+    """Workers with a lower id were started before the last of these failures was counted, and belong to it."""
     down_since_s: float | None = None
-    """Since when work items wait and no worker is up."""
+    """Time since which work items wait and no worker is up; None if this is not so."""
     last_lost: int | None = None
-    """The worker that was lost last, and why:"""
-    last_loss: str = "none was ever lost"
+    """The worker that was lost last."""
+    last_loss: str = "no worker was lost"
+    """Text that names the worker lost last, and the reason."""
     failed: str | None = None
-    """The message of `Fail`; the state is then terminal."""
+    """Message of `Fail`, after which the state never changes; None before that."""
     retries: int = 0
-    """Chunks assigned again: of each assignment of a work item beyond its first."""
+    """Chunks that were assigned again, counted at each assignment of a work item after the first."""
     lost_workers: int = 0
-    """Workers lost, or stopped for a fault."""
+    """Workers that were lost, or stopped because of a fault."""
     duplicates: int = 0
-    """Results and failures that were dropped: stale, repeated, or of an unknown worker."""
+    """Results and failures that were ignored: outdated, repeated, or from an unknown worker."""
 
 
 def initial_state(limits: Limits) -> SchedulerState:
-    """No item and no worker yet; the first step, whatever its event, starts the workers."""
+    """State without work items and workers; the first step starts the workers, whatever its event is."""
     return SchedulerState(limits, limits.workers, {}, {}, {}, {}, deque(), {})
 
 
 def pending(state: SchedulerState) -> int:
-    """Number of items submitted and not delivered."""
+    """Number of work items that have been submitted but not delivered."""
     return len(state.items)
 
 
 def usual_chunk_s(state: SchedulerState, kind: str) -> float | None:
-    """How long a chunk of this kind takes in the median; None while that is not known."""
+    """Median of the recent durations in seconds of a chunk of a kind; None if there are none yet."""
     durations_s = state.durations_s.get(kind)
     return statistics.median(durations_s) if durations_s else None
 
 
 def next_deadline(state: SchedulerState) -> float:
-    """When the next `Tick` will do something, in the seconds of `now`; infinity if only a message can."""
+    """Time of the next deadline, at which a `Tick` has an effect; infinity if there is none."""
     if state.failed is not None:
         return math.inf
     times = [worker.deadline_s for group in (state.up, state.draining) for worker in group.values()]
@@ -112,8 +123,10 @@ def next_deadline(state: SchedulerState) -> float:
 
 
 def told_last_words(state: SchedulerState, worker: int, last_words: str) -> SchedulerState:
-    """The state when it is known what the process of a worker just stopped had written. That is told of the last loss,
-    and of the failure of the run if it came of this loss."""
+    """State with the last output of a stopped worker's process added to the texts about its loss.
+
+    These are the text of the last loss, and the message of `Fail` if this loss made the run fail.
+    """
     if worker != state.last_lost:
         return state
     failed = None if state.failed is None else with_last_words(state.failed, last_words)
@@ -121,7 +134,7 @@ def told_last_words(state: SchedulerState, worker: int, last_words: str) -> Sche
 
 
 def find_slot(worker: Worker, item_id: Hashable, attempt: int) -> int | None:
-    """Index of what a worker has not answered yet; None if it was sent no such thing, or has answered it."""
+    """Index of the slot with an attempt at a work item; None if the worker was not sent it or has answered it."""
     for index, slot in enumerate(worker.slots):
         if slot.attempt == attempt and slot.item.id == item_id:
             return index
@@ -129,6 +142,6 @@ def find_slot(worker: Worker, item_id: Hashable, attempt: int) -> int | None:
 
 
 def holds(state: SchedulerState, worker: int, item_id: Hashable) -> bool:
-    """Whether a work item waits for the answer of this worker."""
+    """Whether a work item is assigned to a worker and has not been delivered."""
     waiting = state.items.get(item_id)
     return waiting is not None and waiting.holder == worker

@@ -1,1 +1,4 @@
-"""What the driver's side and the workers' side both import: messages, noise, processes. It imports nothing of ours."""
+"""Modules that both the driver and the workers import: messages, noise, wire format, platform and process environment.
+
+They import no other package of this project.
+"""

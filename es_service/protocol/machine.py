@@ -1,6 +1,6 @@
-"""What a run's bits depend on besides its config: package versions and the kind of processor.
+"""The platform of a run: package versions and kind of processor, on which its bits depend besides its config.
 
-The driver's and the workers': a worker of a cluster says what it is when it has come up.
+The driver and the workers each have a platform; a worker in a cluster reports its own when it has started.
 """
 
 from __future__ import annotations
@@ -13,28 +13,29 @@ from pathlib import Path
 from typing import Any
 
 VERSION = "0.6.0"
-"""Of es-service itself: of the code that runs. What an editable installation says of it is as old as its last `pip
-install`."""
+"""Version of es-service, written here because the metadata of an editable installation keep the version of the last
+`pip install`."""
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "brax", "mujoco", "mujoco-mjx", "llvmlite")
-"""Others whose version can change a bit of a result."""
+"""Other packages whose version can change a bit of a result."""
 
 
 def platform_info() -> dict[str, str]:
-    """Versions and CPU kind of this machine; the same text wherever results repeat bit for bit."""
+    """Package versions and CPU kind of this machine, by name. Equal platforms give the same results bit for bit."""
     versions = {name: metadata.version(name) for name in PACKAGES}
     return {"python": platform.python_version(), "es-service": VERSION, **versions, "cpu": cpu_kind()}
 
 
 def platform_text(info: Mapping[str, Any]) -> str:
-    """One text for equal platforms."""
+    """A platform as JSON; equal platforms have equal texts."""
     return json.dumps(info, sort_keys=True)
 
 
 def computed_on(driver: Mapping[str, Any], workers: Collection[str]) -> dict[str, Any]:
-    """What a generation was computed on: the driver's platform, and those of the workers unless all are like it.
+    """The platform of a generation: the driver's, with the workers' under "workers" unless all equal the driver's.
 
     Args:
-        workers: `platform_text` of each kind of worker there has been.
+        driver: `platform_info` of the driver.
+        workers: `platform_text` of each kind of worker so far.
     """
     if set(workers) <= {platform_text(driver)}:
         return dict(driver)
@@ -42,13 +43,16 @@ def computed_on(driver: Mapping[str, Any], workers: Collection[str]) -> dict[str
 
 
 def is_mixed(platforms: Iterable[Mapping[str, Any]]) -> bool:
-    """Whether generations were computed on more than one platform, or one of them by workers of more than one."""
+    """Whether generations were computed on several platforms, or one generation by workers on several platforms."""
     found = list(platforms)
     return len({platform_text(one) for one in found}) > 1 or any(len(one.get("workers", ())) > 1 for one in found)
 
 
 def cpu_kind() -> str:
-    """Vendor, family, model and widest vectors of the first processor, such as `AuthenticAMD 26/2 avx512f`."""
+    """Vendor, family, model and widest vector extension of the first processor, such as `AuthenticAMD 26/2 avx512f`.
+
+    Only the machine's architecture where /proc/cpuinfo cannot be read.
+    """
     try:
         lines = Path("/proc/cpuinfo").read_text().split("\n\n", 1)[0].splitlines()
     except OSError:

@@ -1,7 +1,7 @@
-"""What the driver and the workers say to each other: NumPy only, picklable, every array named by its axes.
+"""Messages between the driver and the workers: picklable, with NumPy arrays whose names end in their axes.
 
-A leaf of the import graph: both sides import it and it imports neither. Axes: D policy parameters, P antithetic pairs
-of one chunk, S sign [+, -], E episodes of one evaluation chunk, O observation, B descriptor dimensions.
+Axes: D policy parameters, P antithetic pairs of one chunk, S sign [+, -], E episodes of one evaluation chunk,
+O observation, B descriptor dimensions, T points of a trace. Both sides import this module and it imports neither.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ FloatArray = NDArray[np.float32]
 Bounds = tuple[tuple[float, float], ...]
 Segment = tuple[tuple[float, float], tuple[float, float]]
 SIGNS = (1.0, -1.0)
-"""The two members of a pair, in the order of axis S."""
+"""Signs of the noise of the two members of a pair, in the order of axis S."""
 TRACE_POINTS = 64
-"""Of an evaluation's trace; fewer if the episode has fewer steps."""
+"""Most points T in the trace of an evaluation; a trace has fewer if the episode has fewer steps."""
 EVALUATION_EPISODES_PER_CHUNK = 16
-"""Episodes in one evaluation chunk; a constant, so that its compiled shape is one too."""
+"""Episodes in one evaluation chunk. This is a constant so that the shape that is compiled never changes."""
 
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """What the driver must know about a task before any worker starts; plain data, kept with every run."""
+    """Description of a task, which the driver needs before any worker starts; plain data, stored with every run."""
 
     name: str
     observation_size: int
@@ -35,30 +35,32 @@ class TaskSpec:
     """Default length of an episode in control steps."""
     descriptor_names: tuple[str, ...]
     descriptor_bounds: Bounds
-    """(low, high) per descriptor dimension, in the units of the task."""
+    """(low, high) of each descriptor dimension, in the units of the task."""
     final_fitness: bool
-    """Whether `task.fitness: final` (the reward of the last valid step) makes sense here."""
+    """Whether the task allows `task.fitness: final` (the reward of the last valid step)."""
     has_goal: bool
-    """Whether there is a place to reach, so that distances to it are kept in the history."""
+    """Whether the task has a goal; if it has, the history has columns for the distance to the goal."""
     options: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """Task options a config may set, each with its allowed values; the first is the default."""
+    """Options of the task that a config can set: name -> allowed values, the first of which is the default."""
     summary: str = ""
+    """One line about the task, which `es-service list` shows."""
     descriptors: dict[str, tuple[tuple[str, ...], Bounds]] = field(default_factory=dict)
-    """Where the task's option `descriptor` chooses: name -> (descriptor_names, descriptor_bounds)."""
+    """Descriptors among which the task's option `descriptor` chooses: name -> (descriptor_names, descriptor_bounds).
+    Empty if the task has no such option."""
     walls: tuple[Segment, ...] | None = None
-    """Where the descriptor is a place in the plane: all walls there, so that it is known which places can be reached;
-    None where it is not specified."""
+    """All walls, as segments, if the descriptor is a position in the plane; they determine which cells of a map can be
+    reached. None if they are not specified."""
     wall_clearance: float = 0.0
-    """How near the middle of a wall no descriptor can come."""
+    """Least distance between a descriptor and the middle line of a wall."""
     least_reward: float | None = None
-    """What a QD-score counts from, per step: about the least mean reward of an episode. Not always a bound: short
-    episodes of AntTrap can be below. None where it is not specified."""
+    """Reward per step from which a QD-score counts: about the least mean reward of an episode. It is not always a
+    lower bound: short episodes of AntTrap can be below it. None if it is not specified."""
     no_simd: str = ""
-    """Why simd cannot compile its episodes; empty where it can."""
+    """Reason why simd cannot compile episodes of this task; empty if it can."""
 
 
 def with_options(task: TaskSpec, options: Mapping[str, str]) -> TaskSpec:
-    """The task as these options make it: with the descriptor they choose."""
+    """The task with the descriptor that its option `descriptor` chooses; unchanged if `options` choose none."""
     chosen = options.get("descriptor")
     if chosen not in task.descriptors:
         return task
@@ -68,24 +70,25 @@ def with_options(task: TaskSpec, options: Mapping[str, str]) -> TaskSpec:
 
 @dataclass(frozen=True)
 class PolicyShape:
-    """Layer widths from observation to action; the flat vector holds, layer by layer, weights [in, out] then biases."""
+    """Shape of a policy network. Its parameters are one flat vector [D]: per layer weights [in, out], then biases."""
 
     widths: tuple[int, ...]
+    """Widths of the layers, from the observation to the action."""
 
     @property
     def layers(self) -> tuple[tuple[int, int], ...]:
-        """(inputs, outputs) of every layer."""
+        """(inputs, outputs) of each layer."""
         return tuple(zip(self.widths[:-1], self.widths[1:], strict=True))
 
     @property
     def parameters(self) -> int:
-        """D, the length of the flat vector."""
+        """Number of parameters, D."""
         return sum(inputs * outputs + outputs for inputs, outputs in self.layers)
 
 
 @dataclass(frozen=True)
 class WorkerSpec:
-    """Everything a worker must know, sent once when it starts: constants of the run."""
+    """Constants of the run that a worker needs; sent to it once, when it starts."""
 
     seed: int
     environment: str
@@ -98,23 +101,23 @@ class WorkerSpec:
     action_noise: float
     common_random_numbers: bool
     chunk_pairs: int
-    """Pairs in a training chunk: its compiled shape."""
+    """Pairs in a training chunk; functions are compiled for this shape."""
     rollout_block_pairs: int
-    """With xla, pairs that step together inside a chunk; divides `chunk_pairs`. Few enough for their weights to stay in
-    cache."""
+    """With xla, pairs that step together inside a chunk; a divisor of `chunk_pairs`. It is small so that their weights
+    stay in the processor's cache."""
     gradient_block_pairs: int
     """Pairs whose weighted noise is summed into one partial gradient."""
     rollout: Literal["xla", "simd"] = "xla"
-    """What computes episodes and gradients."""
+    """Implementation that computes episodes and gradients."""
 
 
 class WorkerPlace(NamedTuple):
-    """Where a worker lives."""
+    """Host and process of a worker."""
 
     host: str
     pid: int
     node: str
-    """Id of the node in its cluster."""
+    """Ray's id of the cluster node."""
 
     def __str__(self) -> str:
         return f"{self.host} (pid {self.pid})"
@@ -122,7 +125,7 @@ class WorkerPlace(NamedTuple):
 
 @dataclass(frozen=True)
 class Centre:
-    """The point all chunks of one phase share: policy parameters, noise width, observation statistics."""
+    """Centre of a search distribution, with the standard deviation of its noise and the observation statistics."""
 
     generation: int
     parameters_D: FloatArray
@@ -130,13 +133,14 @@ class Centre:
     """Standard deviation of the parameter noise, in parameter units."""
     observation_mean_O: FloatArray
     observation_std_O: FloatArray
-    """Statistics as they were at the start of the generation, or those that the member keeps from the elite it began
-    with; 0 and 1 where normalisation is off."""
+    """Statistics at the start of the generation, or those of the elite with which the block started; 0 and 1 if
+    normalisation is off."""
 
 
 @dataclass(frozen=True)
 class TrainingChunk:
-    """Roll out pairs `chunk_id * chunk_pairs ...` around the centre, both signs, with action noise."""
+    """Request to roll out `chunk_pairs` pairs around the centre with action noise, from pair `chunk_id * chunk_pairs`
+    on."""
 
     generation: int
     chunk_id: int
@@ -144,7 +148,7 @@ class TrainingChunk:
 
 @dataclass(frozen=True)
 class EvaluationChunk:
-    """Roll out 16 episodes of the unperturbed centre without action noise; episode ids start at 16 * chunk_id."""
+    """Request to roll out 16 episodes of the centre itself without action noise, from episode `16 * chunk_id` on."""
 
     generation: int
     chunk_id: int
@@ -152,27 +156,30 @@ class EvaluationChunk:
 
 @dataclass(frozen=True)
 class GradientChunk:
-    """Sum weight * noise over one fixed block of pairs, starting at pair `chunk_id * gradient_block_pairs`."""
+    """Request to sum weight * noise over one block of pairs, from pair `chunk_id * gradient_block_pairs` on."""
 
     generation: int
     chunk_id: int
     weights_P: FloatArray
-    """Utility of + minus utility of -, per pair of the block; pairs past the end of the population weigh 0."""
+    """Utility of the + member minus utility of the - member, for each pair of the block; 0 for pairs beyond the end of
+    the population."""
 
 
 Chunk = TrainingChunk | EvaluationChunk | GradientChunk
 
 
 class WorkItemId(NamedTuple):
-    """Which work item: what engines and workers call the chunks that travel together."""
+    """Identity of a work item, that is, of chunks that are sent to a worker together."""
 
     phase: int
-    """Number of the `evaluate` call, so that a late answer of an earlier call is never taken for one of this call."""
+    """Number of the `evaluate` call. It distinguishes a late answer to an earlier call from an answer to this call."""
     kind: str
+    """Class name of the chunks."""
     generation: int
     chunk_id: int
-    """Of the first."""
+    """Id of the first chunk."""
     chunks: int
+    """Number of chunks."""
 
     def __str__(self) -> str:
         others = f" and {self.chunks - 1} more" if self.chunks > 1 else ""
@@ -181,38 +188,47 @@ class WorkItemId(NamedTuple):
 
 @dataclass(frozen=True)
 class Moments:
-    """Count, mean and sum of squared deviations of observations, in float64; mergeable."""
+    """Count, mean and sum of squared deviations of observations in float64, which can be merged."""
 
     count: float
     mean_O: NDArray[np.float64]
     m2_O: NDArray[np.float64]
+    """Sum of squared deviations from the mean."""
 
 
 @dataclass(frozen=True)
 class EpisodesResult:
-    """What came of a training chunk (leading axes P, S) or an evaluation chunk (leading axis E)."""
+    """Result of a training chunk, or of an evaluation chunk.
+
+    A training chunk's arrays have leading axes [P, S] and are over the member's episodes. An evaluation chunk's arrays
+    have the leading axis [E] and are of single episodes of the centre.
+    """
 
     fitness: FloatArray
-    """Mean over the member's episodes of its return, or of its last reward with `fitness: final`."""
+    """Mean return, or with `fitness: final` mean reward of the last step."""
     returns: FloatArray
-    """Mean over the member's episodes of the sum of rewards; equals `fitness` with `fitness: sum`."""
+    """Mean return (sum of rewards); equals `fitness` with `fitness: sum`."""
     descriptor: FloatArray
-    """Leading axes + B: mean over the member's episodes, each copied at the end of its episode."""
+    """[..., B]: mean of the descriptors at the ends of the episodes."""
     steps: NDArray[np.int32]
-    """Environment steps taken before or at `done`, summed over the member's episodes."""
+    """Number of environment steps up to and including `done`, summed over the member's episodes."""
     goal_distance: FloatArray
-    """Leading axes + 2: distance to the goal at the end of the episode, and its minimum; NaN without a goal."""
+    """[..., 2]: mean distance to the goal at the end of the episodes, and least distance in any of them; NaN if the
+    task has no goal."""
     moments: Moments | None
-    """Of every observation acted on before `done`; None for evaluations, which feed no statistics."""
+    """Moments of all observations that the policy acted on in valid episodes; None for evaluations, which do not update
+    the observation statistics."""
     trace_T_B: FloatArray | None = None
-    """Of an evaluation: the descriptor along its first episode, from the reset to the end in equal steps."""
+    """Descriptor along the first episode of an evaluation chunk, at equal time intervals from the reset to the last
+    possible step; None for training."""
 
 
 @dataclass(frozen=True)
 class GradientResult:
-    """One partial sum of the gradient estimate, in units of weight x standard normal noise."""
+    """One partial sum of the gradient estimate."""
 
     sum_D: FloatArray
+    """Sum over the pairs of the block of weight x standard normal noise."""
 
 
 ChunkResult = EpisodesResult | GradientResult
@@ -220,23 +236,29 @@ ChunkResult = EpisodesResult | GradientResult
 
 @dataclass(frozen=True)
 class DispatchCounts:
-    """Faults survived so far by an evaluator, over all generations of this process."""
+    """Numbers of workers and of faults of an evaluator since it was made."""
 
     retries: int = 0
-    """Chunks handed out again, also those that a lost worker had not begun."""
+    """Chunks that were sent again, including those that a lost worker had not begun."""
     lost_workers: int = 0
+    """Workers that were lost, or stopped because of a fault."""
     workers: int = 0
-    """Workers the evaluator was asked to keep."""
+    """Workers that the evaluator is to keep running."""
 
 
 class Evaluator(Protocol):
-    """Runs chunks somewhere. The driver neither knows nor cares where, in what order, or how often."""
+    """Interface by which the driver has chunks run. Results do not depend on where, in what order or how often."""
 
     @property
     def counts(self) -> DispatchCounts:
-        """Faults so far."""
+        """Numbers of workers and of faults so far."""
         ...
 
     def evaluate(self, centre: Centre, chunks: Sequence[Chunk]) -> list[ChunkResult]:
-        """Results in the order of `chunks`. Raises EvaluationError, or Interrupted when asked to stop."""
+        """Results of chunks around a centre, in the order of `chunks`.
+
+        Raises:
+            EvaluationError: the chunks cannot be computed.
+            Interrupted: a stop was requested.
+        """
         ...

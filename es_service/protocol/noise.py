@@ -1,19 +1,19 @@
-"""The project's one random generator: counter-based, integer, the same bits in NumPy, XLA and compiled kernels.
+"""The random number generator of the project: counter-based, with the same bits in NumPy, XLA and compiled kernels.
 
-A leaf of the import graph. A number is a pure function of its address, so it is made again wherever it is needed and
-never sent, stored or drawn from a stateful stream. An address has two halves:
+A random number is a pure function of its address. It is computed again wherever it is needed, and never sent, stored
+or drawn from a generator with a state. An address has two parts:
 
-* the *stream*: (run seed, key domain, generation, ids ...), hashed here in 64-bit NumPy into a key of four words;
+* the *stream*: (run seed, domain, generation, ids ...), hashed here in 64-bit NumPy into a key of four words;
 * the *coordinate*: a uint32 counter inside the stream (a policy parameter, a control step x action, ...), hashed with
-  the key by `hash_words`, 32-bit integer operations only, which NumPy, XLA and vector units all do exactly.
+  the key by `hash_words`. It uses 32-bit integer operations only, which are exact in NumPy, XLA and vector units.
 
-The normal variate is a count of coin flips: 62 hashed bits are counted and 2 more spread the count over quarter steps,
-`k = 8 * ones + 2 * dither - 251`, an odd integer with |k| <= 251. Its standard deviation is exactly sqrt(997), so
-`k / sqrt(997)` has mean 0, variance 1, skewness 0, excess kurtosis -0.032, and |x| <= 7.95. The lattice step is 0.063
-standard deviations. `k` is exact in int8 (as (k - 1) / 2), in bfloat16 and in float32, so any storage of it gives the
-same rollout and the same gradient.
+A normal variate is made from a count of bits: 62 hashed bits are counted, and 2 more bits divide each step of the count
+into quarters: `k = 8 * ones + 2 * dither - 251`, an odd integer with |k| <= 251. Its standard deviation is exactly
+sqrt(997), so `k / sqrt(997)` has mean 0, variance 1, skewness 0, excess kurtosis -0.032, and |x| <= 7.95. Its values
+are 0.063 standard deviations apart. `k` is exact in int8 (as (k - 1) / 2), in bfloat16 and in float32, so the rollout
+and the gradient do not depend on the type in which it is stored.
 
-Functions that run on both sides take the array namespace as `xp` (numpy or jax.numpy).
+Functions for both the driver and the workers take the array namespace as `xp` (numpy or jax.numpy).
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 Keys = NDArray[np.uint32]
-"""Stream keys: leading axes of the ids they were made from, then 4 words."""
+"""Stream keys [..., 4]: leading axes of the ids that they were made from, then the four words of a key."""
 
 NORMAL_STD = math.sqrt(997.0)
 """Standard deviation of `normal_integers`: sqrt(64 * 62 / 4 + 5)."""
 KEY_WORDS = 4
+"""uint32 words in a stream key."""
 
 
 class Domain(IntEnum):
-    """What a stream is for. Two uses never share a stream."""
+    """Purpose of a stream. Different purposes never share a stream."""
 
     INITIALISATION = 0
     PARAMETER_NOISE = 1
@@ -55,55 +56,63 @@ _2, _8, _15, _16 = np.uint32(2), np.uint32(8), np.uint32(15), np.uint32(16)
 
 
 def _mix64(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """A bijection of 64-bit words that scatters every input bit (the finaliser of splitmix64)."""
+    """Bijection of 64-bit words in which each input bit affects all output bits (the finaliser of splitmix64)."""
     x = (x ^ (x >> np.uint64(30))) * _MIX_1
     x = (x ^ (x >> np.uint64(27))) * _MIX_2
     return x ^ (x >> np.uint64(31))
 
 
 def _mix(x: int) -> int:
-    """The same of one word, in Python integers; avoids the overhead of NumPy calls."""
+    """Scalar version of `_mix64` in Python integers; avoids NumPy's call overhead."""
     x = (x ^ (x >> 30)) * int(_MIX_1) & _MASK
     x = (x ^ (x >> 27)) * int(_MIX_2) & _MASK
     return x ^ (x >> 31)
 
 
 def stream_keys(seed: int, domain: Domain | tuple[Domain, ...], generation: int, *ids: Any) -> Keys:
-    """Keys of the streams (seed, domain, generation, *ids); ids are ints or integer arrays that broadcast together.
+    """Keys of the streams (seed, domain, generation, *ids).
+
+    Args:
+        domain: one domain, or a tuple of domains, for which the result has an additional first axis.
+        ids: ints or integer arrays that broadcast together.
 
     Returns:
-        uint32 array of the broadcast shape of `ids` + (4,), with an axis in front for several domains. Streams that
-        differ only in the last field never collide.
+        uint32 array of the broadcast shape of `ids` + (4,). Keys of streams that differ only in the last id never
+        collide.
+
+    Raises:
+        OverflowError: the seed, the domain or the generation is not an unsigned 64-bit integer.
     """
     domains = domain if isinstance(domain, tuple) else (domain,)
-    # An axis of domains always: NumPy warns where a scalar wraps around, but not where an array does.
+    # There is always an axis of domains, because NumPy warns when a scalar wraps around, but not when an array does.
     state = np.array([_prefix(seed, one, generation) for one in domains], np.uint64)
     state = state.reshape(-1, *[1] * max(map(np.ndim, ids), default=0))
     for field in ids:
         state = _mix64((state ^ np.asarray(field, np.uint64)) + _GOLDEN)
     halves = _mix64(state[..., None] + _HALVES)
-    words = halves.astype("<u8", copy=False).view("<u4")  # the lower half of each comes first
+    words = halves.astype("<u8", copy=False).view("<u4")  # the lower half of each 64-bit word comes first
     return words if isinstance(domain, tuple) else words[0]
 
 
 def _prefix(seed: int, domain: Domain, generation: int) -> int:
+    """State of the hash of a stream's address before its ids."""
     state = 0
     for field in (int(seed), int(domain), int(generation)):
         if not 0 <= field <= _MASK:
-            raise OverflowError(f"{field} is not a field of 64 bits")
+            raise OverflowError(f"the seed, domain or generation {field} is not between 0 and 2^64 - 1")
         state = _mix((state ^ field) + int(_GOLDEN) & _MASK)
     return state
 
 
 def hash_words(key: Any, coordinate: Any) -> tuple[Any, Any]:
-    """Two hashed words of each coordinate of one stream.
+    """Two hashed words for each coordinate of one stream.
 
     Args:
         key: uint32 [4].
-        coordinate: uint32 array, any shape.
+        coordinate: uint32 array of any shape.
 
     Returns:
-        Two uint32 arrays of the shape of `coordinate`. Each is a bijection of the coordinate for a fixed key.
+        Two uint32 arrays of the shape of `coordinate`. For a fixed key, each is a bijection of the coordinate.
     """
     x = coordinate * _WEYL + key[0]
     x = (x ^ (x >> _16)) * _MUL_1 ^ key[1]
@@ -116,7 +125,7 @@ def hash_words(key: Any, coordinate: Any) -> tuple[Any, Any]:
 
 
 def normal_integers(xp: Any, key: Any, coordinate: Any) -> Any:
-    """Normal variates times sqrt(997), as odd int32 in [-251, 251]; shape of `coordinate` (uint32)."""
+    """Standard normal variates times sqrt(997): odd int32 in [-251, 251], in the shape of `coordinate` (uint32)."""
     x, y = hash_words(key, coordinate)
     ones = xp.bitwise_count(x).astype(np.int32) + xp.bitwise_count(y >> _2).astype(np.int32)
     dither = (y & np.uint32(3)).astype(np.int32)
@@ -124,13 +133,13 @@ def normal_integers(xp: Any, key: Any, coordinate: Any) -> Any:
 
 
 def uniforms(key: Any, coordinate: Any) -> Any:
-    """Uniform float32 in [0, 1) on the grid of 2^-24; shape of `coordinate` (uint32)."""
+    """Uniform variates: float32 multiples of 2^-24 in [0, 1), in the shape of `coordinate` (uint32)."""
     _, y = hash_words(key, coordinate)
     return (y >> _8).astype(np.float32) * np.float32(2.0**-24)
 
 
 def normals(key: Keys, count: int) -> NDArray[np.float32]:
-    """The first `count` standard normal variates of one stream, in NumPy: coordinates 0 .. count - 1."""
+    """Standard normal variates [count] of one stream at coordinates 0 to count - 1, in NumPy."""
     integers = normal_integers(np, key, np.arange(count, dtype=np.uint32))
     return integers.astype(np.float32) / np.float32(NORMAL_STD)
 
@@ -141,4 +150,5 @@ TEST_VECTORS: tuple[tuple[tuple[int, Domain, int, tuple[int, ...]], tuple[int, .
     ((1, Domain.PARAMETER_NOISE, 7, (511,)), (31, -23, -65)),
     ((2**63 - 1, Domain.ACTION_NOISE, 10**6, (4095, 1, 2)), (-13, 1, -1)),
 )
-"""((seed, domain, generation, ids), `normal_integers` at coordinates 0, 1, 2): what any implementation must give."""
+"""Values that every implementation must give: (seed, domain, generation, ids) and `normal_integers` at coordinates 0,
+1, 2."""

@@ -1,6 +1,6 @@
-"""Environment variables of the processes in which workers live, so that nothing set elsewhere changes their bits.
+"""Environment variables of worker processes, which keep settings made elsewhere from changing the bits of results.
 
-The driver starts such processes, a Ray actor finds itself in one.
+The driver sets them for the processes that it starts; a Ray actor sets them in its own process.
 """
 
 from __future__ import annotations
@@ -10,23 +10,24 @@ import sys
 from collections.abc import Mapping
 
 GPU_MEMORY_FRACTION = 0.9
-"""Of a whole GPU; workers that share one divide this among them."""
+"""Fraction of a GPU's memory that workers may use; workers that share a GPU divide it among them."""
 GPU_SETTINGS = {
     "JAX_PLATFORMS": "cuda",
     "JAX_DEFAULT_MATMUL_PRECISION": "highest",
     "XLA_FLAGS": "--xla_gpu_deterministic_ops=true --xla_gpu_autotune_level=0",
 }
-"""So that a GPU repeats its own bits; they are not those of a CPU."""
+"""Settings with which a GPU repeats its own bits, which differ from those of a CPU."""
 
 
 def worker_environment(environment: Mapping[str, str], gpus: float = 0.0) -> dict[str, str]:
-    """Environment variables for a worker process, made from those of whoever starts it.
+    """Environment variables of a worker process, made from those of the process that starts it.
 
-    One thread, one kind of device, and none of the other settings of JAX and XLA, so that nothing set elsewhere can
-    change the bits of a rollout. In force only where JAX has not been imported yet.
+    They allow one thread and one kind of device, and contain no other settings of JAX and XLA, so that settings made
+    elsewhere cannot change the bits of a rollout. They have an effect only if JAX has not been imported yet.
 
     Args:
-        gpus: the worker's share of a GPU, which CUDA_VISIBLE_DEVICES names already; with 0 no GPU is touched.
+        environment: variables of the process that starts the worker.
+        gpus: the worker's share of a GPU, which CUDA_VISIBLE_DEVICES must already name; with 0 no GPU is used.
     """
     kept = {name: value for name, value in environment.items() if not name.startswith(("JAX_", "XLA_", "PJRT_"))}
     threads = dict.fromkeys(("PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -36,9 +37,9 @@ def worker_environment(environment: Mapping[str, str], gpus: float = 0.0) -> dic
 
 
 def child_environment() -> dict[str, str]:
-    """Environment variables for a process like a worker's, without a GPU, that imports what this one can import.
+    """Environment variables of a child process without a GPU, which imports from the same places as this process.
 
-    And nothing else: a current folder with a `workers.py` of its own must not take the place of ours.
+    PYTHONSAFEPATH excludes the current folder, where a user's `workers.py` would hide the package of that name.
     """
     path = os.pathsep.join(path or os.getcwd() for path in sys.path)
     return worker_environment(os.environ) | {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"}

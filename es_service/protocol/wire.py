@@ -1,6 +1,7 @@
-"""Messages over a stream socket, between a driver and a worker on the same machine: eight bytes of length, a pickle.
+"""Messages over a stream socket between a driver and a worker on the same machine.
 
-A leaf of the import graph. The worker's end waits; the driver's never does, whatever state the worker is in.
+A message is eight bytes of length, followed by a pickle. The worker's end blocks. The driver's end never blocks,
+whatever state the worker is in.
 """
 
 from __future__ import annotations
@@ -15,20 +16,21 @@ from typing import Any
 _LENGTH = struct.Struct("!Q")
 _READ_BYTES = 1 << 18
 BUFFER_BYTES = 1 << 20
-"""What sockets are asked to hold, so that most messages are sent at once; the system may grant less."""
+"""Send buffer requested for each socket, so that most messages are sent at once; the system may grant less."""
 
 
 def framed(message: Any) -> bytes:
-    """A message as it travels."""
+    """A message as the bytes that are sent: its length, then its pickle."""
     body = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
     return _LENGTH.pack(len(body)) + body
 
 
 def receive(end: socket.socket) -> Any:
-    """The next message of a socket that waits.
+    """The next message from a blocking socket.
 
     Raises:
-        EOFError: the other end is closed. OSError: it broke.
+        EOFError: the other end has closed the connection.
+        OSError: the connection failed.
     """
     (length,) = _LENGTH.unpack(_exactly(end, _LENGTH.size))
     return pickle.loads(_exactly(end, length))
@@ -46,31 +48,31 @@ def _exactly(end: socket.socket, count: int) -> bytearray:
 
 
 class Channel:
-    """The end that never waits: what the socket does not take yet is kept, as is the beginning of a message."""
+    """The end that never blocks. It keeps bytes that the socket does not take yet and messages that are incomplete."""
 
     def __init__(self, end: socket.socket) -> None:
-        """Take over a socket."""
+        """Take over a socket and make it non-blocking."""
         end.setblocking(False)
         self._end = end
         self._to_send: deque[memoryview] = deque()
         self._read = bytearray()
 
     def fileno(self) -> int:
-        """The socket's, to poll: for reading always, for writing while `is_full`."""
+        """File descriptor of the socket. Poll it for reading, and while `is_full` also for writing."""
         return self._end.fileno()
 
     @property
     def is_full(self) -> bool:
-        """Whether something waits to be sent; `flush` when the socket is writable."""
+        """Whether bytes remain to be sent; call `flush` when the socket is writable."""
         return bool(self._to_send)
 
     def send(self, *frames: bytes) -> None:
-        """Send messages made by `framed`, or begin to."""
+        """Send messages made by `framed`, as far as the socket takes them now."""
         self._to_send.extend(map(memoryview, frames))
         self.flush()
 
     def flush(self) -> None:
-        """Send as much as the socket takes. If that fails the connection is at an end, as `receive` tells."""
+        """Send as much as the socket takes now. If that fails, shut the connection down, which `receive` reports."""
         try:
             while self._to_send:
                 sent = self._end.send(self._to_send[0])
@@ -80,21 +82,21 @@ class Channel:
                     self._to_send.popleft()
         except BlockingIOError:
             pass
-        except OSError:  # perhaps in the middle of a message, so that nothing more can be said
+        except OSError:  # part of a message may have been sent, so no other message can follow
             self._to_send.clear()
             with suppress(OSError):
                 self._end.shutdown(socket.SHUT_RDWR)
 
     @property
     def is_halfway(self) -> bool:
-        """Whether a message has begun to come."""
+        """Whether part of a message has been received."""
         return bool(self._read)
 
     def receive(self) -> tuple[list[Any], bool]:
-        """(whole messages that have come, whether there may be more): no more once the other end is closed.
+        """(complete messages received so far, whether the connection is still open).
 
         Raises:
-            Exception: whatever unpickling a message raises.
+            Exception: any exception that unpickling a message raises.
         """
         is_open = True
         try:
@@ -121,5 +123,5 @@ class Channel:
         return messages, is_open
 
     def close(self) -> None:
-        """Free the socket."""
+        """Close the socket."""
         self._end.close()

@@ -1,5 +1,5 @@
-"""The run store: one SQLite file per run, one transaction per generation, verified when opened.
+"""The run store: one SQLite file per run with one transaction per generation, verified when it is opened for writing.
 
-`writer.py` is the one writer, `reader.py` what everybody else uses. `create`, `verify`, `repair` and `upkeep` are what
-the writer does before and besides committing; `schema`, `codec`, `folder` and `lock` are what all of them share.
+`writer.py` has the only writer, and all readers use `reader.py`. `create`, `beginning`, `repair` and `upkeep` are parts
+of the writer; `verify`, `schema`, `codec`, `folder` and `lock` are shared. `digest.py` computes the digest of a run.
 """

@@ -1,7 +1,7 @@
-"""What a run begins with if not with nothing; stored while its folder is made, so that no run is without it.
+"""Data with which a run begins, stored while its folder is created.
 
-A fork begins with its parent's history and state. A run that starts from another one's centre keeps that centre, so
-that what becomes of the other run changes nothing.
+A fork begins with the history and the state of its parent. A run that starts from the centre of another run stores this
+centre, so later changes of the other run have no effect on it.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from es_service.store.codec import (
 from es_service.store.schema import RunMeta, history_insert
 
 _START = "start"
-"""Key of the table `meta` under which the start is kept."""
+"""Key of the start in the table `meta`."""
 
 
 @dataclass(frozen=True)
 class Beginning:
-    """What to begin with; empty for an ordinary run."""
+    """Data with which a run begins; empty for an ordinary run."""
 
     history: Iterable[Mapping[str, int | float | None]] = ()
-    """A fork's parent's rows of generations 0, 1, ... n, gone through once: they need not fit into memory. Columns this
-    run does not have are left out, those that the parent did not have are empty."""
+    """History rows of a fork's parent, of generations 0 to `newest`. They are iterated over once and need not fit into
+    memory. Columns that this run does not have are left out; columns that the parent does not have get no value."""
     parts: Mapping[str, Part] = field(default_factory=dict)
-    """The state of generation n."""
+    """State of the parent at generation `newest`."""
     platforms: Sequence[tuple[int, dict[str, Any]]] = ()
-    """(first generation, platform) of the parent, up to n."""
+    """(first generation, platform) of the parent, up to generation `newest`."""
     start: Part | None = None
-    """Arrays that generation 0 is to start from; `RunStore.start` gives them back."""
+    """Arrays from which generation 0 starts; `RunStore.start` returns them."""
     newest: int = -1
-    """n."""
+    """Last generation that is taken from the parent; -1 if there is none."""
 
 
 def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Beginning) -> None:
-    """Write `beginning` into the database of a new run, in one transaction."""
+    """Write the data with which a run begins into its new database, in one transaction."""
     newest = beginning.newest
     connection.execute("BEGIN IMMEDIATE")
     in_force: dict[str, tuple[int, str]] = {}
@@ -61,7 +61,7 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
     names = [column.name for column in meta.columns]
     insert = history_insert(meta.columns)
     for generation, given in enumerate(beginning.history):
-        # Of all but the newest generation the state is not kept.
+        # The state of the newest generation is stored, but not those of the generations before it.
         state = state_sha256(state_sum(in_force if generation == newest else {}))
         values = {name: given.get(name) for name in names}
         connection.execute(insert, history_row(meta.columns, generation, values, state))
@@ -76,6 +76,6 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
 
 
 def load_start(connection: sqlite3.Connection) -> dict[str, NDArray[Any]] | None:
-    """`Beginning.start` of a verified database."""
+    """`Beginning.start` from a verified database; None if there is none."""
     row = connection.execute("SELECT value FROM meta WHERE key = ?", (_START,)).fetchone()
     return None if row is None else decode_part(base64.b64decode(row[0]))

@@ -1,6 +1,6 @@
-"""Bytes of the run store: what a state part and a history row are, byte for byte, and their SHA-256.
+"""Encoding of state parts and history rows as bytes, and their SHA-256.
 
-Everything here is deterministic: equal values give equal bytes on every machine. No pickle.
+Everything here is deterministic: equal values give equal bytes on every machine. Pickle is not used.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from es_service.errors import StoreError
 from es_service.loop.history import Column
 
 Part = Mapping[str, NDArray[Any]]
-"""One piece of the search state that changes as a whole: arrays by name, e.g. {"centre_D": ..., "step": int64[]}."""
+"""A part of the search state, which is stored as a whole: name -> array, e.g. {"centre_D": ..., "step": int64[]}."""
 Row = tuple[int | float | None, ...]
-"""Values of one history row in the order of the run's columns; None for what has no value."""
+"""Values of one history row in the order of the run's columns; None stands for no value."""
 
 _MAGIC = b"ESP1"
 _HEADER_LENGTH = struct.Struct("<I")
@@ -33,16 +33,20 @@ _SUM_MODULUS = 2**256
 
 
 def encode_part(part: Part) -> bytes:
-    """Magic, header length, JSON header [[name, dtype, shape], ...] sorted by name, then the raw little-endian arrays.
+    """A state part as bytes.
 
-    Raises StoreError for an array that is not of booleans or numbers.
+    They are a magic number, the length of the header, the JSON header [[name, dtype, shape], ...] sorted by name, and
+    the values of the arrays in little-endian byte order.
+
+    Raises:
+        StoreError: an array has neither bools nor numbers.
     """
     header: list[tuple[str, str, list[int]]] = []
     raw: list[bytes] = []
     for name in sorted(part):
         array = np.asarray(part[name])
         if array.dtype.kind not in _NUMERIC_KINDS:
-            raise StoreError(f"state array {name!r} has dtype {array.dtype}; only booleans and numbers can be stored")
+            raise StoreError(f"state array {name!r} has dtype {array.dtype}; only bools and numbers can be stored")
         little = array.astype(array.dtype.newbyteorder("<"), copy=False)
         header.append((name, little.dtype.str, list(array.shape)))
         raw.append(little.tobytes(order="C"))
@@ -51,9 +55,13 @@ def encode_part(part: Part) -> bytes:
 
 
 def decode_part(payload: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays of `encode_part`, writable. Raises ValueError if `payload` is not exactly one encoded part."""
+    """The arrays that `encode_part` encoded, writable.
+
+    Raises:
+        ValueError: `payload` is not exactly one encoded part.
+    """
     if payload[:4] != _MAGIC or len(payload) < 8:
-        raise ValueError("a state payload does not start as one")
+        raise ValueError(f"a state payload begins with {payload[:4]!r} instead of {_MAGIC!r}")
     position = 8 + _HEADER_LENGTH.unpack_from(payload, 4)[0]
     try:
         entries = [(str(name), np.dtype(kind), tuple(shape)) for name, kind, shape in json.loads(payload[8:position])]
@@ -73,28 +81,31 @@ def decode_part(payload: bytes) -> dict[str, NDArray[Any]]:
 
 
 def part_sha256(part: str, generation: int, payload: bytes) -> str:
-    """Of a state row. Name and generation are in it, so that a row cannot pass for another one."""
+    """SHA-256 of a state row. It includes the part's name and the generation, so that rows cannot be exchanged."""
     digest = hashlib.sha256(f"state\0{part}\0{generation}\0".encode())
     digest.update(payload)
     return digest.hexdigest()
 
 
 def state_sum(rows: Mapping[str, tuple[int, str]]) -> int:
-    """A number that stands for the whole state of a generation, from (generation, sha256) of each part's row in force.
+    """Number that identifies the whole state of a generation: the sum modulo 2^256 of one SHA-256 for each part.
 
-    The sum, modulo 2^256, of one SHA-256 per row: a generation that changes few of many parts changes few terms.
+    A generation that changes few of many parts changes few terms of the sum.
+
+    Args:
+        rows: part -> (generation, sha256) of its newest row.
     """
     return sum(_row_term(part, generation, sha256) for part, (generation, sha256) in rows.items()) % _SUM_MODULUS
 
 
 def changed_sum(total: int, old: Mapping[str, tuple[int, str]], new: Mapping[str, tuple[int, str]]) -> int:
-    """`state_sum` after the rows `new` have come into force in the place of `old`."""
+    """`state_sum` after the rows `new` have replaced the rows `old` in a state whose sum is `total`."""
     return (total - state_sum(old) + state_sum(new)) % _SUM_MODULUS
 
 
 def state_sha256(total: int) -> str:
-    """What is stored of `state_sum` with the history row, so that a state row that has vanished is noticed and not
-    replaced by an older one."""
+    """Text of a `state_sum`, which is stored with the history row. By it, a missing state row is noticed; otherwise an
+    older row of the part would be used."""
     return f"{total:064x}"
 
 
@@ -103,25 +114,33 @@ def _row_term(part: str, generation: int, sha256: str) -> int:
 
 
 def text_sha256(key: str, text: str) -> str:
-    """Of a row that is a key and a JSON text."""
+    """SHA-256 of a row that consists of a key and a JSON text."""
     return hashlib.sha256(f"{key}\0{text}".encode()).hexdigest()
 
 
 def row_values(columns: Sequence[Column], generation: int, history: Mapping[str, int | float | None]) -> Row:
-    """The row to store: every column once, NaN as None, -0.0 as 0.0 (SQLite does not keep the sign).
+    """Values of a history row as they are stored: NaN becomes None, and -0.0 becomes 0.0, as in SQLite.
 
-    `generation` may be left out of `history`. Raises StoreError for a column too many or too few, a value of the
-    wrong type, or another generation.
+    Args:
+        columns: columns of the run.
+        generation: generation of the row.
+        history: value of each column; `generation` may be left out.
+
+    Raises:
+        StoreError: a column is unknown or missing, a value has the wrong type, or the generation differs.
     """
     given = {"generation": generation, **history}
     names = {column.name for column in columns}
     if given.keys() != names:
         raise StoreError(
             f"history row of generation {generation}: unknown columns {sorted(given.keys() - names)}, "
-            f"missing columns {sorted(names - given.keys())}; give exactly the run's columns, NaN for no value"
+            f"missing columns {sorted(names - given.keys())}; give all columns of the run and no others, with NaN for "
+            "no value"
         )
     if given["generation"] != generation:
-        raise StoreError(f"history row of generation {generation} says it is of generation {given['generation']}")
+        raise StoreError(
+            f"history row of generation {generation}: its column generation has the value {given['generation']}"
+        )
     return tuple(_value(column, given[column.name]) for column in columns)
 
 
@@ -135,12 +154,12 @@ def _value(column: Column, value: Any) -> int | float | None:
     except TypeError as error:
         raise StoreError(f"history column {column.name} is {column.type} and cannot hold {value!r}") from error
     if not -(2**63) <= integer < 2**63:
-        raise StoreError(f"history column {column.name} cannot hold {value!r}: it does not fit 64 bits")
+        raise StoreError(f"history column {column.name} cannot hold {value!r}: it does not fit into 64 bits")
     return integer
 
 
 def row_bytes(row: Row) -> bytes:
-    """Canonical bytes of values as read from the database. Raises ValueError for a value no column can hold."""
+    """Bytes of the values of a history row, for its SHA-256. Raises ValueError for a value that is not a number."""
     parts: list[bytes] = []
     for value in row:
         if value is None:
@@ -155,23 +174,27 @@ def row_bytes(row: Row) -> bytes:
 
 
 def column_bytes(columns: Sequence[Column]) -> bytes:
-    """Names and types of the columns, to be hashed before their values."""
+    """Bytes of the names and types of columns, which are hashed before the values."""
     return json.dumps([[column.name, column.type] for column in columns], separators=(",", ":")).encode()
 
 
 def row_sha256(columns: bytes, row: Row, state: str) -> str:
-    """Of a history row: its columns (`column_bytes`), values, and the `state_sha256` stored with it."""
+    """SHA-256 of a history row: of its columns (`column_bytes`), its values and the `state_sha256` stored with it."""
     return hashlib.sha256(b"".join((columns, row_bytes(row), state.encode()))).hexdigest()
 
 
 def history_row(
     columns: Sequence[Column], generation: int, history: Mapping[str, int | float | None], state: str
 ) -> tuple[int | float | str | None, ...]:
-    """A history row as it is stored, `state` being the `state_sha256` of its generation. Raises as `row_values`."""
+    """A history row as it is stored, with the `state_sha256` of its generation and its own SHA-256 at the end.
+
+    Raises:
+        StoreError: as in `row_values`.
+    """
     values = row_values(columns, generation, history)
     return (*values, state, row_sha256(column_bytes(columns), values, state))
 
 
 def row_dict(columns: Sequence[Column], row: Row) -> dict[str, int | float]:
-    """A stored row for its readers: NaN where there is no value."""
+    """Values of a stored row by column name; NaN stands for no value."""
     return {column.name: math.nan if value is None else value for column, value in zip(columns, row, strict=True)}

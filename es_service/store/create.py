@@ -1,4 +1,4 @@
-"""Creating a run folder so that it appears whole or not at all, whenever the process is killed."""
+"""Creation of a run folder, which appears complete or not at all, even if the process is killed."""
 
 from __future__ import annotations
 
@@ -27,14 +27,16 @@ from es_service.store.schema import RunMeta, create_tables, meta_text
 
 _NEW_DATABASE = "run.db.new"
 _LEFT_BEHIND = {LOCK, CONFIG, f"{CONFIG}.new", _NEW_DATABASE, f"{_NEW_DATABASE}-journal"}
-"""What a creation in place may leave when it is killed, and the next one may overwrite."""
+"""Files that a killed creation in an existing folder may leave, which the next creation may overwrite."""
 
 
 def create_run_folder(folder: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -> RunLock:
-    """Make `folder` that of a run that has computed nothing yet, and hold its lock.
+    """Create the folder of a new run and take its lock.
 
-    It is built beside its final place and renamed; in an existing empty folder, `run.db` is renamed into place last.
-    Raises StoreError if the folder is taken or cannot be written.
+    The folder is built beside its final path and then renamed. In an existing empty folder, `run.db` is renamed last.
+
+    Raises:
+        StoreError: the folder is not empty or cannot be written.
     """
     try:
         return _create(folder, config_yaml, meta, beginning)
@@ -45,7 +47,7 @@ def create_run_folder(folder: Path, config_yaml: str, meta: RunMeta, beginning: 
 def _create(folder: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -> RunLock:
     _refuse_taken(folder)
     parent = folder.absolute().parent
-    # A folder that exists may be a mount point or somebody's working directory, which cannot be renamed over.
+    # An existing folder may be a mount point or the current folder of a process, which a rename must not replace.
     beside = not folder.is_dir()
     place = parent / f".{folder.name}.creating" if beside else folder
     try:
@@ -60,7 +62,7 @@ def _create(folder: Path, config_yaml: str, meta: RunMeta, beginning: Beginning)
     lock = acquire_lock(place)
     try:
         if not beside:
-            # Another creation may have been at work until the lock was ours.
+            # Another process may have created a run here before this one got the lock.
             _refuse_taken(folder)
         _build(place, config_yaml, meta, beginning)
         if beside:
@@ -86,17 +88,18 @@ def _build(place: Path, config_yaml: str, meta: RunMeta, beginning: Beginning) -
 
 def _move(place: Path, folder: Path) -> None:
     try:
-        # Replaces an empty folder, fails on any other.
+        # A rename replaces an empty folder, and fails for any other.
         os.rename(place, folder)
     except OSError as error:
         if folder.exists():
-            raise StoreError(f"{folder} appeared while this run was being created; choose another folder") from error
+            text = f"another program created {folder} while this run was being created; choose another folder"
+            raise StoreError(text) from error
         raise
     sync_folder(folder.absolute().parent)
 
 
 def _clear(place: Path, beside: bool) -> None:
-    """Take away what a failed creation wrote, so that the same command can be given again; a whole run stays."""
+    """Delete the files of a failed creation, so that the same command can be repeated. A complete run is kept."""
     with contextlib.suppress(OSError):
         remove_database(place / _NEW_DATABASE)
         if beside:

@@ -1,9 +1,9 @@
-"""The digest of a run: SHA-256 over what must repeat bit for bit, and nothing else.
+"""The digest of a run: a SHA-256 over everything that must repeat bit for bit, and nothing else.
 
-Hashed are values, each with its name, type and shape: not payload bytes as stored, row order on disk, seconds, rates,
-workers, hosts or paths. It is taken from what the tables contain, without looking at the SHA-256 stored beside it
-(`checked_parts` does that first): a flipped bit in a state payload or a deterministic history value gives another
-digest, or a StoreError where the value can no longer be read as one.
+It is computed from values with their names, types and shapes. It does not depend on the stored bytes of payloads, the
+order of rows on disk, seconds, rates, workers, hosts or paths, nor on the stored SHA-256s, which only `checked_parts`
+compares. A changed bit in a state payload or a deterministic history value gives another digest, or a StoreError if the
+value cannot be read any more.
 """
 
 from __future__ import annotations
@@ -29,43 +29,49 @@ from es_service.store.verify import verify
 Connection = sqlite3.Connection
 
 NEWEST = 2**62
-"""Stands for the newest generation."""
+"""Number that stands for the newest generation."""
 
 
 def digest_of(parts: Mapping[str, str]) -> str:
-    """The digest of a run whose `digest_parts` are these."""
+    """Digest of a run, from its `digest_parts`."""
     lines = (f"{name}\0{sha256}\n" for name, sha256 in sorted(parts.items()))
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def digest_parts(folder: Path) -> dict[str, str]:
-    """SHA-256 by name: `state/<part>` of each part's newest value, `map` of all its cells and elites, `history`.
+    """The SHA-256s of which the digest is made, by name.
 
-    Raises StoreError if the run cannot be read.
+    `state/<part>` is that of the newest value of a state part, `map` that of all parts of the behaviour map, and
+    `history` that of the deterministic columns of the history.
+
+    Raises:
+        StoreError: the run cannot be read.
     """
     with reading(folder) as (connection, meta):
         return _parts(folder, connection, meta)
 
 
 def digest_at(folder: Path, generation: int) -> str | None:
-    """The digest that the run had after one of its last two generations; None if that state is no longer kept."""
+    """Digest of the run after one of its last two generations; None if the state of that generation is not stored."""
     with reading(folder) as (connection, meta):
         kept = kept_states(connection)
         return digest_of(_parts(folder, connection, meta, generation)) if generation in kept else None
 
 
 def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
-    """`digest_parts`, and whether the stored generations were computed on more than one platform (versions, CPU or GPU
-    kind), by the driver or by workers; of one moment, after everything stored was checked against its SHA-256.
+    """`digest_parts`, and whether the generations were computed on more than one platform, by the driver or by workers.
 
-    Raises StoreError that names what is damaged.
+    Both are read in one transaction, after everything that is stored was checked against its SHA-256.
+
+    Raises:
+        StoreError: the run cannot be read, or is damaged; the message names the damaged data.
     """
     with reading(folder) as (connection, meta):
         if problems := verify(connection, folder / DATABASE).problems:
             raise StoreError(
                 f"{folder} is damaged: {'; '.join(problems)}",
                 run=folder,
-                ways_out=[WayOut("resume", "go on from the newest generation that is sound", str(folder))],
+                ways_out=[WayOut("resume", "continue from the newest intact generation", str(folder))],
             )
         return _parts(folder, connection, meta), _is_mixed(connection)
 
@@ -79,8 +85,8 @@ def _parts(folder: Path, connection: Connection, meta: RunMeta, until: int = NEW
     try:
         return {**_state(connection, until), "history": _history(connection, meta, until)}
     except ValueError as error:
-        ways_out = [WayOut("resume", "repair what can be repaired", str(folder))]
-        raise StoreError(f"{folder} holds what cannot be read: {error}", run=folder, ways_out=ways_out) from error
+        ways_out = [WayOut("resume", "repair it as far as possible", str(folder))]
+        raise StoreError(f"{folder} has data that cannot be read: {error}", run=folder, ways_out=ways_out) from error
 
 
 def _state(connection: Connection, until: int) -> dict[str, str]:
@@ -93,7 +99,7 @@ def _state(connection: Connection, until: int) -> dict[str, str]:
 
 
 def arrays_sha256(arrays: dict[str, NDArray[Any]]) -> str:
-    """Of arrays by name: name, type, shape and little-endian values of each, in the order of the names."""
+    """SHA-256 of arrays by name: of the name, type, shape and little-endian values of each, sorted by name."""
     total = hashlib.sha256()
     for name in sorted(arrays):
         little = arrays[name].astype(arrays[name].dtype.newbyteorder("<"), copy=False)

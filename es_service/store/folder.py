@@ -1,4 +1,4 @@
-"""A run's folder: the names of its files, the file system under it, and what its errors mean to a user."""
+"""The folder of a run: the names of its files, the kind of its file system, and the messages of its errors."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ CONFIG = "config.yaml"
 DATABASE = "run.db"
 LOCK = "run.lock"
 COPY = "run.db.copy"
-"""The verified copy: what opening turns to when `run.db` itself is damaged, and what readers on a network read."""
+"""Verified copy of `run.db`. It replaces a damaged `run.db`, and readers on a network file system read it."""
 DAMAGED = "run.db.damaged"
-"""Where a `run.db` that could not be used is kept for whoever wants to look into it."""
+"""Name under which a damaged `run.db` is kept, so that it can be examined."""
 
 # fmt: off
 NETWORK_FILE_SYSTEMS = frozenset((
@@ -26,17 +26,20 @@ NETWORK_FILE_SYSTEMS = frozenset((
     "virtiofs", "vmhgfs", "wekafs",
 ))
 # fmt: on
-"""Types on which other hosts see the files, or on which shared memory cannot be relied upon: no WAL there."""
+"""File systems without WAL, because other hosts can use the files or shared memory may not work."""
 LOCAL_FUSE = frozenset({"fuse.fuse-overlayfs", "fuse.ntfs-3g", "fuse.fuse2fs"})
+"""FUSE file systems that are local."""
 _LITTLE_SPACE = 256 * 1024
+"""Free bytes below which a plain I/O error is taken for a full disk."""
 
 
 def is_network_filesystem(path: Path, mountinfo: str | None = None) -> bool:
-    """Whether `path` lies on a network or shared file system; an unknown FUSE type counts as one, to be safe.
+    """Whether a path is on a network or shared file system. An unknown FUSE type counts as one, to be safe.
 
     Args:
-        path: need not exist; its nearest existing ancestors decide.
-        mountinfo: text of a `/proc/<pid>/mountinfo`; this process's own if None. Where there is none, all is local.
+        path: a path, which need not exist.
+        mountinfo: text of a `/proc/<pid>/mountinfo`; None for that of this process. Without this file, the result is
+            false.
     """
     if mountinfo is None:
         try:
@@ -50,7 +53,7 @@ def is_network_filesystem(path: Path, mountinfo: str | None = None) -> bool:
         if not separator or len(fields.split()) < 5 or not source.split():
             continue
         mount_point = Path(re.sub(r"\\([0-7]{3})", lambda octal: chr(int(octal[1], 8)), fields.split()[4]))
-        # Of two mounts on one point the later one lies on top, hence >=.
+        # If there are two mounts on one point, the later one hides the other; therefore >=.
         if target.is_relative_to(mount_point) and len(mount_point.parts) >= depth:
             depth, kind = len(mount_point.parts), source.split()[0].lower()
     return kind in NETWORK_FILE_SYSTEMS or (kind.startswith("fuse.") and kind not in LOCAL_FUSE)
@@ -62,7 +65,7 @@ def sync_folder(folder: Path) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        # Some network file systems cannot fsync a folder; there its rename is synchronous anyway.
+        # Some network file systems cannot fsync a folder, but there, renames are synchronous anyway.
         if error.errno not in (errno.EINVAL, errno.ENOTSUP):
             raise
     finally:
@@ -70,7 +73,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Make the content of `path` survive a power cut. Never for a database that is open: closing drops its locks."""
+    """Make the content of a file survive a power cut. Do not use it for an open database: closing drops its locks."""
     descriptor = os.open(path, os.O_RDWR)
     try:
         os.fsync(descriptor)
@@ -79,7 +82,7 @@ def sync_file(path: Path) -> None:
 
 
 def write_config(folder: Path, text: str) -> None:
-    """Write the run's `config.yaml`, replacing a former one in one step."""
+    """Write the run's `config.yaml`, or replace it atomically."""
     new = folder / f"{CONFIG}.new"
     new.write_text(text, encoding="utf-8")
     sync_file(new)
@@ -88,15 +91,16 @@ def write_config(folder: Path, text: str) -> None:
 
 
 def remove_database(path: Path) -> None:
-    """Delete a database file and whatever SQLite may have left beside it."""
+    """Delete a database file and the files of SQLite beside it."""
     for suffix in ("", "-journal", "-wal", "-shm"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
 def holds_run(folder: Path) -> bool:
-    """Whether there is a run in `folder`: its database, or the copy that opening puts in the place of a lost one.
+    """Whether a folder contains a run: its database, or the copy from which opening restores a lost database.
 
-    Raises StoreError where that cannot be told.
+    Raises:
+        StoreError: the folder cannot be accessed.
     """
     try:
         return (folder / DATABASE).exists() or (folder / COPY).exists()
@@ -105,7 +109,7 @@ def holds_run(folder: Path) -> bool:
 
 
 def require_run_folder(folder: Path) -> None:
-    """Raises StoreError unless `folder` holds a run."""
+    """Raise StoreError unless a folder contains a run."""
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
         raise StoreError(
@@ -115,19 +119,19 @@ def require_run_folder(folder: Path) -> None:
         )
     if not holds_run(folder):
         raise StoreError(
-            f"{folder} is not a run folder: it holds no {DATABASE}. If its creation was stopped, nothing was lost: "
-            f"start it again.",
+            f"{folder} is not a run folder: it contains no {DATABASE}. If the creation of a run was interrupted here, "
+            f"nothing was lost; start the run again.",
             run=folder,
         )
 
 
 def is_disk_full(error: BaseException, folder: Path) -> bool:
-    """Whether an error of SQLite or the operating system came from lack of space (or of quota) under `folder`."""
+    """Whether lack of disk space or quota in `folder` caused an error of SQLite or the operating system."""
     if isinstance(error, OSError):
         return error.errno in (errno.ENOSPC, errno.EDQUOT)
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     if code == sqlite3.SQLITE_IOERR:
-        # Growing the shared memory of the WAL reports lack of space as a plain I/O error.
+        # If there is no space for the shared memory of the WAL, SQLite reports a plain I/O error.
         try:
             return shutil.disk_usage(folder).free < _LITTLE_SPACE
         except OSError:
@@ -136,11 +140,15 @@ def is_disk_full(error: BaseException, folder: Path) -> bool:
 
 
 def explained(error: sqlite3.Error | OSError, folder: Path, doing: str, then: str | None = None) -> StoreError:
-    """The StoreError to raise for a failure of SQLite or the operating system while `doing` something in `folder`.
+    """The StoreError for a failure of SQLite or the operating system in a run folder.
 
-    `then` is what to do after the cause is gone; resuming if None.
+    Args:
+        error: the failure.
+        folder: the run folder.
+        doing: the operation that failed, after "while": "reading the run".
+        then: what the user should do after removing the cause, as an imperative; None to suggest resuming the run.
     """
-    ways_out = [] if then else [WayOut("resume", "go on once the cause is gone", str(folder))]
+    ways_out = [] if then else [WayOut("resume", "continue after the cause is removed", str(folder))]
     ending = f", then {then}." if then else "."
     if is_disk_full(error, folder):
         return StoreError(
@@ -150,9 +158,9 @@ def explained(error: sqlite3.Error | OSError, folder: Path, doing: str, then: st
         )
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
-        hint = f"Another program keeps {folder / DATABASE} open; close it"
+        hint = f"Another program has {folder / DATABASE} open; close that program"
     elif code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN) or isinstance(error, OSError):
-        hint = "Check that the folder and its files exist and may be read and written"
+        hint = "Check that the folder and its files exist and can be read and written"
     else:
         hint = "Everything stored before is safe; check the disk"
     return StoreError(f"{folder}: error while {doing}: {error}. {hint}{ending}", run=folder, ways_out=ways_out)

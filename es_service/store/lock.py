@@ -1,7 +1,7 @@
-"""Who writes to a run: an exclusive `flock` on `run.lock`, held for the life of the writer and naming it.
+"""The lock of a run: an exclusive `flock` on `run.lock`, which its writer holds and whose file names the writer.
 
-The kernel drops the lock when its process ends, however it ends, so a lock is never stale; what the file says is only
-there to be shown.
+The kernel releases the lock when the process ends in any way, so a lock is never stale. The content of the file is only
+for messages.
 """
 
 from __future__ import annotations
@@ -22,44 +22,46 @@ from es_service.errors import RunLockedError, StoreError, WayOut
 from es_service.store.folder import LOCK, explained
 
 _PATIENCE_S = 0.5
-"""`lock_holder` takes a shared lock for an instant; a writer that starts just then tries again for this long."""
+"""Seconds for which a writer tries to take the lock, because `lock_holder` holds a shared lock for an instant."""
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 _held: weakref.WeakSet[RunLock] = weakref.WeakSet()
 
 
 class RunLock:
-    """A lock in hand; `release` lets go of it."""
+    """A lock that this process holds until `release`."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
         _held.add(self)
 
     def release(self) -> None:
-        """Let another writer in. Harmless if done already."""
+        """Release the lock, so that another writer can take it. This may be called again."""
         if self._descriptor >= 0:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._descriptor, 0)
             self.abandon()
 
     def abandon(self) -> None:
-        """Close our handle; the lock itself lives on while another process holds a handle of the same opening."""
+        """Close the file of the lock. The lock remains while another process has inherited the same open file."""
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
 
 
 def acquire_lock(folder: Path) -> RunLock:
-    """Become the only writer of the run in `folder`.
+    """Take the lock of the run in `folder`, whose only writer is then the caller.
 
-    Raises RunLockedError if another process is, StoreError where the lock file cannot be made or locked.
+    Raises:
+        RunLockedError: another process holds the lock.
+        StoreError: the lock file cannot be created or locked.
     """
     try:
         return _acquire(folder, time.monotonic() + _PATIENCE_S)
     except OSError as error:
         if error.errno in _NO_LOCKS:
             raise StoreError(
-                f"{folder / LOCK}: this file system does not support file locks ({error}), so two writers could not "
-                f"be kept apart. Mount it with locks enabled (`flock`), or choose another folder.",
+                f"{folder / LOCK}: this file system does not support file locks ({error}), so two processes could "
+                f"write to the run at the same time. Mount it with locks enabled (`flock`), or choose another folder.",
                 run=folder,
             ) from error
         raise explained(error, folder, f"locking {LOCK}") from error
@@ -91,14 +93,14 @@ def _write_identity(descriptor: int) -> None:
         "pid": os.getpid(),
         "since": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    # The lock is what counts: on a full disk it goes without a name.
+    # The lock itself is enough; on a full disk its file does not name the writer.
     with contextlib.suppress(OSError):
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, json.dumps(identity).encode(), 0)
 
 
 def _is_at(descriptor: int, path: Path) -> bool:
-    """Whether the open file still is the one at `path`: a creation that failed takes its lock file away."""
+    """Whether the open file is still the one at `path`; the creation of a run deletes its lock file if it fails."""
     try:
         return os.path.samestat(os.fstat(descriptor), os.stat(path))
     except FileNotFoundError:
@@ -106,16 +108,17 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 
 def lock_holder(folder: Path) -> dict[str, Any] | None:
-    """Host, pid and since (ISO time, UTC) of the process writing to the run in `folder`; None if nobody is.
+    """The process that holds the lock of the run in `folder`; None if there is none.
 
-    Values are None for the instant in which a new writer has the lock but has not yet written its name.
+    Returns:
+        "host", "pid" and "since" (ISO time, UTC). The values are None if the writer has not written them yet.
     """
     try:
         descriptor = os.open(folder / LOCK, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
         return None
     try:
-        # Shared, so that two who ask at once do not take each other for a writer.
+        # A shared lock, so that two calls at the same time do not see each other as a writer.
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
         return None
     except BlockingIOError:
@@ -139,7 +142,7 @@ def _locked(folder: Path) -> RunLockedError:
     holder = lock_holder(folder) or _identity(b"")
     return RunLockedError(
         f"{folder} is being written by process {holder['pid'] or '(unknown)'} on host {holder['host'] or '(unknown)'} "
-        f"since {holder['since'] or '(unknown)'}; stop that process first, or leave it at work.",
+        f"since {holder['since'] or '(unknown)'}; stop that process first, or wait until it ends.",
         run=folder,
         ways_out=[WayOut("watch", "watch it", str(folder))],
     )
@@ -150,5 +153,5 @@ def _abandon_in_child() -> None:
         lock.abandon()
 
 
-# A forked child shares our handle: a worker that outlives a killed driver must not keep the run locked.
+# A forked child inherits the open file of the lock. A worker that outlives a killed driver must not keep the lock.
 os.register_at_fork(after_in_child=_abandon_in_child)

@@ -1,6 +1,6 @@
-"""Reading a run: short transactions that work while a writer writes, after it was killed, and after a clean end.
+"""Reading a run in short transactions, during writing, after a writer was killed, and after a clean end.
 
-Readers never create, change or repair a run; what they return was checked against its SHA-256.
+Readers never create, change or repair a run. The state and the history rows that they return match their SHA-256.
 """
 
 from __future__ import annotations
@@ -26,10 +26,13 @@ _BUSY_S = 5.0
 
 @contextlib.contextmanager
 def reading(folder: Path) -> Iterator[tuple[sqlite3.Connection, RunMeta]]:
-    """One consistent view of the run in `folder`: a read-only connection inside a transaction, and what the run is.
+    """Context manager with a read-only connection to the run in `folder`, inside a transaction, and its description.
 
-    Keep it short: a writer cannot end its log while it lasts. Raises StoreError if the folder is no run, if it was
-    written by a newer version, or if it cannot be read.
+    All reads in it see the same generation. It should be short, because a writer cannot empty SQLite's log meanwhile.
+
+    Raises:
+        StoreError: the folder is not a run folder, the run was written by a version with another schema, or it cannot
+            be read.
     """
     folder = Path(folder)
     try:
@@ -50,9 +53,9 @@ def _connected(folder: Path) -> tuple[sqlite3.Connection, RunMeta]:
         raise StoreError(f"{folder / DATABASE} is missing", run=folder, ways_out=[way_out])
     if not is_network_filesystem(folder) or not (folder / COPY).exists():
         return _connected_to(folder / DATABASE)
-    # There the database of a writer at work is left alone.
+    # On a network file system, read the copy while a writer is running.
     if lock_holder(folder) is None:
-        # What a killed writer left may have to be rolled back, which is not for readers to do.
+        # This fails if a killed writer left a transaction that must be rolled back, which readers cannot do.
         with contextlib.suppress(sqlite3.Error):
             return _connected_to(folder / DATABASE)
     return _connected_to(folder / COPY)
@@ -63,7 +66,7 @@ def _connected_to(file: Path) -> tuple[sqlite3.Connection, RunMeta]:
     connection = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None)
     try:
         connection.execute("BEGIN")
-        # The first read fixes what the whole transaction sees.
+        # The first read determines the generation that the whole transaction sees.
         return connection, load_meta(connection, file)
     except BaseException:
         connection.close()
@@ -72,22 +75,22 @@ def _connected_to(file: Path) -> tuple[sqlite3.Connection, RunMeta]:
 
 def _unreadable(folder: Path, error: sqlite3.Error | Damaged | OSError) -> StoreError:
     if not isinstance(error, Damaged) and is_no_damage(error, folder):
-        return explained(error, folder, "reading it", "try again, or with a copy of the folder")
+        return explained(error, folder, "reading the run", "try again, or read a copy of the folder")
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     is_database = code != sqlite3.SQLITE_NOTADB and "no such table: meta" not in str(error)
     what = "cannot be read" if is_database else "is not a run folder"
-    way_out = WayOut("resume", "repair what can be repaired, if it is a run", str(folder))
+    way_out = WayOut("resume", "repair it as far as possible, if it is a run", str(folder))
     return StoreError(f"{folder} {what}: {error}", run=folder, ways_out=[way_out])
 
 
 def read_meta(folder: Path) -> RunMeta:
-    """What the run is."""
+    """The description of a run. Raises StoreError as `reading`, as do all functions here that take a folder."""
     with reading(folder) as (_, meta):
         return meta
 
 
 def read_generation(folder: Path) -> int | None:
-    """Newest committed generation; None before the first."""
+    """Newest committed generation; None if there is none."""
     with reading(folder) as (connection, _):
         return connection.execute("SELECT max(generation) FROM history").fetchone()[0]
 
@@ -95,21 +98,24 @@ def read_generation(folder: Path) -> int | None:
 def read_history(
     folder: Path, since_generation: int | None = None, limit: int | None = None
 ) -> list[dict[str, int | float]]:
-    """History rows in order, from `since_generation` on (itself included; all if None); NaN where there is no value.
+    """History rows in order, as values by column name; NaN stands for no value.
 
     Args:
-        limit: at most so many of them.
+        since_generation: generation of the first row; None for all rows.
+        limit: greatest number of rows; None for all rows.
 
-    Raises StoreError for a row that is missing or does not match its SHA-256.
+    Raises:
+        StoreError: a row is missing or does not match its SHA-256.
     """
     with reading(folder) as (connection, meta):
         return _sound_rows(connection, meta, max(since_generation or 0, 0), limit)
 
 
 def read_newest(folder: Path) -> dict[str, int | float] | None:
-    """The newest history row, at the same cost however many there are; None before the first generation.
+    """The newest history row; None if there is none. No other row is read.
 
-    Raises StoreError if it is missing or does not match its SHA-256.
+    Raises:
+        StoreError: the row is missing or does not match its SHA-256.
     """
     with reading(folder) as (connection, meta):
         newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
@@ -118,7 +124,7 @@ def read_newest(folder: Path) -> dict[str, int | float] | None:
 
 
 def read_totals(folder: Path, names: Sequence[str]) -> list[int | float]:
-    """Sums of some columns over the whole history, which is not checked for it, nor held in memory."""
+    """Sums of columns over the whole history, in the order of `names`. Rows are not checked against their SHA-256."""
     sums = ", ".join(f"coalesce(sum(history.{quoted(name)}), 0)" for name in names)
     with reading(folder) as (connection, _):
         return list(connection.execute(f"SELECT {sums} FROM history").fetchone())
@@ -127,7 +133,7 @@ def read_totals(folder: Path, names: Sequence[str]) -> list[int | float]:
 def _sound_rows(
     connection: sqlite3.Connection, meta: RunMeta, first: int, limit: int | None = None
 ) -> list[dict[str, int | float]]:
-    """History rows from generation `first` on. Raises Damaged for one that is missing or is not as it was stored."""
+    """History rows from generation `first` on. Raises Damaged if a row is missing or does not match its SHA-256."""
     query = history_select(meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation LIMIT ?"
     columns = column_bytes(meta.columns)
     rows: list[dict[str, int | float]] = []
@@ -137,19 +143,25 @@ def _sound_rows(
         if not row_is_sound(columns, row, state, sha256) or named["generation"] != first + len(rows):
             raise Damaged(f"the history row of generation {first + len(rows)} is damaged or missing")
         rows.append(named)
-    # Damage can hide the end of a table from SQLite itself; every generation has state rows, too.
+    # Damage can hide the end of a table even from SQLite. The state shows it, since every generation has state rows.
     newest = connection.execute("SELECT max(generation) FROM state").fetchone()[0]
     if newest is not None and newest >= first + len(rows) and len(rows) != limit:
-        raise Damaged(f"the history after generation {first + len(rows) - 1} is missing; the state is of {newest}")
+        at = first + len(rows) - 1
+        raise Damaged(f"the history after generation {at} is missing; the state is that of generation {newest}")
     return rows
 
 
 def read_parts(
     folder: Path, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
 ) -> tuple[int, dict[str, dict[str, NDArray[Any]]]]:
-    """A generation (the newest if None) and every state part as of it, or those whose names are wanted.
+    """A generation and its state, as (generation, arrays by name for each part).
 
-    Raises StoreError if its state is not kept, naming those that are, or does not match its SHA-256.
+    Args:
+        generation: generation of the state; None for the newest.
+        wanted: function that tells from a part's name whether to read this part.
+
+    Raises:
+        StoreError: the state of this generation is not stored, or does not match its SHA-256.
     """
     with reading(folder) as (connection, _):
         kept, states, whole = _kept(connection)
@@ -161,8 +173,8 @@ def read_parts(
             if asked in states and asked == max(states):
                 raise Damaged(f"the state of generation {asked} is damaged")
             raise StoreError(
-                f"{folder} does not keep the state of generation {asked}; it keeps that of {whole}, "
-                f"the history reaches generation {max(states)}",
+                f"{folder} does not keep the state of generation {asked}; it keeps the states of generations {whole}, "
+                f"and its history ends at generation {max(states)}",
                 field="generation",
                 value=asked,
                 allowed=str(whole),
@@ -181,12 +193,12 @@ def read_parts(
 
 
 def kept_states(connection: sqlite3.Connection) -> list[int]:
-    """Generations, at most two, whose whole state is there."""
+    """Generations whose whole state is stored, at most two."""
     return _kept(connection)[2]
 
 
 def _kept(connection: sqlite3.Connection) -> tuple[KeptRows, dict[int, str], list[int]]:
-    """State rows at hand; SHA-256 of the states of the last two generations; those that are whole."""
+    """Stored state rows, `state_sha256` of each of the last two generations, and those whose whole state is stored."""
     kept: KeptRows = {}
     for part, at, sha256 in connection.execute("SELECT part, generation, sha256 FROM state"):
         kept.setdefault(part, {})[at] = sha256
@@ -202,11 +214,11 @@ def state_payload(connection: sqlite3.Connection, part: str, generation: int) ->
 
 
 def read_platforms(folder: Path) -> list[tuple[int, dict[str, Any]]]:
-    """(first generation, platform) in order; each holds until the next."""
+    """Platforms of a run as (first generation, platform) in order; each applies until the next one."""
     with reading(folder) as (connection, _):
         return platforms(connection)
 
 
 def platforms(connection: sqlite3.Connection) -> list[tuple[int, dict[str, Any]]]:
-    """`read_platforms` of a connection inside `reading`."""
+    """`read_platforms` for a connection of `reading`."""
     return [(at, json.loads(text)) for at, text in sound_platforms(connection)]

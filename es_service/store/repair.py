@@ -1,6 +1,6 @@
-"""Opening a run's database for writing: verify it, go back a generation, or turn to the verified copy; never silently.
+"""Opening a run's database for writing: it is verified, and a damaged one is repaired or replaced by the verified copy.
 
-Runs are deterministic: what is lost here is computed again, with the same bits.
+Every repair is reported. Since runs are deterministic, lost generations are computed again with the same bits.
 """
 
 from __future__ import annotations
@@ -20,15 +20,20 @@ _BUSY_S = 10.0
 
 
 def connect(file: Path) -> sqlite3.Connection:
-    """A connection in autocommit mode to an existing or new database; every transaction is written out."""
+    """A connection in autocommit mode to an existing or new database; all transactions are explicit."""
     return sqlite3.connect(file, timeout=_BUSY_S, isolation_level=None)
 
 
 def open_sound(folder: Path, notices: list[str]) -> tuple[sqlite3.Connection, Verdict]:
-    """A connection to the folder's `run.db` and what it holds, after repairing what had to be; the lock is held.
+    """A connection to the folder's `run.db` and the result of its verification, after any necessary repair.
 
-    What was done is added to `notices`. Raises StoreError if nothing can be trusted, or if the files cannot be used
-    for a reason that is no damage.
+    The caller must hold the lock.
+
+    Args:
+        notices: list to which messages about repairs are added.
+
+    Raises:
+        StoreError: neither the database nor its copy can be used, or a file cannot be accessed.
     """
     file = folder / DATABASE
     try:
@@ -56,7 +61,7 @@ def _open_made_sound(file: Path, notices: list[str]) -> tuple[sqlite3.Connection
 
 
 def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str]) -> Verdict:
-    """Verify, and delete what is not sound if a whole generation remains. Raises Damaged if none does."""
+    """Verify a database and delete damaged rows; returns the new result. Raises Damaged if no generation is intact."""
     verdict = verify(connection, file)
     if not verdict.problems:
         return verdict
@@ -69,11 +74,13 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str]) 
     connection.execute("COMMIT")
     found = "; ".join(verdict.problems)
     if verdict.good == verdict.newest:
-        notices.append(f"{file}: {found}. The newest generation, {verdict.good}, is sound; deleted the rest")
+        notices.append(
+            f"{file}: {found}. The newest generation, {verdict.good}, is intact; the damaged rows were deleted"
+        )
     else:
         notices.append(
-            f"{file}: the newest state or history, of generation {verdict.newest}, is damaged ({found}); "
-            f"fell back to generation {verdict.good}"
+            f"{file}: the state or the history of the newest generation, {verdict.newest}, is damaged ({found}); "
+            f"the run fell back to generation {verdict.good}"
         )
     again = verify(connection, file)
     if again.problems:
@@ -82,12 +89,16 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str]) 
 
 
 def _restore_copy(folder: Path, damage: str, notices: list[str]) -> None:
-    """Put the verified copy in the place of `run.db`, which is kept aside. Can be killed anywhere and done again."""
+    """Replace `run.db`, which is kept under another name, by the verified copy.
+
+    If this process is killed at any point, this function can be called again.
+    """
     file, copy, restored = folder / DATABASE, folder / COPY, folder / f"{DATABASE}.restored"
     if not copy.exists():
         raise StoreError(
-            f"{file} cannot be trusted, and there is no {COPY} to turn to: {damage}. If {folder} is not a run folder, "
-            f"name another; if it is, put back a backup of {DATABASE}, or start again in another folder.",
+            f"{file} cannot be used: {damage}. There is no {COPY} from which to restore it. If {folder} is not a run "
+            f"folder, choose another folder; if it is, restore {DATABASE} from a backup, or start a new run in another "
+            "folder.",
             run=folder,
         )
     remove_database(restored)
@@ -97,15 +108,16 @@ def _restore_copy(folder: Path, damage: str, notices: list[str]) -> None:
     except Damaged as error:
         remove_database(restored)
         raise StoreError(
-            f"Nothing in {folder} can be trusted. {DATABASE}: {damage}. {COPY}: {error}. "
-            f"Put back a backup of {DATABASE}, or start again in another folder.",
+            f"Neither {DATABASE} nor {COPY} in {folder} can be used. {DATABASE}: {damage}. {COPY}: {error}. "
+            f"Restore {DATABASE} from a backup, or start a new run in another folder.",
             run=folder,
         ) from error
     with closing(connection):
-        # One file, so that the rename below moves all of it.
+        # The database must be a single file, so that the rename below moves all of it.
         connection.execute("PRAGMA journal_mode = DELETE")
     sync_file(restored)
-    # The database first: without it, being killed here leads back here, and its log cannot be lost before it.
+    # Move the database before its log, which it needs. If this process is killed in between, the next opening finds no
+    # database and restores the copy again.
     if file.exists():
         remove_database(folder / DAMAGED)
         os.replace(file, folder / DAMAGED)
@@ -122,12 +134,14 @@ def _restore_copy(folder: Path, damage: str, notices: list[str]) -> None:
 
 
 def make_copy(connection: sqlite3.Connection, folder: Path) -> None:
-    """Replace the folder's verified copy by one of what `connection` has committed.
+    """Replace the folder's verified copy by a new copy of the database of `connection`.
 
-    The driver waits meanwhile, so rows that are in the former copy as they are here are not checked again.
+    The driver waits meanwhile, so rows that are the same in the former copy are not checked again. If this raises, the
+    former copy remains.
 
-    Raises Damaged if what was copied cannot be trusted (the former copy then stays), sqlite3.Error and OSError where
-    it could not be written.
+    Raises:
+        Damaged: the new copy is damaged.
+        sqlite3.Error, OSError: the new copy cannot be written.
     """
     temporary = folder / f"{COPY}.new"
     try:
@@ -135,7 +149,7 @@ def make_copy(connection: sqlite3.Connection, folder: Path) -> None:
         with closing(connect(temporary)) as target:
             target.execute("PRAGMA synchronous = OFF")
             connection.backup(target)
-            # The copied header says WAL; a copy is a single file that can be read without writing beside it.
+            # The header was copied from a WAL database. Without WAL, readers of the copy write no files beside it.
             target.execute("PRAGMA journal_mode = DELETE")
             verdict = verify(target, temporary, _known_rows(target, folder / COPY))
         if verdict.problems:
@@ -149,13 +163,13 @@ def make_copy(connection: sqlite3.Connection, folder: Path) -> None:
 
 
 def _known_rows(connection: sqlite3.Connection, former: Path) -> int:
-    """History rows, from generation 0 on, that must be sound: the former verified copy has them all, and no others.
+    """Number of history rows, from generation 0 on, that equal those of the former verified copy; 0 if any row differs.
 
-    That both were damaged alike cannot be. To compare them takes a fraction of the time of their SHA-256.
+    These rows are intact, since both files cannot have the same damage. Comparing them is much faster than SHA-256.
     """
     if not former.exists():
         return 0
-    with suppress(sqlite3.Error):  # of the former copy, which may be damaged, or anything at all
+    with suppress(sqlite3.Error):  # the former copy may be damaged, or may be another file
         columns = load_meta(connection, former).columns
         connection.execute("ATTACH ? AS former", (str(former),))
         try:

@@ -1,4 +1,4 @@
-"""Tables of `run.db` and the record of what the run is. The table `meta` keeps its shape in every schema version."""
+"""The tables of `run.db`, and the description of the run. The table `meta` is the same in all schema versions."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from es_service.store.codec import text_sha256
 
 SCHEMA_VERSION = 4
 READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0"}
-"""Older versions of the schema -> the newest es-service that reads them."""
+"""Older schema version -> newest version of es-service that reads it."""
 APPLICATION_ID = 0x45535256
-"""In the file's header, for tools that tell database files apart."""
+"""Number in the header of the file, by which tools recognise the kind of a database."""
 PAGE_BYTES = 8192
+"""Size of a database page."""
 GENERATION_TABLES = ("state", "history", "platform")
-"""Tables whose rows carry a generation: falling back deletes the newer rows of each. Later tables go here; what they
-gain in a generation must be hashed into its history row, as the state is, or a lost row goes unnoticed."""
+"""Tables whose rows belong to a generation; falling back to a generation deletes the newer rows of each table.
+
+A new table of this kind must be added here. Its rows must be hashed into the history row of their generation, as those
+of the state are; otherwise the loss of a row is not noticed."""
 
 _META = "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, sha256 TEXT NOT NULL) WITHOUT ROWID"
 _STATE = (
@@ -32,49 +35,51 @@ _PLATFORM = "CREATE TABLE platform (generation INTEGER PRIMARY KEY, platform TEX
 _OWN_HISTORY_COLUMNS = ("state_sha256", "sha256")
 
 
-class Damaged(Exception):  # noqa: N818 (caught inside the store, which then says what it did about it)
-    """A database file that cannot be trusted; the message says what is wrong with it."""
+class Damaged(Exception):  # noqa: N818 (caught inside the store, which then repairs or reports the damage)
+    """A database is damaged; the message describes the damage, with "it" for the file."""
 
 
 @dataclass(frozen=True)
 class RunMeta:
-    """What a run is. Written once, when it is created; comes back with lists for tuples inside the dicts."""
+    """Description of a run, stored once when the run is created; loading turns tuples inside its dicts into lists."""
 
     run_id: str
     created: str
     """ISO time, UTC."""
     config: dict[str, Any]
-    """The resolved config, JSON-able."""
+    """Resolved config, as values that JSON can represent."""
     constants: dict[str, Any]
-    """What may not change on resume, JSON-able."""
+    """Settings that must not change on resume, as values that JSON can represent."""
     task: dict[str, Any]
-    """The task's `TaskSpec` as a dict, so that a run can be read where its task is not installed."""
+    """The task's `TaskSpec` as a dict, so that the run can be read without the task's package."""
     columns: tuple[Column, ...]
-    """Of the history, `generation` among them."""
+    """Columns of the history, including `generation`."""
     parent: dict[str, Any] | None = None
-    """The run this one was forked from, or took its first centre from: run id, folder, generation, digest."""
+    """Run from which this one was forked or took its first centre: run id, folder, generation, digest. None if there is
+    none."""
 
 
 def meta_text(meta: RunMeta) -> str:
-    """`meta` as JSON. Raises StoreError if its columns cannot be a table's."""
+    """`meta` as JSON. Raises StoreError if no table can have its columns."""
     names = [column.name.casefold() for column in meta.columns]
     twice = sorted({name for name in names if names.count(name) > 1})
     reserved = sorted(set(names) & set(_OWN_HISTORY_COLUMNS))
     if twice or reserved or ("generation", "INTEGER") not in [(column.name, column.type) for column in meta.columns]:
         raise StoreError(
-            f"history columns: given twice {twice}, reserved {reserved}; an INTEGER column `generation` is needed"
+            f"history columns: duplicate names {twice}, reserved names {reserved}; give each column its own name, and "
+            "include an INTEGER column `generation`"
         )
     return json.dumps(asdict(meta), sort_keys=True)
 
 
 def meta_from_text(text: str) -> RunMeta:
-    """The inverse of `meta_text`."""
+    """The description of a run from its `meta_text`."""
     fields = json.loads(text)
     return RunMeta(**{**fields, "columns": tuple(Column(**column) for column in fields["columns"])})
 
 
 def table_statements(columns: Sequence[Column]) -> dict[str, str]:
-    """The CREATE TABLE statement of every table, by name."""
+    """Table name -> its CREATE TABLE statement."""
     own = ", ".join(f"{name} TEXT NOT NULL" for name in _OWN_HISTORY_COLUMNS)
     history = ", ".join(
         f"{quoted(column.name)} {column.type}" + (" PRIMARY KEY" if column.name == "generation" else "")
@@ -89,7 +94,7 @@ def table_statements(columns: Sequence[Column]) -> dict[str, str]:
 
 
 def create_tables(connection: sqlite3.Connection, text: str) -> None:
-    """Make an empty database that of a run, `text` being its `meta_text`."""
+    """Create the tables of a run in an empty database and store its `meta_text`, `text`."""
     connection.execute(f"PRAGMA page_size = {PAGE_BYTES}")
     connection.execute("PRAGMA auto_vacuum = NONE")
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
@@ -102,48 +107,53 @@ def create_tables(connection: sqlite3.Connection, text: str) -> None:
 
 
 def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
-    """What the run is, checked. Raises Damaged, or StoreError if another version of this package wrote `file`."""
+    """The description of the run, after its SHA-256 was checked.
+
+    Raises:
+        Damaged: the description is damaged or missing.
+        StoreError: `file` has another schema version.
+    """
     rows = connection.execute("SELECT key, value, sha256 FROM meta").fetchall()
     for key, value, sha256 in rows:
         if text_sha256(str(key), str(value)) != sha256:
-            raise Damaged(f"the record {key!r} of what the run is does not match its SHA-256")
+            raise Damaged(f"the record {key!r} in its table meta does not match its SHA-256")
     found = {key: value for key, value, _ in rows}
     version = int(found.get("schema_version", 0))
     if version > SCHEMA_VERSION:
         raise StoreError(
-            f"{file} has schema version {version}; this es-service knows versions up to {SCHEMA_VERSION}. "
-            f"Upgrade es-service to read or continue it."
+            f"{file} has schema version {version}; this version of es-service supports versions up to "
+            f"{SCHEMA_VERSION}. Upgrade es-service to read or continue the run."
         )
     if version < 1 or "run" not in found:
-        raise Damaged("the record of what the run is is missing")
+        raise Damaged("the records 'schema_version' and 'run' in its table meta are missing or wrong")
     if version < SCHEMA_VERSION:
         raise StoreError(
-            f"{file} was written by an older es-service; version {READ_BY[version]} reads and continues it "
-            f"(its schema version is {version}, this es-service reads {SCHEMA_VERSION})"
+            f"{file} was written by an older version of es-service; use version {READ_BY[version]} to read or continue "
+            f"it (its schema version is {version}, and this version of es-service supports {SCHEMA_VERSION})"
         )
     return meta_from_text(found["run"])
 
 
 def history_insert(columns: Sequence[Column]) -> str:
-    """The statement that stores a history row: values in the order of `columns`, then state_sha256, sha256."""
+    """SQL statement that stores a history row: values in the order of `columns`, then state_sha256 and sha256."""
     names = [column.name for column in columns] + list(_OWN_HISTORY_COLUMNS)
     return f"INSERT INTO history ({', '.join(map(quoted, names))}) VALUES ({', '.join('?' * len(names))})"
 
 
 def history_select(columns: Sequence[Column]) -> str:
-    """Start of a query for history rows: values in the order of `columns`, then state_sha256, sha256."""
-    # Qualified by the table, because SQLite takes a lone quoted name that is no column for a text.
+    """Beginning of an SQL query for history rows: values in the order of `columns`, then state_sha256 and sha256."""
+    # Names are qualified by the table, because SQLite treats an unqualified quoted name that is no column as a text.
     names = [column.name for column in columns] + list(_OWN_HISTORY_COLUMNS)
     return f"SELECT {', '.join(f'history.{quoted(name)}' for name in names)} FROM history"
 
 
 def history_shared(columns: Sequence[Column], other: str) -> str:
-    """The query for how many history rows the attached database `other` has just as this one has them."""
+    """SQL query for the number of history rows that this database and the attached database `other` share."""
     names = map(quoted, [column.name for column in columns] + list(_OWN_HISTORY_COLUMNS))
     same = " AND ".join(f"ours.{name} IS theirs.{name}" for name in names)
     return f"SELECT count(*) FROM {other}.history AS theirs JOIN main.history AS ours ON {same}"
 
 
 def quoted(name: str) -> str:
-    """`name` as an SQL identifier."""
+    """A name as a quoted SQL identifier."""
     return '"' + name.replace('"', '""') + '"'

@@ -1,4 +1,4 @@
-"""What a run's database needs now and then while it is written: checkpoints of its log and verified copies."""
+"""Regular maintenance of a run's database while it is written: checkpoints of its log, and verified copies."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from es_service.store.schema import Damaged
 
 _LOG = logger(__name__)
 LOCAL_COPY_INTERVAL_S = 180.0
+"""Seconds between copies on a local disk."""
 NETWORK_COPY_INTERVAL_S = 10.0
+"""Seconds between copies on a network file system, where readers read the copy."""
 COPY_TIME_FRACTION = 0.02
-"""Copying waits longer than its interval rather than take more than this part of the time."""
+"""Greatest fraction of the time that copying takes; the interval becomes longer if copies take long."""
 CHECKPOINT_BYTES = 8 * 1024 * 1024
-"""A checkpoint follows the commit with which the log has grown by about this much."""
+"""Approximate growth of the log, in bytes, after which a commit is followed by a checkpoint."""
 CHECKPOINT_INTERVAL_S = 5.0
-"""Or the commit that ends this many seconds after the last one: what a power cut can take."""
+"""Seconds after which a commit is followed by a checkpoint in any case. A power cut can lose about this much time."""
 _CLOSE_PATIENCE_MS = 1000
 
 
 class Upkeep:
-    """Looks after the database of `connection` in `folder`; what fails here becomes a notice and not an error."""
+    """Maintenance of the database of `connection` in `folder`; after the start, failures become notices, not errors."""
 
     def __init__(
         self,
@@ -50,19 +52,19 @@ class Upkeep:
         self._checkpointed_at = time.monotonic()
         connection.execute(f"PRAGMA journal_mode = {'DELETE' if network else 'WAL'}")
         connection.execute(f"PRAGMA synchronous = {'FULL' if network else 'NORMAL'}")
-        # Checkpoints are ours to make, so that a commit's cost is known and tests can be killed around them.
+        # This class makes the checkpoints, so that the cost of a commit is known and tests can kill it around them.
         connection.execute("PRAGMA wal_autocheckpoint = 0")
-        # Old states need not be overwritten with zeros before their pages are used again.
+        # Pages of deleted states need not be overwritten with zeros before they are used again.
         connection.execute("PRAGMA secure_delete = OFF")
-        # Tells at once if the file cannot be written; and after a quick_check, SQLite refuses a checkpoint until some
-        # transaction has been.
+        # This empty transaction fails at once if the file cannot be written. Moreover, after a quick_check, SQLite
+        # refuses checkpoints until there has been a transaction.
         connection.execute("BEGIN IMMEDIATE")
         connection.execute("COMMIT")
         if network and not (folder / COPY).exists():
             self._copy()
 
     def after_commit(self, log_bytes: int) -> None:
-        """Checkpoint and copy if it is time to; the commit added about `log_bytes` to the log."""
+        """Make a checkpoint and a copy if they are due, after a commit that added about `log_bytes` to the log."""
         self._is_copied = False
         self._pending_bytes += log_bytes
         now = time.monotonic()
@@ -71,12 +73,12 @@ class Upkeep:
             try:
                 self._checkpoint("PASSIVE")
             except sqlite3.Error as error:
-                self._notice(f"could not move the newest generations from the log into {DATABASE}", error)
+                self._notice(f"could not move the newest generations from SQLite's log into {DATABASE}", error)
         if now - self._copied_at >= max(self.copy_interval_s, self._copy_seconds / COPY_TIME_FRACTION):
             self._copy()
 
     def finish(self) -> None:
-        """Make the database a single file; a reader that holds on to it, or a full disk, leaves a log beside it."""
+        """Make the database a single file; SQLite's log remains beside it if a reader uses it or the disk is full."""
         if self._network and not self._is_copied:
             self._copy()
         with contextlib.suppress(sqlite3.Error):
@@ -87,7 +89,7 @@ class Upkeep:
 
     def _checkpoint(self, mode: str) -> None:
         self._hook("before_checkpoint")
-        # Also when it fails: the next commit need not try again at once.
+        # This comes before a possible failure, so that the next commit does not try again at once.
         self._checkpointed_at, self._pending_bytes = time.monotonic(), 0
         self._connection.execute(f"PRAGMA wal_checkpoint({mode})").fetchall()
         self._hook("after_checkpoint")
@@ -98,7 +100,7 @@ class Upkeep:
             make_copy(self._connection, self._folder)
             self._is_copied = True
         except (sqlite3.Error, OSError, Damaged) as error:
-            self._notice(f"could not refresh {COPY}; the former one, if any, stays", error)
+            self._notice(f"could not refresh {COPY}; the former copy, if there is one, remains", error)
         self._copied_at = time.monotonic()
         self._copy_seconds = self._copied_at - start
         _LOG.debug("%s: copying took %.3f s", self._folder / COPY, self._copy_seconds)
@@ -111,7 +113,7 @@ class Upkeep:
 
 
 def _age_s(file: Path, limit: float) -> float:
-    """Seconds since `file` was written, between 0 and `limit`; 0 if there is none, whatever the clock says."""
+    """Seconds since a file was written, clipped to [0, limit] in case the clock was changed; 0 if there is no file."""
     try:
         return min(max(time.time() - file.stat().st_mtime, 0.0), limit)
     except OSError:

@@ -1,4 +1,4 @@
-"""What can be trusted in a run's database: SQLite's own check, the tables, and every SHA-256."""
+"""Verification of a run's database: SQLite's own check, the tables, and every SHA-256."""
 
 from __future__ import annotations
 
@@ -29,71 +29,78 @@ _NOT_DAMAGE = {
     sqlite3.SQLITE_CANTOPEN,
     sqlite3.SQLITE_INTERRUPT,
 }
-"""Errors that say nothing about the file's content, so that nothing is moved aside because of them."""
+"""SQLite errors that do not mean that the file is damaged, so the file must not be replaced because of them."""
 KeptRows = dict[str, dict[int, str]]
-"""SHA-256 of the state rows at hand, by part and generation."""
+"""Stored state rows: part -> generation -> SHA-256."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a database that can be read holds, and how much of it is sound."""
+    """Result of the verification of a database that can be read."""
 
     meta: RunMeta
     newest: int | None
-    """Newest generation with a history row; None if none was ever committed."""
+    """Newest generation with a history row; None if there is none."""
     good: int | None
-    """Newest generation of which the whole state and the history up to it are sound."""
+    """Newest generation whose whole state is intact, and the history up to it as well; None if there is none."""
     kept: KeptRows
-    """Sound state rows."""
+    """Intact state rows."""
     bad_rows: tuple[tuple[str, int], ...] = ()
-    """State rows (part, generation) that must go."""
+    """Damaged state rows as (part, generation), which must be deleted."""
     problems: tuple[str, ...] = field(default=())
-    """Everything that is wrong, for a user to read."""
+    """All problems found, as messages for the user."""
 
 
 def is_no_damage(error: BaseException, folder: Path) -> bool:
-    """Whether an error says nothing about the content of the database in `folder`: it was busy, out of reach, or there
-    was no space for what SQLite writes beside it, even to read it."""
+    """Whether an error does not mean that the database in `folder` is damaged.
+
+    The database may have been busy or not accessible, or the disk too full for the files that SQLite writes beside it.
+    """
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     return isinstance(error, OSError) or code in _NOT_DAMAGE or is_disk_full(error, folder)
 
 
 def check_header(file: Path) -> None:
-    """Look at the first bytes of a database that no connection of this process has open. Raises Damaged."""
+    """Raise Damaged if the header of a database is wrong. No connection of this process may have the file open."""
     with file.open("rb") as stream:
         header = stream.read(100)
     if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
         raise Damaged("it is not an SQLite database")
-    # Write and read version: 1 is a rollback journal, 2 is WAL. SQLite would take others for a read-only file.
+    # Write and read version: 1 is a rollback journal, 2 is WAL. SQLite treats a file with others as read-only.
     if header[18] != header[19] or header[18] not in (1, 2):
         raise Damaged("its header names an unknown file format")
 
 
 def verify(connection: sqlite3.Connection, file: Path, known: int = 0) -> Verdict:
-    """Check everything in the database `file`; costs one read of it.
+    """Check everything in a database; this reads all of it once.
 
     Args:
-        known: so many history rows, from generation 0 on, are known to be sound; the last two are checked all the same.
+        connection: connection to the database.
+        file: path of the database.
+        known: number of history rows, from generation 0 on, that are known to be intact. They are not checked again,
+            except the last two.
 
-    Raises Damaged where no part of the file can be relied upon, sqlite3.Error where the check itself could not be
-    made (locked, no permission), StoreError for a newer schema version.
+    Raises:
+        Damaged: the whole file is unusable.
+        sqlite3.Error: the check is not possible (the file is locked, no permission).
+        StoreError: the schema version is another one.
     """
     try:
         return _verify(connection, file, max(0, known - 2))
     except sqlite3.Error as error:
         if is_no_damage(error, file.parent):
             raise
-        raise Damaged(f"SQLite says: {error}") from error
+        raise Damaged(f"SQLite reports: {error}") from error
     except (ValueError, TypeError, KeyError, OverflowError) as error:
-        raise Damaged(f"it holds what was never written to it: {error}") from error
+        raise Damaged(f"it contains values that es-service never writes: {error}") from error
 
 
 def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
-    # Before all else: of a newer schema version nothing more is known than this table.
+    # This must come first: in a newer schema version, only this table is known.
     meta = load_meta(connection, file)
     complaints = [row[0] for row in connection.execute("PRAGMA quick_check(3)")]
     if complaints != ["ok"]:
-        raise Damaged(f"SQLite's quick_check says: {'; '.join(complaints)}")
+        raise Damaged(f"SQLite's quick_check reports: {'; '.join(complaints)}")
     tables = dict(connection.execute("SELECT name, sql FROM sqlite_schema"))
     if tables != table_statements(meta.columns):
         raise Damaged("its tables are not those of a run")
@@ -108,22 +115,22 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
     problems += [f"state of {part!r} at generation {at} has no history row" for part, at in unfinished]
     good = None
     if newest is not None:
-        # Of older generations the state is not kept.
+        # The states of older generations are not stored.
         for generation in (newest, newest - 1):
             in_force = rows_in_force(kept, generation) if 0 <= generation < sound_history else {}
-            # Before a fork's first generation there is history without a state.
+            # A fork has the whole history of its parent, but only the newest of the parent's states.
             if in_force and states[generation] == state_sha256(state_sum(in_force)):
                 good = generation
                 break
         else:
-            problems.append(f"neither generation {newest} nor the one before it can be put together")
+            problems.append(f"neither generation {newest} nor the one before it is complete and intact")
         if good == newest - 1:
-            problems.append(f"generation {newest} cannot be put together")
+            problems.append(f"generation {newest} is not complete and intact")
     return Verdict(meta, newest, good, kept, tuple(bad_rows), tuple(problems))
 
 
 def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems: list[str]) -> list[str | None]:
-    """The `state_sha256` of each generation, None where the history row is not sound; "" before generation `first`."""
+    """The `state_sha256` of each generation; None if its history row is damaged, "" for generations before `first`."""
     columns = column_bytes(meta.columns)
     at = [column.name for column in meta.columns].index("generation")
     states: list[str | None] = [""] * first
@@ -143,7 +150,7 @@ def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems
 
 
 def row_is_sound(columns: bytes, row: tuple, state: object, sha256: object) -> bool:
-    """Whether a history row matches its SHA-256; `columns` are `column_bytes`."""
+    """Whether a history row matches its SHA-256; `columns` comes from `column_bytes`."""
     try:
         return row_sha256(columns, row, str(state)) == sha256
     except ValueError:
@@ -151,7 +158,11 @@ def row_is_sound(columns: bytes, row: tuple, state: object, sha256: object) -> b
 
 
 def sound_platforms(connection: sqlite3.Connection) -> list[tuple[int, str]]:
-    """(first generation, what was recorded) in order. Raises Damaged for one that does not match its SHA-256."""
+    """Recorded platforms as (first generation, JSON text), in order.
+
+    Raises:
+        Damaged: a record does not match its SHA-256.
+    """
     found: list[tuple[int, str]] = []
     for at, text, sha256 in connection.execute("SELECT generation, platform, sha256 FROM platform ORDER BY generation"):
         if text_sha256(f"platform {at}", text) != sha256:
@@ -161,7 +172,7 @@ def sound_platforms(connection: sqlite3.Connection) -> list[tuple[int, str]]:
 
 
 def _state(connection: sqlite3.Connection, problems: list[str]) -> tuple[KeptRows, list[tuple[str, int]]]:
-    """Sound state rows, and (part, generation) of the others."""
+    """Intact state rows, and (part, generation) of the damaged ones."""
     kept: KeptRows = {}
     bad_rows: list[tuple[str, int]] = []
     for part, generation, sha256, payload in connection.execute("SELECT part, generation, sha256, payload FROM state"):
@@ -180,11 +191,11 @@ def _state(connection: sqlite3.Connection, problems: list[str]) -> tuple[KeptRow
 
 
 def rows_in_force(kept: Mapping[str, Mapping[int, str]], generation: int) -> dict[str, tuple[int, str]]:
-    """Per part its newest row up to `generation`, as (generation of the row, sha256)."""
+    """Rows that make up the state at a generation: part -> (generation, sha256) of its newest row up to then."""
     newest = {part: max((at for at in rows if at <= generation), default=None) for part, rows in kept.items()}
     return {part: (at, kept[part][at]) for part, at in newest.items() if at is not None}
 
 
 def state_in_force(kept: Mapping[str, Mapping[int, str]], generation: int) -> str:
-    """`state_sha256` of the state at `generation`, put together from the rows at hand."""
+    """`state_sha256` of the state at a generation, computed from the stored rows."""
     return state_sha256(state_sum(rows_in_force(kept, generation)))

@@ -1,9 +1,9 @@
-"""The run store's writer: one transaction per generation, so that `kill -9` loses the generation in flight only.
+"""The writer of the run store: one transaction per generation, so that `kill -9` loses only the unfinished generation.
 
-A run is a folder: `config.yaml`, `run.db` (SQLite), `run.lock`, and after a while `run.db.copy`. On a local disk
-`run.db` is in WAL mode: a killed process loses nothing that was committed, a power cut at most what was committed since
-the last checkpoint. On network file systems there is no WAL: the journal is rolled back, every commit is synchronous,
-and readers read the copy. A clean end leaves `run.db` as a single file.
+A run is a folder with `config.yaml`, `run.db` (SQLite), `run.lock`, and after some minutes `run.db.copy`. On a local
+disk `run.db` is in WAL mode: a killed process loses nothing that was committed, and a power cut loses at most the
+commits since the last checkpoint. On a network file system `run.db` has a rollback journal instead, every commit is
+synchronous, and readers read the copy. After a clean end, `run.db` is a single file.
 """
 
 from __future__ import annotations
@@ -42,29 +42,29 @@ from es_service.store.upkeep import Upkeep
 from es_service.store.verify import rows_in_force
 
 Values = Mapping[str, int | float | None]
-"""One history row by column name; NaN or None for no value."""
+"""One history row: column name -> value; NaN or None stands for no value."""
 _LOG = logger(__name__)
 NOTHING = Beginning()
-"""The beginning of an ordinary run."""
+"""Beginning of an ordinary run."""
 
 
 def no_hook(name: str) -> None:
-    """What happens at the store's named instants, unless a test wants otherwise: nothing."""
+    """Do nothing. Tests pass another function, which the store calls with the name of each step that it has reached."""
 
 
 class RunStore:
-    """The one writer of a run, from `create` or `open` until `close`; a context manager. Not for several threads."""
+    """The only writer of a run, from `create` or `open` until `close`; a context manager, for use in one thread."""
 
     meta: RunMeta
     notices: list[str]
-    """What opening had to repair, and what later went wrong without ending the run; for the user to read."""
+    """Messages for the user about repairs at opening, and about later problems that did not end the run."""
     generation: int | None
-    """Newest committed generation; None before the first."""
+    """Newest committed generation; None if there is none."""
     start: Part | None
-    """What generation 0 is to start from, if the run was created with that."""
+    """Arrays from which generation 0 starts; None if the run was created without them."""
 
     def __init__(self, folder: Path, lock: RunLock, hook: Callable[[str], None]) -> None:
-        """Open the run in `folder`, whose lock is held; `create` and `open` are the ways in."""
+        """Open the run in `folder`, whose lock is held. Use `create` or `open` instead."""
         self.folder = folder
         self.notices = []
         self._lock = lock
@@ -74,7 +74,7 @@ class RunStore:
         self.meta = verdict.meta
         self.generation = verdict.good
         self._kept = verdict.kept
-        # Parts of which the row before the newest is at hand too, for the generation before.
+        # Parts of which an older row is stored as well, which the generation before the newest needs.
         self._doubled = [part for part, rows in self._kept.items() if len(rows) > 1]
         self._state_sum = 0 if self.generation is None else state_sum(rows_in_force(self._kept, self.generation))
         self._insert_history = history_insert(self.meta.columns)
@@ -97,11 +97,17 @@ class RunStore:
         *,
         hook: Callable[[str], None] = no_hook,
     ) -> RunStore:
-        """Start a run in `folder`, which must not exist or be empty; its parent must exist.
+        """Create a run folder and open it.
 
-        `beginning` is there from the first instant that the run is.
+        Args:
+            folder: path that does not exist, or an empty folder; missing parents are created.
+            config_yaml: text of `config.yaml`.
+            meta: description of the run.
+            beginning: data with which the run begins; no run folder appears without them.
+            hook: function that is called with the name of each step, for tests.
 
-        Raises StoreError if the folder is taken, cannot be written, or the columns of `meta` cannot be stored.
+        Raises:
+            StoreError: the folder is not empty or cannot be written, or the columns of `meta` cannot be stored.
         """
         folder = Path(folder)
         lock = create_run_folder(folder, config_yaml, meta, beginning)
@@ -109,10 +115,11 @@ class RunStore:
 
     @classmethod
     def open(cls, folder: Path, *, hook: Callable[[str], None] = no_hook) -> RunStore:
-        """Continue the run in `folder`: take its lock, verify everything, repair what must be and say so in `notices`.
+        """Open the run in `folder`: take its lock, verify everything, and report repairs in `notices`.
 
-        Raises RunLockedError if another process writes to it; StoreError if it is no run, was written by a newer
-        version, or holds nothing that can be trusted.
+        Raises:
+            RunLockedError: another process is writing to the run.
+            StoreError: there is no run, it has another schema version, or it is damaged beyond repair.
         """
         folder = Path(folder)
         try:
@@ -130,16 +137,24 @@ class RunStore:
             raise
 
     def load(self, without: str | None = None) -> dict[str, dict[str, NDArray[Any]]]:
-        """Every state part as of the newest generation, checked once more; empty before the first commit.
+        """State of the newest generation: part -> name -> array; empty before the first commit.
 
         Args:
-            without: how the names of parts begin that are left out.
+            without: prefix of the names of parts that are left out; None to load all parts.
+
+        Raises:
+            StoreError: a part has been damaged since the run was opened.
         """
         names = sorted(self._kept) if self.generation is not None else []
         return {name: self.part(name) for name in names if without is None or not name.startswith(without)}
 
     def part(self, name: str) -> dict[str, NDArray[Any]]:
-        """One state part as of the newest generation, checked once more. Raises KeyError if there is none."""
+        """One part of the newest generation's state: name -> array.
+
+        Raises:
+            KeyError: there is no such part.
+            StoreError: the part has been damaged since the run was opened.
+        """
         at = max(self._kept[name])
         with self._explaining("loading the state"):
             row = self._connection.execute(
@@ -147,36 +162,36 @@ class RunStore:
             ).fetchone()
             if row is None or part_sha256(name, at, row[0]) != self._kept[name][at]:
                 raise StoreError(
-                    f"{self.folder / DATABASE}: state of {name!r} at generation {at} was damaged since it was opened",
+                    f"{self.folder / DATABASE}: state of {name!r} at generation {at} was damaged after it was opened",
                     run=self.folder,
-                    ways_out=[WayOut("resume", "fall back to what is sound", str(self.folder))],
+                    ways_out=[WayOut("resume", "fall back to the newest intact generation", str(self.folder))],
                 )
             return decode_part(row[0])
 
     def commit(self, generation: int, parts: Mapping[str, Part], history: Values) -> None:
-        """Store a generation: all of it or, if this raises, nothing of it.
+        """Store a generation in one transaction. If this raises, the store is unchanged and can still be used.
 
         Args:
-            generation: the one after `self.generation`, 0 if that is None.
-            parts: those that changed; the others keep their value.
-            history: a value for every column of the run but perhaps `generation`; NaN or None for no value.
+            generation: the generation after `self.generation`, or 0 if that is None.
+            parts: parts of the state that have changed; the others keep their values.
+            history: value of each column of the run; `generation` may be left out; NaN or None stands for no value.
 
-        Raises StoreError for another generation, a row that does not fit the columns, a full disk. After it the store
-        is as before and may still be used.
+        Raises:
+            StoreError: the generation is not the next one, the history does not fit the columns, or the disk is full.
         """
         expected = 0 if self.generation is None else self.generation + 1
         if generation != expected:
-            raise StoreError(f"{self.folder}: generation {generation} cannot be stored, the next one is {expected}")
+            raise StoreError(f"{self.folder}: cannot store generation {generation}; the next generation is {expected}")
         payloads = {part: encode_part(arrays) for part, arrays in parts.items()}
         new = {part: (generation, part_sha256(part, generation, payload)) for part, payload in payloads.items()}
         old = {part: max(self._kept[part].items()) for part in new if part in self._kept}
         total = changed_sum(self._state_sum, old, new)
         history_values = history_row(self.meta.columns, generation, history, state_sha256(total))
-        # Enough stays to put together the newest generation and the one before it.
+        # The rows that remain make up the states of the newest generation and of the one before it.
         outdated = [(part, at) for part in self._doubled for at in self._kept[part] if at < max(self._kept[part])]
         self._hook("before_begin")
         with self._transaction(f"storing generation {generation}") as execute:
-            # First, so that the new rows take the pages of the old ones.
+            # Delete first, so that the new rows use the pages of the old ones.
             for part, at in outdated:
                 execute("DELETE FROM state WHERE part = ? AND generation = ?", (part, at))
             for part, payload in payloads.items():
@@ -196,7 +211,7 @@ class RunStore:
         self.upkeep.after_commit(sum(map(len, payloads.values())) + 4 * PAGE_BYTES)
 
     def last_history(self) -> dict[str, int | float] | None:
-        """The newest generation's history row, NaN where it has no value; None before the first commit."""
+        """History row of the newest generation; NaN stands for no value. None before the first commit."""
         if self.generation is None:
             return None
         with self._explaining("reading the history"):
@@ -205,14 +220,22 @@ class RunStore:
         return row_dict(self.meta.columns, row[:-2])
 
     def record_platform(self, generation: int, platform: dict[str, Any]) -> bool:
-        """Record what the run runs on (versions, CPU kind; JSON-able), in force from `generation` on.
+        """Record the platform of a generation that is not stored yet, and of those after it.
 
-        Replaces what was recorded for `generation` and later, of which nothing is stored. Returns whether it differs
-        from the one in force before; if not, nothing is recorded.
+        This replaces the records of `generation` and later. Nothing is recorded if the platform is the same as before.
+
+        Args:
+            platform: package versions and CPU kind, as values that JSON can represent.
+
+        Returns:
+            Whether the platform differs from that of the generations before, or is the first.
+
+        Raises:
+            StoreError: `generation` is already stored.
         """
         if self.generation is not None and generation <= self.generation:
             raise StoreError(
-                f"{self.folder}: generation {generation} is stored already, its platform cannot be changed"
+                f"{self.folder}: generation {generation} is already stored, so its platform cannot be changed"
             )
         text = json.dumps(platform, sort_keys=True)
         with self._transaction("recording the platform") as execute:
@@ -225,9 +248,9 @@ class RunStore:
         return differs
 
     def close(self) -> None:
-        """Leave `run.db` as a single file and let go of the run. Harmless if done already; raises nothing of its own.
+        """Make `run.db` a single file and release the lock. This may be called again.
 
-        A reader that holds on to the database, or a full disk, leaves a WAL beside it, which loses nothing.
+        If a reader still uses the database or the disk is full, SQLite's log remains beside it, and nothing is lost.
         """
         if self._closed:
             return
@@ -263,7 +286,7 @@ class RunStore:
                 yield self._connection.execute
                 self._connection.execute("COMMIT")
             except BaseException:
-                # SQLite has rolled back by itself after some errors.
+                # After some errors, SQLite has already rolled back.
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
                 raise

@@ -110,7 +110,7 @@ def test_one_flipped_bit_in_a_state_counts(folder, part):
 
 def test_a_state_that_cannot_be_read_is_an_error(folder):
     change(folder, "UPDATE state SET payload = x'00' WHERE part = 'observations' AND generation = 5")
-    with pytest.raises(StoreError, match="does not start as one"):
+    with pytest.raises(StoreError, match="a state payload begins with"):
         digest(folder)
 
 

@@ -285,8 +285,8 @@ def test_what_a_hung_worker_had_written_is_told_with_its_loss(monkeypatch, is_la
     limits = Limits(workers=2, first_deadline_s=1.0, min_deadline_s=1.0, max_attempts=1 if is_last else 2)
     with Engine(transport, limits) as engine:
         if is_last:
-            with pytest.raises(EvaluationError, match=r"failed in 1 attempts.*had written:\nno licence; retrying$"):
+            with pytest.raises(EvaluationError, match=r"failed in 1 attempts.*its process:\nno licence; retrying$"):
                 engine.evaluate(FIRST, CHUNKS)
         else:
             engine.evaluate(FIRST, CHUNKS)
-        assert re.search(r"^worker 0: no answer .* its process had written:\nno licence; retrying$", engine.last_loss)
+        assert re.search(r"^worker 0: no answer .* output of its process:\nno licence; retrying$", engine.last_loss)

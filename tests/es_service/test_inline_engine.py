@@ -118,7 +118,7 @@ class Unreadable:
     [
         (("broken", "no jax here"), "^no jax here$"),
         (("results", "key", 1, Unreadable()), r"(?s)Traceback.*invalid literal for int"),
-        (("something", "else"), "it said"),
+        (("something", "else"), "it sent an unknown message"),
     ],
 )
 def test_a_worker_that_says_what_nobody_can_use_is_lost(transport, said, reason):
@@ -138,7 +138,7 @@ def test_what_a_process_wrote_before_it_was_killed_is_told_of_all_its_workers(tr
     lost = transport.receive(0.0)
     assert isinstance(lost, WorkerLost)
     assert lost.reason == (
-        "worker 0, a thread of the same process, had to be killed; its process had written:\nwaiting for a licence"
+        "worker 0, a thread of the same process, was killed; the last output of its process:\nwaiting for a licence"
     )
     assert transport.kill(0) == ""
 

@@ -17,7 +17,7 @@ FOLDER = Path(__file__).parent / "golden" / "run_0_5"
 def test_a_run_of_0_5_is_refused_and_left_alone():
     before = (FOLDER / "run.db").read_bytes()
     for use in (api.open_run, api.resume, api.fork):
-        with pytest.raises(StoreError, match=r"run\.db was written by an older es-service; version 0\.5\.0 reads"):
+        with pytest.raises(StoreError, match=r"run\.db was written by an older version .*; use version 0\.5\.0 to"):
             use(FOLDER)
     printed = command("status", FOLDER)
     assert printed.returncode == 1

@@ -208,8 +208,8 @@ def test_an_actor_that_is_given_no_place_is_not_lost():
 @pytest.mark.parametrize(
     ("watch", "message"),
     [
-        (None, r"no worker's process answered in 0\.4 s \(no_worker_timeout_s\)\. Each needs 1 CPU; .*has 2 CPU"),
-        (PretendedWatch(), r"given a place in 0\.4 s \(no_worker_timeout_s\)\. Each needs 1 CPU; .*2 CPU.* Add nodes"),
+        (None, r"process answered within 0\.4 s \(no_worker_timeout_s\)\. Each worker needs 1 CPU; .*has 2 CPU"),
+        (PretendedWatch(), r"within 0\.4 s \(no_worker_timeout_s\)\. Each worker needs 1 CPU; .*2 CPU.* Add nodes"),
     ],
 )
 def test_the_wait_for_a_first_place_is_the_policy_s(watch, message):

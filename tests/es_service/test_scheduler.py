@@ -85,7 +85,7 @@ def test_a_poison_task_fails_the_run_with_its_name_and_nothing_happens_after():
         (4.0, WorkerLost(1, "out of memory")),
         (5.0, Failure(0, "a", 3, "ValueError: never")),
     )
-    message = "work item a failed in 3 attempts; the last time it raised on worker 0: ValueError: never"
+    message = "work item a failed in 3 attempts; the last time it raised an exception on worker 0: ValueError: never"
     assert commands == [Fail(message), StopWorker(0, "the run failed"), StopWorker(2, "the run failed")]
     assert state.failed == message
     for event in (WorkerUp(2), Result(0, "a", 3), items("z"), SetWorkers(5), Tick(), WorkerLost(0, "stopped")):
@@ -98,7 +98,8 @@ def test_a_task_that_kills_its_workers_is_poison_too():
     state, _ = play(state, (1.0, items("abc")), (2.0, WorkerLost(0, "died")), (2.0, WorkerUp(1)))
     state, _ = play(state, (3.0, WorkerLost(1, "died")), (5.0, Tick()), (5.0, WorkerUp(2)))
     state, commands = step(state, WorkerLost(2, "signal 11"), 6.0)
-    assert commands == [Fail("work item a failed in 3 attempts; the last time it took worker 2 with it: signal 11")]
+    message = "work item a failed in 3 attempts; the last time worker 2 was lost while running it: signal 11"
+    assert commands == [Fail(message)]
 
 
 def test_deadlines_exempt_compiling_and_follow_the_median_of_their_kind():
@@ -148,7 +149,7 @@ def test_deadlines_and_durations_are_in_proportion_to_the_size_of_an_item():
 )
 def test_seconds_are_said_without_an_exponent(limit_s, said):
     state, _ = play(ready(1, first_deadline_s=limit_s, min_deadline_s=0.1), (0.0, items("a")))
-    reason = f"no answer to work item a in {said} s (first_deadline_s)"
+    reason = f"no answer to work item a within {said} s (first_deadline_s)"
     assert step(state, Tick(), limit_s)[1][0] == StopWorker(0, reason)
 
 
@@ -166,7 +167,7 @@ def test_the_clock_of_a_prefetched_task_starts_when_the_one_ahead_is_done():
     assert next_deadline(state) == 15.0 + 12.5
     assert step(state, Tick(), 27.4) == (state, [])
     state, commands = step(state, Tick(), 27.5)
-    assert commands == [StopWorker(0, "no answer to work item d in 12.5 s (min_deadline_s)"), StartWorker(1)]
+    assert commands == [StopWorker(0, "no answer to work item d within 12.5 s (min_deadline_s)"), StartWorker(1)]
     assert step(state, WorkerUp(1), 28.0)[1] == [Assign(1, "d", 2)]
 
 
@@ -206,7 +207,7 @@ def test_a_late_result_of_a_superseded_attempt_is_accepted():
 
 def test_a_key_may_be_submitted_again_only_after_it_was_delivered():
     state, _ = play(ready(), (1.0, items("ab")))
-    with pytest.raises(ValueError, match="submitted twice"):
+    with pytest.raises(ValueError, match="submitted again"):
         step(state, items("b"), 2.0)
     assert pending(play(state, (2.0, Result(1, "b", 1)), (3.0, items("b")))[0]) == 2
 

@@ -100,7 +100,7 @@ def test_a_place_gives_a_worker_all_its_time_to_come_up():
     state, _ = play(state, *((49.0, Placed(worker)) for worker in range(3)))
     assert next_deadline(state) == 99.0
     state, commands = play(state, (98.0, WorkerUp(0)), (99.0, Tick()))
-    assert commands[0] == StopWorker(1, "did not come up in 50 s (start_deadline_s)")
+    assert commands[0] == StopWorker(1, "did not come up within 50 s (start_deadline_s)")
     for stranger in (0, 1, 7):
         assert step(state, Placed(stranger), 99.5) == (state, [])
 
@@ -124,7 +124,7 @@ def test_a_worker_that_never_comes_up_is_killed_and_replaced():
     state, _ = play(initial_state(LIMITS), (0.0, Tick()), (1.0, WorkerUp(1)))
     assert next_deadline(state) == 50.0
     state, commands = step(state, Tick(), 50.0)
-    assert commands == [StopWorker(0, "did not come up in 50 s (start_deadline_s)"), StartWorker(2)]
+    assert commands == [StopWorker(0, "did not come up within 50 s (start_deadline_s)"), StartWorker(2)]
     assert step(state, WorkerUp(0), 51.0) == (state, [])
     assert step(state, WorkerLost(0, "stopped"), 51.0) == (state, [])
 
@@ -135,8 +135,9 @@ def test_a_worker_without_a_place_is_started_anew_and_nobody_hears_of_it():
     state, _ = play(patient, (0.0, Tick()), (1.0, WorkerUp(0)), (1.0, items("a")))
     for number in range(1, 6):
         state, commands = step(state, Tick(silent=(number,)), 50.0 * number)
-        assert commands == [StopWorker(number, "did not come up in 50 s (start_deadline_s)"), StartWorker(number + 1)]
-    assert (state.lost_workers, state.last_loss, state.start_failures) == (0, "none was ever lost", 0)
+        reason = "did not come up within 50 s (start_deadline_s)"
+        assert commands == [StopWorker(number, reason), StartWorker(number + 1)]
+    assert (state.lost_workers, state.last_loss, state.start_failures) == (0, "no worker was lost", 0)
     state, _ = play(state, (251.0, WorkerLost(0, "killed")), (252.0, WorkerLost(6, "no memory")))
     assert (state.failed, state.lost_workers) == (None, 2)
 
@@ -144,7 +145,7 @@ def test_a_worker_without_a_place_is_started_anew_and_nobody_hears_of_it():
 def test_what_a_silent_worker_does_not_answer_in_time_is_not_to_blame():
     state, _ = play(ready(1), (0.0, items("a")))
     state, commands = step(state, Tick(silent=(0,)), 100.0)
-    assert commands == [StopWorker(0, "no answer to work item a in 100 s (first_deadline_s)"), StartWorker(1)]
+    assert commands == [StopWorker(0, "no answer to work item a within 100 s (first_deadline_s)"), StartWorker(1)]
     assert state.lost_workers == 1
     assert step(state, WorkerUp(1), 101.0)[1] == [Assign(1, "a", 1)]
 
@@ -155,8 +156,8 @@ def test_no_worker_for_too_long_fails_the_run():
     assert next_deadline(play(initial_state(LIMITS), (0.0, Tick()), (5.0, items("a")))[0]) == 35.0
     state, commands = play(state, (50.0, Tick()), (55.0, Tick()))
     assert commands[0] == Fail(
-        "2 work items wait and no worker was up for 30 s (no_worker_timeout_s); "
-        "last loss: worker 1: did not come up in 50 s (start_deadline_s)"
+        "no worker was up for 30 s (no_worker_timeout_s) while 2 work items waited; "
+        "last loss: worker 1: did not come up within 50 s (start_deadline_s)"
     )
     assert play(initial_state(LIMITS), (0.0, Tick()), (40.0, Tick()))[0].failed is None, "nothing waits"
 
@@ -174,7 +175,7 @@ def test_a_drained_worker_finishes_what_it_has_and_is_replaced_without_blame():
     assert play(initial_state(LIMITS), (0.0, Tick()), (1.0, Drain(0)))[1] == [StopWorker(0, "drained"), StartWorker(2)]
     # One that hangs while draining is killed all the same.
     state, commands = play(state, (3.0, WorkerUp(2)), (101.0, Tick()))
-    assert StopWorker(0, "no answer to work item a in 100 s (first_deadline_s)") in commands
+    assert StopWorker(0, "no answer to work item a within 100 s (first_deadline_s)") in commands
 
 
 def test_the_number_of_workers_follows_the_wish():

@@ -31,14 +31,14 @@ def messages_after(*events) -> list[str]:
 def test_messages_of_deadlines_name_the_keys_that_set_them():
     work = Submit(tuple(WorkItem(item_id, "train") for item_id in "abcd"))
     late = messages_after((0.0, work), (10.0, Tick()), (20.0, Tick()))
-    assert late[0] == "did not come up in 10 s (half of compute.no_worker_timeout_s)"
-    assert "no worker was up for 20 s (compute.no_worker_timeout_s); last loss" in late[-1]
+    assert late[0] == "did not come up within 10 s (half of compute.no_worker_timeout_s)"
+    assert "no worker was up for 20 s (compute.no_worker_timeout_s) while" in late[-1]
     assert messages_after((0.0, work), (1.0, WorkerUp(0)), (9.0, Tick()))[0] == (
-        "no answer to work item a in 8 s (compute.compile_timeout_s)"
+        "no answer to work item a within 8 s (compute.compile_timeout_s)"
     )
     answers = [(1.0, WorkerUp(0)), (2.0, Result(0, "a", 1)), (2.1, Result(0, "b", 1))]
     assert messages_after((0.0, work), *answers, (7.1, Tick()))[0] == (
-        "no answer to work item c in 5 s (at least compute.chunk_timeout_s)"
+        "no answer to work item c within 5 s (at least compute.chunk_timeout_s)"
     )
 
 

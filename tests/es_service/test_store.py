@@ -141,7 +141,7 @@ def test_state_and_history_come_back_bit_for_bit(tmp_path):
 def test_only_the_next_generation_can_be_committed(tmp_path):
     with create(tmp_path / "run", generations=3) as run:
         for wrong in (0, 2, 4):
-            with pytest.raises(StoreError, match=f"generation {wrong} cannot be stored, the next one is 3"):
+            with pytest.raises(StoreError, match=f"cannot store generation {wrong}; the next generation is 3"):
                 run.commit(wrong, parts_of(wrong), history_row(wrong))
         advance(run, 3)
 
@@ -285,6 +285,6 @@ def test_platforms_are_recorded_where_they_change(tmp_path):
         assert not run.record_platform(3, {"cpu": "a", "jax": "1"})
         advance(run, 4)
         assert run.record_platform(5, {"cpu": "b"})
-        with pytest.raises(StoreError, match="generation 4 is stored already"):
+        with pytest.raises(StoreError, match="generation 4 is already stored"):
             run.record_platform(4, {"cpu": "c"})
     assert read_platforms(folder) == [(0, {"cpu": "a", "jax": "1"}), (5, {"cpu": "b"})]

@@ -82,11 +82,11 @@ def test_history_rows_that_do_not_fit_are_refused_by_name():
     row = history_row(3)
     with pytest.raises(StoreError, match=r"unknown columns \['speed'\], missing columns \['env_steps'\]"):
         row_values(COLUMNS, 3, {name: 1 for name in [*row, "speed"] if name != "env_steps"})
-    with pytest.raises(StoreError, match="generation 4 says it is of generation 3"):
+    with pytest.raises(StoreError, match="generation 4: its column generation has the value 3"):
         row_values(COLUMNS, 4, row)
     with pytest.raises(StoreError, match=r"env_steps is INTEGER and cannot hold 1\.5"):
         row_values(COLUMNS, 3, {**row, "env_steps": 1.5})
-    with pytest.raises(StoreError, match="does not fit 64 bits"):
+    with pytest.raises(StoreError, match="does not fit into 64 bits"):
         row_values(COLUMNS, 3, {**row, "env_steps": 2**63})
 
 

@@ -42,7 +42,7 @@ def test_a_damaged_newest_state_falls_back_one_generation(tmp_path):
         read_parts(folder)
     with RunStore.open(folder) as run:
         assert len(run.notices) == 1
-        assert "of generation 5, is damaged" in run.notices[0]
+        assert "of the newest generation, 5, is damaged" in run.notices[0]
         assert "fell back to generation 4" in run.notices[0]
         assert run.generation == 4
         assert_same_state(run.load(), state_at(4))
@@ -71,7 +71,7 @@ def test_a_damaged_older_state_is_cleared_away_and_costs_nothing(tmp_path):
     with pytest.raises(StoreError, match="'observations' at generation 4 does not match"):
         read_parts(folder, 4)
     with RunStore.open(folder) as run:
-        assert "newest generation, 5, is sound" in run.notices[0]
+        assert "newest generation, 5, is intact" in run.notices[0]
         assert run.generation == 5
     assert_sound(folder, 5)
 
@@ -104,11 +104,11 @@ def test_without_anything_sound_the_run_is_refused_and_left_as_it_is(tmp_path, m
         (folder / name).write_bytes((folder / name).read_bytes()[:5000])
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     for _ in range(2):
-        with pytest.raises(StoreError, match=r"Nothing in .* can be trusted"):
+        with pytest.raises(StoreError, match=r"Neither run\.db nor run\.db\.copy in .* can be used"):
             RunStore.open(folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     (folder / "run.db.copy").unlink()
-    with pytest.raises(StoreError, match=r"cannot be trusted, and there is no run.db.copy"):
+    with pytest.raises(StoreError, match=r"cannot be used: .* There is no run\.db\.copy"):
         RunStore.open(folder)
 
 
@@ -168,7 +168,7 @@ def test_another_platform_or_meta_is_noticed(tmp_path):
         with pytest.raises(StoreError, match="platform recorded at generation 0 does not match"):
             use(tmp_path / "run")
     behind_the_stores_back(tmp_path / "run", "UPDATE meta SET value = replace(value, '0', '1') WHERE key = 'run'")
-    with pytest.raises(StoreError, match="record 'run' of what the run is does not match"):
+    with pytest.raises(StoreError, match="record 'run' in its table meta does not match"):
         read_history(tmp_path / "run")
 
 

@@ -96,7 +96,7 @@ def test_a_creation_killed_at_any_file_operation_can_be_continued_or_repeated(tm
             outcomes.add(("repeated", name in died))
             assert folder.exists() is name.startswith("existing")
             if folder.exists():
-                with pytest.raises(StoreError, match="nothing was lost: start it again"):
+                with pytest.raises(StoreError, match="nothing was lost; start the run again"):
                     RunStore.open(folder)
             create(folder, generations=1).close()
         assert_sound(folder, 0)

@@ -293,7 +293,7 @@ def test_fork_with_changes_and_from_a_generation_that_is_not_kept(finished, tmp_
     assert len(open_run(tmp_path / "a").history) == 33
     code, printed = es("fork", finished[0], "--generation", 3, "--out", tmp_path / "c", *more)
     assert code == 1
-    assert "it keeps that of [29, 30]" in printed
+    assert "it keeps the states of generations [29, 30]" in printed
     assert not (tmp_path / "c").exists()
 
 

@@ -148,7 +148,7 @@ def test_a_cluster_without_room_is_named_with_what_it_has(monkeypatch):
     monkeypatch.setattr(module, "connect", lambda address, claim, workers: connect(address, claim, 0))
     start = time.monotonic()
     with pytest.raises(
-        EvaluationError, match=r"this machine has no place for a worker\. Each needs 1 CPU; .*has 0 CPU, 0 GPU"
+        EvaluationError, match=r"this machine has no room for a worker\. Each worker needs 1 CPU; .*has 0 CPU, 0 GPU"
     ):
         ray_engine(spec(), Limits(1), actor=WorkerActor)
     assert time.monotonic() - start < 30
@@ -226,5 +226,5 @@ def test_two_workers_share_one_gpu_and_its_memory(monkeypatch):
 
 
 def test_a_gpu_that_is_not_there_is_named():
-    with pytest.raises(EvaluationError, match=r"Each needs 1 CPU and 1 GPU; the cluster has 1 CPU, 0 GPU in all"):
+    with pytest.raises(EvaluationError, match=r"needs 1 CPU and 1 GPU; the cluster has 1 CPU, 0 GPU in total"):
         ray_engine(spec(), Limits(1), actor=WorkerActor, claim=Claim(gpus=1))

@@ -127,7 +127,7 @@ def test_damage_gives_the_same_digest_or_a_named_error(config, finished, tmp_pat
         if code == 0:
             assert digest(folder) == digest(finished[0])
         else:
-            assert f"{folder}/run.db cannot be trusted" in printed.replace("\n", "")
+            assert f"{folder}/run.db cannot be used" in printed.replace("\n", "")
 
 
 def test_other_versions_on_resume_are_told_and_make_the_digest_mixed(config, tmp_path, monkeypatch):

@@ -43,7 +43,7 @@ def test_a_step_that_makes_other_arrays_than_a_reset_is_refused():
 def test_why_a_task_cannot_have_it():
     assert rollout.why_not(SHIPPED["point_maze"]) == ""
     sorting = describe_environment("tests.examples.sorting:Sorting")
-    assert "the primitive sort, from" in rollout.why_not(sorting)
+    assert "the primitive sort (at " in rollout.why_not(sorting)
 
 
 class Heat:
