@@ -61,7 +61,7 @@ def test_a_run_of_it_goes_on_where_it_was_with_the_same_bits(tmp_path):
         ("tests.examples.minimal_criterion:min", "has no function 'min'"),
         (f"{__name__}:NOT_CALLABLE", "has no function 'NOT_CALLABLE'"),
         (f"{__name__}:raises", r"raises raised KeyError: 'sigma'"),
-        (f"{__name__}:something_else", r"returned 3, which is no es_service\.search\.algorithms\.base\.Algorithm"),
+        (f"{__name__}:something_else", r"returned 3; it must return an es_service\.search\.algorithms\.base\.Alg"),
         (".:x", "cannot import"),
     ],
 )
