@@ -151,10 +151,10 @@ def _rows(map_, rows):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("forgetful", r"generation 3 cannot be kept: the novelty archive has lost or changed entries; .* 2 is saved"),
-        ("growing", r"generation 1 cannot be kept: the search has 3 centres, and had 2"),
-        ("emptying", r"the map has lost cells, or has them in another order"),
-        ("foreign", r"generation 0 cannot be kept: the new elite of cell \d+ is not the centre that was evaluated"),
+        ("forgetful", r"generation 3 cannot be stored: the novelty archive has lost or changed entries; .* 2 is saved"),
+        ("growing", r"generation 1 cannot be stored: the search has 3 centres, but it had 2 before"),
+        ("emptying", r"the behaviour map has lost cells or changed their order"),
+        ("foreign", r"generation 0 cannot be stored: the new elite of cell \d+ is not the centre that was evaluated"),
     ],
 )
 def test_a_state_that_the_store_could_not_give_back_ends_the_run(tmp_path, name, reason):
