@@ -1,1 +1,1 @@
-"""YAML and overrides -> a validated, fully resolved `RunConfig` (`loading.py` in, `model.py` out)."""
+"""The config of a run: `loading.py` turns YAML and overrides into the validated, resolved `RunConfig` of `model.py`."""

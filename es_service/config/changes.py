@@ -1,4 +1,4 @@
-"""What changes with a key of a run: the keys that follow from it, the constants of the run; and what cannot change."""
+"""Changes of a run's config: which values are derived from a changed key, and which changes resume or fork refuses."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ STATE_KEYS = (
     "map.bounds",
     "map.cells",
 )
-"""What the form and meaning of a run's state depend on: with another value no state of an earlier run can be used."""
+"""Keys that determine the form and the meaning of a run's state; if one of them changes, the state cannot be used."""
 ALIKE = ("ns_es", "nsr_es", "nsra_es")
-"""Searches with the same state: a fork may go from one to another. Only the weight of fitness, which then begins anew,
-tells them apart."""
+"""Algorithms whose states have the same form, so that a fork may change from one to another. They differ only in the
+weight of fitness, which the fork starts anew."""
 START_KEYS = ("search.preset", "search.init_from", "policy.init", "search.fitness_weight_start")
-"""What is used where a run starts and never again."""
+"""Keys that are used only when a run starts."""
 _SHAPES = ("compute.chunk_pairs", "compute.rollout_block_pairs", "compute.gradient_block_pairs")
 _MAP = ("map.kind", "map.bounds", "map.cells")
 _FOLLOWERS = {
@@ -40,13 +40,18 @@ _FOLLOWERS = {
     "search.pairs": _SHAPES,
     "compute.chunk_pairs": _SHAPES[1:],
 }
-"""Key -> how the names of those begin whose values follow from it, unless they are written as well."""
+"""Key -> prefixes of the keys whose values are derived from it, unless they are set explicitly."""
 ABSENT = "(absent)"
-"""Stands for a constant that only one of two runs has."""
+"""Stands for the value of a constant that only the other run has."""
 
 
 def without_followers(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
-    """Resolved values without those that follow from one that is about to be another."""
+    """Resolved values without those that are derived from a key which is about to change.
+
+    Args:
+        values: resolved values of the config.
+        wanted: the values that are about to replace some of them.
+    """
     changed = [
         key
         for key in _FOLLOWERS
@@ -57,17 +62,17 @@ def without_followers(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> d
 
 
 def are_alike(name: str, old: Any, new: Any) -> bool:
-    """Whether a change of a key leaves the state what it is although its key says otherwise."""
+    """Whether this change keeps the state usable although its key is in STATE_KEYS: both algorithms are in ALIKE."""
     return name == "search.algorithm" and old in ALIKE and new in ALIKE
 
 
 def does_not_fit(name: str, old: Any, new: Any) -> bool:
-    """Whether no state of a run with the old value of a key can be used with the new one."""
+    """Whether a state made with the old value of a key cannot be used with the new value."""
     return name in STATE_KEYS and not are_alike(name, old, new)
 
 
 def foreign_options(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
-    """The options of a config's task that mean nothing once another task is wanted instead of it."""
+    """Keys of the options that belong to the config's own task, if `wanted` chooses another task; else none."""
     task = "task.environment"
     if task not in wanted or wanted[task] == values.get(task):
         return []
@@ -75,7 +80,7 @@ def foreign_options(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> lis
 
 
 def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Where two results of `constants()` differ: (dotted key, old value, new value), ABSENT where a side lacks it."""
+    """Differences between two results of `constants()`: (dotted key, old value, new value), ABSENT if missing."""
     return [
         (name, old.get(name, ABSENT), new.get(name, ABSENT))
         for name in {**old, **new}
@@ -86,29 +91,32 @@ def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tu
 def refused_changes(
     run: object, changes: Sequence[tuple[str, Any, Any]], besides: Mapping[str, Any] = MappingProxyType({})
 ) -> ConfigError:
-    """The error for a resume that would change constants of the run: all of them, and the ways out.
+    """The error for a resume that would change constants of the run; it lists all of them and the ways out.
 
     Args:
         run: folder of the run.
-        besides: keys that a fork has to set as well, and their values.
+        changes: (dotted key, old value, new value) of each constant, as `changed_constants` returns them.
+        besides: further keys that a fork must set, and their values.
     """
     fixed = [name for name, old, new in changes if does_not_fit(name, old, new) or name in START_KEYS]
     forkable = {name: new for name, _, new in changes if name not in fixed and new != ABSENT}
     problems = [Problem(f"{name}: {show(old)} -> {show(new)}", name, new, show(old), old) for name, old, new in changes]
     heading = (
-        f"{run}: a run keeps its task, policy, search, novelty, map, seed and chunk shapes for life; this would change:"
+        f"{run}: the task, policy, search, novelty, map, seed and chunk shapes of a run cannot be changed. "
+        "The changes that are refused:"
     )
     ways = []
     if forkable:
         ways.append(
-            WayOut("fork", "go on from its state with other settings", str(run), settings={**forkable, **besides})
+            WayOut("fork", "continue from its state with other settings", str(run), settings={**forkable, **besides})
         )
     if fixed:
         ways.append(start_afresh(run))
-    note = f"a fork has to keep {', '.join(fixed)}" if fixed else ""
+    note = f"a fork cannot change {', '.join(fixed)} either" if fixed else ""
     return ConfigError.listing(heading, problems, note, run=run, ways_out=ways)
 
 
 def start_afresh(run: object) -> WayOut:
-    """The way out where the state of a run is of no use with the settings that are wanted."""
-    return WayOut("run", "start anew from its centre (same task and network)", settings={"search.init_from": str(run)})
+    """The way out if the wanted settings cannot use the run's state: a new run that starts from its centre."""
+    purpose = "start a new run from its centre (same task and network)"
+    return WayOut("run", purpose, settings={"search.init_from": str(run)})

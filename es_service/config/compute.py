@@ -1,4 +1,4 @@
-"""The section of a config that says how the work is cut and where it runs."""
+"""The config section `compute`: how the work is divided into chunks and where it runs."""
 
 from __future__ import annotations
 
@@ -10,78 +10,85 @@ from es_service.config.fields import Count, NotNegative, Positive, Section, Swit
 
 
 class WorkerResources(Section):
-    """What one worker takes of a node, with engine ray."""
+    """Resources that Ray reserves for one worker (engine ray)."""
 
-    cpu: Count = Field(1, description="CPU cores that Ray sets aside for a worker; it uses one.")
+    cpu: Count = Field(1, description="CPU cores that Ray reserves for each worker; a worker uses one core.")
     gpu: NotNegative = Field(
-        0.0, description="GPUs of a worker, 1 or a fraction that it shares; 0 runs episodes on the CPU."
+        0.0,
+        description="GPUs that Ray reserves for each worker. With a fraction below 1, workers share a GPU; with 0, "
+        "episodes run on the CPU.",
     )
 
 
 class ComputeConfig(Section):
-    """How the work is cut and where it runs. Only `rollout` and the three `*_pairs` are constants of the run."""
+    """How the work is divided and where it runs. Only `rollout` and the three `*_pairs` are constants of the run."""
 
     engine: Literal["ray", "inline"] = Field(
         "ray",
-        description="What runs the workers. ray: actors, here or in a cluster. inline: this program's child processes.",
+        description="How the workers run. ray: as Ray actors, on this machine or in a cluster. inline: as child "
+        "processes of this program.",
     )
     inline_workers: Literal["processes", "threads"] = Field(
         "processes",
-        description="With engine inline, what workers are: processes; or threads of one, for rollout simd, which takes "
-        "less memory, and loses all of them with one.",
+        description="With engine inline: whether each worker is a process, or all workers are threads of one process. "
+        "Threads need rollout simd and take less memory, but if one worker crashes, all are lost.",
     )
     address: Text | None = Field(
         None,
-        description="With engine ray: a cluster to join, HOST:PORT, or auto for the one on this machine; null starts a "
-        "Ray of its own.",
+        description="With engine ray: address of the cluster to connect to, HOST:PORT, or auto for the cluster on this "
+        "machine; null starts a Ray instance for this run.",
     )
     workers: Literal["auto"] | Count = Field(
         "auto",
-        description="Worker processes. auto: one per core of the machine or cluster at hand. Never changes results.",
+        description="Number of workers. auto: one for each core of the machine or cluster. The number of workers never "
+        "changes results.",
     )
     worker_resources: WorkerResources = Field(
         default_factory=lambda: WorkerResources(cpu=1, gpu=0.0),
-        description="What one worker takes of a node, with engine ray.",
+        description="With engine ray: resources that Ray reserves for one worker.",
     )
     rollout: Literal["xla", "simd"] = Field(
-        description="What computes episodes. simd: code compiled for this kind of processor, some twenty times faster; "
-        "xla: JAX, for GPUs and for tasks that simd cannot compile. auto: simd where that can be."
+        description="How episodes are computed. simd: by code compiled for this kind of processor, about twenty times "
+        "faster. xla: by JAX, for GPUs and for tasks that simd cannot compile. auto: simd where it is possible."
     )
     chunk_pairs: Count = Field(
-        description="Pairs in one unit of work; divides search.pairs. auto: the largest divisor of it not above "
-        "an eighth of it, within 16 to 64, a multiple of 8 if there is one."
+        description="Pairs in one chunk; must divide search.pairs. auto: the largest divisor of search.pairs up to an "
+        "eighth of it (this limit is at least 16 and at most 64), and a multiple of 8 if there is one."
     )
     rollout_block_pairs: Count = Field(
-        description="Pairs that step together, so that their weights stay in cache; divides chunk_pairs. auto: the "
-        "largest divisor of it not above 32 whose weights take at most 5 MiB."
+        description="With rollout xla: pairs whose episodes step together, so that their weights stay in the cache; "
+        "must divide chunk_pairs. auto: the largest divisor of chunk_pairs up to 32 whose weights take at most 5 MiB."
     )
     gradient_block_pairs: Count = Field(
-        description="Pairs summed into one partial gradient; not above search.pairs. auto: as few whole chunks as "
-        "make at most 32 blocks, and blocks that are worth a message."
+        description="Pairs summed into one partial gradient; at most search.pairs. auto: the smallest number of whole "
+        "chunks that gives at most 32 blocks and makes each block large enough to be worth a message."
     )
     chunk_timeout_s: Positive = Field(
-        30.0, description="Least deadline of a chunk in seconds; slow chunks raise it for those that follow."
+        30.0,
+        description="Shortest deadline of a chunk in seconds; slow chunks make the deadline of later chunks longer.",
     )
     compile_timeout_s: Positive = Field(
         120.0,
-        description="Deadline of a worker's first chunk of each kind, which compiles; or what later ones may take, if "
-        "that is longer.",
+        description="Deadline in seconds of a worker's first chunk of each kind, which includes compilation. If the "
+        "deadline of later chunks is longer, it applies to the first one too.",
     )
-    max_attempts: Count = Field(4, description="Times a chunk is tried before the run stops with its error.")
+    max_attempts: Count = Field(4, description="Attempts to compute a chunk before the run stops with its error.")
     no_worker_timeout_s: Positive = Field(
         120.0,
-        description="Seconds without any live worker after which the run stops, in a cluster that has no room yet as "
-        "well; a worker that takes half as long to start is replaced.",
+        description="Seconds without a live worker after which the run stops, also in a cluster that has no room yet. "
+        "A worker that has not started after half of this time is replaced.",
     )
     dispatch_log: Switch = Field(
-        False, description="Whether the run folder gets a dispatch.jsonl: what each worker was sent, answered, died of."
+        False,
+        description="Whether the run folder gets a dispatch.jsonl: what was sent to each worker, what it answered, and "
+        "why it was lost.",
     )
 
 
 COMPUTE_CONSTANTS = ("rollout", "chunk_pairs", "rollout_block_pairs", "gradient_block_pairs")
-"""Keys of `compute` that fix floating-point results, and therefore the run."""
+"""Keys of `compute` that affect floating-point results and are therefore constants of the run."""
 ENGINE_IMPLIES: dict[str, dict[str, Any]] = {
     "inline": {"compute.address": None, "compute.worker_resources.cpu": 1, "compute.worker_resources.gpu": 0},
     "ray": {"compute.inline_workers": "processes"},
 }
-"""Engine -> settings that belong to the other one, as it needs them."""
+"""Engine -> settings that only the other engine uses, with the values that they must have with this one."""

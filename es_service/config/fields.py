@@ -1,4 +1,4 @@
-"""What a config is made of: sections that take no wrong type, and types with what an error message says is allowed."""
+"""Building blocks of the config model: strict sections, and types annotated with the values allowed, in words."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from es_service.protocol.messages import Bounds
 
 OPTIONS = "task.options."
 RESOURCES = "compute.worker_resources."
-"""How the keys of the two groups inside a section begin."""
+"""Prefixes of the keys in the two groups that are inside a section."""
 
 
 def _tuple(value: Any) -> Any:
@@ -18,7 +18,7 @@ def _tuple(value: Any) -> Any:
 
 
 def _tuples(value: Any) -> Any:
-    """Lists as tuples, and whole numbers among them as they are in a file: [[-1, 1], [0, 2.5]]."""
+    """Convert nested lists to tuples and whole numbers in them to floats, for values such as [[-1, 1], [0, 2.5]]."""
     if not isinstance(value, list | tuple):
         return value
     return tuple(
@@ -52,6 +52,6 @@ CellCounts = Annotated[
 
 
 class Section(BaseModel):
-    """Frozen; a whole number is a number, but a number is no text."""
+    """Base of the config sections: frozen, no unknown keys, no conversion of types except from int to float."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)

@@ -1,4 +1,4 @@
-"""The keys of a config: which there are, what a file or an override says of each, what is wrong with any other."""
+"""The keys of a config: which exist, their values in a file or in overrides, and the problems of unknown ones."""
 
 from __future__ import annotations
 
@@ -27,24 +27,27 @@ FIELDS = {name: field for name, field in RunConfig.model_fields.items() if name 
     for name, field in model.model_fields.items()
     if f"{section}.{name}." not in (OPTIONS, RESOURCES)
 }
-"""Dotted key -> what it may be; the task's options, whose names are the task's, are not among them."""
+"""Dotted key -> its field in the model. Task options are not included, since each task defines its own."""
 GROUPS = (*SECTIONS, OPTIONS.removesuffix("."), RESOURCES.removesuffix("."))
-"""What holds keys and is no value itself."""
+"""Names of sections and of groups inside sections, which hold keys and have no value."""
 ALIASES = {
     "population": "search.pairs",
     "popsize": "search.pairs",
     "lr": "search.learning_rate",
     "std": "search.sigma",
 }
-"""What others call a key of ours."""
+"""Name that other libraries use -> our key."""
 RENAMED = {"search.members": "search.centres", "search.member_choice": "search.centre_choice"}
-"""What keys of ours were called before version 0.6."""
+"""Name of a key before version 0.6 -> its present name."""
 BUDGET = [name for name in FIELDS if name.startswith("budget.")]
-"""Keys of which one must be set."""
+"""Keys of which at least one must be set."""
 
 
 def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, Any], set[str], list[Problem]]:
-    """Flat values of the known keys, the groups that are no mapping, and the problems of both other kinds of key."""
+    """Sort the keys of a nested mapping: (values by dotted key, names of groups that are not mappings, problems).
+
+    There is a problem for each unknown key, each key with a dot, and each group that is not a mapping.
+    """
     values: dict[str, Any] = {}
     unusable: set[str] = set()
     problems: list[Problem] = []
@@ -52,7 +55,7 @@ def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, An
         name = f"{group}{key}"
         if "." in str(key):
             section, leaf = name.rsplit(".", 1)
-            problems.append(unfit(name, value, f"no dots in a file; write {leaf} inside {section}:"))
+            problems.append(unfit(name, value, f"a key in a file has no dots; write {leaf} inside {section}:"))
         elif name in GROUPS and isinstance(value, Mapping):
             below = sort_keys(value, f"{name}.")
             values |= below[0]
@@ -60,8 +63,8 @@ def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, An
             problems += below[2]
         elif name in GROUPS:
             unusable.add(name)
-            hint = f"indent them below `{_leaf(name)}:`, or delete the line for the defaults"
-            problems.append(unfit(name, value, f"{show(value)} where keys belong; {hint}"))
+            hint = f"indent its keys below `{_leaf(name)}:`, or delete the line to use the defaults"
+            problems.append(unfit(name, value, f"{show(value)} is not a mapping of keys; {hint}"))
         elif name in FIELDS or group == OPTIONS:
             values[name] = value
         else:
@@ -70,11 +73,12 @@ def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, An
 
 
 Overrides = Iterable[str] | Mapping[str, Any]
-"""Changes of a config: "search.sigma=0.05" and the like, values in YAML, later ones winning; or values by key."""
+"""Changes of a config: strings such as "search.sigma=0.05", with values in YAML, the last one for a key winning; or a
+mapping from key to value."""
 
 
 def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]]:
-    """Values by dotted key, and a problem for each override that has none to give."""
+    """Values by dotted key, and a problem for each override that cannot be used."""
     values: dict[str, Any] = {}
     problems: list[Problem] = []
     if isinstance(overrides, Mapping):
@@ -83,7 +87,8 @@ def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]
         name, equals, text = (part.strip() for part in override.partition("="))
         where = f"override {override}"
         if not equals or not name or not text:
-            hint = "write null for no value" if name and equals else "write a.b=c, such as search.sigma=0.05"
+            example = "write KEY=VALUE, such as search.sigma=0.05"
+            hint = "the value is missing; write null for no value" if name and equals else example
             problems.append(Problem(f"{where}: {hint}"))
         elif name in GROUPS:
             keys = [key for key in FIELDS if key.startswith(f"{name}.")] or [f"{OPTIONS}start"]
@@ -95,7 +100,8 @@ def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]
             except ValueError as error:
                 problems.append(Problem(f"{where}: {error}", name, text))
                 continue
-            is_word = _is_option(name) and isinstance(value, bool | int | float)  # such as off, or 10
+            # YAML reads off as a bool and 10 as a number, but the value of an option is text.
+            is_word = _is_option(name) and isinstance(value, bool | int | float)
             values[name] = text if is_word else value
         else:
             problem = _unknown_key(name, FIELDS, text)
@@ -104,16 +110,17 @@ def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]
 
 
 def _is_option(name: str) -> bool:
-    """Whether a key is that of a task's option, whatever the task."""
+    """Whether a key has the form of a task option, for any task."""
     option = name.removeprefix(OPTIONS)
     return option not in ("", name) and "." not in option
 
 
 def _unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:
-    """The problem of a key that is none: the same key elsewhere, else the nearest one, else what there is.
+    """The problem of an unknown key. It suggests the same name in another section, else the most similar key; if there
+    is neither, it lists the keys of the section.
 
     Args:
-        candidates: what may have been meant.
+        candidates: keys that may have been meant.
     """
     if name in RENAMED:
         return unfit(name, value, f"this key is now {RENAMED[name]}", suggestion=RENAMED[name])

@@ -1,8 +1,8 @@
-"""YAML and overrides -> `RunConfig`, or one error that lists everything wrong with them.
+"""Turns YAML and overrides into a `RunConfig`, or raises one error that lists everything that is wrong with them.
 
-The order is: read, sort keys into sections, apply overrides, fill in the preset, check each value alone, check names,
-resolve what is left open, check the sections against each other. A value that fails a step is reported once and taken
-out, so that the later steps still check everything else.
+The steps are: read, sort keys into sections, apply overrides, fill in the preset, check each value alone, check names,
+resolve what is left open, check the sections against each other. A value that fails a step is reported once and
+removed, so that the later steps still check everything else.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from es_service.errors import ConfigError, Problem
 from es_service.protocol.messages import TaskSpec
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
-"""Where a config comes from: the path of a YAML file, the name of a shipped one, or what such a file would contain."""
+"""Where a config comes from: the path of a YAML file, the name of a shipped one, or the content of one."""
 
 
 def load_config(
@@ -49,16 +49,17 @@ def load_config(
     no_vectors: str = "",
     new: bool = True,
 ) -> RunConfig:
-    """The config of a new run.
+    """Load the config of a new run.
 
     Args:
-        source: a YAML file, the name of a shipped config, or a nested mapping like one.
-        overrides: "search.sigma=0.05" and the like, values in YAML, of which a later one wins; or values by key. Where
-            they name another task, options of the source's own task are left out (`left_out` says which).
-        tasks: what `task.environment` may name.
-        algorithms: what `search.algorithm` may name.
-        no_vectors: why this machine's processor cannot run what simd compiles; empty where it can.
-        new: whether the run that it starts from, if any, must be there.
+        source: a YAML file, the name of a shipped config, or a nested mapping with the content of one.
+        overrides: strings such as "search.sigma=0.05", with values in YAML, the last one for a key winning; or a
+            mapping from key to value. If they choose another task, the options of the source's own task are dropped;
+            `left_out` returns those.
+        tasks: the tasks that `task.environment` may name.
+        algorithms: the algorithms that `search.algorithm` may name.
+        no_vectors: why this machine's processor cannot run the code that simd compiles; empty if it can.
+        new: whether the run that `search.init_from` names, if any, must exist.
 
     Raises:
         ConfigError: names the file, then lists every problem on a line of its own.
@@ -67,8 +68,10 @@ def load_config(
 
 
 def left_out(source: Source, overrides: Overrides) -> list[str]:
-    """The options that `load_config` leaves out of a config because the overrides want another task than it has, which
-    gets its own default options. `source` and `overrides` as they were accepted by `load_config`."""
+    """Keys of the task options that `load_config` drops because the overrides choose another task.
+
+    The other task gets its own default options. `source` and `overrides` must be ones that `load_config` accepts.
+    """
     mapping = source if isinstance(source, Mapping) else read_yaml_file(config_file(source))
     return foreign_options(sort_keys(mapping)[0], parse_overrides(overrides)[0])
 
@@ -81,11 +84,11 @@ def changed_config(
     algorithms: Mapping[str, object],
     no_vectors: str = "",
 ) -> RunConfig:
-    """The config of a run that exists, with some keys changed; what follows from those, by a preset or from the task,
-    is resolved anew. Whether the run can change so is for the caller to say.
+    """The config of an existing run with some keys changed.
 
-    Arguments as for `load_config`; `source` is a resolved config, such as the run's own `config.yaml`. The run it once
-    started from need no longer be there.
+    Values that are derived from the changed keys, by a preset or from the task, are resolved again. The caller checks
+    whether the run may change in this way. Arguments are as for `load_config`; `source` is a resolved config, such as
+    the run's own `config.yaml`. The run that `search.init_from` names need not exist any more.
 
     Raises:
         ConfigError: as for `load_config`.
@@ -135,7 +138,7 @@ def _load(
         except KeyError:
             allowed, meant = f"{one_of(known)}, or {besides}", nearest(chosen, known)
             hint = f"; did you mean {meant}?" if meant else ""
-            sentence = f"{key}: {show(chosen)} is no known {what}; must be {allowed}{hint}"
+            sentence = f"{key}: {show(chosen)} is not a known {what}; must be {allowed}{hint}"
             problems.append(Problem(sentence, key, chosen, allowed, meant))
         except ConfigError as error:
             problems.append(Problem(f"{key}: {error}", key, chosen))
@@ -149,7 +152,7 @@ def _load(
     problems += centre_problems(values) + shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):
-        problems.append(unfit("budget", None, f"nothing ends this run; set at least one of {one_of(BUDGET)}"))
+        problems.append(unfit("budget", None, f"this run has no limit; set at least one of {one_of(BUDGET)}"))
     if problems:
         count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
         raise ConfigError.listing(f"{name}: {count}", problems)
@@ -157,23 +160,23 @@ def _load(
 
 
 def _asks(value: object, ask: str | None) -> bool:
-    """Whether a value leaves its key open; `==` alone would trip over arrays in a Python mapping."""
+    """Whether a value asks for its key to be resolved. A plain `==` would fail for an array in a Python mapping."""
     return value is None if ask is None else isinstance(value, str) and value == ask
 
 
 def _preset_values(values: Mapping[str, Any]) -> dict[str, Any]:
-    """What the config's preset says; nothing where it names none of ours, which is reported as a bad value."""
+    """Values of the config's preset; empty if the preset is unknown, which is reported as a bad value."""
     preset = values.get("search.preset", FIELDS["search.preset"].default)
     if not isinstance(preset, str) or preset not in PRESETS:
         return {}
     filled = preset_values(preset)
     if values.get("policy.observation_normalization") is False:
-        filled["policy.observation_clip"] = None  # its bound is in standard deviations, which there are none of
+        filled["policy.observation_clip"] = None  # the bound is in standard deviations, which are then unknown
     return filled
 
 
 def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The inverse of flattening; every section is there, if empty."""
+    """Nested mappings from dotted keys, the inverse of `flat`; every section is present, even if empty."""
     nested: dict[str, Any] = {section: {} for section in SECTIONS}
     for name, value in values.items():
         *path, leaf = name.split(".")
@@ -185,20 +188,20 @@ def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _value_problems(values: Mapping[str, Any]) -> dict[str, Problem]:
-    """Keys whose value is wrong by itself -> what is wrong. What is absent is no problem here."""
+    """Key -> problem for each value that is invalid by itself. Missing keys are not reported here."""
     try:
         RunConfig.model_validate(_nested(values))
     except ValidationError as error:
         found = [item["loc"] for item in error.errors(include_url=False)]
     else:
         return {}
-    # A location goes deeper than our keys where a value has parts: ("policy", "hidden", 1).
+    # Where a value has parts, a location is longer than our key: ("policy", "hidden", 1).
     names = {n for loc in found for k in range(len(loc)) if (n := ".".join(map(str, loc[: k + 1]))) in values}
     return {name: _bad_value(name, value) for name, value in values.items() if name in names}
 
 
 def _bad_value(name: str, value: object) -> Problem:
-    """Name, value, what is allowed, and how to write what was probably meant."""
+    """The problem of an invalid value: what is allowed, and how to write what was probably meant."""
     if name not in FIELDS:
         return not_allowed(name, value, "text, so write it in quotes")
     field = FIELDS[name]
@@ -207,7 +210,7 @@ def _bad_value(name: str, value: object) -> Problem:
         allowed = f"{show(LEFT_OPEN[name])} or {allowed}"
     hint, meant = "", None
     if value is None:
-        hint = "; leave the key out for its default"
+        hint = "; leave the key out to use its default"
     elif isinstance(value, str) and "number" in allowed and _is_number(value):
         hint, meant = f"; remove the quotes around {value}", parse_value(value)
     elif isinstance(value, float) and "whole number" in allowed and value.is_integer() and 1 <= value < 2**53:
@@ -225,7 +228,7 @@ def _is_number(text: str) -> bool:
 
 
 def _allowed(annotation: Any, metadata: Iterable[object] = ()) -> str:
-    """What a type allows, in words: those written beside it, else its literal values."""
+    """What a type allows, in words: the text in its annotation if there is one, else its literal values."""
     for words in metadata:
         if isinstance(words, str):
             return words

@@ -1,4 +1,4 @@
-"""What a config leaves open of the behaviour map, and whether it fits the task's descriptor."""
+"""Defaults of the section `map`, and checks of the behaviour map against the task's descriptor."""
 
 from __future__ import annotations
 
@@ -16,20 +16,24 @@ MOST_AUTO_CELLS = 10_000
 MOST_CELLS = 10_000_000
 CVT_CELLS = 1024
 MOST_CVT_CELLS = 4096
-"""Placing them takes time that grows with their square: some 15 seconds for so many."""
+"""The time to place the centroids grows with the square of their number: about 15 seconds for this many."""
 MOST_GRID_DIMENSIONS = 6
-"""Of a descriptor for which `kind: auto` is a grid."""
+"""Largest number of descriptor dimensions for which `kind: auto` is a grid."""
 LARGEST = 1e30
-"""Of bounds and offsets, so that sums and differences of them stay finite."""
+"""Largest absolute value of bounds and offsets, so that their sums and differences stay finite."""
 
 
 def default_kind(dimensions: int) -> str:
-    """grid for up to six dimensions, else cvt."""
+    """Kind of map for a descriptor: grid for up to six dimensions, else cvt."""
     return "grid" if dimensions <= MOST_GRID_DIMENSIONS else "cvt"
 
 
 def default_cells(kind: str, dimensions: int) -> tuple[int, ...]:
-    """20 x 20 in the plane, 100 on a line; else as many alike, 2 at least, as make at most 10,000. Of a cvt 1,024."""
+    """Default number of cells: 1,024 for a cvt; for a grid, the cells along each dimension.
+
+    These are 100 for one dimension and 20 x 20 for two. For more, all dimensions have the same number: the largest that
+    gives at most 10,000 cells in all, but at least 2.
+    """
     if kind == "cvt":
         return (CVT_CELLS,)
     each = {1: 100, 2: 20}.get(dimensions) or max(2, int(MOST_AUTO_CELLS ** (1.0 / dimensions) + 1e-9))
@@ -37,7 +41,7 @@ def default_cells(kind: str, dimensions: int) -> tuple[int, ...]:
 
 
 def default_qd_offset(values: Mapping[str, Any], task: TaskSpec) -> float:
-    """The least fitness of an episode, where the task names its least reward; else 0."""
+    """Lowest fitness of an episode, from the lowest reward that the task specifies; 0 if it specifies none."""
     if task.least_reward is None:
         return 0.0
     counted = 1 if values.get("task.fitness") == "final" else values.get("task.episode_steps", task.episode_steps)
@@ -45,10 +49,10 @@ def default_qd_offset(values: Mapping[str, Any], task: TaskSpec) -> float:
 
 
 def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
-    """Where the map does not fit the descriptor, or the algorithm needs one."""
+    """Problems of a map that does not fit the descriptor, is too large, or is off although the algorithm needs it."""
     problems = []
     if values.get("search.algorithm") == "me_es" and values.get("map.enabled", True) is False:
-        why = " for me_es, which draws its parents from the map"
+        why = " for me_es, whose blocks start from elites of the map"
         problems.append(not_allowed("map.enabled", False, "true", why=why))
     names = with_options(task, options_of(values)).descriptor_names
     bounds, cells, kind = values.get("map.bounds"), values.get("map.cells"), values.get("map.kind")
@@ -59,8 +63,8 @@ def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     if bounds is not None:
         if len(bounds) != len(names):
             allowed = f"a list of {len(names)} pairs [low, high], or auto"
-            what = f"{show(bounds)} has {len(bounds)} pairs; the descriptor has {len(names)} dimensions"
-            problem = f"{what} ({', '.join(names)}), so must be {allowed}"
+            what = f"{show(bounds)} has {len(bounds)} pairs, but the descriptor has {len(names)} dimensions"
+            problem = f"{what} ({', '.join(names)}); must be {allowed}"
             problems.append(unfit("map.bounds", bounds, problem, allowed=allowed))
         else:
             problems += [

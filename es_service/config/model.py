@@ -1,7 +1,7 @@
-"""What a run is: the resolved, frozen config, and what of it can never change once the run exists.
+"""The resolved, frozen config of a run, and the part of it that can never change once the run exists.
 
-A `RunConfig` holds no `auto` that would change results: `loading.load_config` fills in presets, defaults and
-shapes and checks the sections against each other, so build one with it and not by hand.
+A `RunConfig` contains no `auto` that would affect results. Create it with `loading.load_config` and not by hand:
+`load_config` fills in presets, defaults and shapes and checks the sections against each other.
 """
 
 from __future__ import annotations
@@ -31,9 +31,11 @@ from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
 
 
 class TaskConfig(Section):
-    """What is to be learned. Constants of the run."""
+    """The task that is to be learned. Constants of the run."""
 
-    environment: Text = Field(description="Name of the task: one of ours, brax:NAME, or module:Class, one of your own.")
+    environment: Text = Field(
+        description="Name of the task: a shipped one, brax:NAME, or module:Class for one of your own."
+    )
     episode_steps: Count = Field(description="Length of an episode in control steps. null: the task's own length.")
     fitness: Literal["sum", "final"] = Field(
         "sum",
@@ -45,7 +47,7 @@ class TaskConfig(Section):
     )
     options: dict[Text, Text] = Field(
         default_factory=dict,
-        description="The task's own settings, such as `start`; by default the first value of each.",
+        description="Settings of the task, such as `start`; the default of each is its first allowed value.",
     )
 
 
@@ -74,7 +76,7 @@ class SearchConfig(Section):
     """The evolution strategy. Constants of the run."""
 
     algorithm: Text = Field(
-        description="Name of the search algorithm: one of ours, or module:function, one of your own."
+        description="Name of the search algorithm: a shipped one, or module:function for one of your own."
     )
     preset: Literal["literature", "uber"] = Field(
         "literature", description="Which column of the preset table fills in the keys that the config leaves out."
@@ -88,13 +90,13 @@ class SearchConfig(Section):
         0.005, description="Weight decay, added to the gradient before Adam: lambda in -g + lambda x."
     )
     centres: Count = Field(
-        description="Centres searched side by side, each with its own optimiser; one is updated per generation. "
-        "auto: 1 for es and me_es, which allow no other, and for one of your own, else 5."
+        description="Number of centres searched side by side, each with its own optimiser; one is updated per "
+        "generation. auto: 1 for es and me_es, which allow no other number, and for a search of your own; else 5."
     )
     centre_choice: Literal["novelty", "round_robin", "uniform"] = Field(
         "novelty",
-        description="How the centre to update is chosen: with probability proportional to its novelty, in turn, or all "
-        "alike.",
+        description="How the centre to update is chosen. novelty: with probability proportional to its novelty. "
+        "round_robin: in turn. uniform: all with the same probability.",
     )
     fitness_weight_start: Fraction = Field(
         description="nsra_es: weight of fitness beside novelty at the start. Set by the preset."
@@ -106,35 +108,40 @@ class SearchConfig(Section):
         description="nsra_es: generations without improvement before the weight of fitness falls. Set by the preset."
     )
     fitness_weight_min_gain: NotNegative = Field(
-        description="nsra_es: an improvement beats the record by more than this fraction of its size. Set by the "
-        "preset."
+        description="nsra_es: a centre is an improvement if its fitness exceeds the record by more than this fraction "
+        "of the record's absolute value. Set by the preset."
     )
     mode: Literal["explore_exploit", "explore", "exploit"] = Field(
         "explore_exploit",
-        description="me_es: what a block of generations climbs: novelty (explore), fitness (exploit), or either.",
+        description="me_es: what a block of generations maximises. explore: novelty. exploit: fitness. "
+        "explore_exploit: one of the two, as search.alternation says.",
     )
     alternation: Literal["round_robin", "coin"] = Field(
-        "round_robin", description="me_es: whether exploring and exploiting blocks take turns or a coin decides."
+        "round_robin",
+        description="me_es: how exploring and exploiting blocks follow each other. round_robin: in turn. coin: each "
+        "block is chosen at random, with probability 1/2.",
     )
     first_block: Literal["explore", "exploit"] = Field(
-        description="me_es: what the first block does where they take turns. Set by the preset."
+        description="me_es: what the first block does with alternation round_robin. Set by the preset."
     )
     block_generations: Count = Field(
-        10, description="me_es: generations between two draws from the map; each block has a fresh optimiser."
+        10,
+        description="me_es: generations in a block; each block starts from an elite drawn from the map, with a fresh "
+        "optimiser.",
     )
     cell_sampling: Literal["top", "score"] = Field(
-        description="me_es: how a cell is drawn, as QDax (top) or the released code (score) has it; "
-        "es_service/search/algorithms/me_es.py says how. Set by the preset."
+        description="me_es: how the cell of that elite is drawn: as in QDax (top) or as in the released code (score); "
+        "es_service/search/algorithms/me_es.py describes both. Set by the preset."
     )
     parent_statistics: Literal["global", "elite"] = Field(
         "global",
-        description="me_es: observation statistics that a block runs with: those of the whole run, or those that the "
-        "elite it began with was evaluated with. With elite, all elites descend from the first centre and so keep its "
-        "statistics: none, unless the run started from another one.",
+        description="me_es: observation statistics that a block uses. global: those of the whole run. elite: those "
+        "with which the elite at its start was evaluated. With elite, all elites descend from the first centre and "
+        "keep its statistics, so observations are not normalised unless the run started from a policy of another run.",
     )
     evaluation_episodes: Count = Field(
         30,
-        description="Episodes without noise on which each new centre is judged; counted as environment steps.",
+        description="Noise-free episodes on which each new centre is evaluated; they count as environment steps.",
     )
     common_random_numbers: Switch = Field(
         description="Whether the two members of a pair share resets and action noise. Set by the preset."
@@ -144,13 +151,13 @@ class SearchConfig(Section):
     )
     init_from: Text | None = Field(
         None,
-        description="Policy of another run that this one starts from: RUN, its folder, for the centre updated last, "
-        "RUN:best, or RUN:3,17 for a cell's elite; null for random weights.",
+        description="Policy of another run from which this run starts: RUN (its folder) for the centre updated last, "
+        "RUN:best for the best centre, or RUN:3,17 for a cell's elite; null for random weights.",
     )
 
 
 class NoveltyConfig(Section):
-    """What is novel. Constants of the run."""
+    """How novelty is measured. Constants of the run."""
 
     neighbours: Count = Field(
         10, description="Novelty is the mean distance to this many nearest entries of the novelty archive."
@@ -161,38 +168,38 @@ class NoveltyConfig(Section):
 
 
 class MapConfig(Section):
-    """The behaviour map, whose cells keep the fittest evaluated centre each. Constants of the run."""
+    """The behaviour map, in which each cell keeps the fittest evaluated centre. Constants of the run."""
 
     enabled: Switch = Field(True, description="Whether the run fills a map; me_es needs one.")
     kind: Literal["grid", "cvt"] = Field(
-        description="grid: cells of equal sides. cvt: as many cells as wanted, for many dimensions. auto: grid for up "
-        "to six dimensions."
+        description="grid: cells of equal size. cvt: any number of cells around centroids, for many dimensions. auto: "
+        "grid for up to six dimensions, else cvt."
     )
     bounds: BoundPairs = Field(
-        description="[low, high] for each dimension of the descriptor; what lies outside belongs to the border cells. "
-        "auto: the task's own."
+        description="[low, high] for each dimension of the descriptor; descriptors outside belong to the border cells. "
+        "auto: the bounds of the task."
     )
     cells: CellCounts = Field(
-        description="grid: cells along each dimension. cvt: one number, of all. auto: [20, 20] for two dimensions, "
-        "10,000 in all at most for others; [1024] for cvt."
+        description="grid: number of cells along each dimension. cvt: one number, the number of all cells. auto: [100] "
+        "for one dimension, [20, 20] for two, at most 10,000 cells in all for more; [1024] for a cvt."
     )
     qd_offset: Number = Field(
-        description="Fitness that counts as 0 in the QD-score. auto: the least reward of the task times its steps "
-        "(fitness: sum), or 0 where the task names none."
+        description="Fitness that counts as 0 in the QD-score. auto: the lowest reward of the task, times the steps of "
+        "an episode with fitness sum; 0 if the task specifies no lowest reward."
     )
 
 
 class BudgetConfig(Section):
-    """When to stop: whichever comes first. At least one is set. May change on resume."""
+    """Limits at which the run stops; the first one reached ends it. At least one is set. May change on resume."""
 
-    generations: Count | None = Field(None, description="Generations in all, sessions before a resume included.")
-    env_steps: Count | None = Field(None, description="Environment steps in all, evaluations included.")
-    wall_clock_s: Positive | None = Field(None, description="Seconds of running in all, sessions together.")
-    target_fitness: Number | None = Field(None, description="Mean evaluation fitness of a centre that is good enough.")
+    generations: Count | None = Field(None, description="Number of generations, summed over all sessions.")
+    env_steps: Count | None = Field(None, description="Number of environment steps, evaluations included.")
+    wall_clock_s: Positive | None = Field(None, description="Running time in seconds, summed over all sessions.")
+    target_fitness: Number | None = Field(None, description="Mean evaluation fitness of a centre that ends the run.")
 
 
 class RunConfig(Section):
-    """A whole run. Equal configs give equal results, wherever and however often they run."""
+    """The config of a whole run. Equal configs give equal results, wherever and however often they run."""
 
     task: TaskConfig
     policy: PolicyConfig
@@ -201,14 +208,14 @@ class RunConfig(Section):
     map: MapConfig
     budget: BudgetConfig
     compute: ComputeConfig
-    seed: Seed = Field(0, description="Address of all random numbers of the run.")
+    seed: Seed = Field(0, description="Seed of all random numbers of the run.")
 
     def resolved_yaml(self) -> str:
-        """The text of the run folder's `config.yaml`: every value spelled out; loading it gives an equal config."""
+        """The text of the run folder's `config.yaml`, with every value. Loading it gives an equal config."""
         return dump_yaml(self.model_dump(mode="json"))
 
     def constants(self) -> dict[str, Any]:
-        """What resume must not change: dotted key -> plain JSON value, in the order of the config."""
+        """Values that resume must not change: dotted key -> plain JSON value, in the order of the config."""
         sections = self.model_dump(mode="json")
         del sections["budget"]
         sections["compute"] = {key: sections["compute"][key] for key in COMPUTE_CONSTANTS}
@@ -216,7 +223,7 @@ class RunConfig(Section):
 
 
 def flat(sections: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one: {"search": {"sigma": 0.02}} -> {"search.sigma": 0.02}."""
+    """Flatten nested mappings: {"search": {"sigma": 0.02}} -> {"search.sigma": 0.02}."""
     values: dict[str, Any] = {}
     for key, value in sections.items():
         values |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
@@ -224,12 +231,12 @@ def flat(sections: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def policy_shape(config: RunConfig, task: TaskSpec) -> PolicyShape:
-    """The network between the task's observation and action."""
+    """Shape of the policy network, from the task's observation to its action."""
     return PolicyShape((task.observation_size, *config.policy.hidden, task.action_size))
 
 
 def worker_spec(config: RunConfig, task: TaskSpec) -> WorkerSpec:
-    """What every worker of the run is told once, when it starts."""
+    """The message that every worker of the run receives once, when it starts."""
     settings, policy, compute = config.task, config.policy, config.compute
     return WorkerSpec(
         seed=config.seed,

@@ -1,11 +1,11 @@
-"""The keys on which the presets differ, in one table; configs/README.md shows it, the config loader reads it.
+"""Table of the keys on which the presets differ. The config loader reads it, and configs/README.md shows it.
 
 A preset fills in what a config leaves out. A key written in the config wins, and the run's own `config.yaml` records
 every value, so a later change of this table changes no existing run.
 
 Sources named below: ES-starter is OpenAI's evolution-strategies-starter (Salimans et al. 2017, arXiv:1703.03864); DNE
 is Uber's deep-neuroevolution (Conti et al. 2018, arXiv:1712.06560); ME-ES is Uber's Map-Elites-Evolutionary (Colas et
-al. 2020, arXiv:2003.01825). All of them were read as code, not as papers.
+al. 2020, arXiv:2003.01825). All values are from their code, not from the papers.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from types import MappingProxyType
 
 PRESETS = MappingProxyType(
     {
-        "literature": "what independent implementations do; ours where they say nothing",
-        "uber": "what the authors' released ME-ES code does",
+        "literature": "values of independent implementations; our own choice where they specify none",
+        "uber": "values of the authors' released ME-ES code",
     }
 )
-"""Preset name -> what it stands for. Each name is also a column of the table."""
+"""Preset name -> its meaning. Each name is also a column of the table."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ _ROWS = (
         "search.pairs",
         512,
         5000,
-        "uber: ME-ES, 10,000 episodes a generation as + and - pairs. literature: ours, sized for one machine; the "
-        "papers used 5,000 to 10,000 episodes a generation, so compare results at equal environment steps.",
+        "uber: ME-ES, 10,000 episodes per generation in + and - pairs. literature: our choice, sized for one machine; "
+        "the papers used 5,000 to 10,000 episodes per generation, so compare results at equal environment steps.",
     ),
     PresetRow(
         "policy.init",
@@ -60,8 +60,8 @@ _ROWS = (
         "search.common_random_numbers",
         True,
         False,
-        "uber: ME-ES, where the two members of a pair start from different resets. literature: ours; sharing reset and "
-        "action noise inside a pair takes their luck out of its difference.",
+        "uber: ME-ES, where the two members of a pair start from different resets. literature: our choice; if a pair "
+        "shares resets and action noise, the difference of its members contains less noise.",
     ),
     PresetRow(
         "search.fitness_weight_start",
@@ -74,7 +74,7 @@ _ROWS = (
         "search.fitness_weight_patience",
         50,
         20,
-        "NSRA-ES. uber: ME-ES. literature: the same implementations as for its start.",
+        "NSRA-ES. uber: ME-ES. literature: the same implementations as for fitness_weight_start.",
     ),
     PresetRow(
         "search.fitness_weight_min_gain",
@@ -106,12 +106,12 @@ _ROWS = (
 
 
 def preset_table() -> list[PresetRow]:
-    """Every key on which the presets differ; for documentation."""
+    """Rows of all keys on which the presets differ, for documentation."""
     return list(_ROWS)
 
 
 def preset_values(preset: str) -> dict[str, object]:
-    """What one preset says: dotted key -> value.
+    """Values of one preset: dotted key -> value.
 
     Raises:
         KeyError: `preset` is not a key of PRESETS.

@@ -1,4 +1,4 @@
-"""What is wrong with a config, as data and as a line for the user: field, value, what is allowed, what was meant."""
+"""Problems of a config, as data and as a line for the user: field, value, what is allowed, what was meant."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from es_service.errors import Problem
 
 
 def nearest(name: object, candidates: Collection[str]) -> str | None:
-    """The candidate that was probably meant, if one is near."""
+    """The candidate most similar to a name; None if none is similar."""
     near = get_close_matches(str(name), candidates, n=1)
     return near[0] if near else None
 
 
 def did_you_mean(name: object, candidates: Collection[str]) -> str:
-    """A hint to append to a message: "; did you mean X?", or nothing where no candidate is near."""
+    """A hint to append to a message: "; did you mean X?", or "" if no candidate is similar."""
     near = nearest(name, candidates)
     return f"; did you mean {near}?" if near else ""
 
 
 def one_of(names: Collection[str]) -> str:
-    """Names in a sentence: "a", "a or b", "a, b or c"."""
+    """Join names for a sentence: "a", "a or b", "a, b or c"."""
     *first, last = map(str, names)
     return f"{', '.join(first)} or {last}" if first else last
 
@@ -31,7 +31,7 @@ def one_of(names: Collection[str]) -> str:
 def not_allowed(
     field: str, value: Any, allowed: str, *, why: str = "", hint: str = "", suggestion: Any = None
 ) -> Problem:
-    """The problem of a value that cannot be: "search.pairs: 0 is not allowed; must be a whole number, at least 1".
+    """The problem of an invalid value: "search.pairs: 0 is not allowed; must be a whole number, at least 1".
 
     Args:
         why: words after "is not allowed", with the space before them.
@@ -45,5 +45,5 @@ def not_allowed(
 
 
 def unfit(field: str, value: Any, what: str, *, suggestion: Any = None, allowed: str | None = None) -> Problem:
-    """The problem of a value that does not go with another one; `what` is all that follows "field: "."""
+    """The problem of a value that does not fit another one; `what` is the whole text after "field: "."""
     return Problem(f"{field}: {what}", field, value, allowed, suggestion)

@@ -1,9 +1,9 @@
-"""What a config leaves open, and whether its sections fit together.
+"""Resolves the values that a config leaves open, and checks its sections against each other.
 
-Every rule here is a function of the config and the task alone, never of the machine: the shapes it fixes decide which
-floating-point results a run gets. (One looks at the processor: `compute.rollout: auto` is xla where simd's code cannot
-run; what it chose stays with the run.) Values travel as one flat mapping, "search.sigma" -> 0.02; a key that is missing
-from it was invalid and has been reported already, so rules that need it keep silent.
+Every rule here depends only on the config and the task and never on the machine, because the resolved shapes affect the
+floating-point results of a run. (The one exception is `compute.rollout: auto`, which is xla if the processor cannot run
+simd's code; the choice is stored with the run.) Values are passed as one flat mapping, "search.sigma" -> 0.02. A key
+that is missing from it was invalid and has been reported already, so rules that need it report nothing.
 """
 
 from __future__ import annotations
@@ -33,35 +33,35 @@ LEFT_OPEN: dict[str, str | None] = {
     "compute.rollout_block_pairs": "auto",
     "compute.gradient_block_pairs": "auto",
 }
-"""Keys that this module resolves -> the value that asks for it, in a file the same as leaving the key out."""
+"""Keys that this module resolves -> the value that asks for it. Leaving the key out has the same effect."""
 SINGLE_CENTRE = ("es", "me_es")
 """Algorithms with a single centre."""
 CENTRES = 5
-"""Of the other searches (the meta-population of Conti et al. 2018): deep-neuroevolution's Humanoid settings and the
-released ME-ES code."""
+"""Default number of centres of the other algorithms (the meta-population of Conti et al. 2018). Source:
+deep-neuroevolution's Humanoid settings and the released ME-ES code."""
 
 MOST_CHUNK_PAIRS = 64
-"""Enough to fill vector units and hide a message's cost; few enough that a lost chunk is cheap."""
+"""Upper limit: enough pairs to fill vector units and outweigh the cost of a message; a lost chunk costs little."""
 LEAST_CHUNK_PAIRS = 16
-"""Smaller ones cost more to send than they help to share out a small population."""
+"""Lower limit: with smaller chunks the cost of messages exceeds the gain from distributing a small population."""
 CHUNKS = 8
-"""Wanted of a population of 128 to 512 pairs, so that several workers can share it."""
+"""Number of chunks for 128 to 512 pairs, so that several workers can share the population."""
 MOST_PARAMETERS = 80_000_000
-"""The store keeps a centre and Adam's two moments, 12 bytes a parameter, in one value: SQLite's end at 1e9."""
+"""The store keeps a centre and Adam's two moments, 12 bytes per parameter, in one value; SQLite allows 1e9 bytes."""
 MOST_ROLLOUT_BLOCK_PAIRS = 32
-"""Enough to fill vector units."""
+"""Enough pairs to fill vector units."""
 MOST_ROLLOUT_BLOCK_BYTES = 5 * 2**20
-"""Above this the weights of the pairs that step together fall out of a core's share of the cache."""
+"""If the weights of the pairs that step together are larger, they do not fit into a core's share of the cache."""
 MOST_GRADIENT_BLOCKS = 32
-"""A partial gradient is as large as the policy, so a generation sends few of them."""
+"""A partial gradient is as large as the policy, so a generation should send only a few."""
 LEAST_GRADIENT_BLOCK_NUMBERS = 4_000_000
-"""Noise numbers in a block, about two milliseconds of work; a smaller block would cost more to send than to sum."""
+"""Fewest noise numbers in a block, about 2 ms of work; a smaller block would cost more to send than to sum."""
 FEW_CHUNK_PAIRS = 8
-"""Below this a chunk is likely to cost more to send and start than to compute."""
+"""A chunk with fewer pairs is likely to cost more to send and start than to compute."""
 
 
 def default_chunk_pairs(pairs: int) -> int:
-    """The largest divisor of `pairs` not above an eighth of them, within 16 to 64; a multiple of 8 if there is one.
+    """The largest divisor of `pairs` up to pairs / 8 (a limit of at least 16, at most 64); a multiple of 8 if possible.
 
     512 -> 64, 5000 -> 40, 64 -> 16, 7 -> 7.
     """
@@ -71,7 +71,7 @@ def default_chunk_pairs(pairs: int) -> int:
 
 
 def default_rollout_block_pairs(chunk_pairs: int, parameters: int) -> int:
-    """The largest divisor of `chunk_pairs` not above 32 whose weights (float32, both signs) take at most 5 MiB.
+    """The largest divisor of `chunk_pairs` up to 32 whose weights (float32, both signs) take at most 5 MiB.
 
     (64, 4482) -> 32; (40, 75528) -> 8.
     """
@@ -80,9 +80,9 @@ def default_rollout_block_pairs(chunk_pairs: int, parameters: int) -> int:
 
 
 def default_gradient_block_pairs(pairs: int, chunk_pairs: int, parameters: int) -> int:
-    """As few whole chunks as make at most 32 blocks of `pairs`, and blocks that are worth a message.
+    """Pairs in the fewest whole chunks that give at most 32 blocks, each large enough to be worth a message.
 
-    (512, 64, 4482) -> 512, all of them; (4096, 64, 4482) -> 896; (5000, 40, 75528) -> 160.
+    (512, 64, 4482) -> 512, all pairs; (4096, 64, 4482) -> 896; (5000, 40, 75528) -> 160.
     """
     chunks = -(-pairs // chunk_pairs)
     worth = -(-LEAST_GRADIENT_BLOCK_NUMBERS // (parameters * chunk_pairs))
@@ -92,13 +92,13 @@ def default_gradient_block_pairs(pairs: int, chunk_pairs: int, parameters: int) 
 def resolve(
     values: Mapping[str, Any], left_open: Collection[str], task: TaskSpec | None, no_vectors: str
 ) -> dict[str, Any]:
-    """Fill in what was left open, as far as the values it follows from are there.
+    """Fill in the values that were left open, if the values from which they are derived are present.
 
     Args:
         values: valid values of the config.
-        left_open: keys of LEFT_OPEN that the config leaves to us.
+        left_open: keys of LEFT_OPEN that are to be resolved.
         task: the task that `task.environment` names, or None where that is invalid.
-        no_vectors: why this machine's processor cannot run what simd compiles; empty where it can.
+        no_vectors: why this machine's processor cannot run the code that simd compiles; empty if it can.
     """
     values = dict(values)
     if task is not None:
@@ -132,13 +132,13 @@ def resolve(
         if "compute.gradient_block_pairs" in left_open and pairs is not None:
             values["compute.gradient_block_pairs"] = default_gradient_block_pairs(pairs, chunk_pairs, parameters)
     if isinstance(values.get("search.init_from"), str):
-        # Absolute, so that the record still says which run it was when read from another directory.
+        # An absolute path, so that the stored config names the same run from every working directory.
         values["search.init_from"] = os.path.abspath(os.path.expanduser(values["search.init_from"]))
     return values
 
 
 def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
-    """Where the config asks of the task what it cannot do."""
+    """Problems of settings that the task does not support."""
     problems = []
     if values.get("task.fitness") == "final" and not task.final_fitness:
         why = f" for {task.name}, whose last reward says little about the episode"
@@ -160,13 +160,13 @@ def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
 
 
 def policy_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
-    """Where the network is larger than a run can keep."""
+    """The problem of a network that is too large for the run store."""
     shape = _policy_shape(values, task)
     if shape.parameters <= MOST_PARAMETERS:
         return []
     hidden = list(shape.widths[1:-1])
     what = f"{show(hidden)} makes more than {MOST_PARAMETERS:,} parameters for {task.name}"
-    problem = f"{what}, the most that the run store takes; must be narrower"
+    problem = f"{what}, which is the most that the run store can keep; the layers must be narrower"
     return [unfit("policy.hidden", hidden, problem, allowed="narrower")]
 
 
@@ -175,7 +175,7 @@ def _policy_shape(values: Mapping[str, Any], task: TaskSpec) -> PolicyShape:
 
 
 def centre_problems(values: Mapping[str, Any]) -> list[Problem]:
-    """Where the algorithm cannot have as many centres."""
+    """The problem of a number of centres that the algorithm does not support."""
     algorithm, centres = values.get("search.algorithm"), values.get("search.centres")
     if algorithm not in SINGLE_CENTRE or centres in (None, 1):
         return []
@@ -183,7 +183,7 @@ def centre_problems(values: Mapping[str, Any]) -> list[Problem]:
 
 
 def shape_problems(values: Mapping[str, Any]) -> list[Problem]:
-    """Where pairs, chunks and blocks do not divide each other."""
+    """Problems of numbers of pairs, chunks and blocks that do not fit each other."""
     problems = []
     pairs, chunk = values.get("search.pairs"), values.get("compute.chunk_pairs")
     rollout, gradient = values.get("compute.rollout_block_pairs"), values.get("compute.gradient_block_pairs")
@@ -205,14 +205,14 @@ def shape_problems(values: Mapping[str, Any]) -> list[Problem]:
 
 
 def engine_problems(values: Mapping[str, Any]) -> list[Problem]:
-    """Where the config asks for a cluster or a GPU without Ray, or for a share of a GPU that Ray cannot give."""
+    """Problems of a cluster or GPU without Ray, threads without simd, and a share of GPUs that Ray cannot assign."""
     problems = []
     if _value(values, "compute.engine") != "ray":
         problems = [
             unfit(
                 name,
                 values[name],
-                f"{show(values[name])} needs compute.engine = ray, which is {values['compute.engine']}",
+                f"{show(values[name])} needs compute.engine = ray, but the engine is {values['compute.engine']}",
                 suggestion=FIELDS[name].default,
             )
             for name in ("compute.address", f"{RESOURCES}cpu", f"{RESOURCES}gpu")
@@ -221,8 +221,8 @@ def engine_problems(values: Mapping[str, Any]) -> list[Problem]:
     inline, threads = values.get("compute.engine") == "inline", values.get("compute.inline_workers") == "threads"
     if threads and not (inline and values.get("compute.rollout", "simd") == "simd"):
         what = (
-            "threads needs compute.engine = inline and compute.rollout = simd, in whose code threads do not wait for "
-            "each other; must be processes"
+            "threads needs compute.engine = inline and compute.rollout = simd, because only simd's code runs in "
+            "several threads at once; must be processes"
         )
         problems.append(unfit("compute.inline_workers", "threads", what, allowed="processes"))
     gpus = _value(values, f"{RESOURCES}gpu")
@@ -236,21 +236,21 @@ def _on_gpu(values: Mapping[str, Any]) -> bool:
 
 
 def _value(values: Mapping[str, Any], key: str) -> Any:
-    """What the config says, or the field's default."""
+    """The value in the config, or the field's default."""
     return values.get(key, FIELDS[key].default)
 
 
 def _why_no_simd(values: Mapping[str, Any], task: TaskSpec, no_vectors: str) -> str:
-    """Why a new run cannot have simd; in a cluster this machine's processor says nothing."""
+    """Why a new run cannot use simd; empty if it can. In a cluster this machine's processor is not considered."""
     return task.no_simd or (no_vectors if values.get("compute.address") is None else "")
 
 
 def rollout_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
-    """Where simd is asked for and cannot be had."""
+    """The problem of a config that asks for simd where simd cannot be used."""
     if values.get("compute.rollout") != "simd":
         return []
     if _on_gpu(values):
-        why = f"simd runs on CPUs, and {RESOURCES}gpu is not 0"
+        why = f"simd runs only on CPUs, but {RESOURCES}gpu is {show(_value(values, f'{RESOURCES}gpu'))}"
     elif task.no_simd:
         why = f"simd cannot run {task.name}: {task.no_simd}"
     else:
@@ -259,7 +259,7 @@ def rollout_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]
 
 
 def config_warnings(config: RunConfig, task: TaskSpec, no_vectors: str = "") -> list[str]:
-    """What is legal and probably not meant; one line each, for the command line to print before the run starts.
+    """Warnings about settings that are valid but probably not intended; the command line prints them before the run.
 
     Args:
         no_vectors: as for `resolve`.
@@ -267,21 +267,22 @@ def config_warnings(config: RunConfig, task: TaskSpec, no_vectors: str = "") -> 
     warnings = []
     values = {"compute.address": config.compute.address}
     if config.compute.rollout == "xla" and (why := _why_no_simd(values, task, no_vectors)):
-        warnings.append(f"compute.rollout: xla, since simd cannot run {task.name}: {why}")
+        warnings.append(f"compute.rollout: xla is used because simd cannot run {task.name}: {why}")
     pairs, chunk = config.search.pairs, config.compute.chunk_pairs
     if chunk < FEW_CHUNK_PAIRS and pairs > MOST_CHUNK_PAIRS:
         near = round(pairs / MOST_CHUNK_PAIRS) * MOST_CHUNK_PAIRS
         auto = default_chunk_pairs(pairs)
         hint = (
-            f"auto would be {auto}"
+            f"auto would choose {auto}"
             if auto >= FEW_CHUNK_PAIRS
-            else f"search.pairs = {near} has chunks of {default_chunk_pairs(near)}"
+            else f"search.pairs = {near} would give chunks of {default_chunk_pairs(near)}"
         )
-        warnings.append(f"compute.chunk_pairs: {chunk} makes {pairs // chunk} small chunks a generation, slow; {hint}")
+        what = f"{chunk} makes {pairs // chunk} small chunks per generation, which is slow"
+        warnings.append(f"compute.chunk_pairs: {what}; {hint}")
     budget = config.budget
     if budget.generations is None and budget.env_steps is None and budget.wall_clock_s is None:
         warnings.append(
-            f"budget: only target_fitness ({budget.target_fitness}) ends this run, which it may never reach; "
-            "consider budget.generations as well"
+            f"budget: this run ends only when it reaches target_fitness ({budget.target_fitness}), which may never "
+            "happen; consider setting budget.generations as well"
         )
     return warnings

@@ -10,7 +10,7 @@ from es_service.errors import ConfigError, Problem
 
 PACKAGE = Path(__file__).parents[1]
 PLACES = (PACKAGE.parent / "configs", PACKAGE / "shipped_configs")
-"""A clone's and an installed package's; the first that is there counts."""
+"""The folder of a clone and that of an installed package; the first one that exists is used."""
 
 
 def shipped_configs() -> dict[str, Path]:
@@ -20,7 +20,7 @@ def shipped_configs() -> dict[str, Path]:
 
 
 def config_file(source: str | os.PathLike[str]) -> Path:
-    """The file that a user means by a path, or by the name of a shipped config where no such file exists."""
+    """The file at a path or, if it does not exist, the file of the shipped config with this name."""
     path = Path(source)
     if path.exists() or path.name != os.fspath(source):
         return path
@@ -31,7 +31,7 @@ def shipped_text(name: str) -> str:
     """The text of a shipped config. Raises ConfigError for another name."""
     known = shipped_configs()
     if name not in known:
-        hint = did_you_mean(name, known) or f"; there are {', '.join(known)}"
+        hint = did_you_mean(name, known) or f"; the shipped configs are {', '.join(known)}"
         problem = Problem(f"no shipped config has this name{hint}", "config", name, suggestion=nearest(name, known))
         raise ConfigError.listing(f"{name}: 1 problem", [problem])
     return known[name].read_text()

@@ -1,4 +1,4 @@
-"""What a run starts from: `search.init_from`, and whether it is there."""
+"""Parses `search.init_from`, the policy that a run starts from, and checks that its folder exists."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from es_service.errors import Problem
 
 
 def start_of(init_from: str) -> tuple[str, str | tuple[int, ...]]:
-    """What `search.init_from` names: (folder of a run, "centre" for the one updated last, "best", or a cell's place).
+    """Parse `search.init_from`: (folder of a run, "centre" for the one updated last, "best", or the index of a cell).
 
-    RUN, RUN:best and RUN:3,17; a folder whose own name ends so is meant if there is one.
+    The forms are RUN, RUN:best and RUN:3,17. If a folder has the whole text as its name, that folder is used.
     """
     folder, _, which = init_from.rpartition(":")
     if not folder or os.path.isdir(init_from) or not re.fullmatch(r"best|\d+(,\d+)*", which):
@@ -24,7 +24,7 @@ def start_of(init_from: str) -> tuple[str, str | tuple[int, ...]]:
 
 
 def folder_problems(values: Mapping[str, Any]) -> list[Problem]:
-    """Where the config names a run that is not there."""
+    """The problem of a `search.init_from` that does not name an existing folder."""
     start = values.get("search.init_from")
     if start is None:
         return []
@@ -33,8 +33,8 @@ def folder_problems(values: Mapping[str, Any]) -> list[Problem]:
         found = os.stat(folder)
     except (FileNotFoundError, NotADirectoryError):
         what = "does not exist"
-    except (OSError, ValueError) as error:  # in a folder that may not be looked into, too long, a null character
-        what = f"cannot be looked at ({getattr(error, 'strerror', error)})"
+    except (OSError, ValueError) as error:  # permission denied, too long, or a null character
+        what = f"cannot be accessed ({getattr(error, 'strerror', error)})"
     else:
         what = "" if stat.S_ISDIR(found.st_mode) else "is a file"
     allowed = "the folder of another run, or null"

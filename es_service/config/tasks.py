@@ -1,6 +1,7 @@
-"""Tasks by name, as the driver needs them: ours from a table, `brax:NAME` and `package.module:Class` by asking.
+"""Descriptions of tasks by name, for the driver.
 
-Asking starts a process, since it imports JAX and Brax; each name is asked for once.
+Shipped tasks are in a table. `brax:NAME` and `package.module:Class` are described by a child process, because this
+imports JAX and Brax; each name is described once.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ from workers import environments
 from workers.simd.backend.target import NoVectorsError, host_target
 
 DESCRIBE_S = 120.0
-"""Longest wait for a description; the first import of Brax on a slow disk takes a while."""
+"""Longest wait for a description, in seconds; the first import of Brax from a slow disk can take long."""
 
 
 class Tasks(Mapping[str, TaskSpec]):
-    """Iterates over our own tasks; looks up any."""
+    """Tasks by name. Iteration yields the shipped tasks; lookup also finds `brax:NAME` and `module:Class`."""
 
     def __getitem__(self, name: str) -> TaskSpec:
-        """Raises KeyError for a plain name that is none of ours, ConfigError for another that cannot be had."""
+        """Raises KeyError for a plain name that is not shipped, ConfigError for another that cannot be described."""
         return _described(name) if ":" in name else environments.SHIPPED[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -37,7 +38,7 @@ class Tasks(Mapping[str, TaskSpec]):
 
 
 TASKS = Tasks()
-"""Of the command line and the Python interface; the workers' table has ours alone."""
+"""Tasks of the command line and the Python interface; the workers' own table has only the shipped tasks."""
 
 
 def task_of(config: RunConfig) -> TaskSpec:
@@ -47,7 +48,10 @@ def task_of(config: RunConfig) -> TaskSpec:
 
 @cache
 def no_vectors() -> str:
-    """Why this machine's processor cannot run what simd compiles; empty where it can. For `compute.rollout: auto`."""
+    """Why this machine's processor cannot run the code that simd compiles; empty if it can.
+
+    Decides about `compute.rollout: auto`.
+    """
     try:
         host_target()
     except NoVectorsError as error:
@@ -67,10 +71,10 @@ def _described(name: str) -> TaskSpec:
             check=False,
         )
     except subprocess.TimeoutExpired:
-        raise ConfigError(f"{name} could not be described in {DESCRIBE_S:g} s") from None
+        raise ConfigError(f"{name} could not be imported and described within {DESCRIBE_S:g} s") from None
     lines = process.stdout.splitlines()
     if process.returncode or not lines:
-        raise ConfigError(f"{name} raised while it was imported:\n{process.stderr.strip()}")
+        raise ConfigError(f"{name} could not be imported or described:\n{process.stderr.strip()}")
     answer = json.loads(lines[-1])
     if "problem" in answer:
         raise ConfigError(answer["problem"])
@@ -78,7 +82,7 @@ def _described(name: str) -> TaskSpec:
 
 
 def _task_spec(fields: dict) -> TaskSpec:
-    """JSON has lists where a TaskSpec has tuples."""
+    """A TaskSpec from JSON, with tuples in place of lists."""
 
     def bounds(pairs: list) -> tuple[tuple[float, float], ...]:
         return tuple((float(low), float(high)) for low, high in pairs)

@@ -1,1 +1,1 @@
-"""The loop (`driver.py`) and what a generation is made of. It knows no files, no Ray and no method by name."""
+"""The main loop (`driver.py`) and the parts of a generation; independent of files, of Ray and of any single method."""

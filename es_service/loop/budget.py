@@ -1,4 +1,4 @@
-"""When a run is over: its budget against how far it has come."""
+"""Compares the budget of a run with its progress, to decide whether the run is over."""
 
 from __future__ import annotations
 
@@ -24,28 +24,30 @@ _REASONS = {
 
 
 def limits_of(budget: BudgetConfig) -> dict[str, float]:
-    """What is set, by key."""
+    """The limits that are set, by key of the budget."""
     return {key: limit for key in REACHED if (limit := getattr(budget, key)) is not None}
 
 
 def spent(limits: Mapping[str, float], row: Mapping[str, float]) -> dict[str, str]:
-    """Why a run is over, in words, by key of the budget; nothing if it is not.
+    """Why a run is over, in words, by key of the budget; empty if it is not over.
 
-    Budgets are checked between generations, so steps may overshoot.
+    Budgets are checked between generations, so a run may take more steps than its limit.
 
     Args:
-        row: the newest generation's, of which the columns in REACHED are needed.
+        row: the newest generation's row of the history; only the columns in REACHED are used.
     """
     return {key: _REASONS[key].format(limit) for key, limit in limits.items() if row[REACHED[key]] >= limit}
 
 
 def raised(limits: Mapping[str, float], row: Mapping[str, Any]) -> dict[str, float | None]:
-    """What to set, by key, so that a run that is over goes on: twice as much of what is spent, no target that is
-    reached; nothing if it is not over."""
+    """Limits to set, by key, so that a run that is over can continue; empty if it is not over.
+
+    A limit that is spent is doubled, and a target fitness that is reached becomes None.
+    """
     wanted: dict[str, float | None] = {}
     for key in spent(limits, row):
-        limit, reached = limits[key], row[REACHED[key]]  # steps may have overshot it by more than it is
+        limit, reached = limits[key], row[REACHED[key]]  # steps may exceed twice their limit
         wanted[key] = None if key == "target_fitness" else math.ceil(2 * (limit if 2 * limit > reached else reached))
     if "target_fitness" in wanted and limits.keys() == {"target_fitness"}:
-        wanted["generations"] = 2 * max(1, row["generation"])  # something must end it
+        wanted["generations"] = 2 * max(1, row["generation"])  # otherwise nothing would end the run
     return wanted

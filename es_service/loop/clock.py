@@ -1,4 +1,4 @@
-"""Where the seconds of a run go."""
+"""Measurement of how the time of a run is spent."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ import time
 
 
 class Clock:
-    """Where the seconds of a generation go. Time of the commit is shown with the generation after it."""
+    """Measures how the time of each generation is spent. The time of a commit counts for the following generation.
+
+    Args:
+        before_s: seconds spent in earlier sessions of the run.
+    """
 
     def __init__(self, before_s: float) -> None:
         self._origin = time.perf_counter() - before_s
@@ -18,13 +22,13 @@ class Clock:
         return time.perf_counter() - self._origin
 
     def lap(self, name: str) -> None:
-        """Book the time since the last lap under `name`."""
+        """Add the time since the last lap to the total of `name`."""
         now = time.perf_counter()
         self._laps[name] = self._laps.get(name, 0.0) + now - self._last
         self._last = now
 
     def finish_generation(self) -> tuple[float, dict[str, float]]:
-        """(seconds since the last call, laps since then by name)."""
+        """End a generation: (seconds since the end of the last one, seconds of its laps by history column)."""
         now = time.perf_counter()
         seconds, laps = now - self._generation_start, self._laps
         self._generation_start, self._laps = now, {}

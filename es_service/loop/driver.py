@@ -1,7 +1,7 @@
-"""The loop everybody reads: ask, roll out, weigh, step, evaluate, tell, keep.
+"""The main loop of a run: ask, roll out, weights, gradient, step, evaluate, tell, commit.
 
-It knows no Ray, no JAX, no files and no method by name; its collaborators are arguments. Whatever happens, the store
-holds the last finished generation, and the next one depends only on (config, seed, state).
+The loop is independent of Ray, JAX, files and any single method; everything that it works with is an argument. At any
+time the store has the last finished generation, and the next one depends only on (config, seed, state).
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ from es_service.search.novelty import novelty
 from es_service.search.observation_statistics import merge_moments
 
 Reachable = NDArray[np.bool_] | None
-"""Which cells of the map can be reached, [cells]; None where the task does not know."""
+"""Whether each cell of the map can be reached, [cells]; None if this is unknown."""
 
 
 class Stored(Protocol):
-    """What a run store has of earlier sessions."""
+    """What the loop reads from a run store: the state that earlier sessions have stored."""
 
     @property
     def generation(self) -> int | None:
@@ -66,7 +66,7 @@ class Stored(Protocol):
 
 
 class Store(Protocol):
-    """What the loop needs of a run store."""
+    """What the loop needs from a run store during a run."""
 
     def part(self, name: str) -> Arrays: ...
     def commit(self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow) -> None: ...
@@ -74,13 +74,13 @@ class Store(Protocol):
 
 @dataclass(frozen=True)
 class Search:
-    """What a run is about, apart from where it runs: task, settings, method, starting point."""
+    """Definition of a run apart from where it runs: config, algorithm, starting point and task."""
 
     config: RunConfig
     algorithm: Algorithm
     initial: Callable[[], tuple[Sequence[FloatArray], Moments]]
-    """The initial centres, and the observation statistics they come with (none counted unless they are another
-    run's)."""
+    """Returns the initial centres [D] and their observation statistics, which are empty unless the centres are from
+    another run."""
     task: TaskSpec
 
 
@@ -94,14 +94,15 @@ def run(
     """Run generations until the budget is spent.
 
     Args:
-        state: the newest in `store`, to go on from; None to begin, with a store that has none.
-        report: called with each history row after it is safe in the store.
+        state: the newest state in `store`, from which to continue; None to begin a run, with an empty store.
+        report: called with each history row after it has been committed.
 
     Returns:
         The last state and the reason for ending, in words.
 
     Raises:
-        EvaluationError, StoreError: nothing committed is lost. Interrupted: a signal asked to stop.
+        EvaluationError, StoreError: the run cannot continue; nothing committed is lost.
+        Interrupted: a signal asked the run to stop.
     """
     budget = search.config.budget
     clock = Clock(0.0)
@@ -140,7 +141,7 @@ def spent(budget: BudgetConfig, state: RunState) -> str | None:
 def _first_generation(
     search: Search, evaluator: Evaluator, clock: Clock, map_: BehaviourMap | None, reachable: Reachable
 ) -> tuple[RunState, HistoryRow]:
-    """Generation 0: the initial centres, evaluated. The history shows the fittest of them."""
+    """Evaluate the initial centres, which is generation 0. Its row of the history describes the fittest of them."""
     config, algorithm = search.config, search.algorithm
     centres, observations = search.initial()
     learned = first_state(centres, len(search.task.descriptor_names), algorithm.fitness_weight, map_)
@@ -182,7 +183,7 @@ def _first_generation(
 def _next_generation(
     search: Search, evaluator: Evaluator, store: Store, clock: Clock, state: RunState, reachable: Reachable
 ) -> tuple[RunState, HistoryRow]:
-    """One generation: a pure function of (search, state, elites in the store) but for its timings."""
+    """Compute one generation: a pure function of (search, state, elites in the store) apart from the timings."""
     config, algorithm = search.config, search.algorithm
     settings, sizes = config.search, config.compute
     generation = state.generation + 1
@@ -206,7 +207,7 @@ def _next_generation(
     new_centre_D = moved.centres[asked.centre].centre_D
     require_finite(new_centre_D, settings.learning_rate, generation)
     clock.lap("seconds_driver")
-    new_centre = replace(centre, parameters_D=new_centre_D)  # evaluated with the statistics of the generation's start
+    new_centre = replace(centre, parameters_D=new_centre_D)  # with the statistics of the generation's start
     evaluation = evaluate_centre(evaluator, new_centre, settings.evaluation_episodes)
     clock.lap("seconds_evaluation")
     told = centre_evaluation(generation, asked.centre, evaluation, population)
@@ -251,7 +252,7 @@ def _keep(
     state: RunState,
     row: HistoryRow,
 ) -> RunState:
-    """Commit a finished generation, then show it."""
+    """Commit a finished generation, then report it."""
     clock.lap("seconds_driver")
     seconds, laps = clock.finish_generation()
     steps = state.env_steps - (before.env_steps if before else 0)

@@ -1,6 +1,7 @@
-"""The pieces of one generation: what to ask the workers for, and how their answers become one.
+"""Parts of one generation: the chunks that are sent to the workers, and how their results are combined.
 
-Order never comes from arrival: results are taken by chunk id, and partial gradients are added in one fixed binary tree.
+The order in which results arrive has no influence: they are taken by chunk id, and partial gradients are added in one
+fixed binary tree. Axes: P antithetic pairs, S signs [+, -], E evaluation episodes, D policy parameters.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ Result = TypeVar("Result", EpisodesResult, GradientResult)
 def make_centre(
     config: RunConfig, generation: int, centre_D: FloatArray, observations: Moments, state: CentreState | None = None
 ) -> Centre:
-    """What is sent to the workers of a centre: its parameters, and the statistics in force."""
+    """The centre as it is sent to the workers: its parameters and the observation statistics that it runs with."""
     mean_O, std_O = statistics_in_force(observations, state, config.policy.observation_normalization)
     return Centre(generation, centre_D, config.search.sigma, mean_O, std_O)
 
@@ -45,17 +46,17 @@ def make_centre(
 def evaluate_population(
     evaluator: Evaluator, centre: Centre, *, pairs: int, chunk_pairs: int
 ) -> tuple[EpisodesResult, list[Moments]]:
-    """Roll out all pairs around the centre: results with axes [P, S], and each chunk's observations in chunk order."""
+    """Roll out all pairs around the centre: (results with axes [P, S], observation moments in chunk order)."""
     chunks = [TrainingChunk(centre.generation, chunk_id) for chunk_id in range(pairs // chunk_pairs)]
     results = _all_of(EpisodesResult, evaluator.evaluate(centre, chunks))
     return _concatenate(results, pairs), [result.moments for result in results if result.moments is not None]
 
 
 def evaluate_centre(evaluator: Evaluator, centre: Centre, episodes: int, index: int = 0) -> EpisodesResult:
-    """Roll out the unperturbed centre: results with axis [E]. Episodes past the wanted number are discarded.
+    """Roll out the unperturbed centre: results with axis [E]. Episodes beyond the wanted number are discarded.
 
     Args:
-        index: of this centre among those evaluated in the same generation; each has resets of its own.
+        index: index of this centre among those evaluated in the same generation; each index has its own resets.
     """
     count = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
     chunks = [EvaluationChunk(centre.generation, chunk_id) for chunk_id in range(index * count, (index + 1) * count)]
@@ -64,7 +65,7 @@ def evaluate_centre(evaluator: Evaluator, centre: Centre, episodes: int, index: 
 
 
 def estimate_gradient(evaluator: Evaluator, centre: Centre, weights_P: FloatArray, block_pairs: int) -> FloatArray:
-    """(1 / pairs) * sum over pairs of weight * noise, in standard normal units; workers sum blocks of pairs."""
+    """Gradient estimate [D]: (1 / pairs) * sum over pairs of weight * standard normal noise. Workers sum blocks."""
     chunks = []
     for chunk_id, first in enumerate(range(0, weights_P.size, block_pairs)):
         block_P = weights_P[first : first + block_pairs]
@@ -75,9 +76,9 @@ def estimate_gradient(evaluator: Evaluator, centre: Centre, weights_P: FloatArra
 
 
 def tree_sum(blocks: Sequence[FloatArray]) -> FloatArray:
-    """Sum by adding neighbours level by level: ((0 + 1) + (2 + 3)) + ...; an odd one out moves up unchanged.
+    """Sum by adding neighbours level by level: ((0 + 1) + (2 + 3)) + ...; an odd last one moves up unchanged.
 
-    The tree is fixed by the number of blocks alone, so any node of it may be computed anywhere.
+    The tree depends only on the number of blocks, so any of its nodes may be computed anywhere.
     """
     level = list(blocks)
     while len(level) > 1:
@@ -87,12 +88,12 @@ def tree_sum(blocks: Sequence[FloatArray]) -> FloatArray:
 
 
 def valid_members(result: EpisodesResult) -> NDArray[np.bool_]:
-    """Which members (or episodes) have a finite fitness and descriptor; leading axes only."""
+    """Whether each member (or episode) has a finite fitness and a finite descriptor, with the axes of the fitness."""
     return np.isfinite(result.fitness) & np.isfinite(result.descriptor).all(axis=-1)
 
 
 def invalidate(population: EpisodesResult, max_invalid_fraction: float, generation: int) -> tuple[EpisodesResult, int]:
-    """Give every invalid member the fitness NaN, which ranks last: (population, number of invalid members).
+    """Set the fitness of every invalid member to NaN, which ranks last: (population, number of invalid members).
 
     Raises:
         EvaluationError: more than `max_invalid_fraction` of the members are invalid.
@@ -112,7 +113,7 @@ def invalidate(population: EpisodesResult, max_invalid_fraction: float, generati
 
 
 def require_some_finite(evaluations: Sequence[EpisodesResult], environment: str) -> None:
-    """Raise an EvaluationError where no episode of any initial centre is valid: the task is wrong, not the policy."""
+    """Raise an EvaluationError if no episode of any initial centre is valid; this is an error of the task."""
     count = sum(evaluation.fitness.size for evaluation in evaluations)
     if any(valid_members(evaluation).any() for evaluation in evaluations):
         return
@@ -123,8 +124,8 @@ def require_some_finite(evaluations: Sequence[EpisodesResult], environment: str)
     wrong = " and ".join(name for name, is_finite in finite.items() if not is_finite) or "fitness or descriptor"
     steps = min(int(evaluation.steps.min()) for evaluation in evaluations)
     raise EvaluationError(
-        f"generation 0: the {wrong} is NaN or infinite in each of the {count} episodes of the initial policies, the "
-        f"shortest of which has {steps} steps. Nothing can be learned from it: look for a division by 0, a root or "
+        f"generation 0: the {wrong} is NaN or infinite in each of the {count} episodes of the initial centres; the "
+        f"shortest episode has {steps} steps. The run cannot learn from this: look for a division by 0, a root or "
         f"logarithm of a negative number, or physics that diverges, in the task {environment}",
         field="task.environment",
         value=environment,
@@ -132,7 +133,7 @@ def require_some_finite(evaluations: Sequence[EpisodesResult], environment: str)
 
 
 def require_finite(centre_D: FloatArray, learning_rate: float, generation: int) -> None:
-    """Raise an EvaluationError for a centre that an update has made infinite."""
+    """Raise an EvaluationError for a centre that is not finite after its update."""
     if not np.isfinite(centre_D).all():
         raise EvaluationError(
             f"generation {generation}: the centre is not finite after its update with search.learning_rate = "
@@ -142,18 +143,22 @@ def require_finite(centre_D: FloatArray, learning_rate: float, generation: int) 
             ways_out=[
                 WayOut(
                     "fork",
-                    "go on from there with a smaller learning rate",
+                    "continue from there with a smaller learning rate",
                     settings={"search.learning_rate": learning_rate / 10},
                 )
             ],
         )
 
 
-@np.errstate(invalid="ignore", over="ignore")  # an infinite fitness makes the centre invalid, which is told
+@np.errstate(invalid="ignore", over="ignore")  # an infinite fitness makes the centre invalid
 def centre_evaluation(
     generation: int, centre: int, evaluation: EpisodesResult, population: EpisodesResult | None = None
 ) -> CentreEvaluation:
-    """What a centre's evaluation episodes say of it, and the population that led to it, invalid fitness being NaN."""
+    """The evaluation of a centre, from its evaluation episodes and the population that led to it.
+
+    Args:
+        population: its invalid members have the fitness NaN; None for an initial centre.
+    """
     return CentreEvaluation(
         generation,
         centre,
@@ -165,8 +170,10 @@ def centre_evaluation(
 
 
 def entered(state: SearchState, told: CentreEvaluation, centre: Centre, evaluation: EpisodesResult) -> dict[int, Elite]:
-    """The centre just evaluated as an elite, by its cell, if it entered the map. The map says so, not the state: a
-    search of the user's need not keep `CentreState.cell`."""
+    """The centre just evaluated as an elite, by its cell; empty if it did not enter the map.
+
+    The map decides this and not `CentreState.cell`, which a search of the user need not set.
+    """
     if state.map is None or (cell := state.map.cell_of(told.generation, told.centre)) is None:
         return {}
     assert evaluation.trace_T_B is not None, "an evaluation has a trace"
@@ -174,7 +181,7 @@ def entered(state: SearchState, told: CentreEvaluation, centre: Centre, evaluati
 
 
 def better(best: Best, centre: Centre, told: CentreEvaluation) -> Best:
-    """The better of the best so far and a centre just evaluated; an invalid centre (not finite) is no improvement."""
+    """The best centre after one more evaluation. An invalid centre, or one of equal fitness, does not replace it."""
     if not told.valid or told.fitness <= best.fitness:
         return best
     mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
@@ -182,25 +189,25 @@ def better(best: Best, centre: Centre, told: CentreEvaluation) -> Best:
 
 
 def steps_of(result: EpisodesResult) -> int:
-    """Environment steps of some episodes."""
+    """Total number of environment steps of episodes."""
     return int(result.steps.sum(dtype=np.int64))
 
 
 def _highest(fitness: FloatArray) -> float:
-    """Of the finite values; NaN where there is none."""
+    """Highest finite value; NaN if there is none."""
     finite = fitness[np.isfinite(fitness)]
     return float(finite.max()) if finite.size else math.nan
 
 
 def _all_of(kind: type[Result], results: Sequence[object]) -> list[Result]:
-    """The same results, known to be of one kind."""
+    """The same results, checked to be of one kind."""
     checked = [result for result in results if isinstance(result, kind)]
-    assert len(checked) == len(results), f"an evaluator answered with something else than {kind.__name__}"
+    assert len(checked) == len(results), f"an evaluator returned a result that is not a {kind.__name__}"
     return checked
 
 
 def _concatenate(results: Sequence[EpisodesResult], count: int) -> EpisodesResult:
-    """Join along the first axis and keep the first `count`; observation moments are left to the caller."""
+    """Join results along the first axis and keep the first `count`; the result has no observation moments."""
 
     def join(name: str) -> np.ndarray:
         return np.concatenate([getattr(result, name) for result in results])[:count]

@@ -13,9 +13,9 @@ from es_service.protocol.messages import DispatchCounts, EpisodesResult, FloatAr
 from es_service.search.maps.behaviour_map import BehaviourMap, map_statistics
 
 HistoryRow = dict[str, int | float | None]
-"""Values by name of the column, as the loop makes them."""
+"""Values by name of the column, as the loop writes them."""
 Row = Mapping[str, Any]
-"""The same, to read; a value that is missing may be NaN."""
+"""The same for readers; a missing value may be NaN."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Column:
     type: Literal["INTEGER", "REAL"]
     deterministic: bool
     meaning: str = field(compare=False)
-    """Words for a reader: a run whose columns were explained in others is continued all the same."""
+    """Explanation for a reader. It is not compared, so that a run with other explanations can be continued."""
 
 
 _FITNESS = (
@@ -88,7 +88,7 @@ _SEARCH_AND_TIMES = (
 
 
 def history_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
-    """All columns of a run: `centre_<name>` per descriptor dimension, distances if the task has a goal, the map's."""
+    """All columns of a run, with those of its descriptor's dimensions, of its goal and of its map, if it has these."""
     descriptor = tuple(
         column
         for name in task.descriptor_names
@@ -101,7 +101,7 @@ def history_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
 
 
 def search_columns(centre: int, fitness_weight: float, centre_novelty: float | None, archive_size: int) -> HistoryRow:
-    """What the search did; no novelty in generation 0."""
+    """Columns about the search; `centre_novelty` is None in generation 0."""
     return {
         "centre": centre,
         "fitness_weight": fitness_weight,
@@ -111,13 +111,13 @@ def search_columns(centre: int, fitness_weight: float, centre_novelty: float | N
 
 
 def step_columns(old_D: FloatArray | None, new_D: FloatArray) -> HistoryRow:
-    """How far the centre went, and where to; None for generation 0, whose centres came from nowhere."""
+    """Columns about the update of the centre; `old_D` is None for generation 0, which has no update."""
     return {"update_norm": None if old_D is None else _norm(new_D - old_D), "parameter_norm": _norm(new_D)}
 
 
 @np.errstate(invalid="ignore", over="ignore")
 def population_columns(population: EpisodesResult | None, invalid_members: int) -> HistoryRow:
-    """Quartiles of the valid members' fitness and return; None for generation 0, which has no population."""
+    """Quartiles of the valid members' fitness and return; `population` is None for generation 0, which has none."""
     columns: HistoryRow = {"invalid_members": invalid_members}
     for quantity in ("fitness", "return"):
         names = [f"population_{quantity}_{name}" for name in ("min", "q25", "median", "q75", "max")]
@@ -131,9 +131,9 @@ def population_columns(population: EpisodesResult | None, invalid_members: int) 
     return columns
 
 
-@np.errstate(invalid="ignore", over="ignore")  # of infinite values there is no deviation: NaN says so
+@np.errstate(invalid="ignore", over="ignore")  # the deviation of infinite values is NaN
 def evaluation_columns(evaluation: EpisodesResult, task: TaskSpec) -> HistoryRow:
-    """What the new centre's evaluation episodes say: fitness, return, where they end, how near the goal."""
+    """Columns about the new centre's evaluation episodes: fitness, return, descriptor and distance to the goal."""
     mean_B = evaluation.descriptor.mean(axis=0, dtype=np.float64).tolist()
     std_B = evaluation.descriptor.std(axis=0, dtype=np.float64).tolist()
     columns: HistoryRow = {
@@ -159,7 +159,7 @@ def map_columns(
     centre: int,
     start_cell: int | None,
 ) -> HistoryRow:
-    """What became of the map, and the cells that a generation began with and entered; nothing where there is no map."""
+    """Columns about the map, the cell that a generation started from and the cell it entered; empty without a map."""
     if map_ is None:
         return {}
     cell = map_.cell_of(generation, centre)
@@ -167,7 +167,7 @@ def map_columns(
 
 
 def fault_columns(now: DispatchCounts, *, since: DispatchCounts) -> HistoryRow:
-    """Faults survived since, and the workers at present."""
+    """Columns about faults since an earlier count, and the present number of workers."""
     return {
         "retries": now.retries - since.retries,
         "lost_workers": now.lost_workers - since.lost_workers,

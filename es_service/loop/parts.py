@@ -1,8 +1,8 @@
-"""The state as the run store keeps it: parts by name, each a few arrays. Every pair of functions stands side by side.
+"""The state as the run store keeps it: parts by name, each a few arrays. Inverse functions stand side by side.
 
-`state_parts` gives the parts that a generation has changed, `state_from_parts` puts a state together again. What a part
-is made of is here and nowhere else; the searches and the maps know nothing of it. Elites are written when they enter
-the map and read one at a time.
+`state_parts` returns the parts that a generation has changed, and `state_from_parts` makes a state from parts. The
+content of the parts is defined only here; searches and maps do not depend on it. Elites are written when they enter the
+map and read one at a time.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from es_service.search.optimizer import Adam
 
 Arrays = dict[str, np.ndarray]
 Parts = Mapping[str, Mapping[str, np.ndarray]]
-"""Arrays by name, by the name of their part."""
+"""Name of a part -> name of an array -> array."""
 
 OBSERVATIONS, COUNTERS, WEIGHT, BEST, GEOMETRY_PART = "observations", "counters", "weight", "best", "map"
 CENTRE_PREFIX, CELL_PREFIX, ELITE_PREFIX, BLOCK_PREFIX = "centre_", "cell_", "elite_", "novelty_"
-"""How the names of parts begin that have a number."""
+"""Prefixes of the names of numbered parts."""
 BLOCK_ENTRIES = 256
-"""Entries of the novelty archive in one part: a generation rewrites the last part and no other."""
+"""Entries of the novelty archive in one part. A generation rewrites only the last of these parts."""
 
 
 def centre_part(index: int) -> str:
@@ -36,12 +36,12 @@ def centre_part(index: int) -> str:
 
 
 def cell_part(cell: int) -> str:
-    """Name of the part with what is known of a cell's elite."""
+    """Name of the part with a cell's entry in the behaviour map: fitness, descriptor and origin of its elite."""
     return f"{CELL_PREFIX}{cell:08d}"
 
 
 def elite_part(cell: int) -> str:
-    """Name of the part with what a cell's elite is made of."""
+    """Name of the part with a cell's elite: parameters, observation statistics and trace."""
     return f"{ELITE_PREFIX}{cell:08d}"
 
 
@@ -51,10 +51,10 @@ def block_part(block: int) -> str:
 
 
 def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
-    """The parts of `state` that differ from `before`, all of them for None.
+    """The parts of `state` that differ from `before`; all parts if `before` is None.
 
     Raises:
-        StoreError: the search's state is none that can follow `before`; see `SearchState`.
+        StoreError: the search's state cannot follow `before`; see `SearchState`.
     """
     require_successor(before, state)
     search, earlier = state.search, before.search if before is not None else None
@@ -78,7 +78,7 @@ def state_from_parts(parts: Parts, generation: int, wall_clock_s: float, dimensi
     """Inverse of `state_parts(state, None)`; elites are not needed.
 
     Args:
-        dimensions: of a descriptor, as long as the archive has no entry.
+        dimensions: number of descriptor dimensions, needed while the novelty archive has no entry.
     """
     centres = []
     while centre_part(len(centres)) in parts:
@@ -105,7 +105,7 @@ def _counters_to_arrays(state: RunState) -> Arrays:
 
 
 def moments_to_arrays(moments: Moments) -> Arrays:
-    """Observation statistics."""
+    """Arrays of observation statistics."""
     return {"count": np.asarray(moments.count, np.float64), "mean_O": moments.mean_O, "m2_O": moments.m2_O}
 
 
@@ -115,7 +115,7 @@ def moments_from_arrays(arrays: Mapping[str, np.ndarray]) -> Moments:
 
 
 def centre_to_arrays(centre: CentreState) -> Arrays:
-    """A centre with its optimiser, and what it knows of itself."""
+    """Arrays of a centre: its parameters, its optimiser, its archive entry, its cell and its own statistics."""
     adam = centre.adam
     own = {"own_mean_O": centre.own_mean_O, "own_std_O": centre.own_std_O}
     return {
@@ -137,7 +137,7 @@ def centre_from_arrays(arrays: Mapping[str, np.ndarray]) -> CentreState:
 
 
 def weight_to_arrays(weight: FitnessWeight) -> Arrays:
-    """The fitness weight and what adapts it."""
+    """Arrays of the weight of fitness and of its adaptation."""
     return {
         "value": np.asarray(weight.value, np.float64),
         "record": np.asarray(weight.record, np.float64),
@@ -151,7 +151,7 @@ def weight_from_arrays(arrays: Mapping[str, np.ndarray]) -> FitnessWeight:
 
 
 def archive_to_parts(archive: NoveltyArchive, stored: int) -> dict[str, Arrays]:
-    """The blocks that differ from those of the archive's first `stored` entries."""
+    """The blocks that are new or changed if the archive's first `stored` entries are stored already."""
     parts = {}
     for block in range(stored // BLOCK_ENTRIES, -(-archive.size // BLOCK_ENTRIES)):
         entries = slice(block * BLOCK_ENTRIES, (block + 1) * BLOCK_ENTRIES)
@@ -177,7 +177,7 @@ def archive_from_parts(parts: Parts, dimensions: int) -> NoveltyArchive:
 
 
 def geometry_to_arrays(geometry: Geometry) -> Arrays:
-    """The cells of a map: centroids too, since other versions of SciPy might place them otherwise."""
+    """Arrays of a map's cells, with the centroids, because other versions of SciPy might place them differently."""
     bounds = {"bounds_B_2": np.array(geometry.bounds, np.float64)}
     if isinstance(geometry, Grid):
         return bounds | {"shape_B": np.array(geometry.shape, np.int64)}
@@ -193,7 +193,7 @@ def geometry_from_arrays(arrays: Mapping[str, np.ndarray]) -> Geometry:
 
 
 def map_to_parts(map_: BehaviourMap, before: BehaviourMap | None) -> dict[str, Arrays]:
-    """What is known of the elites that differ from an earlier map; of None, of all, and the cells' own part."""
+    """Parts of the cells whose elites differ from an earlier map; for None, of all cells, and the geometry's part."""
     parts = {GEOMETRY_PART: geometry_to_arrays(map_.geometry)} if before is None else {}
     same_N = np.zeros(map_.size, bool)
     if before is not None:
@@ -233,7 +233,7 @@ def map_from_parts(parts: Parts) -> BehaviourMap | None:
 
 
 def elite_to_arrays(elite: Elite) -> Arrays:
-    """What an elite is made of."""
+    """Arrays of an elite."""
     return {name: getattr(elite, name) for name in Elite.__dataclass_fields__}
 
 
@@ -243,7 +243,7 @@ def elite_from_arrays(arrays: Mapping[str, np.ndarray]) -> Elite:
 
 
 def best_to_arrays(best: Best) -> Arrays:
-    """The best centre so far."""
+    """Arrays of the best centre so far."""
     return {
         "generation": np.asarray(best.generation, np.int64),
         "fitness": np.asarray(best.fitness, np.float64),

@@ -1,4 +1,4 @@
-"""All that a run carries from one generation to the next."""
+"""Everything that a run carries from one generation to the next."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from es_service.search.observation_statistics import normalisation
 
 @dataclass(frozen=True)
 class Best:
-    """The centre with the highest mean fitness so far, with the statistics it was evaluated with."""
+    """The centre with the highest mean fitness so far, and the observation statistics used in its evaluation."""
 
     generation: int
     fitness: float
@@ -35,44 +35,46 @@ class RunState:
     observations: Moments
     best: Best
     env_steps: int
-    """Environment steps so far, evaluations counted; a Python int, it outgrows 32 bits."""
+    """Environment steps so far, evaluations included; a Python int, since it can exceed 32 bits."""
     episodes: int
     wall_clock_s: float
-    """Seconds spent so far, all sessions together. Kept in the history, not in the state: it is not deterministic."""
+    """Seconds spent so far in all sessions. They are stored only in the history, because they are not deterministic."""
     elites: Mapping[int, Elite] = field(default_factory=dict)
-    """Those that entered the map in this generation, by cell; older ones are in the store only."""
+    """Elites that entered the map in this generation, by cell; older ones are only in the store."""
 
 
 def require_successor(before: RunState | None, state: RunState) -> None:
-    """Raise a StoreError for a state that cannot follow `before` (None: the first), as a search of one's own may make;
-    `SearchState` says what a search may change."""
+    """Raise a StoreError if a state cannot follow `before` (None for the first state).
+
+    A search of the user may return such a state; `SearchState` describes what a search may change.
+    """
     wrong = _not_followed(before.search, state.search) if before is not None else ""
     wrong = wrong or _foreign_elite(before.search.map if before is not None else None, state.search.map, state.elites)
     if wrong:
         saved = f"Everything up to generation {before.generation} is saved." if before is not None else ""
         raise StoreError(
-            f"generation {state.generation} cannot be kept: {wrong}; es_service/search/algorithms/base.py says of "
-            f"SearchState what a search may change. {saved}".rstrip()
+            f"generation {state.generation} cannot be stored: {wrong}; the class SearchState in "
+            f"es_service/search/algorithms/base.py describes what a search may change. {saved}".rstrip()
         )
 
 
 def _not_followed(before: SearchState, after: SearchState) -> str:
-    """What is wrong with a state after another; empty if nothing is. Searches of ours are right by construction."""
+    """Why a state cannot follow another; empty if it can. States of the shipped algorithms always can."""
     if len(after.centres) != len(before.centres):
-        return f"the search has {len(after.centres)} centres, and had {len(before.centres)}"
+        return f"the search has {len(after.centres)} centres, but it had {len(before.centres)} before"
     if not extends(after.archive, before.archive):
         return "the novelty archive has lost or changed entries"
     if (after.map is None) != (before.map is None):
-        return "the map came or went"
+        return "the behaviour map was added or removed"
     if after.map is None or before.map is None or after.map is before.map:
         return ""
     if not np.array_equal(after.map.cell_N[: before.map.size], before.map.cell_N):
-        return "the map has lost cells, or has them in another order"
+        return "the behaviour map has lost cells or changed their order"
     return ""
 
 
 def _foreign_elite(before: BehaviourMap | None, after: BehaviourMap | None, elites: Mapping[int, Elite]) -> str:
-    """What is wrong with the elites that a map has and an earlier one had not, when `elites` entered it."""
+    """Why the new elites of a map are wrong, if they are not those in `elites`; empty if nothing is wrong."""
     if after is None or after is before:
         return ""
     new_N = np.ones(after.size, bool)
@@ -87,8 +89,10 @@ def _foreign_elite(before: BehaviourMap | None, after: BehaviourMap | None, elit
 def statistics_in_force(
     observations: Moments, centre: CentreState | None, enabled: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """(mean, standard deviation) that a centre's episodes run with: its own if it has any, else the whole run's; 0 and
-    1 where observations are not normalised."""
+    """Mean and standard deviation with which a centre's episodes normalise observations, float32 [O] each.
+
+    They are the centre's own if it has any, else those of the whole run; 0 and 1 if observations are not normalised.
+    """
     if enabled and centre is not None and centre.own_mean_O is not None and centre.own_std_O is not None:
         return centre.own_mean_O, centre.own_std_O
     return normalisation(observations, enabled)

@@ -1,1 +1,1 @@
-"""The methods: pure functions on a search's state. Algorithms, maps, novelty, shaping, optimiser, statistics."""
+"""Search methods as pure functions of a search's state: algorithms, maps, novelty, shaping, optimiser, statistics."""

@@ -1,7 +1,10 @@
-"""Novelty: how far a descriptor lies from those of all centres evaluated before it. Conti et al. 2018.
+"""Novelty: mean distance of a descriptor to its nearest entries of the novelty archive.
 
-Update station. The archive only grows: one entry per evaluated valid centre, in order. A k-d tree proposes neighbours
-where the archive is large; what counts is always computed by one float64 expression, so the tree changes no bit.
+Source: Conti et al. 2018 (arXiv:1712.06560). The novelty archive only grows: it gets one entry for each valid evaluated
+centre, in order. In a large archive a k-d tree proposes the candidates, but distances are always computed by the same
+float64 expression, so the tree does not change any bit of the result.
+
+Axes: N entries of the novelty archive, Q queries, K nearest candidates, B descriptor dimensions.
 """
 
 from __future__ import annotations
@@ -18,27 +21,31 @@ if TYPE_CHECKING:
 Distance = Literal["euclidean", "squared_euclidean"]
 
 TREE_STEP = 256
-"""Entries between two trees, at first. Those after the newest tree are compared one by one."""
+"""Least number of entries between two trees. Entries after the newest tree are compared one by one."""
 COPIES = 64
-"""Entries with equal descriptors that a tree holds at most: searches of policies that do not move, or end in a corner,
-make piles of them, and each query near a pile would look at all of it."""
+"""Largest number of entries with equal descriptors in a tree. Policies that do not move, or that end in a corner,
+produce many such entries, and each query near them would visit them all."""
 LEAST_ROOM = 256
-"""Entries that an archive's arrays have room for, at first."""
+"""Least capacity of an archive's arrays, in entries."""
 SPARE_CANDIDATES = 6
-"""Neighbours asked of the tree beyond those wanted, so that rounding inside it can be noticed."""
+"""Additional neighbours that are requested from the tree, so that an effect of its rounding can be noticed."""
 TREE_ROUNDING = 1e-9
-"""Relative bound, generous, on how much the tree's distances differ from ours."""
+"""Generous bound on the relative difference between the tree's distances and ours."""
 
 
 @dataclass
 class _Room:
-    """Arrays longer than what they hold. An entry is written once, behind all others, so archives that are the first
-    entries of the same room never see a change, and a generation copies nothing of what came before."""
+    """Arrays with spare capacity, which archives of successive generations share.
+
+    An entry is written once, after all others. Archives that consist of the first entries of the same room therefore
+    never change, and a generation does not copy earlier entries.
+    """
 
     descriptor_B: NDArray[np.float64]
     generation: NDArray[np.int64]
     centre: NDArray[np.int64]
     used: int
+    """Number of entries written so far."""
 
 
 @dataclass(frozen=True)
@@ -47,28 +54,28 @@ class _Tree:
 
     kd: KDTree
     entries: int
-    """How many."""
+    """Number of those entries."""
     entry_K: NDArray[np.int64] | None
-    """Which of them are in it; None for all."""
+    """Indices of the entries that are in the tree; None for all of them."""
 
     def entries_of(self, points: ArrayLike) -> NDArray[np.int64]:
-        """Indices of the entries that points of the tree are."""
+        """Indices of the entries for points of the tree."""
         return np.asarray(points) if self.entry_K is None else self.entry_K[np.asarray(points)]
 
 
 @dataclass(frozen=True)
 class NoveltyArchive:
-    """Descriptors of all centres evaluated so far, in order. N: entries; B: descriptor dimensions."""
+    """Descriptors of all valid centres evaluated so far, in order. It is immutable: `extended` returns a new one."""
 
     descriptor_N_B: NDArray[np.float64]
     generation_N: NDArray[np.int64]
-    """When each was evaluated; 0 for initial centres."""
+    """Generation in which each was evaluated; 0 for initial centres."""
     centre_N: NDArray[np.int64]
-    """Which of the search's centres each was."""
+    """Index of the centre that made each entry."""
     tree: _Tree | None = None
-    """Follows from `descriptor_N_B`."""
+    """A tree over the first entries, derived from `descriptor_N_B`; None for a small archive."""
     room: _Room | None = None
-    """What the arrays are the beginning of."""
+    """Storage of which the arrays are the first part; None if they are their own storage."""
 
     @property
     def size(self) -> int:
@@ -77,22 +84,31 @@ class NoveltyArchive:
 
 
 def empty_archive(dimensions: int) -> NoveltyArchive:
-    """An archive without entries: nothing is near anything, so every novelty is 0."""
+    """A novelty archive without entries, in which every novelty is 0.
+
+    Args:
+        dimensions: number of descriptor dimensions.
+    """
     return NoveltyArchive(np.zeros((0, dimensions)), np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
 def archive_of(
     descriptor_N_B: NDArray[np.float64], generation_N: NDArray[np.int64], centre_N: NDArray[np.int64]
 ) -> NoveltyArchive:
-    """An archive of entries that were made before, in their order."""
+    """A novelty archive of existing entries, in the order given."""
     return _with_tree(_Room(descriptor_N_B, generation_N, centre_N, generation_N.size), None)
 
 
 def extended(archive: NoveltyArchive, descriptor_B: ArrayLike, generation: int, centre: int) -> NoveltyArchive:
-    """The archive with one entry more; the old one stays as it is."""
+    """The archive with one more entry, the last; the given archive does not change.
+
+    Raises:
+        ValueError: the descriptor has another shape than those of the archive.
+    """
     size, room = archive.size, archive.room
     if np.shape(descriptor_B) != archive.descriptor_N_B.shape[1:]:
-        raise ValueError(f"a descriptor of {np.shape(descriptor_B)} for an archive of {archive.descriptor_N_B.shape}")
+        shapes = f"{np.shape(descriptor_B)}, but those of the archive have {archive.descriptor_N_B.shape[1:]}"
+        raise ValueError(f"the descriptor has shape {shapes}")
     if room is None or room.used != size or room.used == room.generation.size:
         room = _copied(archive)
     room.descriptor_B[size], room.generation[size], room.centre[size] = descriptor_B, generation, centre
@@ -101,7 +117,7 @@ def extended(archive: NoveltyArchive, descriptor_B: ArrayLike, generation: int, 
 
 
 def extends(archive: NoveltyArchive, earlier: NoveltyArchive) -> bool:
-    """Whether an archive begins with all entries of an earlier one."""
+    """Whether an archive begins with all entries of an earlier one, unchanged and in the same order."""
     if archive.room is not None and archive.room is earlier.room and _address(archive) == _address(earlier):
         return archive.size >= earlier.size
     return all(
@@ -122,18 +138,21 @@ def novelty(
     distance: Distance,
     exclude_Q: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
-    """Mean distance of each query to its `neighbours` nearest entries; to all of them if there are fewer.
+    """Mean distance of each query to its `neighbours` nearest entries, or to all entries if there are fewer.
 
-    Distances are computed in float64, sorted ascending and added in that order. A query without any neighbour has
-    novelty 0; one that is not finite has novelty NaN.
+    Distances are computed in float64, sorted in ascending order and added in this order. A query without any neighbour
+    has novelty 0; a query that is not finite has novelty NaN.
 
     Args:
-        descriptor_Q_B: queries, any number of leading axes before the descriptor's.
-        distance: squared_euclidean is the mean of squared distances, as in the released ME-ES code.
-        exclude_Q: for each query the index of the entry that is the query itself, or -1; with one leading axis.
+        descriptor_Q_B: descriptors of the queries, with any number of leading axes.
+        neighbours: `novelty.neighbours`, k in the paper.
+        distance: euclidean, in units of the descriptor, or squared_euclidean, the mean of squared distances in squared
+            units, as in the released ME-ES code.
+        exclude_Q: index of an entry that each query ignores, usually its own, or -1 for none; only for queries with one
+            leading axis.
 
     Returns:
-        float64, the leading axes of the queries.
+        float64, with the leading axes of the queries.
     """
     shape = np.shape(descriptor_Q_B)[:-1]
     query_Q_B = np.asarray(descriptor_Q_B, np.float64).reshape(-1, archive.descriptor_N_B.shape[1])
@@ -149,7 +168,7 @@ def _address(archive: NoveltyArchive) -> int:
 
 
 def _copied(archive: NoveltyArchive) -> _Room:
-    """A room of its own for an archive, with as much space again behind it."""
+    """A new room with a copy of an archive's entries and capacity for as many again."""
     size = archive.size
     capacity = max(2 * size, LEAST_ROOM)
     room = _Room(
@@ -161,8 +180,11 @@ def _copied(archive: NoveltyArchive) -> _Room:
 
 
 def _with_tree(room: _Room, tree: _Tree | None) -> NoveltyArchive:
-    """The archive of what a room holds, with a tree over as many entries as its size asks for: `tree` if it is that
-    one, else a new one. New trees grow as rare as they grow dear: every sqrt(size) entries, a power of two."""
+    """The archive of all entries in a room, with a tree over the entries up to a multiple of a step.
+
+    `tree` is used if it covers just those entries; otherwise a new tree is built. The more entries a tree has, the
+    longer it takes to build, so the step grows with them: it is a power of two near sqrt(size), at least TREE_STEP.
+    """
     descriptor_N_B = room.descriptor_B[: room.used]
     step = max(TREE_STEP, 1 << room.used.bit_length() // 2)
     covered = room.used // step * step
@@ -172,12 +194,12 @@ def _with_tree(room: _Room, tree: _Tree | None) -> NoveltyArchive:
 
 
 def _tree(descriptor_N_B: NDArray[np.float64]) -> _Tree:
-    """A tree over all entries, but over the first COPIES of equal ones."""
-    from scipy.spatial import KDTree  # a quarter of a second that most runs need not spend
+    """A tree over all entries, with at most the first COPIES of those with equal descriptors."""
+    from scipy.spatial import KDTree  # imported late: it takes 0.25 s, and most runs do not need it
 
     size = len(descriptor_N_B)
     word_N = np.zeros(size, np.uint64)
-    for b in range(descriptor_N_B.shape[1]):  # equal descriptors give equal words, others hardly ever
+    for b in range(descriptor_N_B.shape[1]):  # equal descriptors give equal hashes, others almost never
         word_N = word_N * np.uint64(0x9E3779B97F4A7C15) + np.ascontiguousarray(descriptor_N_B[:, b]).view(np.uint64)
     sorted_N = np.sort(word_N)
     if not (sorted_N[COPIES:] == sorted_N[:-COPIES]).any():
@@ -195,9 +217,9 @@ def _mean_nearest(
     neighbours: int,
     distance: Distance,
 ) -> NDArray[np.float64]:
-    """Mean distance to the nearest entries for finite queries: candidates of the tree where that is enough."""
+    """Mean distance of finite queries to their nearest entries, [Q]; from the tree's candidates if these suffice."""
     tree = archive.tree
-    asked = neighbours + 1 + SPARE_CANDIDATES  # one more in case the excluded entry is among them
+    asked = neighbours + 1 + SPARE_CANDIDATES  # + 1 in case the excluded entry is among them
     if tree is None or asked >= tree.kd.n or (tree.entry_K is not None and asked > COPIES):
         return _mean_smallest(_squared(archive, query_Q_B, excluded_Q), neighbours, distance)
     reach_Q_K, point_Q_K = tree.kd.query(query_Q_B, asked)
@@ -206,10 +228,10 @@ def _mean_nearest(
     near_Q_K[candidate_Q_K == excluded_Q[:, None]] = np.inf
     tail_Q_N = _squared(archive, query_Q_B, excluded_Q, tree.entries)
     squared_Q_K = _smallest(np.concatenate([near_Q_K, tail_Q_N], axis=1), neighbours)
-    # Sure unless an entry that the tree left out could, after rounding, be among the nearest.
+    # A result is sure unless an entry that the tree did not return could, with rounding, be among the nearest.
     sure_Q = np.sqrt(squared_Q_K[:, -1]) <= reach_Q_K[:, -1] * (1.0 - TREE_ROUNDING)
     mean_Q = _mean_smallest(squared_Q_K, neighbours, distance)
-    for index in np.flatnonzero(~sure_Q):  # where many ends are the same, as at a border, the last candidates are equal
+    for index in np.flatnonzero(~sure_Q):  # such as many entries at equal distance, where episodes end at a border
         one = slice(index, index + 1)
         radius = reach_Q_K[index, -1] * (1.0 + TREE_ROUNDING)
         within = tree.entries_of(tree.kd.query_ball_point(query_Q_B[index], radius))
@@ -222,7 +244,7 @@ def _mean_nearest(
 def _squared(
     archive: NoveltyArchive, query_Q_B: NDArray[np.float64], excluded_Q: NDArray[np.int64], first: int = 0
 ) -> NDArray[np.float64]:
-    """Squared distances [Q, N - first] to the entries from `first` on, infinite to the excluded one."""
+    """Squared distances [Q, N - first] to the entries from `first` on, infinite for the excluded entry."""
     squared_Q_N = _squared_to(query_Q_B, archive.descriptor_N_B[None, first:])
     rows = np.flatnonzero(excluded_Q >= first)
     squared_Q_N[rows, excluded_Q[rows] - first] = np.inf
@@ -230,7 +252,7 @@ def _squared(
 
 
 def _squared_to(query_Q_B: NDArray[np.float64], entry_Q_N_B: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The one expression for a squared distance: (x0 - y0)^2 + (x1 - y1)^2 + ..., in this order."""
+    """Squared distances [Q, N], (x0 - y0)^2 + (x1 - y1)^2 + ... in this order; the only place that computes them."""
     total_Q_N = np.zeros(np.broadcast_shapes((len(query_Q_B), 1), entry_Q_N_B.shape[:2]))
     for b in range(query_Q_B.shape[1]):
         difference_Q_N = query_Q_B[:, None, b] - entry_Q_N_B[..., b]
@@ -239,18 +261,18 @@ def _squared_to(query_Q_B: NDArray[np.float64], entry_Q_N_B: NDArray[np.float64]
 
 
 def _smallest(squared_Q_N: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """The smallest of each row, ascending, as many as there are up to `count`."""
+    """The `count` smallest values of each row in ascending order; all values if a row has fewer."""
     if count < squared_Q_N.shape[1]:
         squared_Q_N = np.partition(squared_Q_N, count - 1, axis=1)[:, :count]
     return np.sort(squared_Q_N, axis=1)
 
 
 def _mean_smallest(squared_Q_N: NDArray[np.float64], count: int, distance: Distance) -> NDArray[np.float64]:
-    """Mean of the smallest finite distances of each row; 0 where there is none."""
+    """Mean of the `count` smallest finite distances of each row, [Q]; 0 for a row without any."""
     squared_Q_K = _smallest(squared_Q_N, count)
     distance_Q_K = np.sqrt(squared_Q_K) if distance == "euclidean" else squared_Q_K
     there_Q_K = np.isfinite(distance_Q_K)
     total_Q = np.zeros(len(squared_Q_K))
-    for k in range(distance_Q_K.shape[1]):  # one by one: np.sum may add in another order
+    for k in range(distance_Q_K.shape[1]):  # added one by one, since np.sum may use another order
         total_Q += np.where(there_Q_K[:, k], distance_Q_K[:, k], 0.0)
     return total_Q / np.maximum(there_Q_K.sum(axis=1), 1)

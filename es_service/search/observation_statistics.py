@@ -1,4 +1,4 @@
-"""Running statistics of observations, merged on the driver in chunk order and in float64."""
+"""Running statistics of observations, merged by the driver in chunk order and in float64. Axis O: observation."""
 
 from __future__ import annotations
 
@@ -9,16 +9,20 @@ import numpy as np
 from es_service.protocol.messages import FloatArray, Moments
 
 STD_FLOOR = 0.1
-"""Least standard deviation used for normalising; source: released code of the ES papers, sqrt(max(var, 0.01))."""
+"""Least standard deviation for normalisation. Source: released code of the ES papers, sqrt(max(var, 0.01))."""
 
 
 def no_observations(size: int) -> Moments:
-    """Statistics before the first generation: nothing counted."""
+    """Statistics of no observations, as before the first generation.
+
+    Args:
+        size: length of an observation.
+    """
     return Moments(0.0, np.zeros(size), np.zeros(size))
 
 
 def merge_moments(total: Moments, parts: Iterable[Moments]) -> Moments:
-    """`total` and `parts`, one after another in the order given (the order decides the last bits).
+    """Merge `parts` into `total` one after another, in the order given, which affects the last bits of the result.
 
     Source: pairwise update of Chan, Golub and LeVeque 1983.
     """
@@ -36,7 +40,11 @@ def merge_moments(total: Moments, parts: Iterable[Moments]) -> Moments:
 
 
 def normalisation(moments: Moments, enabled: bool) -> tuple[FloatArray, FloatArray]:
-    """(mean, standard deviation) to normalise with; 0 and 1 if off or nothing is counted, never below STD_FLOOR."""
+    """Mean and standard deviation (population formula) that normalise observations, float32 [O] each.
+
+    They are 0 and 1 if normalisation is off or if nothing has been counted. The standard deviation is at least
+    STD_FLOOR.
+    """
     if not enabled or moments.count == 0.0:
         size = moments.mean_O.shape[0]
         return np.zeros(size, np.float32), np.ones(size, np.float32)

@@ -1,6 +1,6 @@
-"""Adam as the evolution-strategies papers' code has it, in NumPy float32.
+"""Adam as in the released code of the evolution-strategies papers, in NumPy float32.
 
-Not optax's: here epsilon is added to sqrt(v) *before* the bias correction.
+It differs from optax: here epsilon is added to sqrt(v) *before* the bias correction.
 """
 
 from __future__ import annotations
@@ -20,28 +20,39 @@ class Adam:
     """Optimiser state of one centre. D: policy parameters."""
 
     m_D: FloatArray
+    """Running mean of the descent direction."""
     v_D: FloatArray
+    """Running mean of its square."""
     step: int
-    """Updates made."""
+    """Number of updates made."""
 
 
 def fresh_adam(parameters: int) -> Adam:
-    """Moments zero, no update made."""
+    """The optimiser state before any update: both moments are 0.
+
+    Args:
+        parameters: D, the number of policy parameters.
+    """
     return Adam(np.zeros(parameters, np.float32), np.zeros(parameters, np.float32), 0)
 
 
 def adam_ascent(
     adam: Adam, centre_D: FloatArray, gradient_D: FloatArray, *, learning_rate: float, l2: float
 ) -> tuple[Adam, FloatArray]:
-    """One step up the gradient estimate: (new optimiser state, new centre).
+    """Take one step up the gradient estimate: (new optimiser state, new centre).
 
-    The weight penalty goes through Adam: what it minimises is -gradient + l2 * centre.
-    Step: learning_rate * sqrt(1 - b2^t) / (1 - b1^t) * m / (sqrt(v) + eps), t counted from 1.
+    The weight penalty is part of the direction in which Adam descends: -gradient + l2 * centre. The new centre is the
+    old one minus learning_rate * sqrt(1 - b2^t) / (1 - b1^t) * m / (sqrt(v) + eps), with t counted from 1.
+
+    Args:
+        gradient_D: estimate of the gradient; it points to higher utility.
+        learning_rate: step size, in parameter units.
+        l2: weight of the penalty.
 
     Source: released code of deep-neuroevolution and ME-ES (optimizers.py); constants 0.9, 0.999, 1e-8.
     """
     step = adam.step + 1
-    with np.errstate(over="ignore", invalid="ignore"):  # the driver says so if the centre is not finite
+    with np.errstate(over="ignore", invalid="ignore"):  # the driver refuses a centre that is not finite
         descent_D = centre_D * np.float32(l2) - gradient_D
         m_D = adam.m_D * np.float32(BETA_1) + descent_D * np.float32(1.0 - BETA_1)
         v_D = adam.v_D * np.float32(BETA_2) + np.square(descent_D) * np.float32(1.0 - BETA_2)
@@ -51,5 +62,5 @@ def adam_ascent(
 
 
 def _float32(x: np.ndarray) -> FloatArray:
-    """The same array: everything above is float32 already, which NumPy's type stubs do not see."""
+    """The same array, typed as float32: it already is float32, but NumPy's type stubs do not show this."""
     return x.astype(np.float32, copy=False)

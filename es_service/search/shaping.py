@@ -1,4 +1,4 @@
-"""Fitness -> utilities: what the gradient estimate weighs the noise with."""
+"""Utilities from fitness, and from these the weights of the noise in the gradient estimate."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 def centred_ranks(fitness_PS: ArrayLike) -> NDArray[np.float64]:
     """Map fitness to utilities in [-0.5, 0.5], evenly spaced by rank over all members; higher fitness, higher utility.
 
-    Only the order matters, so a strictly increasing map of the fitness changes nothing. Equal values share the mean of
-    their ranks. Members whose fitness is not finite are invalid and share the lowest ranks, averaged.
+    Only the order matters, so a strictly increasing function of the fitness gives the same utilities. Equal values get
+    the mean of their ranks. Members whose fitness is not finite are invalid; they get the mean of the lowest ranks.
 
     Args:
         fitness_PS: fitness of every member, any shape, at least two members.
@@ -29,8 +29,11 @@ def centred_ranks(fitness_PS: ArrayLike) -> NDArray[np.float64]:
 
 
 def pair_weights(utility_P_S: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Utility of + minus utility of -, per pair: the antithetic weight of the pair's noise.
+    """Weight of each pair's noise, [P]: the utility of the member with sign + minus that of the member with sign -.
 
-    Swapping the signs of all pairs negates every weight exactly, and with it the gradient estimate.
+    Swapping the signs of all pairs negates every weight exactly, and therefore the gradient estimate.
+
+    Args:
+        utility_P_S: utilities with axes P (pairs) and S (signs [+, -]).
     """
     return (utility_P_S[:, 0] - utility_P_S[:, 1]).astype(np.float32)

@@ -103,7 +103,7 @@ def test_awkward_populations_load_with_a_warning():
     assert warning.startswith("compute.chunk_pairs: 1 makes 127 small chunks")
     assert "search.pairs = 128" in warning
     (warning,) = config_warnings(load(MINIMAL, "compute.chunk_pairs=4"), POINT_MAZE)
-    assert "auto would be 64" in warning
+    assert "auto would choose 64" in warning
     endless = load(MINIMAL, "budget.generations=null", "budget.target_fitness=-25")
     (warning,) = config_warnings(endless, POINT_MAZE)
     assert "target_fitness (-25.0)" in warning
@@ -114,7 +114,7 @@ def test_auto_chooses_simd_by_this_machine_unless_a_cluster_runs_the_workers():
     here = load_config(MINIMAL, no_vectors=why, **of)
     assert here.compute.rollout == "xla"
     (warning,) = config_warnings(here, POINT_MAZE, why)
-    assert warning == f"compute.rollout: xla, since simd cannot run point_maze: {why}"
+    assert warning == f"compute.rollout: xla is used because simd cannot run point_maze: {why}"
     there = load_config(MINIMAL, {"compute.address": "auto", "compute.engine": "ray"}, no_vectors=why, **of)
     assert (there.compute.rollout, config_warnings(there, POINT_MAZE, why)) == ("simd", [])
 
@@ -122,14 +122,15 @@ def test_auto_chooses_simd_by_this_machine_unless_a_cluster_runs_the_workers():
 def test_simd_is_what_auto_chooses_where_it_can_be_had():
     assert load().compute.rollout == "simd"
     assert load(MINIMAL, "compute.worker_resources.gpu=1").compute.rollout == "xla"
-    with pytest.raises(ConfigError, match=r"simd runs on CPUs, and compute.worker_resources.gpu is not 0"):
+    with pytest.raises(ConfigError, match=r"simd runs only on CPUs, but compute.worker_resources.gpu is 1;"):
         load(MINIMAL, "compute.worker_resources.gpu=1", "compute.rollout=simd")
     no_simd = replace(POINT_MAZE, no_simd="the processor (i486) has no AVX2")
     here = {"point_maze": no_simd}
     config = load_config(MINIMAL, tasks=here, algorithms=ALGORITHMS)
     assert config.compute.rollout == "xla"
     (warning,) = config_warnings(config, no_simd)
-    assert warning == "compute.rollout: xla, since simd cannot run point_maze: the processor (i486) has no AVX2"
+    why = "the processor (i486) has no AVX2"
+    assert warning == f"compute.rollout: xla is used because simd cannot run point_maze: {why}"
     with pytest.raises(ConfigError, match=r"simd cannot run point_maze: the processor .* must be auto or xla"):
         load_config(MINIMAL, ("compute.rollout=simd",), tasks=here, algorithms=ALGORITHMS)
 

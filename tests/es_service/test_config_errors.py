@@ -53,8 +53,8 @@ def problems(source=MINIMAL, *overrides: str) -> list[str]:
         ("search.l2=-1", "-1 ... must be a number, at least 0"),
         ("search.max_invalid_fraction=1.5", "1.5 ... must be a number from 0 to 1"),
         ("search.preset=litrature", "litrature ... must be literature or uber; did you mean literature?"),
-        ("search.algorithm=ess", "ess is no known algorithm; must be es, or module:function; did you mean es?"),
-        ("task.environment=pointmaze", "pointmaze is no known task; must be point_maze or no_final, or brax:NAME, or"),
+        ("search.algorithm=ess", "ess is not a known algorithm; must be es, or module:function; did you mean es?"),
+        ("task.environment=pointmaze", "pointmaze is not a known task; must be point_maze or no_final, or brax:NAME"),
         ("task.episode_steps=auto", "auto ... must be null or a whole number, at least 1"),
         ("task.fitness=finl", "finl ... must be sum or final; did you mean final?"),
         ("task.options.start=cornr", "cornr ... must be default or corner; did you mean corner?"),
@@ -71,18 +71,18 @@ def problems(source=MINIMAL, *overrides: str) -> list[str]:
         ("compute.workers=0", "0 ... must be auto or a whole number, at least 1"),
         ("compute.chunk_pairs=half", "half ... must be auto or a whole number"),
         ("policy.hidden=[10000000000, 10000000000]", "[10000000000, 10000000000] makes more than 80,000,000 para"),
-        ("policy.hidden=[8950, 8950]", "[8950, 8950] makes more than 80,000,000 parameters for point_maze, the most"),
+        ("policy.hidden=[8950, 8950]", "[8950, 8950] makes more than 80,000,000 parameters for point_maze, which"),
         ("search.init_from=/etc/passwd", "/etc/passwd is a file; must be the folder of another run, or null"),
         ("search.init_from=/etc/passwd/run", "/etc/passwd/run does not exist; must be the folder of another run"),
-        ("search.init_from=/" + 300 * "a", f"/{300 * 'a'} cannot be looked at (File name too long); must be the"),
-        ('search.init_from="/a\\0b"', "/a\0b cannot be looked at (embedded null byte); must be the folder of another"),
+        ("search.init_from=/" + 300 * "a", f"/{300 * 'a'} cannot be accessed (File name too long); must be the"),
+        ('search.init_from="/a\\0b"', "/a\0b cannot be accessed (embedded null byte); must be the folder of another"),
         ("search.init_from=/no/such/run", "/no/such/run does not exist; must be the folder of another run"),
         ("map.kind=gird", "gird ... must be auto or grid or cvt; did you mean grid?"),
         ("map.bounds=3", "3 ... must be auto or a list of pairs [low, high], such as [[-1, 1], [-1, 1]]"),
         ("map.bounds=[[0, 1], [0, .inf]]", "[[0, 1], [0, .inf]] is not allowed"),
         ("map.bounds=[[0, 1], [a, 1]]", "[[0, 1], [a, 1]] is not allowed"),
         ("map.bounds=[[0, 1], [1]]", "[[0, 1], [1]] is not allowed"),
-        ("map.bounds=[[0, 1]]", "[[0, 1]] has 1 pairs; the descriptor has 2 dimensions (x, y), so must be a list of"),
+        ("map.bounds=[[0, 1]]", "[[0, 1]] has 1 pairs, but the descriptor has 2 dimensions (x, y); must be a list of"),
         ("map.bounds=[[0, 1], [3, -2]]", "[3, -2] for y ... must be [low, high] with low below high; did you mean"),
         ("map.bounds=[[-1e308, 1e308], [0, 1]]", "[[-1.0e+308, 1.0e+308], [0, 1]] ... must be within 1e+30 of 0"),
         ("map.qd_offset=-1e308", "-1.0e+308 ... must be within 1e+30 of 0"),
@@ -119,9 +119,9 @@ def test_a_bad_value_is_one_line_with_field_value_and_what_is_allowed(override, 
         ("task.options.start.x=3", "override task.options.start.x=3: task.options.start.x: unknown key"),
         ("qqq.zzz=3", "unknown key; the sections are task, policy, search, novelty, map, budget, compute"),
         ("budget.qqq=3", "unknown key; budget has generations, env_steps, wall_clock_s, target_fitness"),
-        ("search.sigma", "override search.sigma: write a.b=c, such as search.sigma=0.05"),
-        ("=3", "override =3: write a.b=c"),
-        ("search.init_from=", "override search.init_from=: write null for no value"),
+        ("search.sigma", "override search.sigma: write KEY=VALUE, such as search.sigma=0.05"),
+        ("=3", "override =3: write KEY=VALUE"),
+        ("search.init_from=", "override search.init_from=: the value is missing; write null"),
         ("search=3", "override search=3: search is a section; set its keys one by one, such as search.algorithm=..."),
         ("task.options=3", "task.options is a section; set its keys one by one, such as task.options.start=..."),
         ("policy.hidden=[64,", "override policy.hidden=[64,: line 1, column 5: not YAML"),
@@ -131,7 +131,7 @@ def test_a_bad_value_is_one_line_with_field_value_and_what_is_allowed(override, 
         ("compute.worker_resources.gpu=1.5", "gpu: 1.5 is not allowed; must be a whole number or a fraction below 1"),
         ("compute.worker_resources.gpus=1", "did you mean compute.worker_resources.gpu?"),
         ("compute.worker_resources=1", "is a section; set its keys one by one, such as compute.worker_resources.cpu="),
-        ("budget.generations=null", "budget: nothing ends this run; set at least one of budget.generations, bud"),
+        ("budget.generations=null", "budget: this run has no limit; set at least one of budget.generations, bud"),
     ],
 )  # fmt: skip
 def test_a_problem_elsewhere_is_one_line_with_a_hint(override, message):
@@ -144,14 +144,14 @@ def test_a_run_to_start_from_in_a_folder_that_may_not_be_looked_into(tmp_path):
     (tmp_path / "locked").mkdir(mode=0)
     with without_root_rights():
         (line,) = problems(MINIMAL, f"search.init_from={tmp_path}/locked/run")
-    assert "cannot be looked at (Permission denied); must be the folder of another run, or null" in line
+    assert "cannot be accessed (Permission denied); must be the folder of another run, or null" in line
 
 
 def test_a_cluster_or_a_gpu_without_ray_is_refused():
     asked = ("compute.engine=inline", "compute.address=auto", "compute.worker_resources.gpu=0.5")
     assert problems(MINIMAL, *asked) == [
-        "compute.address: auto needs compute.engine = ray, which is inline",
-        "compute.worker_resources.gpu: 0.5 needs compute.engine = ray, which is inline",
+        "compute.address: auto needs compute.engine = ray, but the engine is inline",
+        "compute.worker_resources.gpu: 0.5 needs compute.engine = ray, but the engine is inline",
     ]
 
 
@@ -160,13 +160,13 @@ def test_a_cluster_or_a_gpu_without_ray_is_refused():
     [
         (MINIMAL_TEXT + "weather: {rain: 10}\n", "weather: unknown key; the top level has task, policy, search"),
         (MINIMAL_TEXT + "polcy: {hidden: [3]}\n", "polcy: unknown key; did you mean policy?"),
-        (MINIMAL_TEXT + "policy:\n", "policy: null where keys belong; indent them below `policy:`, or delete"),
-        (MINIMAL_TEXT + "compute: 3\n", "compute: 3 where keys belong"),
+        (MINIMAL_TEXT + "policy:\n", "policy: null is not a mapping of keys; indent its keys below `policy:`, or"),
+        (MINIMAL_TEXT + "compute: 3\n", "compute: 3 is not a mapping of keys"),
         (MINIMAL_TEXT + "seed: 1\nseed: 2\n", 'line 5, column 1: found duplicate key "seed" with value "2"'),
-        (MINIMAL_TEXT + "policy.hidden: [3]\n", "policy.hidden: no dots in a file; write hidden"),
+        (MINIMAL_TEXT + "policy.hidden: [3]\n", "policy.hidden: a key in a file has no dots; write hidden"),
         (MINIMAL_TEXT.replace("algorithm: es", "preset: uber"), "search.algorithm: missing; must be es"),
         (MINIMAL_TEXT.replace("es}", "es, sigma: 1, sigma: 2}"), 'found duplicate key "sigma" with value "2" (o'),
-        (MINIMAL_TEXT.replace("maze}", "maze, options: }"), "task.options: null where keys belong"),
+        (MINIMAL_TEXT.replace("maze}", "maze, options: }"), "task.options: null is not a mapping of keys"),
         ("- 1\n", "the top level is [1]; write sections such as `task:`"),
         ("", "the file is empty"),
         ("# nothing\n", "the file is empty"),
@@ -249,7 +249,7 @@ seed: true
 @pytest.mark.parametrize("section", ["task", "search", "budget", "compute", "policy"])
 def test_an_unusable_section_is_one_problem(section):
     (line,) = problems({**MINIMAL, "compute": {"chunk_pairs": 64}, section: None})
-    assert line.startswith(f"{section}: null where keys belong")
+    assert line.startswith(f"{section}: null is not a mapping of keys")
 
 
 @settings(deadline=None, max_examples=150)
@@ -292,4 +292,4 @@ def test_a_map_that_does_not_fit_the_algorithm_or_its_kind_is_refused():
     with pytest.raises(ConfigError) as caught:
         load_config(MINIMAL, ["search.algorithm=me_es", "map.enabled=false"], tasks=TASKS, algorithms={"me_es": None})
     (line,) = (line.strip() for line in str(caught.value).splitlines()[1:])
-    assert line.startswith("map.enabled: false is not allowed for me_es, which draws its parents from the map; must be")
+    assert line.startswith("map.enabled: false is not allowed for me_es, whose blocks start from elites of the map")

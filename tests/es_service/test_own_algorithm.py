@@ -61,7 +61,7 @@ def test_a_run_of_it_goes_on_where_it_was_with_the_same_bits(tmp_path):
         ("tests.examples.minimal_criterion:min", "has no function 'min'"),
         (f"{__name__}:NOT_CALLABLE", "has no function 'NOT_CALLABLE'"),
         (f"{__name__}:raises", r"raises raised KeyError: 'sigma'"),
-        (f"{__name__}:something_else", r"returned 3, which is no es_service\.search\.algorithms\.base\.Algorithm"),
+        (f"{__name__}:something_else", r"returned 3; it must return an es_service\.search\.algorithms\.base\.Alg"),
         (".:x", "cannot import"),
     ],
 )
@@ -151,10 +151,10 @@ def _rows(map_, rows):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("forgetful", r"generation 3 cannot be kept: the novelty archive has lost or changed entries; .* 2 is saved"),
-        ("growing", r"generation 1 cannot be kept: the search has 3 centres, and had 2"),
-        ("emptying", r"the map has lost cells, or has them in another order"),
-        ("foreign", r"generation 0 cannot be kept: the new elite of cell \d+ is not the centre that was evaluated"),
+        ("forgetful", r"generation 3 cannot be stored: the novelty archive has lost or changed entries; .* 2 is saved"),
+        ("growing", r"generation 1 cannot be stored: the search has 3 centres, but it had 2 before"),
+        ("emptying", r"the behaviour map has lost cells or changed their order"),
+        ("foreign", r"generation 0 cannot be stored: the new elite of cell \d+ is not the centre that was evaluated"),
     ],
 )
 def test_a_state_that_the_store_could_not_give_back_ends_the_run(tmp_path, name, reason):

@@ -70,7 +70,7 @@ def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, cap
     assert suggested[::2] == ["--set"] * len(suggested[1::2])
     assert options is None or set(suggested[1::2]) == options
     before = run.generation or 0
-    with pytest.raises(ConfigError, match="to go on from its state") as refused:
+    with pytest.raises(ConfigError, match="to continue from its state") as refused:
         api.resume(run.folder, {"search.sigma": 0.05})
     way = refused.value.way_out
     assert way is not None

@@ -1,8 +1,8 @@
-"""Search algorithms: a name -> a factory. One method, one short file; shared steps are functions.
+"""Search algorithms by name. Each method has a short file of its own; the steps that they share are functions.
 
-An algorithm is a handful of pure functions on a `SearchState`; it never evaluates anything itself. Each generation the
-driver asks it whether to start afresh from an elite (`start_cell`), what to perturb (`ask`), how to weigh the noise
-(`weights`) and where that leads (`step`), and lets it learn from the new centre's evaluation (`tell`).
+An algorithm is a few pure functions of a `SearchState`; it does not run episodes itself. In each generation the driver
+asks it whether to restart from an elite (`start_cell`), which centre to perturb (`ask`), how to weight the noise
+(`weights`) and what the new centre is (`step`), and then tells it the evaluation of the new centre (`tell`).
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ OURS: dict[str, Factory] = {"es": es, "ns_es": ns_es, "nsr_es": nsr_es, "nsra_es
 
 
 class Algorithms(Mapping[str, Factory]):
-    """Iterates over our own algorithms; looks up any, `package.module:function` too."""
+    """Algorithms by name. Iteration yields the shipped ones; lookup also finds `package.module:function`."""
 
     def __getitem__(self, name: str) -> Factory:
-        """Raises KeyError for a plain name that is none of ours, ConfigError for a function that cannot be had."""
+        """Raises KeyError for a plain name that is not shipped, ConfigError for a function that cannot be imported."""
         if ":" not in name:
             return OURS[name]
         import_factory(name)

@@ -1,4 +1,7 @@
-"""What every search algorithm is made of: its state, what it asks for, its functions."""
+"""Types of all search algorithms: their state, what they ask for, what they are told, and their functions.
+
+Axes: D policy parameters, O observation, B descriptor dimensions, P antithetic pairs, S signs [+, -].
+"""
 
 from __future__ import annotations
 
@@ -14,58 +17,67 @@ from es_service.search.novelty import NoveltyArchive
 from es_service.search.optimizer import Adam, fresh_adam
 
 NO_ENTRY = -1
-"""`CentreState.entry` of a centre that has never been valid so far."""
+"""Value of `CentreState.entry` for a centre without a valid evaluation so far."""
 NO_CELL = -1
-"""`CentreState.cell` of a centre that is no elite."""
+"""Value of `CentreState.cell` for a centre that is not an elite."""
 
 
 @dataclass(frozen=True)
 class CentreState:
-    """One centre with its optimiser. NS-ES and its kin search with several side by side (the meta-population of Conti
-    et al. 2018), ES and ME-ES with one."""
+    """One centre with its optimiser.
+
+    NS-ES, NSR-ES and NSRA-ES search with several centres side by side (the meta-population of Conti et al. 2018),
+    ES and ME-ES with one.
+    """
 
     centre_D: FloatArray
     adam: Adam
     entry: int = NO_ENTRY
-    """Index of its newest entry in the novelty archive."""
+    """Index of the centre's newest entry in the novelty archive, or NO_ENTRY."""
     cell: int = NO_CELL
-    """Cell of the map whose elite it is."""
+    """Cell of the behaviour map whose elite this centre is, or NO_CELL."""
     own_mean_O: FloatArray | None = None
     own_std_O: FloatArray | None = None
-    """Observation statistics that it runs with instead of the whole run's; None if it does not."""
+    """Mean and standard deviation with which its episodes normalise observations; None for those of the whole run."""
 
 
 @dataclass(frozen=True)
 class FitnessWeight:
-    """How much fitness counts beside novelty, from 0 to 1, and what an adaptive rule remembers to change it."""
+    """Weight of fitness relative to novelty, and what an adaptive rule remembers to change it."""
 
     value: float
+    """From 0 (novelty alone) to 1 (fitness alone)."""
     record: float = -np.inf
     """The fitness to beat: mean evaluation fitness of the centre that last counted as an improvement."""
     stagnant: int = 0
-    """Generations since then, or since the weight was last lowered."""
+    """Generations since the record was set or the weight was last lowered, whichever is later."""
 
 
 @dataclass(frozen=True)
 class SearchState:
-    """All that a search remembers between generations.
+    """Everything that a search remembers between generations.
 
-    The store writes what a generation has changed, so a search of one's own may replace centres (never add or drop
-    one), extend the archive (`novelty.extended`; never take entries out: compare with the newest, if those alone are to
-    count) and insert into the map (`behaviour_map.insert`; never empty a cell). Anything else ends the run with a
-    StoreError.
+    The store writes only what a generation has changed. A search of your own may therefore replace centres (but not add
+    or remove one), extend the novelty archive with `novelty.extended` (but not remove entries; if only the newest ones
+    are to count, compare with those), and insert into the behaviour map with `behaviour_map.insert` (but not empty a
+    cell). Any other change stops the run with a StoreError.
     """
 
     centres: tuple[CentreState, ...]
     archive: NoveltyArchive
     weight: FitnessWeight
     map: BehaviourMap | None = None
-    """None where the config switches it off."""
+    """The behaviour map; None if `map.enabled` is false."""
 
 
 def from_elite(state: SearchState, cell: int, elite: Elite, *, own_statistics: bool = False) -> SearchState:
-    """The state with an elite in the place of centre 0: its parameters, a fresh optimiser and, if wanted, the
-    observation statistics it came with, which it then keeps."""
+    """The state in which an elite replaces centre 0, with a fresh optimiser.
+
+    Args:
+        cell: cell of the elite.
+        own_statistics: whether the centre keeps the observation statistics with which the elite was evaluated; else it
+            uses those of the whole run.
+    """
     centre = CentreState(
         elite.centre_D,
         fresh_adam(elite.centre_D.size),
@@ -79,27 +91,29 @@ def from_elite(state: SearchState, cell: int, elite: Elite, *, own_statistics: b
 
 @dataclass(frozen=True)
 class Ask:
-    """What to evaluate in this generation: the population around one centre."""
+    """What to evaluate in a generation: the population around one centre."""
 
     centre: int
+    """Index of the centre."""
     centre_D: FloatArray
     fitness_weight: float
-    """How much fitness counts beside novelty in this generation, from 0 to 1."""
+    """Weight of fitness relative to novelty in this generation, from 0 to 1."""
 
 
 @dataclass(frozen=True)
 class CentreEvaluation:
-    """What the evaluation episodes say of a centre."""
+    """Result of the evaluation episodes of a centre."""
 
     generation: int
-    """0 for an initial centre."""
+    """Generation that produced the centre; 0 for an initial centre."""
     centre: int
+    """Index of the centre."""
     valid: bool
     """Whether fitness and descriptor of every episode are finite."""
     fitness: float
-    """Mean over the episodes."""
+    """Mean fitness over the episodes."""
     descriptor_B: NDArray[np.float64]
-    """Mean over the episodes."""
+    """Mean descriptor over the episodes."""
     population_max: float = np.nan
     """Highest fitness of a valid member of the population that led to it; NaN for an initial centre."""
 
@@ -113,12 +127,12 @@ class Algorithm:
     weights: Callable[[SearchState, Ask, EpisodesResult], NDArray[np.float32]]
     """(state, asked, the whole population's results with axes P, S) -> weight of each pair's noise [P]."""
     step: Callable[[SearchState, Ask, FloatArray], SearchState]
-    """(state, asked, gradient estimate [D]) -> state with the planned centre moved."""
+    """(state, asked, gradient estimate [D]) -> state with the asked centre moved up the gradient."""
     tell: Callable[[SearchState, CentreEvaluation], SearchState]
-    """(state, a centre's evaluation) -> state that has learned from it; initial centres come first, in order."""
+    """(state, evaluation of a centre) -> state updated with it. Initial centres are told first, in their order."""
     fitness_weight: float
-    """What the state's `weight` starts with."""
+    """Initial value of the state's `weight`."""
     start_cell: Callable[[SearchState, int], int | None] = lambda state, generation: None
-    """(state, generation) -> cell whose elite that generation starts from; None to go on from where it is."""
+    """(state, generation) -> cell whose elite the generation starts from; None to continue from the present centre."""
     restart: Callable[[SearchState, int, Elite], SearchState] = from_elite
     """(state, start cell, its elite) -> state that the generation starts from."""

@@ -1,7 +1,8 @@
-"""ES: one centre climbs the rank-shaped return. Salimans et al. 2017, with antithetic pairs and Adam.
+"""ES: one centre climbs rank-shaped fitness. Salimans et al. 2017 (arXiv:1703.03864), with antithetic pairs and Adam.
 
-Loop: mirrored rollouts -> utilities by centred rank of fitness -> gradient estimate (1 / pairs) * sum (u+ - u-) * noise
--> Adam on -gradient + l2 * centre. No division by sigma: Adam is scale-free, only the ratio to l2 would change.
+A generation: mirrored rollouts -> utilities by centred rank of fitness -> gradient estimate (1 / pairs) * sum (u+ - u-)
+* noise -> Adam on -gradient + l2 * centre. The estimate is not divided by sigma, because the step of Adam does not
+depend on the scale of its gradient; the division would only change the ratio to l2.
 """
 
 from __future__ import annotations
@@ -12,5 +13,5 @@ from es_service.search.algorithms.steps import novelty_search
 
 
 def es(config: RunConfig) -> Algorithm:
-    """Plain evolution strategy: fitness alone, one centre. Its archive is kept for comparison and steers nothing."""
+    """Plain evolution strategy: one centre climbs fitness. Its novelty archive is kept for comparison only."""
     return novelty_search(config, fitness_weight=1.0)

@@ -1,20 +1,22 @@
-"""ME-ES: ES steps between elites of a behaviour map. Colas et al. 2020 (arXiv:2003.01825).
+"""ME-ES: blocks of ES generations that start from elites of the behaviour map. Colas et al. 2020 (arXiv:2003.01825).
 
-Generations come in blocks of `block_generations`. Before a block an elite is drawn from the map and takes the centre's
-place with a fresh optimiser; inside it the ES climbs from wherever it has come, whether or not its centres entered the
-map. A block either explores, climbing novelty among all centres ever evaluated, or exploits, climbing fitness.
+A block has `block_generations` generations. At its start an elite is drawn from the map and replaces the centre, with a
+fresh optimiser. In the following generations the ES continues from its latest centre, whether or not its centres
+entered the map. A block either explores, which climbs novelty, or exploits, which climbs fitness.
 
-How the cell is drawn, no two sources agree on (`cell_sampling`). `top`, as QDax has it, whose authors say they follow
-the paper: exploring, one of the 5 most novel elites; exploiting, with probability a half each, one of the 2 fittest, or
-one of the 2 fittest of the 5 that entered last. `score`, as in the released code: exploring, any elite with probability
-0.1, else one of the 5 most novel in proportion to novelty; exploiting, with probability a half (and always with fewer
-than 5 elites) the one with the highest score, else, of the newest min(5, half of all) cells, one of the 2 with the
-highest scores in proportion to score - lowest score + 1.
+The sources differ in how the elite is drawn (`cell_sampling`):
 
-Our choices, in both: an elite's novelty is that of its descriptor in today's archive without its own entry (the
-released code lets it grow a generation old, and finds the own entry by distance 0), where all are 0 any elite is drawn;
-of equal elites the one in the cell that was filled first counts as better. While the map is empty, as long as no centre
-has been valid or after a fork that emptied it, the search goes on from where it is.
+* `top`, as in QDax, whose authors say they follow the paper. Exploring: one of the 5 most novel elites. Exploiting:
+  with probability 1/2 one of the 2 fittest elites, else one of the 2 fittest of the 5 elites that entered last.
+* `score`, as in the released code. Exploring: with probability 0.1 any elite, else one of the 5 most novel, with
+  probability proportional to novelty. Exploiting: with probability 1/2, and always with fewer than 5 elites, the elite
+  with the highest score; else one of the 2 elites with the highest scores among the min(5, half of all) cells that were
+  filled last, with probability proportional to score - lowest score + 1.
+
+Our own choices, for both: The novelty of an elite is that of its descriptor in the present novelty archive without the
+elite's own entry (the released code uses values that are one generation old, and finds the own entry by distance 0). If
+all novelties are 0, any elite is drawn. Of equally good elites the one whose cell was filled first counts as better.
+While the map is empty (no centre has been valid yet, or a fork emptied the map), the search continues from its centre.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.novelty import NoveltyArchive, novelty
 
 MODE_CHOICE, CELL_CHOICE = 1, 2
-"""Last ids of the streams of Domain.SELECTION: what a block does, where it starts."""
+"""Last ids of the random streams of Domain.SELECTION: for what a block does, and for the cell where it starts."""
 MOST_NOVEL, FITTEST, NEWEST = 5, 2, 5
 ANYWHERE = 0.1
 """Probability of exploring from any cell, with `cell_sampling: score`."""
@@ -42,7 +44,7 @@ Mode = Literal["explore", "exploit"]
 
 
 def me_es(config: RunConfig) -> Algorithm:
-    """MAP-Elites with ES: blocks of exploring or exploiting generations from elites of the behaviour map."""
+    """MAP-Elites with ES: blocks of exploring or exploiting generations that start from elites of the behaviour map."""
     search = config.search
     shared = novelty_search(config, fitness_weight=_weight(block_mode(search, config.seed, 1)))
 
@@ -64,7 +66,7 @@ def me_es(config: RunConfig) -> Algorithm:
 
 
 def block_mode(search: SearchConfig, seed: int, generation: int) -> Mode:
-    """What the block does that a generation (from 1 on) belongs to."""
+    """Whether the block of a generation (counted from 1) explores or exploits."""
     if search.mode != "explore_exploit":
         return search.mode
     block = (generation - 1) // search.block_generations
@@ -83,10 +85,12 @@ def cell_shares(
     sampling: Literal["top", "score"],
     drawn: float,
 ) -> NDArray[np.float64]:
-    """In what proportions the filled cells are drawn from, [N]; 0 for those that are not.
+    """Relative probability with which each filled cell of the map is drawn, [N] in the order of the map.
 
     Args:
-        drawn: uniform in [0, 1); chooses between two ways of drawing where there are two.
+        mode: what the block does.
+        sampling: `search.cell_sampling`.
+        drawn: a uniform random number in [0, 1), which decides where there are two ways of drawing.
     """
     share_N = np.zeros(map_.size)
     if mode == "explore":
@@ -102,7 +106,7 @@ def cell_shares(
         newest = np.arange(map_.size) if drawn < 0.5 else np.sort(_best(map_.generation_N, NEWEST))
         share_N[newest[_best(map_.fitness_N[newest], FITTEST)]] = 1.0
     else:
-        # Initial centres have no score: they come last, and count as much as the lowest.
+        # Initial centres have no score: they rank last, and are drawn as if they had the lowest score.
         known_N = np.isfinite(map_.score_N)
         lowest = map_.score_N[known_N].min() if known_N.any() else 0.0
         score_N = np.where(known_N, map_.score_N, -np.inf)
@@ -116,7 +120,7 @@ def cell_shares(
 
 
 def elite_novelty(map_: BehaviourMap, archive: NoveltyArchive, settings: NoveltyConfig) -> NDArray[np.float64]:
-    """Novelty of each elite's descriptor in the archive without the entry it made itself, [N]."""
+    """Novelty of each elite's descriptor in the novelty archive without the elite's own entry, [N]."""
     return novelty(
         archive,
         map_.descriptor_N_B,
@@ -127,8 +131,10 @@ def elite_novelty(map_: BehaviourMap, archive: NoveltyArchive, settings: Novelty
 
 
 def _own_entries(map_: BehaviourMap, archive: NoveltyArchive) -> NDArray[np.int64]:
-    """Index of the entry that each elite made, [N]; -1 of one that made none. Entries ascend by generation and, among
-    those of generation 0, centre."""
+    """Index of each elite's own entry in the novelty archive, [N]; -1 for an elite without one.
+
+    The search relies on the order of the entries: by generation and, within generation 0, by centre.
+    """
     centres = 1 + max(map_.centre_N.max(initial=0), archive.centre_N.max(initial=0))
     entry_N, elite_N = (one.generation_N * centres + one.centre_N for one in (archive, map_))
     found_N = np.searchsorted(entry_N, elite_N)
@@ -141,5 +147,5 @@ def _weight(mode: Mode) -> float:
 
 
 def _best(values: NDArray, count: int) -> NDArray[np.intp]:
-    """Indices of the highest values, descending; of equal ones the first."""
+    """Indices of the `count` highest values, in descending order; of equal values the first comes first."""
     return np.argsort(-values, kind="stable")[:count]

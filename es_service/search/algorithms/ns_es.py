@@ -1,4 +1,4 @@
-"""NS-ES: the ES that climbs novelty alone, with a meta-population. Conti et al. 2018 (arXiv:1712.06560)."""
+"""NS-ES: several centres climb novelty alone (a meta-population). Conti et al. 2018 (arXiv:1712.06560)."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from es_service.search.algorithms.steps import novelty_search
 
 
 def ns_es(config: RunConfig) -> Algorithm:
-    """Novelty search: rank of novelty; fitness steers nothing."""
+    """Novelty search: utilities are ranks of novelty; fitness has no influence."""
     return novelty_search(config, fitness_weight=0.0)

@@ -1,4 +1,4 @@
-"""NSR-ES: the ES that climbs novelty and fitness in equal parts. Conti et al. 2018 (arXiv:1712.06560)."""
+"""NSR-ES: several centres climb novelty and fitness in equal parts. Conti et al. 2018 (arXiv:1712.06560)."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from es_service.search.algorithms.steps import novelty_search
 
 
 def nsr_es(config: RunConfig) -> Algorithm:
-    """Novelty search with reward: mean of rank of novelty and rank of fitness."""
+    """Novelty search with reward: utilities are the mean of the ranks of novelty and of fitness."""
     return novelty_search(config, fitness_weight=0.5)

@@ -1,9 +1,9 @@
-"""NSRA-ES: novelty and fitness, the balance adapted to progress. Conti et al. 2018 (arXiv:1712.06560).
+"""NSRA-ES: novelty and fitness, with a weight that adapts to progress. Conti et al. 2018 (arXiv:1712.06560).
 
-w is the weight of fitness. Each evaluated centre either beats the record, which raises w by `fitness_weight_step` (to 1
-at most), or it does not; after `fitness_weight_patience` of those in a row w falls by a step (to 0 at least), and the
-count begins again. Record and count belong to the whole meta-population. Initial centres set no record, so the first
-centre after them always does, as in the released code.
+w is the weight of fitness. If an evaluated centre beats the record, w rises by `fitness_weight_step` (to at most 1).
+After `fitness_weight_patience` consecutive centres that do not, w falls by one step (to at least 0), and the count
+starts again. All centres share one record and one count. Initial centres set no record, so the first valid centre after
+them always does, as in the released code.
 """
 
 from __future__ import annotations
@@ -18,12 +18,16 @@ from es_service.search.algorithms.steps import novelty_search
 
 
 def nsra_es(config: RunConfig) -> Algorithm:
-    """Novelty search with reward, adaptive: more novelty while the best stagnates, more fitness while it improves."""
+    """Adaptive novelty search with reward: more weight on fitness after progress, more on novelty in stagnation."""
     return novelty_search(config, config.search.fitness_weight_start, partial(adapted_weight, config.search))
 
 
 def adapted_weight(search: SearchConfig, weight: FitnessWeight, evaluation: CentreEvaluation) -> FitnessWeight:
-    """w after one more evaluated centre. An invalid centre is no improvement."""
+    """The weight of fitness after one more evaluated centre.
+
+    The centre is an improvement if it is valid and its fitness exceeds record + fitness_weight_min_gain * |record|; a
+    fitness equal to this is not.
+    """
     bar = (
         weight.record + search.fitness_weight_min_gain * abs(weight.record)
         if math.isfinite(weight.record)

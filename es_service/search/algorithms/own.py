@@ -1,10 +1,11 @@
-"""A search of the user's own: `package.module:function`.
+"""Search algorithms of the user, named `package.module:function`.
 
     def function(config: RunConfig) -> Algorithm: ...
 
-`es_service.search.algorithms.base` has what an Algorithm is made of, `steps` what ours share: most searches are one of
-ours with one function replaced. What it remembers between generations is a `SearchState`, which the run store keeps; a
-value kept anywhere else is lost with the process. It runs in the driver; a docstring's first line says what it is.
+`es_service.search.algorithms.base` defines `Algorithm`; `steps` has the functions that the shipped algorithms share.
+Most searches of your own are a shipped one with one function replaced. A search remembers between generations only its
+`SearchState`, which the run store keeps; a value kept anywhere else is lost when the process ends. The search runs in
+the driver.
 """
 
 from __future__ import annotations
@@ -20,24 +21,25 @@ from es_service.search.algorithms.base import Algorithm
 
 
 def import_factory(path: str) -> Callable[[RunConfig], object]:
-    """The user's function. Raises ConfigError if it cannot be had."""
+    """Import the user's function. Raises ConfigError if this fails, or if there is no such function."""
     module, _, name = path.partition(":")
     if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # a console script does not look where it was started
+        sys.path.append(os.getcwd())  # a console script does not search its working folder
     try:
         found = getattr(importlib.import_module(module), name, None)
     except Exception as error:  # the user's code can raise anything
         kind = type(error).__name__
         raise ConfigError(
-            f"cannot import {module} ({kind}: {error}); start in the folder that contains it, or install it"
+            f"cannot import {module} ({kind}: {error}); start in the folder that contains the module, or install it"
         ) from error
     if not callable(found):
-        raise ConfigError(f"{module} has no function {name!r}; es_service/search/algorithms/own.py says what is needed")
+        needed = "es_service/search/algorithms/own.py describes the function that is needed"
+        raise ConfigError(f"{module} has no function {name!r}; {needed}")
     return found
 
 
 def make_own(path: str, config: RunConfig) -> Algorithm:
-    """The search that a user's function makes for a run. Raises ConfigError if it raises, or makes something else."""
+    """Call the user's function for a run. Raises ConfigError if this fails or does not return an `Algorithm`."""
     factory = import_factory(path)
     try:
         made = factory(config)
@@ -45,6 +47,6 @@ def make_own(path: str, config: RunConfig) -> Algorithm:
         raise ConfigError(f"search.algorithm: {path} raised {type(error).__name__}: {error}") from error
     if not isinstance(made, Algorithm):
         raise ConfigError(
-            f"search.algorithm: {path} returned {made!r}, which is no es_service.search.algorithms.base.Algorithm"
+            f"search.algorithm: {path} returned {made!r}; it must return an es_service.search.algorithms.base.Algorithm"
         )
     return made

@@ -1,4 +1,8 @@
-"""Steps that the search algorithms share; each algorithm's own file says which it takes."""
+"""Functions that the search algorithms share; the file of each algorithm says which it uses.
+
+Axes: M centres of the search (C is the axis of a cvt map's centroids), N entries of the novelty archive, P antithetic
+pairs, S signs [+, -], B descriptor dimensions, D policy parameters.
+"""
 
 from __future__ import annotations
 
@@ -27,17 +31,17 @@ from es_service.search.optimizer import adam_ascent, fresh_adam
 from es_service.search.shaping import centred_ranks, pair_weights
 
 CENTRE_CHOICE = 0
-"""Last id of the streams of Domain.SELECTION: which centre to update."""
+"""Last id of the random streams of Domain.SELECTION that choose the centre to update."""
 
 AdaptWeight = Callable[[FitnessWeight, CentreEvaluation], FitnessWeight]
 
 
 def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight | None = None) -> Algorithm:
-    """A member of the family of Conti et al. 2018: ES on (1 - w) * rank(novelty) + w * rank(fitness).
+    """An algorithm of the family of Conti et al. 2018: ES on the utility (1 - w) * rank(novelty) + w * rank(fitness).
 
     Args:
-        fitness_weight: w, at the start.
-        adapt: how an evaluated centre (not an initial one) changes w; None if nothing does.
+        fitness_weight: initial value of w.
+        adapt: (weight, evaluation of a centre that is not an initial one) -> new weight; None for a constant w.
     """
 
     def ask(state: SearchState, generation: int) -> Ask:
@@ -62,17 +66,24 @@ def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight 
 def first_state(
     centres: Sequence[FloatArray], dimensions: int, fitness_weight: float, map_: BehaviourMap | None = None
 ) -> SearchState:
-    """The state before any evaluation: initial centres, fresh optimisers, an empty archive, an empty map or none."""
+    """The state before any evaluation: initial centres, fresh optimisers and an empty novelty archive.
+
+    Args:
+        centres: parameters of each initial centre, [D] each.
+        dimensions: number of descriptor dimensions.
+        fitness_weight: initial weight of fitness.
+        map_: the empty behaviour map; None for a run without one.
+    """
     states = tuple(CentreState(centre_D, fresh_adam(centre_D.size)) for centre_D in centres)
     return SearchState(states, empty_archive(dimensions), FitnessWeight(fitness_weight), map_)
 
 
 def choose_centre(state: SearchState, generation: int, config: RunConfig) -> int:
-    """Index of the centre to update in a generation.
+    """Index of the centre to update in a generation, by `search.centre_choice`.
 
-    novelty: with probability proportional to its novelty among all centres ever evaluated, judged now; a centre that
-    was never valid counts as the most novel one; uniform if all are 0. uniform: each with the same probability.
-    round_robin: in turn, centre 0 in generation 1.
+    novelty: with probability proportional to the centre's novelty in the present novelty archive; a centre without a
+    valid evaluation counts as the most novel one; if all novelties are 0, all have the same probability.
+    uniform: all with the same probability. round_robin: in turn, starting with centre 0 in generation 1.
     """
     count, how = len(state.centres), config.search.centre_choice
     if count == 1:
@@ -92,7 +103,7 @@ def choose_centre(state: SearchState, generation: int, config: RunConfig) -> int
 
 
 def novelty_of_centres(state: SearchState, settings: NoveltyConfig) -> NDArray[np.float64]:
-    """Novelty of each centre, as it was when last valid, in the archive without that entry; 0 if it never was."""
+    """Novelty of each centre's newest entry in the novelty archive without that entry, [M]; 0 if it has no entry."""
     novelty_M = np.zeros(len(state.centres))
     entry_M = np.array([centre.entry for centre in state.centres])
     known_M = np.flatnonzero(entry_M != NO_ENTRY)
@@ -109,10 +120,11 @@ def novelty_of_centres(state: SearchState, settings: NoveltyConfig) -> NDArray[n
 def mixed_utilities(
     state: SearchState, w: float, population: EpisodesResult, settings: NoveltyConfig
 ) -> NDArray[np.float64]:
-    """(1 - w) * rank(novelty) + w * rank(fitness) per member of the population, axes [P, S].
+    """Utility of each member of the population, [P, S]: (1 - w) * rank(novelty) + w * rank(fitness).
 
-    Ranks are taken per objective and then mixed, so that the scales of fitness and novelty do not matter. Novelty is
-    judged in the archive as it was before the generation. An invalid member (fitness NaN) is last in both.
+    Ranks are those of `centred_ranks`, in [-0.5, 0.5], taken for each objective separately, so that the scales of
+    fitness and novelty do not matter. Novelty is computed in the novelty archive as it was before the generation. An
+    invalid member (fitness NaN) has the lowest rank in both.
     """
     utility_P_S = np.zeros(population.fitness.shape)
     if w > 0.0:
@@ -127,7 +139,7 @@ def mixed_utilities(
 
 
 def moved(state: SearchState, asked: Ask, gradient_D: FloatArray, search: SearchConfig) -> SearchState:
-    """The state with the asked centre one step up the gradient estimate, by its own Adam; the others untouched."""
+    """The state after one step of the asked centre up the gradient estimate [D], by its own Adam."""
     centre = state.centres[asked.centre]
     adam, centre_D = adam_ascent(
         centre.adam, centre.centre_D, gradient_D, learning_rate=search.learning_rate, l2=search.l2
@@ -136,7 +148,7 @@ def moved(state: SearchState, asked: Ask, gradient_D: FloatArray, search: Search
 
 
 def archived(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
-    """The state with a valid centre in the archive, as its newest entry."""
+    """The state with a valid centre appended to the novelty archive; unchanged for an invalid centre."""
     if not evaluation.valid:
         return state
     archive = extended(state.archive, evaluation.descriptor_B, evaluation.generation, evaluation.centre)
@@ -145,9 +157,10 @@ def archived(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
 
 
 def mapped(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
-    """The state with a valid centre offered to the map; the centre then knows of which cell it is the elite, if any.
+    """The state with a valid centre inserted into the behaviour map, if it is better than the elite of its cell.
 
-    A centre that was an elite first hands that cell the score of the population it led.
+    `CentreState.cell` is then the cell whose elite the centre is, or NO_CELL. If the centre was an elite before this
+    generation, that elite first gets a new score: the highest fitness of the population around it.
     """
     centre, map_ = state.centres[evaluation.centre], state.map
     if map_ is None:

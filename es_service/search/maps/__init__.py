@@ -1,1 +1,1 @@
-"""The behaviour map: cells of the descriptor space, and in each the fittest centre that was ever evaluated there."""
+"""The behaviour map (archive in pyribs, repertoire in QDax): cells of the descriptor space, each with its elite."""

@@ -1,8 +1,9 @@
-"""The map's light half, which the driver keeps in memory: what is known of each cell's elite, but not its parameters.
+"""The behaviour map as the driver keeps it in memory: fitness, descriptor and origin of each cell's elite.
 
-An elite is the centre with the highest mean fitness over its evaluation episodes among all that ended, on average, in a
-cell. Its parameters, its observation statistics and the trace of one of its episodes are written to the run store when
-it enters and read again when it is wanted. N: filled cells, in the order of their discovery; B: descriptor dimensions.
+An elite is the evaluated centre with the highest mean fitness among all whose mean descriptor is in a cell. Its
+parameters, its observation statistics and the trace of one of its episodes are written to the run store when it enters
+the map and read when they are needed. Axes: N filled cells, in the order in which they were first filled; B descriptor
+dimensions; D policy parameters; O observation; T points of a trace.
 """
 
 from __future__ import annotations
@@ -19,19 +20,21 @@ from es_service.search.maps.geometry import Geometry
 
 @dataclass(frozen=True)
 class BehaviourMap:
-    """The filled cells. Insertion gives a new map; the old one stays as it is."""
+    """The filled cells of a map. It is immutable: `insert` returns a new map."""
 
     geometry: Geometry
     cell_N: NDArray[np.int64]
+    """Number of each filled cell, as `geometry` counts cells."""
     fitness_N: NDArray[np.float64]
-    """Mean over the evaluation episodes, never estimated again."""
+    """Mean fitness over the evaluation episodes; it is never estimated again."""
     descriptor_N_B: NDArray[np.float64]
     generation_N: NDArray[np.int64]
-    """In which each elite was evaluated."""
+    """Generation in which each elite was evaluated; 0 for initial centres."""
     centre_N: NDArray[np.int64]
+    """Index of the centre that became the elite."""
     score_N: NDArray[np.float64]
-    """Highest fitness of a population member in the generation that made the elite, or in the latest one that started
-    from it: a lucky number, by which `cell_sampling: score` chooses. NaN where there was no population."""
+    """Highest fitness of a member of the population that led to the elite or, later, of the latest population around
+    it; one noisy value, which `cell_sampling: score` uses. NaN where there was no population."""
 
     @property
     def size(self) -> int:
@@ -39,26 +42,26 @@ class BehaviourMap:
         return self.cell_N.size
 
     def row_of(self, cell: int) -> int | None:
-        """Where in the arrays a cell is; None if it is empty."""
+        """Index of a cell on axis N; None if the cell is empty."""
         found = np.flatnonzero(self.cell_N == cell)
         return int(found[0]) if found.size else None
 
     def cell_of(self, generation: int, centre: int) -> int | None:
-        """The cell whose elite a centre is as it was in a generation; None if it is none's."""
+        """The cell whose elite is the centre that was evaluated in a generation; None if there is none."""
         found = np.flatnonzero((self.generation_N == generation) & (self.centre_N == centre))
         return int(self.cell_N[found[0]]) if found.size else None
 
 
 @dataclass(frozen=True)
 class Elite:
-    """The map's heavy half: what a cell's elite is made of."""
+    """The elite of a cell as the run store keeps it: parameters, observation statistics and trace."""
 
     centre_D: FloatArray
     observation_mean_O: FloatArray
     observation_std_O: FloatArray
-    """Statistics it was evaluated with."""
+    """Mean and standard deviation of observations with which it was evaluated."""
     trace_T_B: FloatArray
-    """Descriptor along one evaluation episode, from its reset to its end in equal steps."""
+    """Descriptor along one evaluation episode, from reset to end at equal intervals."""
 
 
 def empty_map(geometry: Geometry) -> BehaviourMap:
@@ -71,9 +74,15 @@ def empty_map(geometry: Geometry) -> BehaviourMap:
 def insert(
     map_: BehaviourMap, descriptor_B: NDArray[np.float64], fitness: float, generation: int, centre: int, score: float
 ) -> tuple[BehaviourMap, int, bool]:
-    """Offer an evaluated centre to its cell: (map, cell, whether it is the cell's elite now).
+    """Insert an evaluated centre if it is better than its cell's elite: (new map, cell, whether it was inserted).
 
-    It is if the cell was empty or its elite's fitness is less; an equal one stays.
+    It is inserted if the cell was empty or the fitness of the present elite is strictly lower; if they are equal, the
+    present elite stays.
+
+    Args:
+        descriptor_B: mean descriptor, finite.
+        fitness: mean fitness over the evaluation episodes.
+        score: see `BehaviourMap.score_N`.
     """
     cell = int(map_.geometry.cells_of(descriptor_B[None])[0])
     row = map_.row_of(cell)
@@ -108,7 +117,7 @@ def insert(
 
 
 def with_score(map_: BehaviourMap, cell: int, centre: int, score: float) -> BehaviourMap:
-    """The map with another score of the elite that a centre has in a cell; unchanged if it is another centre's now."""
+    """The map with a new score for a cell's elite; unchanged if the elite is not from the centre with this index."""
     row = map_.row_of(cell)
     if row is None or map_.centre_N[row] != centre:
         return map_
@@ -118,8 +127,14 @@ def with_score(map_: BehaviourMap, cell: int, centre: int, score: float) -> Beha
 def map_statistics(
     map_: BehaviourMap, qd_offset: float, reachable: NDArray[np.bool_] | None
 ) -> dict[str, float | None]:
-    """Coverage, best fitness and QD-score of a map: the sum over elites of fitness - qd_offset, exact before its last
-    rounding, so that the order of the cells does not matter."""
+    """Coverage, best fitness and QD-score of a map, by history column.
+
+    The QD-score is the sum of fitness - qd_offset over all elites. It is summed exactly and rounded once, so that the
+    order of the cells does not matter.
+
+    Args:
+        reachable: whether each cell can be reached, [cells]; None if this is unknown.
+    """
     filled = map_.size
     return {
         "map_cells": filled,
@@ -131,7 +146,7 @@ def map_statistics(
 
 
 def make_elite(centre: Centre, trace_T_B: FloatArray) -> Elite:
-    """What is kept of a centre that has become an elite."""
+    """The elite made of a centre that has entered the map."""
     return Elite(centre.parameters_D, centre.observation_mean_O, centre.observation_std_O, trace_T_B)
 
 

@@ -1,8 +1,8 @@
-"""How the space of descriptors is cut into cells: a regular grid, or the Voronoi cells of spread-out centroids.
+"""Division of the descriptor space into cells: a regular grid, or the Voronoi cells of evenly spread centroids.
 
-Descriptors outside the bounds belong to the nearest cell of the border. Everything is float64 and written so that equal
-descriptors fall into equal cells on every machine. Where the centroids of a cvt come to lie may depend on it, so they
-are stored with the run.
+Descriptors outside the bounds belong to a cell at the border. All computation is in float64 and written so that equal
+descriptors fall into the same cell on every machine. The positions of a cvt's centroids may depend on the machine, so
+they are stored with the run. Axes: N descriptors or places, B descriptor dimensions, C centroids.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from es_service.config.model import MapConfig
 
 LATTICE_PER_CELL = 8
-"""Places along each side of a cell that are looked at to find out whether it can be reached."""
+"""Number of places along each side of a cell that are tested to find out whether the cell can be reached."""
 MOST_LATTICE_POINTS = 2_000_000
 OUTER_LATTICE = 100
 SAMPLES_PER_CENTROID = 50
 LLOYD_STEPS = 20
 CENTROID_STREAM = 2**32
-"""Last id of the stream of Domain.INITIALISATION that places centroids; no centre has it."""
+"""Last id of the random stream of Domain.INITIALISATION that places centroids; no centre has this id."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A regular grid. Cells are numbered with the last descriptor dimension running fastest."""
+    """A regular grid. Cells are numbered in row-major order: the last descriptor dimension changes fastest."""
 
     bounds: Bounds
     shape: tuple[int, ...]
@@ -46,15 +46,18 @@ class Grid:
 
     @cached_property
     def edges(self) -> tuple[NDArray[np.float64], ...]:
-        """Per dimension: edge i is low + i * (high - low) / cells, the last exactly high."""
+        """Edges of cells along each dimension: edge i is low + i * (high - low) / cells; the last is exactly high."""
         return tuple(
             np.array([*(low + i * (high - low) / cells for i in range(cells)), high])
             for (low, high), cells in zip(self.bounds, self.shape, strict=True)
         )
 
     def cells_of(self, descriptor_N_B: ArrayLike) -> NDArray[np.int64]:
-        """Cell of each finite descriptor. Cell i reaches from edge i (included) to edge i + 1 (excluded); the last one
-        includes its upper edge. Outside the bounds: the border cell."""
+        """Cell of each finite descriptor, [N].
+
+        Along each dimension, cell i reaches from edge i (included) to edge i + 1 (excluded); the last cell includes its
+        upper edge. A descriptor outside the bounds belongs to the border cell.
+        """
         descriptor_N_B = np.asarray(descriptor_N_B, np.float64)
         cell_N = np.zeros(len(descriptor_N_B), np.int64)
         for b, (edges, cells) in enumerate(zip(self.edges, self.shape, strict=True)):
@@ -62,7 +65,7 @@ class Grid:
         return cell_N
 
     def index_of(self, cell: int) -> tuple[int, ...]:
-        """The cell's place along each dimension, as users name it: `--cell 3,17`."""
+        """Index of a cell along each dimension, as users write it: `--cell 3,17`."""
         return tuple(int(i) for i in np.unravel_index(cell, self.shape))
 
     def cell_at(self, index: tuple[int, ...]) -> int | None:
@@ -76,7 +79,7 @@ class Grid:
 class Cvt:
     """Cells around centroids that are spread evenly: a centroidal Voronoi tessellation (Vassiliades et al. 2018).
 
-    Distances are measured with the bounds of each dimension as its unit, so that metres and fractions count alike.
+    Distances are measured in units of high - low of each dimension, so that all dimensions count equally.
     """
 
     bounds: Bounds
@@ -89,11 +92,11 @@ class Cvt:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """As of a grid with one dimension."""
+        """The number of cells, as for a grid with one dimension."""
         return (self.size,)
 
     def cells_of(self, descriptor_N_B: ArrayLike) -> NDArray[np.int64]:
-        """Index of the nearest centroid; of equally near ones the first."""
+        """Index of the centroid nearest to each descriptor, [N]; of equally near ones the first."""
         descriptor_N_B = np.asarray(descriptor_N_B, np.float64)
         cell_N = np.zeros(len(descriptor_N_B), np.int64)
         block = max(1, 2**20 // self.size)
@@ -108,7 +111,7 @@ class Cvt:
         return cell_N
 
     def index_of(self, cell: int) -> tuple[int, ...]:
-        """The cell's number, alone."""
+        """The cell's number, as an index with one element."""
         return (cell,)
 
     def cell_at(self, index: tuple[int, ...]) -> int | None:
@@ -120,24 +123,25 @@ Geometry = Grid | Cvt
 
 
 def make_geometry(config: MapConfig) -> Geometry:
-    """The cells that a config asks for; the same for every seed, so that runs can be compared cell by cell."""
+    """The cells that a config specifies; they are the same for every seed, so that runs can be compared by cell."""
     if config.kind == "grid":
         return Grid(config.bounds, config.cells)
     return Cvt(config.bounds, _centroids(config.bounds, config.cells[0]))
 
 
 def reachable_cells(geometry: Geometry, task: TaskSpec) -> NDArray[np.bool_] | None:
-    """Whether each cell holds a place where an episode can end, [cells]; None where the task does not know its walls.
+    """Whether each cell contains a place where an episode can end, [cells]; None if this is unknown.
 
-    Out of reach is what is nearer than `task.wall_clearance` to the middle of a wall, and what is outside the task's
-    own bounds. None, too, for more than two million cells.
+    A place cannot be reached if it is nearer to the middle of a wall than `task.wall_clearance`, or outside the task's
+    own bounds. The result is None if the task does not specify its walls, if the descriptor does not have two
+    dimensions, if there are more than two million cells, or if no cell could be reached.
     """
     if task.walls is None or len(geometry.bounds) != 2 or geometry.size > MOST_LATTICE_POINTS:
         return None
     per_cell = min(LATTICE_PER_CELL, int(math.sqrt(MOST_LATTICE_POINTS / geometry.size)))
     shape = geometry.shape if isinstance(geometry, Grid) else (math.isqrt(geometry.size) + 1,) * 2
-    # The same number of places in each cell of a grid, so that none is missed; what lies outside the map's bounds
-    # belongs to its border cells.
+    # Each cell of a grid gets the same number of places, so that none is missed. The second lattice covers the task's
+    # bounds, because places outside the map's bounds belong to its border cells.
     place_N_2 = np.concatenate(
         [
             _lattice(geometry.bounds, (per_cell * shape[0], per_cell * shape[1])),
@@ -157,7 +161,7 @@ def reachable_cells(geometry: Geometry, task: TaskSpec) -> NDArray[np.bool_] | N
 
 
 def _lattice(bounds: Bounds, counts: tuple[int, int]) -> NDArray[np.float64]:
-    """The middles of equal rectangles that fill a plane region, [counts[0] * counts[1], 2]."""
+    """Midpoints of equal rectangles that fill a region of the plane, [counts[0] * counts[1], 2]."""
     axes = [
         low + (np.arange(count) + 0.5) / count * (high - low) for count, (low, high) in zip(counts, bounds, strict=True)
     ]
@@ -165,8 +169,8 @@ def _lattice(bounds: Bounds, counts: tuple[int, int]) -> NDArray[np.float64]:
 
 
 def _centroids(bounds: Bounds, count: int) -> NDArray[np.float64]:
-    """Lloyd's algorithm on random points, from the first of them."""
-    from scipy.cluster.vq import kmeans2  # a tenth of a second that most runs need not spend
+    """Evenly spread centroids, [C, B]: Lloyd's algorithm on random places, started from the first `count` of them."""
+    from scipy.cluster.vq import kmeans2  # imported late: it takes 0.1 s, and most runs do not need it
 
     low_B, high_B = np.array(bounds, np.float64).T
     samples = SAMPLES_PER_CENTROID * count
