@@ -1,6 +1,6 @@
 """Evolution strategies for neuro-evolution: `from es_service import load_config, run, open_run`.
 
-Names come from `es_service.api` when they are first used, so that importing a part of the package imports no more.
+Names are imported from `es_service.api` at their first use, so that importing one module does not import everything.
 """
 
 from __future__ import annotations

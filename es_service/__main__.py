@@ -1,6 +1,7 @@
-"""Entry point of `es-service` and `python -m es_service`: signals first, everything else after.
+"""Entry point of `es-service` and `python -m es_service`.
 
-Importing takes half a second; a Ctrl-C in it should not end in a traceback either.
+It installs signal handlers before it imports the rest, because the imports take half a second, in which Ctrl-C should
+not cause a traceback.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def main() -> None:
 
         run_command()
     except Interrupted as stop:
-        # All is closed and told. Python's own end crashes where the signal met Ray while Ray's handlers were in force.
+        # All is closed and reported. Python's own exit crashes if the signal arrived while Ray had its handlers set.
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError):
                 stream.flush()

@@ -1,4 +1,4 @@
-"""The Python interface: start a run, go on with it, fork it."""
+"""The Python interface: start, resume and fork runs."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook
 
 RUNS_FOLDER = Path("runs")
-"""Where runs go unless told otherwise, relative to the current folder."""
+"""Default parent folder of runs, relative to the current folder."""
 
 
 _KEPT_OF_A_TASK = ("observation_size", "action_size", "descriptor_names", "has_goal")
-"""What policies and history of a run depend on."""
+"""Fields of a task that the policies and the history of a run depend on."""
 
 
 def _ignore(row: Mapping[str, Any]) -> None:
-    """Nothing to do for a generation."""
+    """Do nothing; the default for `on_generation`."""
 
 
 def _warn(notice: str) -> None:
@@ -57,15 +57,19 @@ def run(
     on_notice: OnNotice = _warn,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
-    """Start a run and work until its budget is spent.
+    """Start a run and continue it until its budget is spent.
 
     Args:
-        out: folder of the run, new or empty, made with its parents; default
+        config: a RunConfig, or what `load_config` accepts.
+        out: folder of the run, new or empty, which is created with its parents; default
             runs/<environment>_<algorithm>_seed<seed>_<time>-<process>.
-        hook: called at the store's named points; for tests that kill the process there.
+        on_generation: called with the history row of each generation after it is committed.
+        on_notice: called with each notice for the user; by default, notices are RuntimeWarnings.
+        hook: called with the name of each point of the store that is passed; for tests that kill the process there.
 
     Raises:
-        ConfigError, StoreError, EvaluationError; Interrupted after SIGINT or SIGTERM. Committed generations are safe.
+        ConfigError: the config is wrong. StoreError: the folder cannot be used. EvaluationError: the rollouts cannot
+            continue. Interrupted: SIGINT or SIGTERM arrived. Committed generations are safe in every case.
     """
     if not isinstance(config, RunConfig):
         config = load_config(config)
@@ -83,17 +87,17 @@ def resume(
     on_notice: OnNotice = _warn,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
-    """Go on with a run from its last committed generation; it ends with the same bits as if never interrupted.
+    """Continue a run from its last committed generation; its result has the same bits as without an interruption.
 
     Args:
-        overrides: only budget, engine, workers and time limits may change; the run's `config.yaml` then says so.
+        overrides: only budget, engine, workers and time limits may change; the run's `config.yaml` records the change.
 
     Raises:
         ConfigError: a constant of the run would change (all are listed). Otherwise as `run`.
     """
 
     def changed(store: RunStore) -> RunConfig:
-        # All of the file, unlike `Run.present_config`: whoever has edited a constant there is to be told, not ignored.
+        # The whole file, unlike `Run.present_config`: a constant that was edited there must be refused, not ignored.
         recorded = store.folder / CONFIG
         source = recorded if recorded.exists() else store.meta.config
         return changed_config(source, overrides)
@@ -108,7 +112,7 @@ def run_or_resume(
     on_generation: OnGeneration = _ignore,
     on_notice: OnNotice = _warn,
 ) -> Outcome:
-    """Start a run, or go on with it if the folder holds it already: the same call again after whatever happened.
+    """Start a run, or resume it if the folder already holds it; the same call can be repeated after any interruption.
 
     Raises:
         ConfigError: the folder's run has other constants than `config` (all are listed). Otherwise as `run`.
@@ -127,9 +131,9 @@ def _go_on(
     on_notice: OnNotice,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
-    """Open a run, make sure that the config for this session is its own, and work."""
+    """Open a run, check that the config of this session fits it, and continue it."""
     with RunStore.open(folder, hook=hook) as store, in_run(store.meta.run_id):
-        # What opening has repaired stays so, whatever is refused now. Told once: `work` tells what is there later.
+        # Repairs remain even if the config is refused below, so they are reported now; `work` reports later notices.
         for notice in store.notices:
             on_notice(notice)
         store.notices.clear()
@@ -140,8 +144,8 @@ def _go_on(
         task = task_of(config)
         if other := _other_task(store.meta.task, task):
             raise ConfigError(
-                f"{folder}: the task {config.task.environment} is not what it was ({other}), so what the run has kept "
-                "does not fit it; undo that, or start a new run",
+                f"{folder}: the task {config.task.environment} has changed since the run was created ({other}), so the "
+                "run's data do not fit it; undo the change, or start a new run",
                 field="task.environment",
                 value=config.task.environment,
                 run=folder,
@@ -151,7 +155,7 @@ def _go_on(
                 f"{folder} was written by a version of es-service with other history columns; continue it with that "
                 "version",
                 run=folder,
-                ways_out=[WayOut("fork", "go on from its state in a new run", str(folder))],
+                ways_out=[WayOut("fork", "continue from its state in a new run", str(folder))],
             )
         try:
             write_config(folder, config.resolved_yaml())
@@ -161,8 +165,8 @@ def _go_on(
 
 
 def _budget_of_a_fork(config: RunConfig, standing: Standing) -> dict[str, Any]:
-    """The keys of the budget that a fork has to set besides those that are to change: what it would not take over from
-    the run, and what it would find spent."""
+    """Budget settings that a fork needs besides the changed keys: the limits in `config` that differ from those of the
+    run, and larger limits where they are already spent."""
     limits = limits_of(config.budget)
     wanted = {key: limits.get(key) for key in REACHED if limits.get(key) != standing.limits.get(key)}
     wanted |= raised(limits, standing.row) if standing.row else {}
@@ -170,7 +174,7 @@ def _budget_of_a_fork(config: RunConfig, standing: Standing) -> dict[str, Any]:
 
 
 def _other_task(recorded: Mapping[str, Any], task: TaskSpec) -> str:
-    """Where a task, a user's that was edited, has other policies or another history than it had; empty if nowhere."""
+    """Differences between the recorded task and the present one that the run's data depend on; empty if none."""
     present = asdict(task) | {"descriptor_names": list(task.descriptor_names)}
     values = [(name, recorded[name], present[name]) for name in _KEPT_OF_A_TASK]
     return ", ".join(f"{name}: {show(old)} -> {show(new)}" for name, old, new in values if old != new)
@@ -186,33 +190,36 @@ def fork(
     on_notice: OnNotice = _warn,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
-    """Start a new run from another run's state (the newest, or that of `generation` if it is kept), settings changed.
+    """Start a new run from another run's state, with changed settings.
 
-    The history up to there comes along and generations count on, so a fork that changes nothing ends with the same
-    bits as its parent would. Where a setting changes what an evaluation means, of the task or of how observations are
-    normalised, no fitness seen so far counts any more: the best centre, nsra_es's record and the map begin anew; the
-    weight of fitness stays as it is. From one of ns_es, nsr_es and nsra_es a fork may go to another, whose weight of
-    fitness then begins anew. A generation's number alone says what me_es does in it, so that other blocks
-    (`search.block_generations`, `mode`, `first_block`, `alternation`) count at once, also in the middle of one.
+    The new run copies the history and continues the numbering of generations, so a fork without changes ends with the
+    same bits as its parent. If a setting changes the meaning of an evaluation (the task, or how observations are
+    normalised), all past fitness is discarded: the best centre, nsra_es's record and the map start again; the weight
+    of fitness is kept. A fork may change between ns_es, nsr_es and nsra_es; its weight of fitness then starts again.
+    me_es derives its blocks from the generation's number alone, so changes of `search.block_generations`, `mode`,
+    `first_block` and `alternation` take effect at once, also in the middle of a block.
+
+    Args:
+        generation: one of the parent's last two generations; None: the newest.
 
     Raises:
-        ConfigError: a change that the state does not fit (another task, descriptor, network, algorithm or map), or that
-            a fork has no use for. StoreError: the generation is not kept. Otherwise as `run`.
+        ConfigError: the state does not fit a change (another task, descriptor, network, algorithm or map), or a key
+            would have no effect. StoreError: the generation is not kept. Otherwise as `run`.
     """
     config = fork_config(parent, overrides)
     lineage, beginning = forked(open_run(parent), config, generation)
     outcome = _create_and_work(config, out, lineage, beginning, on_generation, on_notice, hook)
     if outcome.run.generation == (begun := lineage["generation"]):
         on_notice(
-            f"nothing was run: {outcome.reason} at generation {begun} already, where this fork begins; resume it with "
-            "a larger budget"
+            f"no generation was run: {outcome.reason} already at generation {begun}, where this fork begins; resume it "
+            "with a larger budget"
         )
     return outcome
 
 
 def default_folder(config: RunConfig) -> Path:
-    """A new folder name under `runs/` that says what the run is and when it began; runs begun together have their
-    process's number besides, so that none is refused the other's folder."""
+    """A new folder under `runs/`, named after task, algorithm, seed, time and process id, so that runs that start at
+    the same time get different folders."""
     when = datetime.now().strftime("%Y%m%d-%H%M%S")
     name = f"{config.task.environment}_{config.search.algorithm}_seed{config.seed}_{when}-{os.getpid()}"
     names = (name if number == 1 else f"{name}-{number}" for number in count(1))

@@ -1,4 +1,4 @@
-"""The error family. Each error has a sentence for a tired user and, as data, what it knows: field, value, ways out.
+"""The errors of this package. Each has a sentence for the user and, as data, its field, value and ways out.
 
     try:
         resume("runs/a", ["search.sigma=0.3"])
@@ -7,7 +7,7 @@
         fork(way.run, way.settings)
 
 `str(error)` ends with the ways out as Python calls; the command line prints the same ones as shell commands. Every
-error survives pickling, for callers that have runs in processes of a pool.
+error can be pickled, for callers that run in the processes of a pool.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ Action = Literal["run", "resume", "fork", "watch", "install"]
 
 @dataclass(frozen=True)
 class WayOut:
-    """Something to do about an error: one of the functions of `es_service.api`, and its arguments."""
+    """A remedy for an error: a function of `es_service.api` and its arguments."""
 
     action: Action
-    """run, resume and fork are functions; watch is `open_run`; install is about this package's own extras."""
+    """run, resume and fork are functions; watch stands for `open_run`; install, for an installation of an extra."""
     purpose: str
-    """What it is good for, to be read after "to": "continue it"."""
+    """What it achieves, as words that follow "to", such as "continue it"."""
     run: str | None = None
-    """Folder of the run to resume, fork or watch; None where whoever raised the error did not know it."""
+    """Folder of the run to resume, fork or watch; None if it is not known where the error is raised."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Keys of the config to set, and their values."""
     out: str | None = None
-    """With run: the folder of the new run."""
+    """Folder of the new run, for the action run."""
     extra: str | None = None
-    """With install: the extra of this package that is needed."""
+    """Extra of this package that is needed, for the action install."""
 
     def call(self) -> str:
-        """The Python call; of an installation, the command, which no call stands for."""
+        """The Python call as text; for an installation, the shell command."""
         settings = repr(dict(self.settings)) if self.settings else ""
         match self.action:
             case "install":
-                # No package index has es-service itself.
+                # es-service is on no package index, so a clone is needed.
                 return f"in a clone of es-service: pip install -c constraints.txt -e '.[{self.extra}]'"
             case "run":
                 config = f"load_config(config, {settings})" if settings else "config"
@@ -57,19 +57,19 @@ class Problem:
     """One thing that is wrong with a config."""
 
     sentence: str
-    """A line for the user; it begins with the field where there is one."""
+    """One line for the user; it begins with the field, if there is one."""
     field: str | None = None
-    """Dotted key."""
+    """Dotted key of the config."""
     value: Any = None
-    """What was given."""
+    """The value given."""
     allowed: str | None = None
-    """What would be right, in words."""
+    """The allowed values, in words."""
     suggestion: Any = None
-    """What was probably meant: a name or a value."""
+    """The name or value that was probably meant."""
 
 
 class ServiceError(Exception):
-    """Base of everything this package raises on purpose; the command line prints it without a traceback."""
+    """Base class of all errors that this package raises; the command line prints them without a traceback."""
 
     def __init__(
         self,
@@ -82,22 +82,22 @@ class ServiceError(Exception):
         run: object = None,
         ways_out: Sequence[WayOut] = (),
     ) -> None:
-        """As the attributes; `run` is anything that `str` makes a folder's name of."""
+        """See the attributes; `run` is converted with `str`."""
         super().__init__(sentence)
         self.sentence = sentence
         """What is wrong, with the value seen."""
         self.field = field
         """Dotted key of the config, or name of the argument, that is wrong."""
         self.value = value
-        """What was given for it."""
+        """The value given for it."""
         self.allowed = allowed
-        """What would be right, in words."""
+        """The allowed values, in words."""
         self.suggestion = suggestion
-        """What was probably meant: a name or a value."""
+        """The name or value that was probably meant."""
         self.run = None if run is None else str(run)
-        """Folder of the run that this is about."""
+        """Folder of the run that the error is about."""
         self.ways_out = tuple(ways_out)
-        """What can be done, the best first."""
+        """Remedies, the best first."""
 
     @property
     def way_out(self) -> WayOut | None:
@@ -112,7 +112,7 @@ class ConfigError(ServiceError, ValueError):
     """A config file, an override or an argument is wrong; lists every problem found (exit code 2)."""
 
     problems: tuple[Problem, ...] = ()
-    """Each problem of a config by itself; the error's own `field` and what belongs to it are those of the first."""
+    """The problems of a config; `field`, `value`, `allowed` and `suggestion` of the error are those of the first."""
 
     @classmethod
     def listing(
@@ -124,7 +124,7 @@ class ConfigError(ServiceError, ValueError):
         run: object = None,
         ways_out: Sequence[WayOut] = (),
     ) -> ConfigError:
-        """The error that lists problems, at least one, a line each between a heading and a note."""
+        """An error that lists one or more problems, each on a line, between a heading and a note."""
         lines = [heading, *(f"  {problem.sentence}" for problem in problems), *([note] if note else [])]
         first = problems[0]
         error = cls(
@@ -141,7 +141,7 @@ class ConfigError(ServiceError, ValueError):
 
 
 class EvaluationError(ServiceError, RuntimeError):
-    """Rollouts cannot go on: a chunk that fails everywhere, no live worker, too many invalid members."""
+    """Rollouts cannot continue: a chunk failed in every attempt, no worker is live, or too many members are invalid."""
 
 
 class StoreError(ServiceError, RuntimeError):
@@ -149,7 +149,7 @@ class StoreError(ServiceError, RuntimeError):
 
 
 class NotInRunError(ServiceError, LookupError):
-    """A run does not have what was asked of it: a map, a cell, an elite (exit code 2)."""
+    """A run does not have what was requested, such as a map, a cell or an elite (exit code 2)."""
 
 
 class RunLockedError(StoreError):

@@ -1,1 +1,1 @@
-"""The command line: what a person types and reads. Nothing imports it but `__main__`."""
+"""The command line: commands, options and printed tables. Only `es_service.__main__` imports this package."""

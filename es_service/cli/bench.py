@@ -1,4 +1,4 @@
-"""The command line's `es-service bench`: how fast is this machine?"""
+"""The commands `es-service bench ...`: measurements of this machine's speed."""
 
 from __future__ import annotations
 
@@ -10,26 +10,34 @@ import typer
 from es_service.config.problems import one_of
 from es_service.errors import ConfigError
 
-bench = typer.Typer(help="Measure this machine.", no_args_is_help=True)
+bench = typer.Typer(help="Measure the speed of this machine.", no_args_is_help=True)
 
 
 @bench.callback()
 def _bench() -> None:
-    """Keeps `rollouts` a command of its own while it is the only one."""
+    """Do nothing; this callback keeps `rollouts` a subcommand although it is the only one."""
 
 
 @bench.command()
 def rollouts(
-    task: Annotated[list[str] | None, typer.Option("--task", help="Task to measure; default: all of ours.")] = None,
-    policy: Annotated[str | None, typer.Option("--policy", help="on or off; default: both.")] = None,
-    rollout: Annotated[str, typer.Option("--rollout", help="xla, simd (our own compiler), or both.")] = "xla,simd",
-    batch: Annotated[
-        list[int] | None, typer.Option("--batch", min=2, help="Episodes that step together, an even number.")
+    task: Annotated[
+        list[str] | None, typer.Option("--task", help="Task to measure; default: all shipped tasks.")
     ] = None,
-    seconds: Annotated[float, typer.Option("--seconds", min=0.0, help="To measure for, each.")] = 3.0,
+    policy: Annotated[
+        str | None, typer.Option("--policy", help="With a policy (on), without (off); default: both.")
+    ] = None,
+    rollout: Annotated[
+        str, typer.Option("--rollout", help="xla, simd (this project's compiler) or xla,simd.")
+    ] = "xla,simd",
+    batch: Annotated[
+        list[int] | None, typer.Option("--batch", min=2, help="Number of episodes that step together; must be even.")
+    ] = None,
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=0.0, help="Duration of each measurement in seconds.")
+    ] = 3.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print a list of rows as JSON.")] = False,
 ) -> None:
-    """Environment steps a second: physics alone and with policies, on one core and on all, beside the paper's."""
+    """Measure environment steps per second: with and without a policy, on one core and on all."""
     from es_service.cli import bench_rollouts as measured
 
     policies = {None: (False, True), "on": (True,), "off": (False,)}.get(policy)
@@ -37,11 +45,9 @@ def rollouts(
     if policies is None:
         raise ConfigError(f"--policy {policy}: must be on or off")
     if not set(rollouts) <= set(measured.ROLLOUTS):
-        raise ConfigError(
-            f"--rollout {rollout}: must be {one_of(measured.ROLLOUTS)}, or both with a comma between them"
-        )
-    if any(number % 2 for number in batch or ()):
-        raise ConfigError("--batch: must be even, for whole pairs")
+        raise ConfigError(f"--rollout {rollout}: must be {one_of(measured.ROLLOUTS)}, or both separated by a comma")
+    if odd := [number for number in batch or () if number % 2]:
+        raise ConfigError(f"--batch {odd[0]}: must be even, so that it consists of whole pairs")
     rows = measured.bench_rollouts(
         task or (), policies=policies, rollouts=rollouts, batches=batch or (), seconds=seconds
     )

@@ -33,20 +33,20 @@ def bench_rollouts(
     batches: Sequence[int] = (),
     seconds: float = 3.0,
 ) -> Iterator[dict[str, Any]]:
-    """One row per task, with and without policy, rollout, batch, and on one core and on all: as each is measured.
+    """Yield one row per task, policy (on, off), rollout, batch and number of cores (one, all), as each is measured.
 
-    The hidden layers are the paper's: 64x64 for PointMaze, else 256x256. Each core has a process like a worker's; rates
-    on several, measured side by side, are added. Where simd cannot compile a task, its rows are one {"task", "rollout",
-    "note"}, and xla is what there is.
+    The hidden layers are the paper's: 64x64 for PointMaze, else 256x256. Each core has a process like a worker's; the
+    rates of several, measured at the same time, are added. If simd cannot compile a task, its simd rows are replaced
+    by one row {"task", "rollout", "note"}.
 
     Raises:
-        ConfigError: a task cannot be had. EvaluationError: it cannot be run, or not by simd, and nothing else was asked
-            for.
+        ConfigError: a task is unknown. EvaluationError: a task cannot be run, or simd cannot compile it and no other
+            rollout was requested.
     """
     for task in tasks:
         if task not in TASKS:
             raise ConfigError(
-                f"--task {task}: no known task; must be {one_of(TASKS)}, or brax:NAME, or module:Class"
+                f"--task {task}: unknown task; must be {one_of(TASKS)}, or brax:NAME, or module:Class"
                 f"{did_you_mean(task, TASKS)}"
             )
     every = sorted({1, cores()})
@@ -85,7 +85,7 @@ def _row(arguments: Mapping[str, Any], count: int) -> dict[str, Any]:
                 command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
             )
             ends.enter_context(process)  # waits for it
-            ends.callback(process.kill)  # should another fail, or a signal arrive
+            ends.callback(process.kill)  # in case another process fails or a signal arrives
             started.append(process)
         for process in started:
             printed, errors = process.communicate()

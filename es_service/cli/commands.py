@@ -1,4 +1,4 @@
-"""Commands as messages show them, and errors with their ways out as commands."""
+"""Shell commands as messages show them, and error messages with their ways out as shell commands."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ PROGRAM = "es-service"
 
 
 def command(*words: object) -> str:
-    """A command of this program that can be copied into a shell, whatever its words contain: a folder's name may have
-    spaces."""
+    """A command of this program, quoted so that it can be copied into a shell: a folder's name may contain spaces."""
     return shlex.join([*_program(), *map(str, words)])
 
 
 def assignments(values: Mapping[str, Any]) -> list[str]:
-    """Overrides that set these keys: "search.sigma=0.05"."""
+    """Overrides that set these keys, such as "search.sigma=0.05"."""
     return [f"{key}={in_line(value)}" for key, value in values.items()]
 
 
 def settings(values: Mapping[str, Any]) -> list[str]:
-    """Options of a command that set these keys."""
+    """Command-line options that set these keys."""
     options, engine = [], values.get("compute.engine")
-    if engine in ENGINE_IMPLIES:  # an option that says the rest as well
+    if engine in ENGINE_IMPLIES:  # --engine also sets the keys that it implies
         options = ["--engine", engine]
         implied = {"compute.engine": engine} | ENGINE_IMPLIES[engine]
         values = {key: value for key, value in values.items() if key not in implied or implied[key] != value}
@@ -38,7 +37,7 @@ def settings(values: Mapping[str, Any]) -> list[str]:
 
 
 def way_command(way: WayOut) -> str:
-    """The command that is a way out."""
+    """The shell command of a way out."""
     folder = way.run or "RUN"
     match way.action:
         case "install":
@@ -51,15 +50,15 @@ def way_command(way: WayOut) -> str:
 
 
 def error_message(error: ServiceError) -> str:
-    """What an error says, and its ways out as commands, a line each."""
+    """The sentence of an error, and its ways out as shell commands, one per line."""
     ways = [f"  to {way.purpose}: {way_command(way)}" for way in error.ways_out]
     return "\n".join([error.sentence, *ways])
 
 
 def _program() -> list[str]:
-    """What the shell starts this program by: its name may not be in PATH, as after `make run`."""
+    """The words that start this program in a shell. Its name may be missing from PATH, as after `make run`."""
     if shutil.which(PROGRAM):
         return [PROGRAM]
-    python = Path(sys.executable or "python")  # a program that has Python inside may not know one
+    python = Path(sys.executable or "python")  # empty in a program that embeds Python
     script = python.with_name(PROGRAM)
     return [str(script)] if script.exists() else [str(python), "-m", "es_service"]

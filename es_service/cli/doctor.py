@@ -1,4 +1,4 @@
-"""`es-service doctor`: can this machine run, and what will its results depend on."""
+"""The checks of `es-service doctor`: whether this machine can run searches, and what their results depend on."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from workers.simd.backend.target import NoVectorsError, host_target
 from workers.simd.episodes.kernel import compile_kernel
 
 Finding = tuple[str, str]
-"""("ok" | "note" | "FAIL", text)."""
+"""Level ("ok", "note" or "FAIL") and text of one finding."""
 MIN_FREE_BYTES = 1 << 30
 MIN_MEMORY_BYTES = 2 << 30
 
 
 def examine(console: Console) -> bool:
-    """Print every finding; whether nothing failed."""
+    """Print every finding and return whether no check failed."""
     healthy = True
     for check in (_software, _ray, _machine, _vectors, _disk, _noise, _rollout):
         for level, text in _guarded(check):
@@ -64,7 +64,7 @@ def _software() -> Iterator[Finding]:
     versions = platform_info()
     cpu = versions.pop("cpu")
     yield "ok", ", ".join(f"{name} {version}" for name, version in versions.items())
-    yield "ok", f"processor {cpu}: results repeat bit for bit on this kind and these versions"
+    yield "ok", f"processor {cpu}: results repeat bit for bit on this kind of processor with these versions"
     yield "ok", f"SQLite {sqlite3.sqlite_version}, {sys.platform}"
 
 
@@ -74,23 +74,23 @@ def _ray() -> Iterator[Finding]:
     except metadata.PackageNotFoundError:
         yield "note", "Ray is not installed: only --engine inline runs here"
         return
-    jobs = "with" if find_spec("aiohttp") else "without"
-    yield "ok", f"ray {version}, {jobs} what `ray start` with a dashboard and `submit` need (the extra `cluster`)"
+    jobs = "installed" if find_spec("aiohttp") else "not installed"
+    yield "ok", f"ray {version}; the extra `cluster`, which Ray's dashboard and `submit` need, is {jobs}"
 
 
 def _machine() -> Iterator[Finding]:
     usable, present = cores(), os.cpu_count() or 1
-    yield "ok", f"{usable} of {present} cores usable: that many workers by default"
+    yield "ok", f"{usable} of {present} cores are usable; by default, each runs one worker"
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
     yield ("ok" if memory >= MIN_MEMORY_BYTES else "note"), f"{memory / 2**30:.1f} GiB of memory free"
 
 
 def _vectors() -> Iterator[Finding]:
-    """The width of the vectors that steps can be compiled for, tried on a small one."""
+    """Check that simd supports this processor, by compiling and running a small kernel."""
     try:
         target = host_target()
     except NoVectorsError as error:
-        yield "note", f"simd: {error}: rollouts run on xla"
+        yield "note", f"simd: {error}; rollouts run on xla"
         return
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
@@ -117,13 +117,13 @@ def _noise() -> Iterator[Finding]:
         key = stream_keys(seed, domain, generation, *ids)
         found = normal_integers(np, key, np.arange(len(expected), dtype=np.uint32))
         if found.tolist() != list(expected):
-            yield "FAIL", f"noise of stream {(seed, domain, generation, *ids)} is {found.tolist()}, not {expected}"
+            yield "FAIL", f"noise of stream {(seed, domain, generation, *ids)} is {found.tolist()}; expected {expected}"
             return
     yield "ok", f"noise equals its {len(TEST_VECTORS)} test vectors"
 
 
 def _rollout() -> Iterator[Finding]:
-    """Start one worker as a run would, and let it work for a moment."""
+    """Start one worker as a run would, and measure its speed briefly."""
     config = load_config(
         {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
     )

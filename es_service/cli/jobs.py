@@ -1,4 +1,4 @@
-"""The command line's `es-service submit | jobs | logs | stop`: runs as jobs of a Ray cluster."""
+"""The commands `es-service submit | jobs | logs | stop`: runs as jobs of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -19,39 +19,39 @@ from es_service.runs import jobs
 
 job_commands = typer.Typer()
 of_jobs = partial(job_commands.command, rich_help_panel="Cluster jobs")
-"""What makes a command one of these, in `--help` too."""
+"""Decorator of these commands, which `--help` lists under "Cluster jobs"."""
 
 JobsOption = Annotated[
-    str, typer.Option("--address", help="The cluster's dashboard, such as http://127.0.0.1:8265.", show_default=False)
+    str, typer.Option("--address", help="URL of the cluster's dashboard: http://HOST:8265.", show_default=False)
 ]
-JobArgument = Annotated[str, typer.Argument(help="Id of a job, as `submit` printed it.", show_default=False)]
+JobArgument = Annotated[str, typer.Argument(help="Id of a job, as printed by `submit`.", show_default=False)]
 
 
 @of_jobs()
 def submit(
     config: ConfigArgument,
     address: JobsOption,
-    out: Annotated[str, typer.Option("--out", help="Folder of the run on the cluster's head, or a disk it shares.")],
+    out: Annotated[str, typer.Option("--out", help="Absolute path of the run on the cluster's head node.")],
     set_: SetOption = None,
     seed: SeedOption = None,
     workers: WorkersOption = None,
 ) -> None:
-    """Send a run to a Ray cluster as a job. The same command again goes on with it, after whatever happened."""
+    """Submit a run to a Ray cluster as a job. The same command again resumes the run, whatever interrupted it."""
     wanted = overrides(set_, seed=seed, workers=workers, address="auto")
     _require_absolute_start(config, wanted)
-    loaded = api.load_config(config, wanted, new=False)  # paths are those of the cluster's head, which checks them
+    loaded = api.load_config(config, wanted, new=False)  # the cluster's head node checks its paths
     job = jobs.submit(loaded, address, out)
     print(job)
     print_note(f"submitted; watch it with: {command('logs', job, '--address', address, '--follow')}")
 
 
 def _require_absolute_start(config: Path, wanted: list[str]) -> None:
-    """Raise a ConfigError for a `search.init_from` that would mean another folder here than on the cluster's head."""
+    """Raise a ConfigError for a relative `search.init_from`, which would be another folder on the head node."""
     in_file = read_yaml_file(config_file(config)).get("search")
     named = {"search.init_from": in_file.get("init_from")} if isinstance(in_file, dict) else {}
     start = (named | parse_overrides(wanted)[0]).get("search.init_from")
     if isinstance(start, str) and not start.startswith("/"):
-        raise ConfigError(f"search.init_from: {start} must be absolute, a path as the cluster's head sees it")
+        raise ConfigError(f"search.init_from: {start} must be an absolute path on the cluster's head node")
 
 
 @of_jobs(name="jobs")
@@ -67,7 +67,7 @@ def logs(
     address: JobsOption,
     follow: Annotated[bool, typer.Option("--follow", help="Keep printing until the job ends.")] = False,
 ) -> None:
-    """Print what a job of a cluster has printed."""
+    """Print the output of a cluster job."""
     for text in jobs.logs(job, address, follow=follow):
         print(text, end="", flush=True)
     if follow:
@@ -78,5 +78,5 @@ def logs(
 
 @of_jobs()
 def stop(job: JobArgument, address: JobsOption) -> None:
-    """Stop a job of a cluster; what is committed stays, and submitting it again goes on from there."""
+    """Stop a cluster job. Finished generations are kept, and the same `submit` again resumes the run."""
     print_note(f"{job} {jobs.stop(job, address).lower()}")

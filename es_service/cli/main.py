@@ -84,18 +84,18 @@ def run(
     address: AddressOption = None,
     log_level: LogLevelOption = None,
     or_resume: Annotated[
-        bool, typer.Option("--or-resume", help="Go on with the run if --out holds it already.")
+        bool, typer.Option("--or-resume", help="Resume the run if the --out folder already holds it.")
     ] = False,
 ) -> None:
     """Start a run from a config file."""
     wanted = overrides(set_, seed=seed, workers=workers, engine=engine, address=address)
     if or_resume and out is None:
-        raise ConfigError("--or-resume needs --out: without it every run has a folder of its own")
+        raise ConfigError("--or-resume needs --out: add --out FOLDER to name the folder of the run to start or resume")
     begun = or_resume and out is not None and holds_run(out)
     loaded = api.load_config(config, wanted, new=not begun)
     if foreign := left_out(config, wanted):
         task = loaded.task.environment
-        print_note(f"note: {', '.join(foreign)} of {config} is not for {task}, which has its default options")
+        print_note(f"note: ignored {', '.join(foreign)} of {config}, since {task} replaces its task (default options)")
     for warning in config_warnings(loaded, task_of(loaded), no_vectors()):
         print_note(f"note: {warning}")
     folder = out if out is not None else api.default_folder(loaded)
@@ -111,7 +111,7 @@ def resume(
     address: AddressOption = None,
     log_level: LogLevelOption = None,
 ) -> None:
-    """Go on with a run; only budget, engine, workers and time limits may change."""
+    """Continue a run; only budget, engine, workers and time limits may change."""
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
     _session(folder, partial(api.resume, folder, wanted))
 
@@ -120,7 +120,7 @@ def resume(
 def fork(
     parent: RunArgument,
     generation: Annotated[
-        int | None, typer.Option("--generation", help="One of the last two; default: newest.")
+        int | None, typer.Option("--generation", help="One of the parent's last two; default: the newest.")
     ] = None,
     set_: SetOption = None,
     out: OutOption = None,
@@ -140,15 +140,15 @@ def status(
     folders: Annotated[
         list[Path] | None, typer.Argument(help="Folders of runs; default: the newest under runs/.", show_default=False)
     ] = None,
-    follow: Annotated[bool, typer.Option("--follow", help="Keep watching one run until its driver ends.")] = False,
+    follow: Annotated[bool, typer.Option("--follow", help="Watch one run until its driver ends.")] = False,
 ) -> None:
-    """Show where a run stands, also while it is being written; of several runs, a line each."""
+    """Show the state of a run, also while it is running; for several runs, print one line each."""
     if follow and len(folders or ()) != 1:
-        raise ConfigError(f"--follow: watches one run, got {len(folders or ())} folders; name one, or leave it out")
+        raise ConfigError(f"--follow: needs exactly one folder, got {len(folders or ())}; give one, or omit --follow")
     if not folders:
         folders = newest_runs(api.RUNS_FOLDER)
         if not folders:
-            print_note(f"there is no run under {api.RUNS_FOLDER}/ here; name the folder of one")
+            print_note(f"there is no run under {api.RUNS_FOLDER}/ in this folder; give the folder of a run")
             return
         print_overview(console, folders)
         return
@@ -164,9 +164,9 @@ def status(
 @app.command(name="digest")
 def digest_(
     folder: RunArgument,
-    parts: Annotated[bool, typer.Option("--parts", help="One line per part of the state.")] = False,
+    parts: Annotated[bool, typer.Option("--parts", help="Also print a line for each part of the run.")] = False,
 ) -> None:
-    """Print the SHA-256 over everything deterministic in a run, after checking all of it."""
+    """Check all data of a run and print a SHA-256 of everything deterministic in it."""
     found, mixed = digest.checked_parts(folder)
     if parts:
         for name, value in found.items():
@@ -178,7 +178,7 @@ def digest_(
 def config_(
     name: Annotated[str, typer.Argument(help="Name of a shipped config, as `list` shows it.", show_default=False)],
 ) -> None:
-    """Print a shipped config, to be kept as a file and edited."""
+    """Print a shipped config, which you can save as a file and edit."""
     print(shipped_text(name), end="")
 
 
@@ -191,24 +191,24 @@ def list_() -> None:
 @app.command()
 def evaluate(
     folder: RunArgument,
-    best: Annotated[bool, typer.Option("--best", help="The best centre (default).")] = False,
-    centre: Annotated[bool, typer.Option("--centre", help="The newest centre.")] = False,
+    best: Annotated[bool, typer.Option("--best", help="Evaluate the best centre (default).")] = False,
+    centre: Annotated[bool, typer.Option("--centre", help="Evaluate the newest centre.")] = False,
     cell: Annotated[
-        list[str] | None, typer.Option("--cell", metavar="I,J", help="A cell's elite; may be given several times.")
+        list[str] | None, typer.Option("--cell", metavar="I,J", help="Evaluate a cell's elite; can be repeated.")
     ] = None,
-    every: Annotated[bool, typer.Option("--all", help="Every elite of the map.")] = False,
-    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Fresh episodes of each.")] = 100,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the fresh episodes.")] = 0,
+    every: Annotated[bool, typer.Option("--all", help="Evaluate every elite of the map.")] = False,
+    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes per policy.")] = 100,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the episodes.")] = 0,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Also write the rows to this CSV file.")] = None,
     log_level: LogLevelOption = None,
 ) -> None:
-    """Run fresh episodes of what a run has found, beside what it believed of it."""
+    """Evaluate policies of a run on fresh episodes, and print the results beside the stored values."""
     from es_service.cli.tables.evaluations import csv_file, print_evaluations
     from es_service.runs import evaluation
 
     if every and cell:
-        raise ConfigError("--all has every cell already; give --all or --cell")
+        raise ConfigError("--all and --cell cannot be combined: --all includes every cell; give one of them")
     found = api.open_run(folder)
     chosen = evaluation.candidates(
         found,
@@ -225,10 +225,10 @@ def evaluate(
 @app.command()
 def export(
     folder: RunArgument,
-    to: Annotated[str, typer.Option("--to", help="csv, parquet, npz or ribs.", show_default=False)],
+    to: Annotated[str, typer.Option("--to", help="Format: csv, parquet, npz or ribs.", show_default=False)],
     out: Annotated[Path | None, typer.Option("--out", help="Folder to write into; default: RUN/export.")] = None,
 ) -> None:
-    """Write history, novelty archive and map as tables, or policies as arrays."""
+    """Write history, novelty archive and behaviour map as tables, or the policies as arrays."""
     from es_service.runs.export import export as write
 
     for file in write(api.open_run(folder), to, out if out is not None else folder / "export"):
@@ -241,16 +241,16 @@ app.add_typer(bench, name="bench")
 
 @app.command()
 def doctor() -> None:
-    """Check that this machine can run, and show what results depend on."""
+    """Check that this machine can run searches, and show what their results depend on."""
     from es_service.cli.doctor import examine
 
     raise typer.Exit(0 if examine(console) else 1)
 
 
 def main() -> None:
-    """Run the command; turn errors into one readable message and an exit code. `__main__` is the way in."""
+    """Run the command; turn errors into one readable message and an exit code. Called by `es_service.__main__`."""
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # a ± is no reason to fail where there is only ASCII
+        sys.stdout.reconfigure(errors="replace")  # print ? for a ± where only ASCII can be printed
     try:
         app()
     except Interrupted:
@@ -262,23 +262,23 @@ def main() -> None:
         print_error(error)
         sys.exit(1)
     except MemoryError as error:
-        print_error(f"not enough memory: {error}. A smaller policy.hidden or search.pairs needs less.")
+        print_error(f"not enough memory: {error}. Reduce policy.hidden or search.pairs.")
         sys.exit(1)
 
 
 def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
-    """Show a run while it works, and at its end what came of it. It goes on where nobody reads that any more."""
+    """Show the progress of a run, and a summary at its end. The run continues if the output is closed."""
     began = False
 
     def tell(show: Callable[[Any], None], what: Row | str) -> None:
         try:
             show(what)
-        except SystemExit:  # what rich makes of a broken pipe; from then on it prints nothing
-            print_note(f"nobody reads the output any more; the run goes on: {command('status', folder, '--follow')}")
+        except SystemExit:  # raised by rich for a broken pipe; from then on rich prints nothing
+            print_note(f"the output was closed; the run continues. Watch: {command('status', folder, '--follow')}")
 
     def tell_generation(show: Callable[[Row], None], row: Row) -> None:
         nonlocal began
-        began = True  # whatever has become of the folder's name since
+        began = True  # remembered, since the folder may be renamed later
         tell(show, row)
 
     try:
@@ -286,7 +286,7 @@ def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
             outcome = work(on_generation=partial(tell_generation, show), on_notice=partial(tell, note))
     except Interrupted:
         if began or holds_run(folder):
-            print_note(f"interrupted; every finished generation is saved. Go on with: {command('resume', folder)}")
+            print_note(f"interrupted; every finished generation is saved. Continue with: {command('resume', folder)}")
         else:
             print_note("interrupted before the run began; nothing was written")
         raise
@@ -295,8 +295,8 @@ def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
 
 
 def _place(text: str) -> tuple[int, ...]:
-    """A cell as it is typed: 3,17."""
+    """Place of a cell, parsed from text such as 3,17."""
     try:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
-        raise ConfigError(f"--cell {text}: must be whole numbers with commas between them, such as 3,17") from None
+        raise ConfigError(f"--cell {text}: must be whole numbers separated by commas, such as 3,17") from None

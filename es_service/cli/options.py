@@ -1,4 +1,4 @@
-"""What the commands of the command line share: options, what they stand for in a config, how notes are printed."""
+"""Options that several commands share, the config keys that they set, and the printing of notes and errors."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ RunArgument = Annotated[Path, typer.Argument(help="Folder of a run.", show_defau
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one key, e.g. search.sigma=0.05.")
 ]
-OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the new run; default: a name under runs/.")]
+OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the new run; default: a new one under runs/.")]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Seed of all random numbers.")]
-WorkersOption = Annotated[int | None, typer.Option("--workers", help="Worker processes; default: as configured.")]
+WorkersOption = Annotated[int | None, typer.Option("--workers", help="Number of workers; default: as configured.")]
 EngineOption = Annotated[str | None, typer.Option("--engine", help="What runs the workers: inline or ray.")]
 AddressOption = Annotated[
     str | None, typer.Option("--address", help="Ray cluster to join: HOST:PORT, or auto. Implies --engine ray.")
@@ -68,11 +68,12 @@ def overrides(
     engine: str | None = None,
     address: str | None = None,
 ) -> list[str]:
-    """What options imply, then `--set` values, then the keys that options stand for; later ones win.
+    """Overrides for the keys that options imply, then for `--set`, then for the keys that options name; later ones win.
 
-    So what a file, or a run's record, says of a cluster is moot, and a `--set` that contradicts the options is refused.
+    The implied keys replace the cluster settings of the config file or of the resumed run. A `--set` that contradicts
+    them stays in force, so that the checks of the config refuse the combination.
     """
-    if address is not None:  # a cluster to join is a Ray cluster
+    if address is not None:  # only a Ray cluster can be joined
         implied = ENGINE_IMPLIES["ray"] | ({} if engine else {"compute.engine": "ray"})
     else:
         implied = ENGINE_IMPLIES.get(engine or "", {})
@@ -82,12 +83,12 @@ def overrides(
 
 
 def print_note(message: str, style: str | None = None) -> None:
-    """A line for the user that is no result; nothing where nobody reads it, of which rich makes an exit."""
+    """Print a line that is not a result to stderr. If stderr is closed, rich raises SystemExit, which is ignored."""
     with contextlib.suppress(SystemExit):
         errors.print(message, style=style, highlight=False, markup=False, soft_wrap=True)
 
 
 def print_error(error: ServiceError | str) -> None:
-    """What has gone wrong, and what to do."""
+    """Print an error message and its ways out."""
     message = error_message(error) if isinstance(error, ServiceError) else error
     print_note(f"error: {message}", style="red")

@@ -1,1 +1,1 @@
-"""What can be done with a run folder: work on it, read it, fork it, evaluate it, export it, send it as a job."""
+"""Operations on run folders: run, read, fork, evaluate, export, and submit as a job."""

@@ -1,6 +1,6 @@
-"""Configs checked against all there is: every task and every search, those of the user's own too.
+"""Configs checked against all known tasks and searches, including those of the user.
 
-Nothing is made of a config that its search refuses: no folder, no worker.
+A config that its search refuses fails here, before a folder is created or a worker is started.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ def load_config(source: Source, overrides: Overrides = (), *, new: bool = True) 
     """Read a YAML file (or a mapping like one), apply overrides such as "search.sigma=0.05", resolve and check it all.
 
     Args:
-        new: whether a run is to be started with it here and now, so that the run it starts from must be there.
+        new: whether a run is about to start with it on this machine; the folder of `search.init_from` must then exist.
 
     Raises:
         ConfigError: lists every problem found.
@@ -39,6 +39,6 @@ def changed_config(source: Source, overrides: Overrides = ()) -> RunConfig:
 
 
 def _accepted(config: RunConfig) -> RunConfig:
-    """The config, unless its search, perhaps one of the user's own, refuses it."""
+    """Return the config if its search accepts it; otherwise raise the error of the search."""
     ALGORITHMS[config.search.algorithm](config)
     return config

@@ -1,8 +1,8 @@
-"""Fresh episodes for policies that a run has kept, beside what the run believed of them.
+"""Evaluation of a run's stored policies on fresh episodes, for comparison with their stored fitness.
 
-An elite, or a best centre, is the highest of many noisy means: part of its fitness is luck. Episodes that selection has
-never seen tell how much. Every policy gets the same fresh episodes, and the same command again gets them too;
-another seed makes others.
+An elite or a best centre has the highest of many noisy means, so part of its stored fitness is luck. Fresh episodes,
+which selection has never seen, show how large that part is. They depend only on the seed, so every policy gets the
+same ones.
 """
 
 from __future__ import annotations
@@ -29,65 +29,68 @@ from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, is_no_elite
 
 FRESH_GENERATION = 2**40
-"""Of the resets of fresh episodes with seed 0; no run counts so far."""
+"""Generation number in the random streams of fresh episodes with seed 0; no run reaches it."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A policy of a run, and what the run says of it."""
+    """A stored policy to evaluate, with the values stored for it."""
 
     name: str
-    """best, centre, or the place of its cell."""
+    """Its name: "best", "centre", or the place of its cell, such as "3,17"."""
     policy: Policy
     generation: int
-    """In which it was evaluated."""
+    """Generation in which the run evaluated it."""
     stored_fitness: float
+    """Mean fitness that the run stored for it."""
     cell: int | None = None
+    """Number of its cell; None if it is not an elite."""
 
 
 @dataclass(frozen=True)
 class Fresh:
-    """What fresh episodes say of a candidate."""
+    """Results of a candidate's E fresh episodes: fitness [E] and descriptors [E, B]."""
 
     candidate: Candidate
     fitness_E: FloatArray
     descriptor_E_B: FloatArray
     cell: int | None
-    """Where its mean descriptor lies now; None without a map."""
+    """Cell of its mean fresh descriptor; None without a map, or if the descriptor is not finite."""
 
     @property
     def mean(self) -> float:
-        """Mean fitness."""
+        """Mean fitness over the fresh episodes."""
         return float(self.fitness_E.mean(dtype=np.float64))
 
     @property
     def standard_error(self) -> float:
-        """Of the mean: standard deviation (n - 1) over the square root of n; NaN for one episode."""
+        """Standard error of `mean`: standard deviation (n - 1) divided by the square root of n; NaN for one episode."""
         count = self.fitness_E.size
         return float(self.fitness_E.std(dtype=np.float64, ddof=1) / sqrt(count)) if count > 1 else float("nan")
 
     @property
     def descriptor(self) -> NDArray[np.float64]:
-        """Its mean over the episodes, [B]."""
+        """Mean descriptor over the fresh episodes, [B]."""
         return self.descriptor_E_B.mean(axis=0, dtype=np.float64)
 
     @property
     def descriptor_std(self) -> NDArray[np.float64]:
-        """Its standard deviation over the episodes, [B]."""
+        """Standard deviation of the descriptor over the fresh episodes, [B]."""
         return self.descriptor_E_B.std(axis=0, dtype=np.float64)
 
 
 def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[int]], every: bool) -> list[Candidate]:
-    """What is to be evaluated, in this order; cells as often as they are named, every elite in the order of discovery.
+    """The policies to evaluate: the best centre, the newest centre, then elites.
 
-    Each is read as of one generation, also while a driver is writing.
+    The elites are those of `cells` in the given order or, with `every`, all of the map in the order of discovery. The
+    best centre, the newest centre and the elites are each read from one generation, also while a driver is writing.
 
-    Raises NotInRunError for a cell that is not there or empty, for `every` of an empty map, and for a run without any
-    generation.
+    Raises NotInRunError for a cell that does not exist or is empty, for `every` with an empty map, and for a run
+    without a finished generation.
     """
     if run.generation is None:
         way_out = WayOut("resume", "continue it", str(run.folder))
-        raise NotInRunError(f"{run.folder} has no generation yet", run=run.folder, ways_out=[way_out])
+        raise NotInRunError(f"{run.folder} has no finished generation yet", run=run.folder, ways_out=[way_out])
     found = []
     if best:
         moment = run.at(wanted=lambda part: part == BEST)
@@ -114,12 +117,14 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
 def evaluate(
     run: Run, chosen: Sequence[Candidate], episodes: int, workers: int | None = None, seed: int = 0
 ) -> Iterator[Fresh]:
-    """Fresh episodes without noise for each candidate, on this machine: results one by one, in order.
+    """Evaluate each candidate on fresh, noise-free episodes on this machine; yield the results in order.
 
     Args:
-        seed: which fresh episodes, as wide as a run's.
+        episodes: number of episodes per candidate.
+        workers: number of worker processes; None: one per core.
+        seed: seed of the evaluation episodes, from 0 to 2**63 - 1.
 
-    Raises EvaluationError where rollouts cannot go on; Interrupted when asked to stop.
+    Raises EvaluationError if the rollouts cannot continue, and Interrupted after SIGINT or SIGTERM.
     """
     overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": workers or "auto"}
     config = changed_config(run.present_config, overrides)

@@ -1,4 +1,4 @@
-"""A run as tables (csv, parquet), as arrays that NumPy alone opens, or as a pyribs archive."""
+"""Export of a run as tables (csv, parquet), as NumPy arrays (npz) or as a pyribs archive (ribs)."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
 
 
 RIBS_MARGIN = 2e-6
-"""pyribs adds a millionth to a measure before it looks for its cell."""
+"""Least distance of exported descriptors from a cell's edge: pyribs adds 1e-6 to a measure before finding its cell."""
 
 
 def export(run: Run, to: str, folder: Path) -> list[Path]:
-    """Write a run into `folder`, which is made if need be: the files written, older ones of these names replaced.
+    """Write a run into `folder`, which is created if needed, and return the files written. Older files are replaced.
 
     Args:
         to: a key of FORMATS.
 
     Raises:
-        ConfigError: no such format, or a package it needs is not installed. NotInRunError: the run has no map to make
-            one of. StoreError: the folder cannot be written.
+        ConfigError: the format is unknown, or needs a package that is not installed. NotInRunError: the run has no
+            finished generation, or not the map that the format needs. StoreError: the folder cannot be written.
     """
     if to not in FORMATS:
         raise ConfigError(
-            f"{to} is no known format; must be {one_of(FORMATS)}{did_you_mean(to, FORMATS)}",
+            f"the format {to} is unknown; must be {one_of(FORMATS)}{did_you_mean(to, FORMATS)}",
             field="to",
             value=to,
             allowed=one_of(FORMATS),
@@ -45,7 +45,7 @@ def export(run: Run, to: str, folder: Path) -> list[Path]:
         )
     if run.generation is None:
         way_out = WayOut("resume", "continue it", str(run.folder))
-        raise NotInRunError(f"{run.folder} has no generation yet", run=run.folder, ways_out=[way_out])
+        raise NotInRunError(f"{run.folder} has no finished generation yet", run=run.folder, ways_out=[way_out])
     try:
         folder.mkdir(parents=True, exist_ok=True)
         return FORMATS[to](run, folder)
@@ -61,8 +61,8 @@ def tables(run: Run) -> dict[str, pd.DataFrame]:
 
 
 def arrays(run: Run) -> dict[str, np.ndarray]:
-    """All policies of a run after one generation, with what each needs to act: the best centre, the newest one, every
-    elite of the map.
+    """All policies of a run after one generation, with their observation statistics: the best centre, the newest
+    centre and every elite of the map.
 
     Names: `widths` of the layers, `observation_clip` (NaN: none); for the best and the newest centre `best_parameters`
     [D], `best_mean` [O], `best_std` [O], `centre_parameters`, ...; for N elites `cell` [N, dimensions of the map],
@@ -91,11 +91,12 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
 def ribs_archive(run: Run) -> Any:
     """The map as a `ribs.archives.GridArchive`: solutions are parameters, measures descriptors, objectives fitness.
 
-    Fields besides: `generation`, `observation_mean`, `observation_std`. Its arithmetic of cells is another one, so
-    descriptors within two millionths of an edge, and those outside the bounds, are moved that far into their cell.
+    Extra fields: `generation`, `observation_mean`, `observation_std`. pyribs rounds differently, so descriptors nearer
+    than 2e-6 to an edge of their cell, or outside the bounds, are moved to 2e-6 inside their cell.
 
     Raises:
-        ConfigError: pyribs is not installed. NotInRunError: the run has no map, an empty one, or one that is no grid.
+        ConfigError: pyribs is not installed. NotInRunError: the run has no map, or it is empty, not a grid, or has
+            cells that are too small for pyribs.
     """
     try:
         from ribs.archives import GridArchive
@@ -106,7 +107,8 @@ def ribs_archive(run: Run) -> Any:
     map_, elites = run.elites()
     if not isinstance(map_.geometry, Grid):
         raise NotInRunError(
-            f"the map of {run.folder} is a cvt and no grid, as a GridArchive is; npz has it all", run=run.folder
+            f"the map of {run.folder} is a cvt map, but a GridArchive needs a grid; export to npz instead",
+            run=run.folder,
         )
     if not map_.size:
         raise NotInRunError(f"the map of {run.folder} is empty", run=run.folder)
@@ -136,8 +138,8 @@ def ribs_archive(run: Run) -> Any:
     )
     if archive.stats.num_elites != map_.size:
         raise NotInRunError(
-            f"pyribs puts the {map_.size} elites of {run.folder} into {archive.stats.num_elites} of its cells, too "
-            "small for its arithmetic; npz has them all",
+            f"the cells of {run.folder} are too small for pyribs, which puts the {map_.size} elites into "
+            f"{archive.stats.num_elites} cells; export to npz instead",
             run=run.folder,
         )
     return archive
@@ -205,4 +207,4 @@ FORMATS: dict[str, Callable[[Run, Path], list[Path]]] = {
     "npz": _npz,
     "ribs": _ribs,
 }
-"""How a run can be written."""
+"""Function that writes each format."""

@@ -1,8 +1,8 @@
-"""Runs as jobs of a Ray cluster: send one, list them, read what they print, stop them.
+"""Runs as jobs of a Ray cluster: submit, list and stop them, and read their output.
 
 A job is `es-service run ... --or-resume` on the cluster's head, in a working directory that holds just the resolved
-config; es-service itself is installed there. The run's folder is a path on the head or on a disk that it shares. Ray
-forgets its jobs with their cluster, and nothing is lost: the same submission to another cluster goes on with the run.
+config; es-service itself is installed there. The run's folder is a path on the head or on a disk that it shares. Ray's
+list of jobs ends with the cluster, but the run does not: the same submission to another cluster resumes it.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ STOP_S = 15.0
 
 @dataclass(frozen=True)
 class Job:
-    """A job of ours on a cluster."""
+    """A job on a cluster that runs es-service."""
 
     id: str
     state: str
-    """Ray's word: PENDING, RUNNING, SUCCEEDED, FAILED or STOPPED."""
+    """Ray's status: PENDING, RUNNING, SUCCEEDED, FAILED or STOPPED."""
     folder: str
     started_ms: int
 
 
 def submit(config: RunConfig, address: str, out: str) -> str:
-    """Send a run to the cluster whose dashboard is at `address`; the id of its job.
+    """Submit a run to the cluster whose dashboard is at `address`, and return the id of its job.
 
     Args:
-        config: with engine ray; its address is that of the cluster the job finds itself in, "auto".
+        config: must have engine ray and the address "auto", the cluster in which the job runs.
         out: absolute path of the run folder, as the cluster's head sees it. If it holds the run, the job goes on with
             it; if it holds another run, the job fails and says what differs.
 
     Raises:
-        ConfigError: `out` is relative. EvaluationError: no cluster answers, or it refuses us.
+        ConfigError: `out` is relative. EvaluationError: the cluster does not answer, or refuses the job.
     """
     if not out.startswith("/"):
         raise ConfigError(
-            f"the run folder {out} must be absolute, since a job's own directory is deleted; such as /runs/{out}",
+            f"the run folder {out} must be an absolute path, such as /runs/{out}: Ray deletes a job's own directory",
             field="out",
             value=out,
             allowed="an absolute path",
@@ -75,7 +75,7 @@ def submit(config: RunConfig, address: str, out: str) -> str:
 
 
 def list_jobs(address: str) -> list[Job]:
-    """Our jobs on a cluster, newest first. Raises EvaluationError as `submit`."""
+    """The es-service jobs on a cluster, newest first. Raises EvaluationError as `submit`."""
     with _explained(address):
         found = _client(address).list_jobs()
     ours = [
@@ -87,7 +87,7 @@ def list_jobs(address: str) -> list[Job]:
 
 
 def state(job: str, address: str) -> str:
-    """Ray's word for where a job stands. Raises EvaluationError as `submit`, or if there is no such job."""
+    """Ray's status of a job. Raises EvaluationError as `submit`, or if there is no such job."""
     return _state(_client(address), job, address)
 
 
@@ -97,13 +97,13 @@ def _state(client: Any, job: str, address: str) -> str:
 
 
 def logs(job: str, address: str, *, follow: bool = False) -> Iterator[str]:
-    """What a job has printed, in pieces; with `follow`, until it ends. Raises EvaluationError as `state`."""
+    """The output of a job, in pieces; with `follow`, until the job ends. Raises EvaluationError as `state`."""
     client = _client(address)
     with _explained(address, job):
         if not follow:
             yield client.get_job_logs(job)
             return
-        client.get_job_status(job)  # raises for a job that does not exist, which following would wait for
+        client.get_job_status(job)  # raises if there is no such job; following would wait for it
         pieces = client.tail_job_logs(job)
 
         async def next_piece() -> str | None:
@@ -115,7 +115,7 @@ def logs(job: str, address: str, *, follow: bool = False) -> Iterator[str]:
 
 
 def stop(job: str, address: str) -> str:
-    """Stop a job and wait for its end; its state then. Raises EvaluationError as `state`, or if it does not end."""
+    """Stop a job, wait for its end and return its status. Raises EvaluationError as `state`, or if it does not end."""
     client = _client(address)
     with _explained(address, job):
         client.stop_job(job)
@@ -139,7 +139,7 @@ def _client(address: str) -> Any:
             suggestion=url,
         )
     try:
-        import aiohttp  # noqa: F401  what Ray's client lacks without the extra
+        import aiohttp  # noqa: F401  needed by Ray's client, installed by the extra
         from ray.job_submission import JobSubmissionClient
     except ImportError as error:
         raise EvaluationError(
@@ -150,17 +150,17 @@ def _client(address: str) -> Any:
             ],
         ) from error
     for name in ("job.sdk", "dashboard_sdk"):
-        logging.getLogger(f"ray.dashboard.modules.{name}").setLevel(logging.WARNING)  # else a line for each request
+        logging.getLogger(f"ray.dashboard.modules.{name}").setLevel(logging.WARNING)  # else they log every request
     logging.getLogger("ray._private.runtime_env.packaging").setLevel(logging.WARNING)
     with _explained(address):
         return JobSubmissionClient(address)
 
 
 def _host(address: str) -> str:
-    """The host that a wrong address means, as it stands in a URL; this machine if it names none."""
+    """The host of a wrong address, in the form that a URL needs; 127.0.0.1 if it names none."""
     try:
         host = urlsplit(address if "://" in address else f"//{address}").hostname
-    except ValueError:  # a bracket that is not closed
+    except ValueError:  # an unclosed bracket
         host = None
     if host is None or host == "auto":
         return "127.0.0.1"

@@ -1,4 +1,4 @@
-"""What a new run takes from another one: everything (a fork), or a centre (`search.init_from`)."""
+"""What a new run takes from another run: its whole state (a fork) or one policy (`search.init_from`)."""
 
 from __future__ import annotations
 
@@ -42,39 +42,39 @@ from es_service.store.digest import digest_at
 
 NORMALISED = "policy.observation_normalization"
 OBSERVED = ("policy.observation_clip", NORMALISED)
-"""What a policy does with its observations."""
+"""Keys that determine how a policy processes its observations."""
 LUCK = ("task.episodes_per_member", "search.pairs", "search.sigma", "policy.action_noise")
-"""What the highest fitness of a population depends on, besides what an evaluation means."""
+"""Keys that change the highest fitness of a population, but not the meaning of an evaluation."""
 ROWS_AT_ONCE = 4096
-"""Of a history, in memory."""
+"""History rows that are held in memory together."""
 
 
 def fork_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> RunConfig:
-    """The config of a fork: the one that the parent would go on with, with overrides.
+    """The config of a fork: the parent's present config with overrides.
 
     Raises:
-        ConfigError: as `load_config`, the parent's state does not fit the changes, or a key would change nothing.
+        ConfigError: as `load_config`, or the parent's state does not fit the changes, or a key would have no effect.
     """
     origin = open_run(parent)
     if not isinstance(overrides, str | Mapping):
-        overrides = list(overrides)  # it is gone through twice
+        overrides = list(overrides)  # iterated twice
     wanted = parse_overrides(overrides)[0]
     searched = origin.constants["search.algorithm"]
     begins_anew = {"search.fitness_weight_start"} if wanted.get("search.algorithm", searched) != searched else set()
     if idle := [key for key in START_KEYS if key in wanted and key not in begins_anew]:
         raise _refused(
             origin,
-            "a fork has its state and all its settings, so these would change nothing",
+            "a fork continues from its state and its settings, so these keys would have no effect",
             [Problem(key, key, wanted[key]) for key in idle],
-            "instead of a preset, set the keys that it stands for",
+            "instead of search.preset, set the keys that it fills in",
         )
     present = origin.present_config
-    mapping = present | {"search": present["search"] | {"init_from": None}}  # it has the parent's state instead
+    mapping = present | {"search": present["search"] | {"init_from": None}}  # a fork has the parent's state instead
     config = changed_config(mapping, overrides)
     changes = changed_constants(origin.constants, config.constants())
     unfit = [_unfit(name, old, new, name) for name, old, new in changes if does_not_fit(name, old, new)]
     names = task_of(config).descriptor_names
-    if not unfit and list(names) != origin.descriptor_names:  # a task of the user's that is not what it was
+    if not unfit and list(names) != origin.descriptor_names:  # a task of the user that was edited
         what = f"the descriptor of {config.task.environment}"
         unfit = [_unfit(what, origin.descriptor_names, list(names), "task.environment")]
     if not unfit and origin.policy_shape != (shape := policy_shape(config, task_of(config))):
@@ -90,13 +90,13 @@ def _unfit(what: str, old: Any, new: Any, field: str) -> Problem:
 
 
 def _refused(origin: Run, why: str, problems: Sequence[Problem], note: str = "") -> ConfigError:
-    """The error for a fork that cannot be made with some settings; a new run could be, from the origin's centre."""
+    """The error for a fork with settings that it cannot have. Way out: a new run from the origin's centre."""
     ways_out = [start_afresh(origin.folder)]
     return ConfigError.listing(f"{origin.folder}: {why}:", problems, note, run=origin.folder, ways_out=ways_out)
 
 
 def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict[str, Any], Beginning]:
-    """What a fork of `origin` records of it, and begins with: all of it up to a generation, None for the newest.
+    """The parent record and the initial contents of a fork of `origin` at a generation; None for the newest.
 
     Raises:
         StoreError: the state of that generation is not kept.
@@ -117,14 +117,14 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
 
 
 def _history(origin: Run, newest: int) -> Iterator[dict[str, int | float]]:
-    """Rows up to a generation, some at a time: all of a long run's do not fit into memory, and a driver at work cannot
-    end its log while it is being read."""
+    """History rows up to a generation, read in several transactions: a long history may not fit into memory, and a
+    driver cannot shorten its write-ahead log while a transaction reads it."""
     for first in range(0, newest + 1, ROWS_AT_ONCE):
         yield from reader.read_history(origin.folder, first, min(ROWS_AT_ONCE, newest + 1 - first))
 
 
 def _without_fitness(parts: Parts) -> dict[str, Arrays]:
-    """The parts of a state in which no fitness seen so far counts: no best centre, an empty map, no record to beat."""
+    """The parts of a state without any past fitness: no best centre, an empty map, no record to beat."""
     kept = {name: dict(part) for name, part in parts.items() if not name.startswith((CELL_PREFIX, ELITE_PREFIX))}
     for name, part in kept.items():
         if name.startswith(CENTRE_PREFIX):
@@ -135,36 +135,36 @@ def _without_fitness(parts: Parts) -> dict[str, Arrays]:
 
 
 def _without_scores(parts: Parts) -> dict[str, Arrays]:
-    """The parts of a state in which no elite has a score: the luckiest of a population of another size, or whose
-    fitness came about otherwise, is none to compare with."""
+    """The parts of a state without the elites' scores: the highest fitness of a population is not comparable with that
+    of a population of another size, or with another noise in its fitness."""
     nothing = {"score": np.asarray(np.nan)}
     return {name: {**part, **nothing} if name.startswith(CELL_PREFIX) else dict(part) for name, part in parts.items()}
 
 
 def _without_own_statistics(parts: Mapping[str, Part]) -> dict[str, Part]:
-    """The parts of a state whose centres run with the whole run's observation statistics, also those in a block that
-    began with an elite's."""
+    """The parts of a state whose centres all use the observation statistics of the whole run, also in the middle of a
+    block that began with those of an elite."""
     own = ("own_mean_O", "own_std_O")
     return {name: {key: values for key, values in part.items() if key not in own} for name, part in parts.items()}
 
 
 def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> tuple[dict[str, Any], Beginning]:
-    """What a run that starts from a policy of another run records of that, and begins with: from its newest centre, its
-    best one, or the elite of a cell, with the statistics that it runs with.
+    """The parent record and the initial contents of a run that starts from a policy of another run.
 
     Args:
-        init_from: RUN, RUN:best or RUN:3,17.
-        tell: called with a notice where the policy will see other observations than it did.
+        init_from: RUN for its newest centre, RUN:best for its best one, or RUN:3,17 for the elite of a cell; each with
+            the observation statistics that it runs with.
+        tell: called with a notice if the new run processes the policy's observations differently.
 
     Raises:
-        ConfigError: the policy is of another network. NotInRunError: there is no such cell, or nothing in it.
+        ConfigError: the policy has another network. NotInRunError: the cell does not exist or is empty.
     """
     folder, which = start_of(init_from)
     origin, shape = open_run(folder), policy_shape(config, task_of(config))
     if origin.policy_shape != shape:
         raise ConfigError(
             f"search.init_from: the policy of {origin.folder} has layers {list(origin.policy_shape.widths)}, "
-            f"this run's has {list(shape.widths)}; use the same task and policy.hidden",
+            f"this run's policy has {list(shape.widths)}; use the same task and policy.hidden",
             field="search.init_from",
             value=init_from,
             run=origin.folder,
@@ -180,23 +180,23 @@ def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> t
         kept = moment.best if isinstance(which, str) else origin.elite(which)
         centre_D, own = kept.centre_D, (kept.observation_mean_O, kept.observation_std_O)
     if not origin.constants[NORMALISED]:
-        moments = no_observations(shape.widths[0])  # its policy was never given any, though they were gathered
+        moments = no_observations(shape.widths[0])  # they were gathered, but its policy did not use them
     elif own is not None:
-        # Those that its policy runs with, as if that many observations had given them.
+        # The statistics that the policy runs with, weighted by the run's number of observations.
         mean_O, std_O = (values.astype(np.float64) for values in own)
         moments = Moments(moments.count, mean_O, moments.count * np.square(std_O))
     if other := _seen_otherwise(origin, config):
         tell(
-            f"search.init_from: the policy of {origin.folder} acted on other observations than this run gives it "
-            f"({other}), so it may act otherwise from generation 0 on"
+            f"search.init_from: this run processes observations differently from {origin.folder} ({other}), so the "
+            "policy taken from there may act differently"
         )
     start = {"centre_D": centre_D, **moments_to_arrays(moments)}
     return _lineage(origin, moment.generation), Beginning(start=start)
 
 
 def _seen_otherwise(origin: Run, config: RunConfig) -> str:
-    """Which settings make the origin's policy another one; empty if none. Normalisation that begins does not: it begins
-    with no statistics."""
+    """The changed settings with which the origin's policy acts differently; empty if there are none. Normalisation
+    that is newly enabled is not among them: it starts without statistics."""
     new = config.constants()
     changed = [name for name in OBSERVED if origin.constants[name] != new[name]]
     if new[NORMALISED] and NORMALISED in changed:
@@ -205,7 +205,7 @@ def _seen_otherwise(origin: Run, config: RunConfig) -> str:
 
 
 def _lineage(origin: Run, generation: int) -> dict[str, Any]:
-    """Which run, and which state of it; no digest of a state that a driver at work has meanwhile replaced."""
+    """The parent record: a run and its generation. Its digest is None if a driver has replaced that state meanwhile."""
     return {
         "run_id": origin.run_id,
         "folder": str(origin.folder.absolute()),

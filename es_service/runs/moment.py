@@ -1,4 +1,4 @@
-"""A run as it was after one generation: what can be read out of its state, whatever its driver stores meanwhile."""
+"""The state of a run after one generation, read at once, so that a driver that is writing does not change it."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Policy:
-    """A trained controller, NumPy only: observation [O] or [..., O] -> action [..., A] in [-1, 1].
+    """A trained controller that needs only NumPy: observation [O] or [..., O] -> action [..., A] in [-1, 1].
 
-    It carries the observation statistics it runs with, so it needs nothing else.
+    It includes the observation statistics that it runs with.
     """
 
     shape: PolicyShape
@@ -52,12 +52,12 @@ class Policy:
     observation_clip: float | None
 
     def __call__(self, observation: Any) -> FloatArray:
-        """Action for a raw (not normalised) observation; no action noise. Raises ValueError for another size."""
+        """Action for a raw (not normalised) observation, without action noise. Raises ValueError for a wrong size."""
         observation = np.asarray(observation, np.float32)
         size = self.shape.widths[0]
         if observation.shape[-1:] != (size,):
             raise ValueError(
-                f"this policy takes observations of {size} numbers, [..., {size}]; got {observation.shape}"
+                f"this policy takes observations of shape [..., {size}]; got shape {list(observation.shape)}"
             )
         x = normalise(np, observation, self.observation_mean_O, self.observation_std_O, self.observation_clip)
         return act(np, split_layers(self.shape, self.parameters_D), x)
@@ -65,7 +65,7 @@ class Policy:
 
 @dataclass(frozen=True)
 class Moment:
-    """The state of a run after one generation, read at once and checked; perhaps only some of its parts."""
+    """The state of a run after one generation, read at once and checked; `parts` may be only some of its parts."""
 
     folder: Path
     meta: RunMeta
@@ -74,7 +74,7 @@ class Moment:
 
     @property
     def novelty(self) -> pd.DataFrame:
-        """As `Run.novelty`."""
+        """The novelty archive; see `Run.novelty`."""
         import pandas as pd
 
         names = descriptor_names(self.meta)
@@ -84,15 +84,17 @@ class Moment:
 
     @property
     def behaviour_map(self) -> BehaviourMap:
-        """As `Run.behaviour_map`."""
+        """The behaviour map as arrays; see `Run.behaviour_map`."""
         map_ = map_from_parts(self.parts)
         if map_ is None:
-            raise NotInRunError(f"{self.folder} keeps no map; it was started with map.enabled = false", run=self.folder)
+            raise NotInRunError(
+                f"{self.folder} has no behaviour map: it was started with map.enabled = false", run=self.folder
+            )
         return map_
 
     @property
     def map(self) -> pd.DataFrame:
-        """As `Run.map`."""
+        """The behaviour map as a table; see `Run.map`."""
         import pandas as pd
 
         map_, names = self.behaviour_map, descriptor_names(self.meta)
@@ -106,16 +108,17 @@ class Moment:
         )
 
     def cell(self, place: int | Sequence[int]) -> int:
-        """As `Run.cell`."""
+        """Number of a filled cell; see `Run.cell`."""
         map_ = self.behaviour_map
         place = (index(place),) if isinstance(place, int | np.integer) else tuple(map(_whole, place))
         shown = ",".join(map(str, place))
         dimensions = len(map_.geometry.shape)
         if len(place) != dimensions:
-            near = ",".join(map(str, map_places(map_)[0])) if map_.size else "none yet"
+            first = ",".join(map(str, map_places(map_)[0])) if map_.size else ""
+            example = f", such as {first} (the first filled cell)" if first else "; the map is empty"
             raise NotInRunError(
-                f"cell {shown} is not in the map of {self.folder}: a cell has {dimensions} numbers there, "
-                f"such as {near}, the first that was filled",
+                f"cell {shown} is not in the map of {self.folder}: its cells are named by "
+                f"{dimensions} numbers{example}",
                 field="cell",
                 value=place,
                 run=self.folder,
@@ -127,13 +130,13 @@ class Moment:
         hint = f"; the nearest filled cell is {','.join(map(str, near))}" if near else "; the map is empty"
         if cell is None:
             sizes = " and ".join(f"0 to {n - 1}" for n in map_.geometry.shape)
-            why = f"cell {shown} is not in the map of {self.folder}, whose cells are {sizes}"
+            why = f"cell {shown} is not in the map of {self.folder}, whose cells are numbered {sizes}"
         else:
             why = f"cell {shown} of {self.folder} is empty"
         raise NotInRunError(f"{why}{hint}", field="cell", value=place, suggestion=near, run=self.folder)
 
     def elites(self, cells: Collection[int] | None = None) -> tuple[BehaviourMap, dict[int, Elite]]:
-        """As `Run.elites`."""
+        """The map and its elites; see `Run.elites`."""
         map_ = self.behaviour_map
         chosen = map_.cell_N.tolist() if cells is None else cells
         return map_, {cell: elite_from_arrays(self.parts[elite_part(cell)]) for cell in chosen}
@@ -145,12 +148,12 @@ class Moment:
 
     @property
     def newest_centre(self) -> CentreState:
-        """The centre that the history row of this generation is about."""
+        """The centre that this generation updated, as its history row says."""
         [row] = reader.read_history(self.folder, self.generation, 1)
         return centre_from_arrays(self.parts[centre_part(int(row["centre"]))])
 
     def policy(self, which: Literal["best", "centre"]) -> Policy:
-        """As `Run.policy`."""
+        """The best or the newest centre as a policy; see `Run.policy`."""
         if which == "best":
             best = self.best
             return make_policy(self.meta, best.centre_D, best.observation_mean_O, best.observation_std_O)
@@ -160,7 +163,7 @@ class Moment:
 
 
 def make_policy(meta: RunMeta, parameters_D: FloatArray, mean_O: FloatArray, std_O: FloatArray) -> Policy:
-    """A policy of a run's shape."""
+    """A policy with the network and the observation clip of a run."""
     return Policy(policy_shape(meta), parameters_D, mean_O, std_O, meta.constants["policy.observation_clip"])
 
 
@@ -171,7 +174,7 @@ def policy_shape(meta: RunMeta) -> PolicyShape:
 
 
 def descriptor_names(meta: RunMeta) -> list[str]:
-    """Of the descriptor's dimensions of a run, in order."""
+    """Names of a run's descriptor dimensions, in order."""
     return list(meta.task["descriptor_names"])
 
 
@@ -182,7 +185,7 @@ def map_places(map_: BehaviourMap) -> NDArray[np.int64]:
 
 
 def nearest_filled(map_: BehaviourMap, place: Sequence[int]) -> tuple[int, ...] | None:
-    """Place of the filled cell nearest to another place, counted in cells (of a cvt: numbers); the first of equals."""
+    """Place of the filled cell whose indices are nearest to `place`, the oldest of equally near ones; None if empty."""
     if not map_.size:
         return None
     return min(
@@ -192,7 +195,7 @@ def nearest_filled(map_: BehaviourMap, place: Sequence[int]) -> tuple[int, ...] 
 
 
 def _whole(number: Any) -> int:
-    """A whole number; pandas makes floats of them where it takes a row out of a table."""
+    """Convert to int. Rows of a pandas table may hold whole numbers as floats. Raises TypeError for a fraction."""
     if int(number) != number:
-        raise TypeError(f"{number!r} is no whole number")
+        raise TypeError(f"{number!r} is not a whole number")
     return int(number)

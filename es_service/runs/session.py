@@ -1,4 +1,4 @@
-"""One sitting of a run: its engine starts, the loop works until the budget is spent or somebody stops it."""
+"""One session of a run: start the engine, and run generations until the budget is spent or a stop is requested."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ LIMIT_NAMES = {
     "min_deadline_s": "at least compute.chunk_timeout_s",
     "no_worker_timeout_s": "compute.no_worker_timeout_s",
 }
-"""What sets how patient the engine is, as its messages say it."""
+"""Config keys that set the engine's time limits, as its messages name them."""
 
 OnGeneration = Callable[[Mapping[str, Any]], None]
-"""Called with each history row once it is safe."""
+"""Called with each history row after its generation is committed."""
 OnNotice = Callable[[str], None]
-"""Called with what had to be repaired, or what the user should know, as soon as it is known."""
+"""Called with each notice for the user, such as a repair of the run or a lost worker."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ class Outcome:
 
     run: Run
     reason: str
-    """Which budget was spent, in words."""
+    """Which part of the budget is spent, in words."""
 
 
 def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_notice: OnNotice) -> Outcome:
-    """Run the loop until the budget is spent."""
+    """Run generations until the budget is spent."""
     task = task_of(config)
     told = 0
 
@@ -71,7 +71,7 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
     tell_notices()
     state = driver.stored_state(store, task)
     if state is not None and (reason := driver.spent(config.budget, state)) is not None:
-        return Outcome(open_run(store.folder), reason)  # no engine need start to find that out
+        return Outcome(open_run(store.folder), reason)  # no engine needs to start
     search = driver.Search(
         config=config,
         algorithm=ALGORITHMS[config.search.algorithm](config),
@@ -115,7 +115,7 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
 
 
 class _OnPlatforms:
-    """The run's store for the loop: what a generation was computed on is recorded before the generation is."""
+    """The run's store for the loop, which records the platform of a generation before it commits the generation."""
 
     def __init__(self, store: RunStore, engine: Engine[Any], on_notice: OnNotice) -> None:
         self._store, self._engine, self._on_notice = store, engine, on_notice
@@ -124,15 +124,15 @@ class _OnPlatforms:
         self.part = store.part
 
     def commit(self, generation: int, parts: Mapping[str, Arrays], history: driver.HistoryRow) -> None:
-        """Record the platform if it is not the one in force, and say so if it is not the first; then commit."""
+        """Record the platform if it has changed, with a notice if the run becomes mixed by that; then commit."""
         workers = self._engine.platforms
         if workers != self._workers:
             platform = computed_on(self._driver, workers)
             is_other = self._store.record_platform(generation, platform)
             if is_other and (generation or is_mixed([platform])):
                 self._on_notice(
-                    f"from generation {generation} on this run has another platform, or workers of several: "
-                    f"{platform}. Its digest now says `mixed`."
+                    f"from generation {generation} on, this run is computed on another platform, or on several: "
+                    f"{platform}. Its digest is now marked `mixed`."
                 )
             self._workers = workers
         self._store.commit(generation, parts, history)
@@ -140,24 +140,24 @@ class _OnPlatforms:
 
 @contextmanager
 def _naming_the_run(folder: Path) -> Iterator[None]:
-    """Add to an error of the rollouts which run it ended, and that this run can be resumed."""
+    """Add to an error of the rollouts the run's folder, and resuming the run as a way out."""
     try:
         yield
     except EvaluationError as error:
         run = str(folder)
-        resume = WayOut("resume", "go on from the last finished generation once the cause is gone", run)
+        resume = WayOut("resume", "continue from the last finished generation after the cause is fixed", run)
         ways_out = [replace(way, run=way.run or run) for way in error.ways_out]
         error.run, error.ways_out = run, (*ways_out, resume)
         raise
 
 
 def dispatch_limits(config: RunConfig) -> Limits:
-    """How patient the engine is, and with how many workers."""
+    """The engine's number of workers and time limits."""
     compute = config.compute
     return Limits(
         workers=worker_count(config),
         max_attempts=compute.max_attempts,
-        start_deadline_s=compute.no_worker_timeout_s / 2,  # two tries fit in
+        start_deadline_s=compute.no_worker_timeout_s / 2,  # so that two attempts fit into it
         first_deadline_s=compute.compile_timeout_s,
         min_deadline_s=compute.chunk_timeout_s,
         no_worker_timeout_s=compute.no_worker_timeout_s,
@@ -166,7 +166,7 @@ def dispatch_limits(config: RunConfig) -> Limits:
 
 
 def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) -> Engine[Any]:
-    """What runs the workers, as configured; they are starting."""
+    """The configured engine, whose workers are starting."""
     spec, compute, limits = worker_spec(config, task_of(config)), config.compute, dispatch_limits(config)
     if compute.engine == "inline":
         return inline_engine(spec, limits, should_stop, threads=compute.inline_workers == "threads", log=log)
@@ -186,8 +186,8 @@ def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) 
 
 
 def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Moments]:
-    """The initial centres, and the observation statistics: random ones with none, or all of them the one that
-    the run was created with."""
+    """The initial centres and observation statistics: random centres without statistics, or copies of the policy of
+    `search.init_from` with its statistics."""
     task, centres = task_of(config), range(config.search.centres)
     if store.start is not None:
         return [store.start["centre_D"] for _ in centres], moments_from_arrays(store.start)
@@ -197,6 +197,6 @@ def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Mome
 
 
 def worker_count(config: RunConfig) -> int:
-    """Workers to start: as configured, or one per core this process may use."""
+    """Number of workers: as configured, or one per core that this process may use."""
     workers = config.compute.workers
     return cores() if workers == "auto" else workers

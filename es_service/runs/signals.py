@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM as a request: the first is noticed at the next wait, a later one ends the process at once."""
+"""SIGINT and SIGTERM as requests to stop: the first takes effect at the next wait, a later one exits at once."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from contextlib import contextmanager, suppress
 from es_service.errors import Interrupted
 
 REPEAT_S = 1.0
-"""A second signal within this time is the same request: launchers forward what the terminal has sent already."""
+"""A second signal within this time is the same request: launchers forward a signal that the terminal also sent."""
 SHOW_CURSOR = b"\x1b[?25h\n"
-"""A live table hides the cursor, and at once means without putting anything back."""
+"""Shows the terminal's cursor, which a live table hides and an immediate exit would not restore."""
 
 
 class StopRequest:
@@ -28,11 +28,11 @@ class StopRequest:
         return self.number
 
     def handle(self, number: int, frame: object) -> None:
-        """Signal handler. Nothing is interrupted half-way: a transaction in hand is finished first."""
+        """Signal handler: remember the first request, so that a transaction is finished first; exit on a later one."""
         now = time.monotonic()
         if self.number is None:
             self.number, self._since_s = number, now
-        elif now - self._since_s > REPEAT_S:  # asked again; what is committed is safe
+        elif now - self._since_s > REPEAT_S:  # a later request; committed generations are safe
             with suppress(OSError):
                 if os.isatty(1):
                     os.write(1, SHOW_CURSOR)
@@ -40,19 +40,19 @@ class StopRequest:
 
 
 EARLY = StopRequest()
-"""A signal that came when there was nothing to finish yet."""
+"""Holds a signal that arrived before any work had begun."""
 
 
 def interrupt(number: int, frame: object) -> None:
-    """Signal handler while there is nothing to finish: raises Interrupted. An import may catch and forget that, so the
-    next `stop_on_signals` knows of it too."""
+    """Signal handler before any work has begun: raise Interrupted. An import may catch and ignore the exception, so
+    the signal is also kept for the next `stop_on_signals`."""
     EARLY.number = number
     raise Interrupted(number)
 
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Catch SIGINT and SIGTERM inside the block; outside the main thread, where Python cannot, catch nothing."""
+    """Catch SIGINT and SIGTERM inside the block. In other threads, Python cannot catch them."""
     request = StopRequest()
     request.number = EARLY.number
     if threading.current_thread() is not threading.main_thread():

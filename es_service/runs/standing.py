@@ -1,4 +1,4 @@
-"""Where a run stands: its newest generation, its budget, whether it is running, finished, or was stopped."""
+"""The standing of a run: its newest generation, its budget, and whether it is running, finished or stopped."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from es_service.store.reader import read_newest
 
 @dataclass(frozen=True)
 class Standing:
-    """A run as it was when it was looked at."""
+    """A run at the moment when it was read."""
 
     run: Run
     driver: Mapping[str, Any] | None
-    """Who is writing, as `lock_holder` has it; None if nobody is."""
+    """The process that is writing, as `lock_holder` returns it; None if there is none."""
     row: Row | None
-    """The newest generation's; None before the first."""
+    """History row of the newest generation; None before the first."""
     limits: Mapping[str, float]
-    """Of the budget that the run would go on with, by key; none if that is not known."""
+    """Limits of the run's present budget by key; empty if the budget cannot be read."""
     problem: str = ""
-    """Why the budget is not known."""
+    """Why the budget cannot be read; empty if it can."""
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Why the run is over, by key of the budget; nothing if it is not."""
+        """Why the run is finished, by key of the budget; empty if it is not."""
         return spent(self.limits, self.row) if self.row else {}
 
 
 def newest_runs(folder: Path, most: int = 10) -> list[Path]:
-    """The runs right below a folder that were written last, the newest first; none if there is no such folder."""
+    """The runs directly below a folder that were written last, newest first; empty if the folder does not exist."""
     written = {path.parent: path.stat().st_mtime for path in folder.glob(f"*/{DATABASE}")}
     return sorted(written, key=lambda run: written[run], reverse=True)[:most]
 
 
 def look(run: Run) -> Standing:
-    """Where a run stands now. Raises StoreError if it cannot be read."""
-    driver = lock_holder(run.folder)  # asked before reading, so that the last row is not missed
+    """The present standing of a run. Raises StoreError if the run cannot be read."""
+    driver = lock_holder(run.folder)  # read before the history, so that the last row is not missed
     row = read_newest(run.folder)
     try:
         return Standing(run, driver, row, limits_of(BudgetConfig.model_validate(run.present_config["budget"])))
@@ -60,32 +60,32 @@ def look(run: Run) -> Standing:
 
 
 def state(standing: Standing) -> str:
-    """running, finished or stopped, and some words on it."""
+    """The state of a run in words: running, finished or stopped, with details."""
     if standing.driver:
         left = to_go(standing)
         who = f"running on {standing.driver['host']}, pid {standing.driver['pid']}"
-        return f"{who}; {left} to go" if left else who
+        return f"{who}; {left} left" if left else who
     if standing.problem:
         return f"stopped, and its budget cannot be read: {standing.problem}"
     if standing.reasons:
         return f"finished: {next(iter(standing.reasons.values()))}"
-    return "stopped before its budget is spent"
+    return "stopped before its budget was spent"
 
 
 def way_on(standing: Standing) -> WayOut:
-    """How to go on with a run that is not running."""
-    return WayOut("resume", "go on", str(standing.run.folder), more(standing))
+    """The way to continue a run that is not running."""
+    return WayOut("resume", "continue it", str(standing.run.folder), more(standing))
 
 
 def more(standing: Standing) -> dict[str, float | None]:
-    """Settings with which a run that is over goes on; none if it is not over."""
+    """Settings with which a finished run can continue; empty if it is not finished."""
     if standing.row is None:
         return {}
     return {f"budget.{key}": value for key, value in raised(standing.limits, standing.row).items()}
 
 
 def to_go(standing: Standing) -> str:
-    """About how long a run takes that goes on as it did so far; empty where that cannot be said."""
+    """Estimate of the remaining time at the run's average speed, such as "about 4 h"; empty if there is none."""
     row = standing.row
     if row is None:
         return ""

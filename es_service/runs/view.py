@@ -1,4 +1,4 @@
-"""A run as its reader sees it: history as a DataFrame, policies as NumPy functions. Reading never changes a run."""
+"""Reading of a run: history as a DataFrame, policies as NumPy functions. Reading never changes a run."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder, opened for reading. Every access reads what is committed now, also while a driver is writing."""
+    """A run folder, opened for reading. Every access reads the committed data, also while a driver is writing."""
 
     folder: Path
 
     @cached_property
     def meta(self) -> RunMeta:
-        """What was fixed when the run was created."""
+        """The data that were fixed when the run was created."""
         return reader.read_meta(self.folder)
 
     @property
     def run_id(self) -> str:
-        """Name of the run for ever, wherever its folder is moved."""
+        """Unique name of the run, which stays the same when its folder is moved."""
         return self.meta.run_id
 
     @property
@@ -49,10 +49,10 @@ class Run:
 
     @property
     def present_config(self) -> dict[str, Any]:
-        """`config` as the run would go on with it: budget, engine and time limits as they were last set.
+        """`config` with the budget, engine, workers and time limits that were set last, as `resume` would use them.
 
-        Other edits of `config.yaml` are left aside: they are for `resume` to refuse, and no part of what the run has.
-        Raises ConfigError if the folder's `config.yaml`, which has them, cannot be read.
+        Other edits of the folder's `config.yaml` are ignored here; `resume` refuses them. Raises ConfigError if that
+        file cannot be read.
         """
         file = self.folder / CONFIG
         if not file.exists():
@@ -65,18 +65,18 @@ class Run:
 
     @property
     def constants(self) -> dict[str, Any]:
-        """What cannot change in this run: dotted key -> value."""
+        """Settings that cannot change in this run: dotted key -> value."""
         return self.meta.constants
 
     @property
     def history(self) -> pd.DataFrame:
-        """One row per generation, indexed by generation; `es_service.loop.history` documents the columns. Whole numbers
-        stay whole where some are missing: pandas' Int64."""
+        """One row per generation, indexed by generation; `es_service.loop.history` documents the columns. Integer
+        columns with missing values have pandas' type Int64."""
         return self.history_until(None)
 
     def history_until(self, generation: int | None) -> pd.DataFrame:
         """`history` up to a generation, that one included."""
-        import pandas as pd  # a quarter of a second that starting a run need not spend
+        import pandas as pd  # takes 0.25 s, which starting a run need not spend
 
         columns, count = self.meta.columns, None if generation is None else generation + 1
         rows = reader.read_history(self.folder, None, count)
@@ -91,12 +91,12 @@ class Run:
     def parts(
         self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
     ) -> tuple[int, dict[str, dict[str, np.ndarray]]]:
-        """(generation, state parts, perhaps only some), verified; the newest, or one of the last two generations."""
+        """A generation (None: the newest, else one of the last two) and its verified state parts, those `wanted`."""
         return reader.read_parts(self.folder, generation, wanted)
 
     def at(self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True) -> Moment:
-        """The state after a generation, the newest or the one before it, or only some of its parts. All of them take
-        as much memory as all of the map's policies."""
+        """The state after a generation (None: the newest, else one of the last two), with the parts whose names are
+        `wanted`. All parts together take as much memory as all of the map's policies."""
         return Moment(self.folder, self.meta, *self.parts(generation, wanted))
 
     @property
@@ -106,32 +106,33 @@ class Run:
 
     @property
     def behaviour_map(self) -> BehaviourMap:
-        """The map as arrays, without the elites' parameters. Raises NotInRunError if the run keeps none."""
+        """The behaviour map as arrays, without the elites' parameters. Raises NotInRunError if the run has none."""
         return self.at(wanted=is_light).behaviour_map
 
     @property
     def map(self) -> pd.DataFrame:
-        """The map, one row per filled cell in the order of discovery: the cell's number, as the history has it, and its
-        place along each dimension (none of a cvt), fitness when it entered, descriptor, generation, centre."""
+        """The behaviour map, one row per filled cell in the order of discovery: the cell's number (as in the history)
+        and its index along each dimension (not for a cvt map); the elite's fitness, descriptor, generation and centre.
+        """
         return self.at(wanted=is_light).map
 
     def cell(self, place: int | Sequence[int]) -> int:
-        """Number of a filled cell named by its place, as `map` has it: (3, 17), or 1023 of a cvt.
+        """Number of the filled cell at a place: its indices, such as (3, 17), or its number in a cvt map, such as 1023.
 
-        Raises NotInRunError if there is no such cell, or nothing in it; the message names the nearest one that is
-        filled.
+        Raises NotInRunError if the cell does not exist or is empty; the message names the nearest filled cell.
         """
         return self.at(wanted=is_light).cell(place)
 
     def elite(self, place: int | Sequence[int]) -> Elite:
-        """What is kept of a cell's elite: parameters, statistics, trace. Raises as `cell`."""
+        """The elite of a cell: parameters, observation statistics and trace. Raises as `cell`."""
         cell = self.cell(place)
         return self.elites([cell])[1][cell]
 
     def elites(self, cells: Collection[int] | None = None) -> tuple[BehaviourMap, dict[int, Elite]]:
-        """The map and, by number of their cells, some of its elites or all of them, as of one generation.
+        """The map, and its elites by the numbers of their cells, read from one generation.
 
-        All of them take as much memory as all of their policies.
+        Args:
+            cells: numbers of the elites' cells; None: all, which takes as much memory as all of their policies.
         """
         names = None if cells is None else {elite_part(cell) for cell in cells}
 
@@ -142,7 +143,7 @@ class Run:
 
     @property
     def descriptor_names(self) -> list[str]:
-        """Of the descriptor's dimensions, in order."""
+        """Names of the descriptor's dimensions, in order."""
         return descriptor_names(self.meta)
 
     @property
@@ -151,9 +152,9 @@ class Run:
         return reader.read_generation(self.folder)
 
     def digest(self) -> str:
-        """SHA-256 over everything deterministic in the run, after checking all that is stored.
+        """SHA-256 of everything deterministic in the run, after a check of all stored data.
 
-        Raises StoreError that names what is damaged, as the command does.
+        Raises StoreError if data are damaged; the message names them.
         """
         return digest_of(checked_parts(self.folder)[0])
 
@@ -163,11 +164,13 @@ class Run:
         return policy_shape(self.meta)
 
     def policy(self, which: Literal["best", "centre"] | int | Sequence[int] = "best") -> Policy:
-        """The best centre so far, or a cell's elite, with the statistics it was evaluated with; or the newest centre
-        with those it would go on with.
+        """A policy of the run, with its observation statistics.
 
         Args:
-            which: "best", "centre", or a cell by its place, such as (3, 17). Raises NotInRunError for an empty one.
+            which: "best" (the best centre so far) or the place of a cell, such as (3, 17) (its elite), with the
+                statistics of their evaluation; or "centre" (the newest centre), with the statistics it would use next.
+
+        Raises NotInRunError for a cell that does not exist or is empty, ValueError for another name.
         """
         if which == "best":
             return self.at(wanted=lambda part: part == BEST).policy("best")
@@ -185,7 +188,7 @@ def is_light(part: str) -> bool:
 
 
 def is_no_elite(part: str) -> bool:
-    """Whether a part of the state is anything but the policy of an elite, of which there may be many."""
+    """Whether a part of the state is not the policy of an elite; there may be many of those."""
     return not part.startswith(ELITE_PREFIX)
 
 

@@ -54,7 +54,7 @@ def test_the_address_is_that_of_the_dashboard(address, host):
 
 
 def test_a_relative_folder_is_refused():
-    with pytest.raises(ConfigError, match=r"the run folder runs/x must be absolute"):
+    with pytest.raises(ConfigError, match=r"the run folder runs/x must be an absolute path"):
         jobs.submit(CONFIG, "http://127.0.0.1:8265", "runs/x")
 
 
@@ -115,7 +115,7 @@ def test_a_start_that_is_another_folder_on_the_head_is_refused(tmp_path, start, 
     search = {"algorithm": "es"} | ({"init_from": start} if in_file else {})
     file.write_text(dump_yaml({"task": {"environment": "point_maze"}, "search": search, "budget": {"generations": 1}}))
     set_ = [] if in_file else [f"search.init_from={start}"]
-    with pytest.raises(ConfigError, match=rf"search\.init_from: {start} must be absolute"):
+    with pytest.raises(ConfigError, match=rf"search\.init_from: {start} must be an absolute path"):
         cli_jobs.submit(file, "http://127.0.0.1:1", "/runs/x", set_=set_)
     with pytest.raises(EvaluationError, match="the Ray job request to"):  # past this check: nothing answers there
         cli_jobs.submit(file, "http://127.0.0.1:1", "/runs/x", set_=["search.init_from=/runs/a"])

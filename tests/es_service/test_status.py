@@ -76,7 +76,7 @@ def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, cap
     assert way is not None
     assert (way.action, way.run) == ("fork", str(run.folder))
     assert way.settings == {"search.sigma": 0.05, **more(look(run))}
-    with pytest.warns(RuntimeWarning, match="nothing was run"):
+    with pytest.warns(RuntimeWarning, match="no generation was run"):
         empty = api.fork(run.folder, ["search.sigma=0.05"], out=tmp_path / "empty").run
     assert more(look(empty)) == more(look(run))
     for going_on in (
@@ -97,7 +97,7 @@ def test_without_a_folder_the_newest_runs_are_shown(run, tmp_path, monkeypatch):
     shown = CliRunner().invoke(app, ["status"], env={"COLUMNS": "200"}).stdout.splitlines()
     assert [line.split()[0] for line in shown] == ["run", "runs/new", "runs/old"]
     refused = CliRunner().invoke(app, ["status", "--follow"])
-    assert "--follow: watches one run, got 0 folders" in str(refused.exception)
+    assert "--follow: needs exactly one folder, got 0" in str(refused.exception)
 
 
 def test_budgets_are_shown_beside_what_is_reached(run, console, capsys):
@@ -117,13 +117,14 @@ def test_stopped_and_running(run, console, capsys):
     config.write_text(text.replace("generations: 5", "generations: 8000"))  # as a driver leaves it that was killed
     print_status(console, run)
     assert (
-        f"stopped before its budget is spent; go on with: es-service resume {run.folder}\n" in capsys.readouterr().out
+        f"stopped before its budget was spent; continue with: es-service resume {run.folder}\n"
+        in capsys.readouterr().out
     )
     lock = acquire_lock(run.folder)
     print_status(console, run)
     lock.release()
     assert "state              running on " in (printed := capsys.readouterr().out)
-    assert " to go\n" in printed
+    assert " left\n" in printed
     assert "\ngeneration         5 of 8,000\n" in printed
     config.write_text(text)
 
@@ -135,9 +136,9 @@ def test_time_to_go_is_that_of_the_budget_that_is_spent_first(run):
         return state(Standing(run, {"host": "a", "pid": 1}, row, limits))
 
     assert running({}) == running({"target_fitness": 1.0}) == "running on a, pid 1"
-    assert running({"generations": 500}) == "running on a, pid 1; about 4 h to go"
-    assert running({"generations": 500, "env_steps": 1_500_000}) == "running on a, pid 1; about 30 min to go"
-    assert running({"wall_clock_s": 3610.0}) == "running on a, pid 1; about 10 s to go"
+    assert running({"generations": 500}) == "running on a, pid 1; about 4 h left"
+    assert running({"generations": 500, "env_steps": 1_500_000}) == "running on a, pid 1; about 30 min left"
+    assert running({"wall_clock_s": 3610.0}) == "running on a, pid 1; about 10 s left"
 
 
 @pytest.mark.parametrize("budget", ["budget: {generations: many}", "budget: 3", "[", "budget: null"])
@@ -178,4 +179,4 @@ def test_the_command_takes_several_runs_and_follows_one(run, tmp_path):
     assert cli.invoke(app, ["status", str(run.folder), str(tmp_path)]).exit_code == 1
     refused = cli.invoke(app, ["status", str(run.folder), str(run.folder), "--follow"])
     assert isinstance(refused.exception, ConfigError)
-    assert "--follow: watches one run, got 2 folders" in str(refused.exception)
+    assert "--follow: needs exactly one folder, got 2" in str(refused.exception)

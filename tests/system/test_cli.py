@@ -126,11 +126,11 @@ def test_list_and_doctor(tmp_path):
     assert code == 0
     words = " ".join(printed.replace("│", " ").split())
     for wanted in (
-        "point_maze a point crosses a square behind two walls; the straight way to the goal is blocked twice "
+        "point_maze a point must reach a goal in a square; two walls block the direct path "
         "observation 2, action 2, steps 200 descriptor: x in [-1, 1], y in [-1, 1] option start: default | corner",
         "brax:NAME any environment",
-        "module:Class one of your own",
-        "module:function One of your own",
+        "module:Class a task of your own",
+        "module:function A search of your own",
         "search.pairs",
     ):
         assert wanted in words

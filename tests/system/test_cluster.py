@@ -180,7 +180,7 @@ def test_a_job_is_submitted_followed_stopped_and_goes_on_in_another_cluster(tmp_
             (("logs", "es-nothing"), "there is no job es-nothing on"),
             (("logs", "es-nothing", "--follow"), "there is no job es-nothing on"),
             (("stop", "es-nothing"), "there is no job es-nothing on"),
-            (("submit", config, "--out", "runs/x"), "the run folder runs/x must be absolute"),
+            (("submit", config, "--out", "runs/x"), "the run folder runs/x must be an absolute path"),
         ):
             code, printed = es(hosts, *arguments)
             assert code in (1, 2)

@@ -25,13 +25,15 @@ def test_evaluate_puts_fresh_values_beside_stored_ones(tmp_path, mapped):
         assert float(row["stored_fitness"]) == fitness
         assert float(row["fresh_fitness"]) == pytest.approx(fitness, abs=1e-3)
         assert float(row["fresh_standard_error"]) == pytest.approx(0.0, abs=1e-4)
-    assert f"{len(mapped.map)} elites: {len(mapped.map)} still end in their cell" in result.stdout
+    assert (
+        f"{len(mapped.map)} elites: the mean descriptor of {len(mapped.map)} still lies in their cell" in result.stdout
+    )
     one = ",".join(map(str, mapped.map[["cell_x", "cell_y"]].iloc[0]))
     assert command("evaluate", mapped.folder, "--cell", one).returncode == 0
     for wrong, message in (
         ("99,0", "is not in the map"),
         ("a", "whole numbers"),
-        ("3", "has 2 numbers there, such as"),
+        ("3", "its cells are named by 2 numbers, such as"),
     ):
         result = command("evaluate", mapped.folder, "--cell", wrong)
         assert result.returncode == 2
@@ -59,7 +61,7 @@ def test_evaluate_replaces_a_file_when_it_has_all_rows(tmp_path, mapped):
         interrupted()
     assert file.read_text() == "of last week\n"
     assert (tmp_path / "rows.csv.new").read_text() == "policy,fitness\nbest,1.5\n"
-    assert notes == [f"what was evaluated until then is in {file}.new"]
+    assert notes == [f"the results so far are in {file}.new"]
     assert command("evaluate", mapped.folder, "--cell", "99,9", "--out", file).returncode == 2
     assert file.read_text() == "of last week\n"
     assert command("evaluate", mapped.folder, "--episodes", 2, "--out", file).returncode == 0

@@ -74,7 +74,7 @@ def test_searches_with_the_same_state_may_follow_one_another(tmp_path, algorithm
     moved = int(rows.loc[5, "centre"])
     for index in {0, 1, 2} - {moved}:
         assert (after[f"centre_{index}"]["centre_D"] == before[f"centre_{index}"]["centre_D"]).all()
-    with pytest.raises(ConfigError, match="would change nothing"):
+    with pytest.raises(ConfigError, match="would have no effect"):
         lineage.fork_config(parent.folder, [f"search.algorithm={other}", "search.fitness_weight_start=0.75"])
     with pytest.raises(ConfigError) as refused:
         api.resume(parent.folder, [f"search.algorithm={algorithm}"])
@@ -131,7 +131,7 @@ def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkey
     other = replace(SHIPPED["point_maze"], action_size=3)
     for module in (checked_config, tasks):
         monkeypatch.setattr(module, "TASKS", {"point_maze": other})
-    with pytest.raises(ConfigError, match=r"point_maze is not what it was \(action_size: 2 -> 3\)"):
+    with pytest.raises(ConfigError, match=r"point_maze has changed since the run was created \(action_size: 2 -> 3\)"):
         api.resume(parent.folder, ["budget.generations=7"])
     with pytest.raises(ConfigError, match=r"the network's layers: \[2, 8, 2\] -> \[2, 8, 3\]\n.*search\.init_from"):
         lineage.fork_config(parent.folder)
@@ -147,7 +147,7 @@ def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkey
 def test_a_task_with_other_columns_is_no_other_version(parent, monkeypatch, change, told):
     for module in (checked_config, tasks):
         monkeypatch.setattr(module, "TASKS", {"point_maze": replace(SHIPPED["point_maze"], **change)})
-    with pytest.raises(ConfigError, match=rf"the task point_maze is not what it was \({told}\)"):
+    with pytest.raises(ConfigError, match=rf"the task point_maze has changed since the run was created \({told}\)"):
         api.resume(parent.folder, ["budget.generations=7"])
 
 
@@ -156,7 +156,7 @@ def test_a_fork_whose_budget_is_spent_says_so(parent, tmp_path):
     forked = api.fork(parent.folder, ["search.sigma=0.1"], out=tmp_path / "fork", on_notice=told.append).run
     assert forked.generation == 6
     (notice,) = told
-    assert notice.startswith("nothing was run: the budget of 6 generations is spent at generation 6 already")
+    assert notice.startswith("no generation was run: the budget of 6 generations is spent already at generation 6")
     assert more(look(forked)) == {"budget.generations": 12}
     api.resume(forked.folder, ["budget.generations=7"], on_notice=told.append)
     assert (forked.generation, len(told)) == (7, 1)
@@ -215,7 +215,7 @@ def test_a_start_from_a_run_that_did_not_normalise_takes_no_statistics(parent, t
          "policy.observation_clip: 5.0 -> null, policy.observation_normalization: true -> false"),
     ):  # fmt: skip
         start(origin, *overrides)
-        assert f"acted on other observations than this run gives it ({change})" in told.pop()
+        assert f"this run processes observations differently from {origin.folder} ({change})" in told.pop()
 
 
 def test_what_a_resume_has_changed_is_so_for_a_fork_and_an_evaluation(parent, tmp_path, monkeypatch):
@@ -246,7 +246,7 @@ def test_a_history_comes_along_in_pieces(parent, tmp_path, monkeypatch):
         return rows
 
     monkeypatch.setattr(reader, "read_history", counted)
-    with pytest.warns(RuntimeWarning, match="nothing was run"):
+    with pytest.warns(RuntimeWarning, match="no generation was run"):
         child = fork(parent, tmp_path / "fork")
     assert lengths == [4, 3]
     assert child.digest() == parent.digest()
@@ -312,7 +312,7 @@ def test_init_from_starts_at_the_other_run_s_centre(config, finished, tmp_path):
     code, printed = es("run", config, "--out", tmp_path / "s", "--set", f"search.init_from={finished[0]}",
                        "--set", "policy.hidden=[16]")  # fmt: skip
     assert code == 2
-    assert "has layers [2, 8, 2], this run's has [2, 16, 2]" in printed
+    assert "has layers [2, 8, 2], this run's policy has [2, 16, 2]" in printed
     assert not (tmp_path / "s").exists()
 
 

@@ -73,7 +73,7 @@ def test_sigterm_while_ray_starts_ends_as_at_any_other_time(config, tmp_path):
             process.terminate()
             _, errors = process.communicate(timeout=60)
         assert (process.returncode, "Traceback" in errors) == (143, False), (delay_s, errors)
-        assert errors.endswith(f"Go on with: es-service resume {folder}\n")
+        assert errors.endswith(f"Continue with: es-service resume {folder}\n")
         reached.append(read_generation(folder))
         delay_s = 2 * delay_s or 0.5
     assert reached.count(None) >= 3

@@ -64,7 +64,7 @@ def test_a_fork_with_another_task_begins_with_an_empty_map(tmp_path, mapped):
     forked = api.fork(mapped.folder, changes, out=tmp_path / "fork").run
     assert len(forked.map) <= 1
     changes = ["task.episode_steps=30", "budget.generations=40"]  # which are spent already
-    with pytest.warns(RuntimeWarning, match="nothing was run"):
+    with pytest.warns(RuntimeWarning, match="no generation was run"):
         forked = api.fork(mapped.folder, changes, out=tmp_path / "empty").run
     assert forked.constants["map.qd_offset"] == pytest.approx(-2.3431 * 30)
     assert len(forked.map) == 0
@@ -125,7 +125,7 @@ def test_a_cell_that_is_empty_or_not_there_names_the_nearest_filled_one(mapped):
     for place, what in ((empty, "is empty"), ((16, 0), "is not in the map"), ((1, 2, 3), "is not in the map")):
         with pytest.raises(NotInRunError, match=what) as error:
             mapped.policy(place)
-        named = tuple(map(int, re.findall(r"(\d+),(\d+)(?:, the first|$)", str(error.value))[0]))
+        named = tuple(map(int, re.findall(r"(\d+),(\d+)(?: \(the first|$)", str(error.value))[0]))
         assert named in filled
         if place == empty:
             assert (named[0] - empty[0]) ** 2 + (named[1] - empty[1]) ** 2 == distance

@@ -120,7 +120,7 @@ def test_an_interruption_names_a_command_that_is_there(config, tmp_path):
         assert run.stdout is not None
         assert run.stdout.readline().startswith("generation 0")
         run.send_signal(signal.SIGINT)
-        assert run.communicate(timeout=60)[1].endswith(f"Go on with: {PROGRAM} resume {folder}\n")
+        assert run.communicate(timeout=60)[1].endswith(f"Continue with: {PROGRAM} resume {folder}\n")
 
 
 def test_run_or_resume_goes_on_where_only_the_copy_is_left(tmp_path):
@@ -184,7 +184,7 @@ def test_a_run_goes_on_where_nobody_reads_its_output(tmp_path, errors):
         run.stdout.close()
         time.sleep(2.5)  # it prints once a second
         if run.stderr:
-            assert run.stderr.readline().endswith(f"the run goes on: es-service status {folder} --follow\n")
+            assert run.stderr.readline().endswith(f"the run continues. Watch: es-service status {folder} --follow\n")
         reached = read_generation(folder) or 0
         wait_until(run, lambda: (read_generation(folder) or 0) > reached)
         run.terminate()

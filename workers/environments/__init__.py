@@ -33,7 +33,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
         options={"start": ("default", "corner")},
         walls=(((-0.5, -0.495), (1.0, -0.495)), ((-1.0, 0.205), (0.5, 0.205))),
         least_reward=-2.3431,  # from the corner (1, -1)
-        summary="a point crosses a square behind two walls; the straight way to the goal is blocked twice",
+        summary="a point must reach a goal in a square; two walls block the direct path",
     ),
     "ant_maze": TaskSpec(
         name="ant_maze",
@@ -55,7 +55,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
         ),
         wall_clearance=ANT_CLEARANCE,
         least_reward=-95.6,  # from the corner (-35, 40)
-        summary="an ant must go round three walls to a goal 60 m away; the straight way ends in a pocket",
+        summary="an ant must go round three walls to a goal 60 m away; the direct path ends in a pocket",
     ),
     "ant_trap": TaskSpec(
         name="ant_trap",
@@ -69,7 +69,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
         walls=(((12.0, -2.0), (12.0, 2.0)), ((7.0, 3.0), (12.0, 3.0)), ((7.0, -3.0), (12.0, -3.0))),
         wall_clearance=ANT_CLEARANCE,
         least_reward=-3.38,  # QDax's figure for an episode's mean, not a bound for this ant
-        summary="an ant is rewarded for running straight into a trap; far ahead is only behind it",
+        summary="an ant is rewarded for running forward; a trap blocks the direct path, so the ant must go round it",
     ),
 }
 """Descriptions of the shipped tasks by name. A test compares each with the task's module."""

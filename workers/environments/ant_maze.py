@@ -1,4 +1,4 @@
-"""AntMaze: an ant must go round three walls to a goal 60 m away; the straight way ends in a pocket.
+"""AntMaze: an ant must go round three walls to a goal 60 m away; the direct path ends in a pocket.
 
 The arena, episode length and descriptor are those of the benchmark paper (Chalumeau et al. 2022); the inner walls, the
 start and the goal are those of the original ME-ES task (Colas et al. 2020).

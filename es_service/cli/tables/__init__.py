@@ -1,1 +1,1 @@
-"""What the commands print: tables and lines."""
+"""Tables and lines that the commands print."""

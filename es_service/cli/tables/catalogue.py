@@ -1,4 +1,4 @@
-"""What there is to choose from: tasks, algorithms, presets, shipped configs."""
+"""Tables of the available tasks, algorithms, presets and shipped configs."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from es_service.search.algorithms import ALGORITHMS
 
 
 def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> None:
-    """Tables of tasks, algorithms, the keys on which presets differ, and shipped configs."""
+    """Print tables of tasks, algorithms, the keys on which presets differ, and shipped configs."""
     tasks = _table("tasks (task.environment)")
     for task in known_tasks.values():
         tasks.add_row(task.name, _about(task))
     tasks.add_row("brax:NAME", "any environment of the installed Brax")
-    tasks.add_row("module:Class", "one of your own; workers/README.md says what it has to have")
+    tasks.add_row("module:Class", "a task of your own; see workers/README.md")
     console.print(tasks)
 
     algorithms = _table("algorithms (search.algorithm)")
     for name, factory in ALGORITHMS.items():
         algorithms.add_row(name, (factory.__doc__ or "").strip().splitlines()[0])
-    algorithms.add_row("module:function", "One of your own; es_service/search/algorithms/own.py says what it gives.")
+    algorithms.add_row("module:function", "A search of your own; see es_service/search/algorithms/own.py.")
     console.print(algorithms)
 
     presets = Table(title="presets (search.preset): the keys on which they differ", title_justify="left")
@@ -47,7 +47,7 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
 def _table(title: str) -> Table:
     table = Table(title=title, title_justify="left")
     table.add_column("name", no_wrap=True)
-    table.add_column("what it is")
+    table.add_column("description")
     return table
 
 
@@ -63,5 +63,5 @@ def _about(task: TaskSpec) -> str:
 
 
 def _value(value: object) -> str:
-    """As one would type it in a config."""
+    """A value as written in a config."""
     return f"{value:g}" if isinstance(value, float) else show(value)

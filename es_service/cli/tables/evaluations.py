@@ -1,4 +1,4 @@
-"""What `es-service evaluate` prints: stored and fresh values side by side."""
+"""The table that `es-service evaluate` prints: stored and fresh values side by side."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ Write = Callable[[Mapping[str, Any]], None]
 
 @contextlib.contextmanager
 def csv_file(path: Path | None, note: Callable[[str], None]) -> Iterator[Write]:
-    """What to call with each row of a table, which is at `path` once all of them are there; None for none.
+    """Yield a function that writes one row to the CSV file at `path`, or does nothing if `path` is None.
 
-    Until then they are in a file beside it, and what was at `path` stays. If something ends this early they are left
-    there, which `note` is told.
+    The rows are written to a new file beside `path`, which replaces `path` when the block ends. If the block ends
+    with an error, the new file is kept, and `note` is called with a sentence that names it.
 
-    Raises ConfigError for a name without .csv, so that nothing else is ever overwritten, StoreError if it cannot be
-    written.
+    Raises ConfigError for a name that does not end in .csv, so that no other kind of file is overwritten, and
+    StoreError if the file cannot be written.
     """
     if path is None:
         yield lambda row: None
@@ -37,7 +37,7 @@ def csv_file(path: Path | None, note: Callable[[str], None]) -> Iterator[Write]:
     new, is_empty = path.with_name(f"{path.name}.new"), True
     with _explained(path):
         if path.is_dir():
-            raise ConfigError(f"--out {path}: is a folder; must be a file")
+            raise ConfigError(f"--out {path}: is a folder; give the name of a file")
         file = new.open("w", newline="")
 
     def write(row: Mapping[str, Any]) -> None:
@@ -56,12 +56,12 @@ def csv_file(path: Path | None, note: Callable[[str], None]) -> Iterator[Write]:
             file.close()
             os.replace(new, path)
     except BaseException:
-        with contextlib.suppress(OSError):  # on a full disk there is still something to write
+        with contextlib.suppress(OSError):  # closing writes the last rows, which fails on a full disk
             file.close()
         if is_empty:
             new.unlink(missing_ok=True)
         else:
-            note(f"what was evaluated until then is in {new}")
+            note(f"the results so far are in {new}")
         raise
 
 
@@ -74,10 +74,10 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def print_evaluations(console: Console, run: Run, results: Iterable[Fresh], write: Write, *, every: bool) -> None:
-    """A line per policy as it comes, its row to `write`; then, if `every` elite was asked, what it says of the map."""
+    """Print a line per policy as results arrive, and `write` its row; with `every`, end with a summary of the map."""
     names = run.descriptor_names
     found: list[Fresh] = []
-    _line(console, f"{'policy':<10} {'from':>7} {'stored':>10} {'fresh':>10} {'± s.e.':>8}  where (± spread)")
+    _line(console, f"{'policy':<10} {'generation':>10} {'stored':>10} {'fresh':>10} {'± s.e.':>8}  descriptor (± std)")
     for fresh in results:
         found.append(fresh)
         row = _row(fresh, names)
@@ -86,7 +86,7 @@ def print_evaluations(console: Console, run: Run, results: Iterable[Fresh], writ
         one = fresh.candidate
         _line(
             console,
-            f"{one.name:<10} {one.generation:>7} {one.stored_fitness:>10.2f} {fresh.mean:>10.2f} "
+            f"{one.name:<10} {one.generation:>10} {one.stored_fitness:>10.2f} {fresh.mean:>10.2f} "
             f"{fresh.standard_error:>8.2f}  {where}",
         )
     if every:
@@ -108,7 +108,7 @@ def _row(fresh: Fresh, names: list[str]) -> dict[str, Any]:
 
 
 def _about_elites(run: Run, elites: list[Fresh]) -> str:
-    """Stored and fresh QD-score, and how many elites still end in their cells."""
+    """Summary of a map: how many elites still end in their cells, and the QD-score, stored and fresh."""
     offset = run.constants["map.qd_offset"]
     stayed = sum(fresh.cell == fresh.candidate.cell for fresh in elites)
     best: dict[int, float] = {}
@@ -118,8 +118,9 @@ def _about_elites(run: Run, elites: list[Fresh]) -> str:
     stored = math.fsum(fresh.candidate.stored_fitness - offset for fresh in elites)
     again = math.fsum(fitness - offset for fitness in best.values())
     return (
-        f"{len(elites)} elites: {stayed} still end in their cell on average; put into a new map by their fresh values "
-        f"they fill {len(best)} cells.\nQD-score (offset {offset:g}): {stored:,.0f} stored, {again:,.0f} fresh"
+        f"{len(elites)} elites: the mean descriptor of {stayed} still lies in their cell; a new map built from the "
+        f"fresh values has {len(best)} filled cells.\n"
+        f"QD-score (offset {offset:g}): {stored:,.0f} stored, {again:,.0f} fresh"
     )
 
 

@@ -1,4 +1,4 @@
-"""Several runs side by side, a line each."""
+"""Overview of several runs, one line each."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _COLUMNS = ("run", "algorithm", "task", "seed", "generation", "env steps", "best
 
 
 def print_overview(console: Console, folders: Sequence[Path]) -> bool:
-    """A line for each run; where one cannot be read, why. Whether all could be."""
+    """Print a line for each run, with the error if it cannot be read; return whether all could be read."""
     rows, problems = [], 0
     for folder in folders:
         try:
@@ -27,7 +27,7 @@ def print_overview(console: Console, folders: Sequence[Path]) -> bool:
     widths = [max(map(len, column)) for column in zip(_COLUMNS, *rows, strict=True)]
     for row in (_COLUMNS, *rows):
         line = "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-        console.print(line, highlight=False, markup=False, soft_wrap=True)  # folders are there to be copied
+        console.print(line, highlight=False, markup=False, soft_wrap=True)  # not wrapped, so that folders can be copied
     return not problems
 
 

@@ -1,4 +1,4 @@
-"""What a run shows while it runs: a live table on a terminal, one plain line a second elsewhere (TERM=dumb, too)."""
+"""Progress of a run: a live table on a terminal; elsewhere, also with TERM=dumb, at most one plain line per second."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ShowRow = Callable[[Row], None]
 ShowNotice = Callable[[str], None]
 TABLE_ROWS = 12
 ROWS_AROUND = 9
-"""Lines of a screen that the table's own frame, its title and the line below need."""
+"""Screen lines needed for the table's frame, its title and the line below it."""
 RATE_WINDOW = 20
 """Generations over which steps per second are averaged for display."""
 _PARTS = ("rollout", "gradient", "evaluation", "driver", "store")
@@ -28,7 +28,7 @@ _PARTS = ("rollout", "gradient", "evaluation", "driver", "store")
 @contextmanager
 def show_progress(console: Console, errors: Console, title: str) -> Iterator[tuple[ShowRow, ShowNotice]]:
     """Yield two functions: one to call with every history row, one with every notice."""
-    if not console.is_terminal or console.is_dumb_terminal:  # which cannot move its cursor up a table
+    if not console.is_terminal or console.is_dumb_terminal:  # a dumb terminal cannot redraw a table
         yield _plain_lines(console), partial(_print_notice, errors)
         return
     recent: deque[Row] = deque(maxlen=RATE_WINDOW)
@@ -38,7 +38,7 @@ def show_progress(console: Console, errors: Console, title: str) -> Iterator[tup
             recent.append(row)
             live.update(live_table(title, recent, console.width, console.height))
 
-        yield show, partial(_print_notice, live.console)  # above the table
+        yield show, partial(_print_notice, live.console)  # notices appear above the table
 
 
 def _print_notice(console: Console, notice: str) -> None:
@@ -46,7 +46,7 @@ def _print_notice(console: Console, notice: str) -> None:
 
 
 def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group:
-    """The last generations, and where their time went; fewer columns and rows on a small screen."""
+    """Table of the last generations, and their time by part; fewer columns and rows on a small screen."""
     columns: dict[str, Callable[[Row], str]] = {
         "generation": lambda row: str(row["generation"]),
         "centre fitness": lambda row: f"{row['centre_fitness_mean']:.2f} ± {row['centre_fitness_std']:.2f}",
@@ -67,7 +67,7 @@ def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group
 
 
 def time_by_part(rows: deque[Row] | list[Row]) -> str:
-    """Shares of the time of some generations: "time: rollout 81 %, gradient 6 %, ..."; faults if there were any."""
+    """Mean time of generations, its shares by part ("5.0 ms a generation: rollout 81 %, ..."), and lost workers."""
     seconds = {part: sum(row[f"seconds_{part}"] or 0.0 for row in rows) for part in _PARTS}
     whole = sum(seconds.values()) or 1.0
     per_generation = 1000.0 * whole / len(rows)
@@ -106,7 +106,7 @@ def _number(value: float | None) -> str:
 
 
 def short(value: float) -> str:
-    """A count with three digits: 850, 12.3 k, 4.56 M."""
+    """A count with three significant digits: 850, 12.3 k, 4.56 M."""
     for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
         if value >= size:
             return f"{value / size:.3g} {unit}"

@@ -1,4 +1,4 @@
-"""Where a run stands, and what to do with it next."""
+"""State and progress of a run, and the next commands for it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FOLLOW_INTERVAL_S = 1.0
 
 
 def print_status(console: Console, run: Run) -> None:
-    """Settings, progress, best result, whether it is running or over."""
+    """Print the settings of a run, its state (running, stopped or finished) and its progress."""
     standing = look(run)
     constants, parent = run.constants, run.meta.parent
     fields = {
@@ -27,7 +27,7 @@ def print_status(console: Console, run: Run) -> None:
     if parent:
         fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
     fields["state"] = (
-        state(standing) if standing.driver else f"{state(standing)}; go on with: {way_command(way_on(standing))}"
+        state(standing) if standing.driver else f"{state(standing)}; continue with: {way_command(way_on(standing))}"
     )
     _print_fields(console, fields | _progress(standing))
 
@@ -42,13 +42,13 @@ def follow_status(console: Console, run: Run) -> None:
             console.print(plain_line(standing.row), highlight=False, soft_wrap=True)
         if not standing.driver:
             way = way_command(way_on(standing))
-            _print_line(console, f"no driver is running: {state(standing)}; go on with: {way}")
+            _print_line(console, f"no driver is running: {state(standing)}; continue with: {way}")
             return
         time.sleep(FOLLOW_INTERVAL_S)
 
 
 def print_summary(console: Console, run: Run, reason: str) -> None:
-    """What a session ends with: the result, the folder, the next commands."""
+    """Print the summary of a session at its end: the result, the folder and the next commands."""
     standing, folder = look(run), run.folder
     doubled = {"search.sigma": float(f"{run.constants['search.sigma'] * 2:g}")}
     _print_line(console, f"\nDone: {reason}.")
@@ -67,10 +67,10 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
 def _progress(standing: Standing) -> dict[str, str]:
     last, limits = standing.row, standing.limits
     if last is None:
-        return {"generation": "none is finished yet"}
+        return {"generation": "no generation is finished yet"}
     goal = {}
     if "goal_distance" in last:
-        goal["goal distance"] = f"{last['goal_distance']:.3f} at the end, {last['goal_distance_min']:.3f} at its least"
+        goal["goal distance"] = f"{last['goal_distance']:.3f} at the end, minimum {last['goal_distance_min']:.3f}"
     filled = {}
     if "map_cells" in last:
         filled["map"] = f"{last['map_cells']:,} cells, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
@@ -78,7 +78,7 @@ def _progress(standing: Standing) -> dict[str, str]:
     lost, retries = read_totals(standing.run.folder, ("lost_workers", "retries"))
     faults = {}
     if lost or retries:
-        faults["faults survived"] = f"{lost} workers replaced, {retries} chunks handed out again"
+        faults["faults handled"] = f"{lost} workers replaced, {retries} chunks sent again"
     of = {key: f" of {limit:,}" for key, limit in limits.items()}
     target = f" (target: {limits['target_fitness']:g})" if "target_fitness" in limits else ""
     return {
@@ -101,5 +101,5 @@ def _print_fields(console: Console, fields: dict[str, str]) -> None:
 
 
 def _print_line(console: Console, text: str) -> None:
-    """As it is: folders and commands are there to be copied, so nothing is wrapped or cut."""
+    """Print a line without wrapping or cutting it, so that folders and commands can be copied."""
     console.print(text, highlight=False, markup=False, soft_wrap=True)
