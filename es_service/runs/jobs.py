@@ -46,7 +46,7 @@ def submit(config: RunConfig, address: str, out: str) -> str:
 
     Args:
         config: must have engine ray and the address "auto", the cluster in which the job runs.
-        out: absolute path of the run folder, as the cluster's head sees it. If it holds the run, the job goes on with
+        out: absolute path of the run folder, as the cluster's head sees it. If it holds the run, the job continues
             it; if it holds another run, the job fails and says what differs.
 
     Raises:

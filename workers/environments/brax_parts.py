@@ -16,21 +16,22 @@ from typing import Any
 
 from workers.environments import TaskError
 
-WORKS_WITH = {"brax": "0.14.", "mujoco": "4.0.", "mujoco-mjx": "3.17."}
+WORKS_WITH = {"brax": ("0.14.",), "mujoco": ("3.16.", "3.17.", "4.0."), "mujoco-mjx": ("3.16.", "3.17.")}
 """Prefixes of the versions with which the physics was compared with Brax's; each MJX release may break Brax."""
 
 
 def check_versions() -> None:
     """Raise TaskError if Brax or MuJoCo is not installed in the supported version."""
-    for package, version in WORKS_WITH.items():
+    for package, versions in WORKS_WITH.items():
         try:
             installed = metadata.version(package)
             found = f"{package} {installed} is installed"
         except metadata.PackageNotFoundError:
             installed, found = "", f"{package} is not installed"
-        if not installed.startswith(version):
+        if not installed.startswith(versions):
+            required = " or ".join(f"{prefix}*" for prefix in versions)
             raise TaskError(
-                f"{found}, but {package} {version}* is required: pip install -c constraints.txt brax mujoco mujoco-mjx"
+                f"{found}, but {package} {required} is required: pip install -c constraints.txt brax mujoco mujoco-mjx"
             )
 
 
