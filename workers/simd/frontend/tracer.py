@@ -59,8 +59,8 @@ class Tracer:
             except UnsupportedError as error:
                 # An equation inside of a library's function may have no source line; the calling equation has one.
                 where = source_info_util.summarize(equation.source_info)
-                if where and "(at " not in str(error):
-                    raise UnsupportedError(f"{error} (at {where})") from None
+                if where and not error.place:
+                    raise UnsupportedError(str(error), where) from None
                 raise
             if not isinstance(outputs, list):
                 outputs = [outputs]

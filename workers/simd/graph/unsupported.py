@@ -9,6 +9,11 @@ from collections.abc import Iterator
 class UnsupportedError(Exception):
     """A function cannot be compiled; the message names the unsupported part and where it comes from."""
 
+    def __init__(self, message: str, place: str = "") -> None:
+        """`place` is the line of the task that has the unsupported part, if that is known."""
+        super().__init__(f"{message} (at {place})" if place else message)
+        self.place = place
+
 
 @contextlib.contextmanager
 def refusing() -> Iterator[None]:
