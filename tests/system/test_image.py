@@ -47,6 +47,7 @@ def image(tmp_path_factory):
     if not sh("podman", "--storage-driver=vfs", "images", "--quiet", BASE).strip():
         tree = tmp_path_factory.mktemp("base")
         sh("debootstrap", "--variant=minbase", "--include=python3,python3-venv,ca-certificates", "bookworm", tree)
+        tree.chmod(0o755)  # it becomes the root folder, which pytest made for its own user alone
         sh("tar", "-C", tree, "-cf", f"{tree}.tar", ".")
         sh("podman", "--storage-driver=vfs", "import", f"{tree}.tar", BASE)
     build = ["podman", "--storage-driver=vfs", "build", "--isolation=chroot", "--network=host"]
