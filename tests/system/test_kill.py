@@ -94,7 +94,7 @@ def test_killed_in_every_generation_of_two_blocks(tmp_path):
     assert digest_parts(folder) == digest_parts(tmp_path / "undisturbed")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_killed_fifty_times_in_one_run(tmp_path):
     """Fifty SIGKILLs at random instants of one run, at least forty of them between its first commit and its end."""
     undisturbed, folder = tmp_path / "undisturbed", tmp_path / "run"

@@ -83,7 +83,9 @@ def test_reset_covers_its_rectangle_and_corner_is_fixed():
     np.testing.assert_array_equal(jax.vmap(corner.reset)(keys[:3]), np.float32([[0.9, -0.9]] * 3))
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize(
+    "name", [name if name == "point_maze" else pytest.param(name, marks=pytest.mark.slow) for name in SHIPPED]
+)
 def test_task_table_tells_the_truth(name):
     """The driver plans with the table and never sees the module; a wrong size would only show in a worker."""
     task = SHIPPED[name]

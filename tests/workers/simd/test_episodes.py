@@ -55,6 +55,7 @@ def distance(ours: Episodes, theirs: Episodes) -> np.ndarray:
     return np.maximum(apart, ours.steps != theirs.steps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["ant_maze", "ant_trap"])
 def test_a_few_steps_of_the_ants_are_xlas(task: str):
     """Later they part, as xla's own do when a last bit changes; whole episodes: tests/benchmarks/episode_parity.py."""
@@ -80,7 +81,7 @@ def test_a_few_steps_of_the_ants_are_xlas(task: str):
         ("point_maze", True, 8, (1,)),
         ("point_maze", True, 8, ()),
         ("point_maze", True, 8, (80, 112)),
-        ("ant_trap", True, 5, (256, 256)),
+        pytest.param("ant_trap", True, 5, (256, 256), marks=pytest.mark.slow),
     ],
 )
 def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int, hidden: tuple[int, ...]):
@@ -106,6 +107,7 @@ def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int,
         jax.tree.map(np.testing.assert_array_equal, found[0], other)
 
 
+@pytest.mark.slow
 def test_inputs_that_are_always_zero_are_left_out_and_missed_by_nobody():
     environment, worker_spec = (
         make_environment("ant_trap", {}),

@@ -47,7 +47,7 @@ def words_of(tree) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
 
 
-@pytest.mark.parametrize("name", ["point_maze", "ant_trap"])
+@pytest.mark.parametrize("name", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.slow)])
 def test_bits_are_the_twins_at_every_width(name: str) -> None:
     step, states, actions = step_of(name)
     closed = jax.make_jaxpr(step)(one_of(states), one_of(actions))

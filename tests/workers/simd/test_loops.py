@@ -236,6 +236,7 @@ LEAVES = 4
 STEPS = ("add", "mul", "sin", "half", "abs")
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_random_loops_are_jaxs(data: st.DataObject) -> None:

@@ -110,7 +110,9 @@ def moved(inputs: Any, rng: np.random.Generator, by: float | None) -> Any:
     return jax.tree.map(move, inputs)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [name if name == "point_maze" else pytest.param(name, marks=pytest.mark.slow) for name in NAMES]
+)
 def test_simd_steps_as_xla_does(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     step = control_step(make_environment(name, {}))
     xla = jax.jit(jax.vmap(step))

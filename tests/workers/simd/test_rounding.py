@@ -82,9 +82,9 @@ class Products:
         (f"{__name__}:Products", "final"),
         ("point_maze", "sum"),
         ("point_maze", "final"),
-        ("ant_maze", "final"),
-        ("ant_trap", "sum"),
-        ("brax:hopper", "sum"),
+        pytest.param("ant_maze", "final", marks=pytest.mark.slow),
+        pytest.param("ant_trap", "sum", marks=pytest.mark.slow),
+        pytest.param("brax:hopper", "sum", marks=pytest.mark.slow),
     ],
 )
 def test_training_evaluation_and_omitted_zero_inputs_agree_on_every_bit(task: str, fitness: str) -> None:
@@ -283,6 +283,7 @@ def run(program: list, values: list[Any]) -> list[Any]:
     return values
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(programs(2), programs(1), programs(1))
 def test_bits_do_not_depend_on_what_else_a_kernel_computes(program: list, before: list, after: list) -> None:
