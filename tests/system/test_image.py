@@ -29,6 +29,8 @@ missing = [tool for tool in TOOLS if shutil.which(tool) is None] + ["root"] * (o
 pytestmark = [pytest.mark.image, pytest.mark.skipif(bool(missing), reason=f"needs {', '.join(missing)}")]
 BASE, IMAGE = "localhost/es-test-base", "localhost/es-test"
 ADDRESSES = {"head": "10.78.0.1", "worker": "10.78.0.2"}
+HEAD = f"{ADDRESSES['head']}:6379"
+"""Named, since a chroot shows these containers the Rays of the machine's other processes, too."""
 URL = "http://127.0.0.1:8265"
 TOKEN = "0123456789abcdef" * 4
 
@@ -124,7 +126,9 @@ def test_two_containers_run_a_job(image, tmp_path):
         containers.start("head")
         wait_for(containers.healthy, timeout_s=120)
         containers.start("worker")
-        wait_for(lambda: containers.run("head", "ray", "status").count("node_") == 2, timeout_s=120)
+        wait_for(
+            lambda: containers.run("head", "ray", "status", f"--address={HEAD}").count("node_") == 2, timeout_s=120
+        )
         submit = ("es-service", "submit", config, "--out", "/runs/first", "--set", "budget.generations=200")
         wait_for(lambda: "es-" in containers.run("head", *submit, "--address", URL), timeout_s=120)
         (job,) = [
