@@ -24,7 +24,7 @@ from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import ONE_CORE, Claim, Watch, connect, demand, disconnect, look
 from es_service.errors import EvaluationError
-from es_service.protocol.messages import Centre, Chunk, WorkerPlace, WorkerSpec
+from es_service.protocol.messages import Centre, Work, WorkerPlace, WorkerSpec, forget_oldest
 
 IN_CALL_BYTES = 64 * 2**10
 """Largest size in bytes of a centre that is sent with every call; a larger one is stored, and fetched once per node."""
@@ -122,7 +122,8 @@ class Actors:
         self._to_ask: set[int] = set()
         """Workers that must be asked for their place again before the next chunks, because another worker was lost."""
         self._inbox: deque[Message] = deque()
-        self._centre: tuple[Centre, Any] | None = None
+        self._centres: dict[int, tuple[Centre, Any]] = {}
+        """By `id`, which the centre in the entry keeps from being reused."""
         # Ray would wait for ever. The scheduler's time with the same limit starts later, so the error is raised here,
         # where it can name the resources that are free in the cluster.
         self._placed_by_s = time.monotonic() + limits.no_worker_timeout_s
@@ -154,8 +155,8 @@ class Actors:
                 self._ray.kill(handle, no_restart=True)
         return ""
 
-    def send(self, worker: int, centre: Centre, item_id: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
-        """Call the actor. A large centre is stored once for all calls that share it, until the next centre.
+    def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
+        """Call the actor. A large centre is stored once for all calls that share it.
 
         The loss of an idle actor shows only when it is called. So after a loss, perhaps of a node, each other actor is
         asked for its place before its next chunks, which are charged with its loss only if it has answered that call.
@@ -163,13 +164,16 @@ class Actors:
         if worker not in self._handles:
             return  # it has just been lost when it was sent other chunks, which `receive` is going to report
         try:
-            if self._centre is None or self._centre[0] is not centre:
-                pickled = pickle.dumps(centre, pickle.HIGHEST_PROTOCOL)
-                self._centre = centre, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
+            centres: dict[int, Any] = {}
+            for centre, _ in work:
+                if id(centre) not in centres:
+                    centres[id(centre)] = self._packed(centre)
+            index = {key: number for number, key in enumerate(centres)}
+            chunks = pickle.dumps([(index[id(centre)], chunk) for centre, chunk in work], pickle.HIGHEST_PROTOCOL)
             if worker in self._to_ask:
                 self._to_ask.discard(worker)
                 self._calls[self._handles[worker].place.remote()] = _Call(worker, "place")
-            ref = self._handles[worker].run.remote(self._centre[1], pickle.dumps(chunks, pickle.HIGHEST_PROTOCOL))
+            ref = self._handles[worker].run.remote(chunks, *centres.values())
         except self._ray.exceptions.RayError as error:
             self._lose(worker, _reason(error))
             return
@@ -223,8 +227,17 @@ class Actors:
         for worker in list(self._handles):
             self.kill(worker)
         self._calls.clear()
-        self._centre = None
+        self._centres.clear()
         disconnect(self._ray, forget=forget)
+
+    def _packed(self, centre: Centre) -> Any:
+        """The centre as an argument of a call: pickled, or the reference under which Ray has stored that."""
+        if (known := self._centres.get(id(centre))) is None:
+            pickled = pickle.dumps(centre, pickle.HIGHEST_PROTOCOL)
+            known = centre, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
+            self._centres[id(centre)] = known
+            forget_oldest(self._centres)
+        return known[1]
 
     def _message(self, ref: Any) -> Message | None:
         call, errors = self._calls[ref], self._ray.exceptions

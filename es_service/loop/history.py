@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -116,16 +116,21 @@ def step_columns(old_D: FloatArray | None, new_D: FloatArray) -> HistoryRow:
 
 
 @np.errstate(invalid="ignore", over="ignore")
-def population_columns(population: EpisodesResult | None, invalid_members: int) -> HistoryRow:
-    """Quartiles of the valid members' fitness and return; `population` is None for generation 0, which has none."""
-    columns: HistoryRow = {"invalid_members": invalid_members}
-    for quantity in ("fitness", "return"):
+def population_columns(populations: Sequence[EpisodesResult]) -> HistoryRow:
+    """Number of invalid members, and quartiles of the valid members' fitness and return, of all populations together.
+
+    Args:
+        populations: fitness is NaN for invalid members, which only these have; empty for generation 0.
+    """
+    fitness_N = np.concatenate([np.zeros(0, np.float32), *(one.fitness.ravel() for one in populations)])
+    returns_N = np.concatenate([np.zeros(0, np.float32), *(one.returns.ravel() for one in populations)])
+    columns: HistoryRow = {"invalid_members": int(np.isnan(fitness_N).sum())}
+    for quantity, values in (("fitness", fitness_N), ("return", returns_N)):
         names = [f"population_{quantity}_{name}" for name in ("min", "q25", "median", "q75", "max")]
-        if population is None:
+        if not populations:
             columns |= dict.fromkeys(names)
             continue
-        values = population.fitness if quantity == "fitness" else population.returns
-        values = values[np.isfinite(population.fitness) & np.isfinite(values)].astype(np.float64)
+        values = values[np.isfinite(fitness_N) & np.isfinite(values)].astype(np.float64)
         quartiles = np.quantile(values, [0.0, 0.25, 0.5, 0.75, 1.0]) if values.size else np.full(5, np.nan)
         columns |= dict(zip(names, quartiles.tolist(), strict=True))
     return columns

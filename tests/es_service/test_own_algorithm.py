@@ -38,7 +38,7 @@ def test_the_example_weighs_novelty_of_the_better_half_alone():
     descriptor = np.array([[(2.0, 0.0), (9.0, 0.0)], [(1.0, 0.0), (5.0, 0.0)]], np.float32)
     steps = np.ones((2, 2), np.int32)
     population = EpisodesResult(fitness, fitness, descriptor, steps, descriptor, no_observations(2))
-    weights_P = search.weights(state, Ask(0, state.centres[0].centre_D, 0.0), population)
+    weights_P = search.weights(state, Ask(0, state.centres[0].centre_D, 0.02, 4, 0.0), population)
     lowest, second, best = 0.5 / 3 - 0.5, 2 / 3 - 0.5, 0.5  # two share the ranks 0 and 1
     np.testing.assert_allclose(weights_P, [best - lowest, second - lowest], rtol=1e-6)
 
@@ -114,7 +114,8 @@ def emptying(config):
 def foreign(config):
     """An elite of a cell far away, which no centre of the run has been to."""
 
-    def tell(state, evaluation):
+    def tell(state, evaluations):
+        (evaluation,) = evaluations
         elsewhere = np.array([-0.9, 0.9])
         return replace(state, map=insert(state.map, elsewhere, 1.0 * evaluation.generation, 10**6, 0, 0.0)[0])
 
@@ -124,7 +125,8 @@ def foreign(config):
 def choosy(config):
     """Offers every third centre to the map, and does not tell its centre."""
 
-    def tell(state, evaluation):
+    def tell(state, evaluations):
+        (evaluation,) = evaluations
         if evaluation.generation % 3 != 1:
             return state
         fitness = 1.0 * evaluation.generation  # later ones are fitter, wherever they are
@@ -135,7 +137,7 @@ def choosy(config):
 
 def _telling(config, change):
     ours = ALGORITHMS["es"](config)
-    return replace(ours, tell=lambda state, evaluation: change(ours.tell(state, evaluation)))
+    return replace(ours, tell=lambda state, evaluations: change(ours.tell(state, evaluations)))
 
 
 def _newest(archive, count):

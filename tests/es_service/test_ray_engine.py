@@ -16,7 +16,7 @@ from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorker
 from es_service.dispatch.ray_cluster import ONE_CORE, Membership, look
 from es_service.dispatch.ray_engine import Actors
 from es_service.errors import EvaluationError
-from es_service.protocol.messages import TrainingChunk
+from es_service.protocol.messages import TrainingChunk, around
 from tests.helpers import SPEC, centre, random_parameters
 
 FIRST = centre(random_parameters())
@@ -102,7 +102,7 @@ class PretendedRay:
         methods = {
             "place": lambda: ("host", actor.number, self.node_of(actor.number)),
             "build": lambda: f"kind {actor.number % 2}",
-            "run": lambda centre, chunks: pickle.dumps([f"of {chunk}" for chunk in pickle.loads(chunks)]),
+            "run": lambda chunks, *centres: pickle.dumps([f"of {chunk}" for _, chunk in pickle.loads(chunks)]),
         }
         calls = {name: SimpleNamespace(remote=self._caller(actor, name, body)) for name, body in methods.items()}
         return SimpleNamespace(itself=actor, **calls)
@@ -160,9 +160,9 @@ def test_a_node_that_dies_is_one_fault_of_what_it_ran_however_many_workers_it_he
 
     with ray_engine(ray, limits) as engine:
         while not all(actor.ran for actor in ray.actors):  # so that all are up
-            engine.evaluate(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)])
+            engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
         ray.on_run = node_dies
-        assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
+        assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert engine.counts.lost_workers == 5
 
 
@@ -183,9 +183,9 @@ def test_an_actor_that_waited_for_its_place_says_once_that_it_has_one():
     assert [actors.receive(0.0) for _ in range(3)] == [Placed(1), WorkerUp(1), None]
     ray.end(ray.actors[1])
     for worker in (1, 0):
-        actors.send(worker, FIRST, "key", 1, [CHUNK])
+        actors.send(worker, "key", 1, around(FIRST, [CHUNK]))
     assert isinstance(actors.receive(0.0), WorkerLost)
-    actors.send(0, FIRST, "other key", 1, [CHUNK])
+    actors.send(0, "other key", 1, around(FIRST, [CHUNK]))
     assert [type(actors.receive(0.0)) for _ in range(3)] == [Answer, Answer, type(None)]
 
 
@@ -199,7 +199,7 @@ def test_an_actor_that_is_given_no_place_is_not_lost():
 
     with ray_engine(ray, limits) as engine:
         ray.on_run = hang
-        assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
+        assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert len(ray.actors) > 8
         assert engine.counts.lost_workers == 1
         assert "no answer to work item" in engine.last_loss
@@ -217,7 +217,7 @@ def test_the_wait_for_a_first_place_is_the_policy_s(watch, message):
     since it has room for all: more nodes would not help."""
     limits = Limits(1, start_deadline_s=0.2, no_worker_timeout_s=0.4)
     with pytest.raises(EvaluationError, match=message) as caught, ray_engine(PretendedRay(0), limits, watch) as engine:
-        engine.evaluate(FIRST, [CHUNK])
+        engine.evaluate(around(FIRST, [CHUNK]))
     assert ("Add nodes" in str(caught.value)) == (watch is not None)
 
 
@@ -230,12 +230,12 @@ def test_a_node_that_dies_under_idle_workers_takes_none_of_the_others_along():
     with Engine(actors, Limits(4)) as engine:
         for alive in ({"old"}, {"old", "new"}, set(), {"old", "new"}):
             watch.now = Membership(4, frozenset(), frozenset(alive))
-            engine.evaluate(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)])
+            engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
             assert engine.counts.lost_workers == 0
         for number in range(2):
             ray.end(ray.actors[number])
         watch.now = Membership(2, frozenset(), frozenset({"new"}))
-        assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
+        assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert (engine.counts.lost_workers, engine.counts.workers, engine.counts.retries) == (2, 2, 0)
         assert "its node died" in engine.last_loss
         assert [actor.state for actor in ray.actors[:4]] == ["dead", "dead", "alive", "alive"]
@@ -262,7 +262,7 @@ def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
         actors.start(worker)
     while actors.receive(0.0):
         pass
-    actors.send(0, FIRST, "key", 1, [CHUNK])
+    actors.send(0, "key", 1, around(FIRST, [CHUNK]))
     watch.now = Membership(1, frozenset("1"), frozenset("12"))
     told = [actors.receive(0.0) for _ in range(4)]
     assert told[0] == Drain(1)
@@ -278,7 +278,7 @@ def test_what_is_said_of_an_error_has_no_colours(error, call):
     ray = PretendedRay()
     actors = transport(ray, Limits(1))
     actors.start(0)
-    actors.send(0, FIRST, "key", 1, [CHUNK])
+    actors.send(0, "key", 1, around(FIRST, [CHUNK]))
     ray.actors[0].owed[call].error = error("\x1b[36mray::worker-0\x1b[39m: \x1b[1;31mno\x1b[0m")
     told = [actors.receive(0.0) for _ in range(3)]
     said = [message.reason for message in told if isinstance(message, WorkerLost)]
@@ -291,8 +291,8 @@ def test_a_chunk_that_kills_its_workers_is_found_out_after_as_many_as_it_has_att
     """Although all the others were asked whether they are still there: they are."""
     ray = PretendedRay()
     with ray_engine(ray, Limits(9)) as engine:
-        engine.evaluate(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)])
+        engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
         ray.on_run = ray.end
         with pytest.raises(EvaluationError, match="TrainingChunk 0 of generation 3 failed in 4 attempts"):
-            engine.evaluate(FIRST, [CHUNK])
+            engine.evaluate(around(FIRST, [CHUNK]))
         assert engine.counts.lost_workers == 4

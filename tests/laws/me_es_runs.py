@@ -60,9 +60,9 @@ class Sharing(DirectEvaluator):
         self.counts, self._run_chunk = compiled(preset).counts, compiled(preset)._run_chunk
         self.recorded, self.spoiled = [], spoiled
 
-    def evaluate(self, centre, chunks):
-        results = super().evaluate(centre, chunks)
-        for chunk, result in zip(chunks, results, strict=True):
+    def evaluate(self, work):
+        results = super().evaluate(work)
+        for (_, chunk), result in zip(work, results, strict=True):
             if isinstance(chunk, EvaluationChunk) and chunk.generation in self.spoiled:
                 result.descriptor[1] = np.nan
         return results
