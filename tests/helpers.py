@@ -72,7 +72,7 @@ class MemoryStore:
     def last_history(self) -> dict | None:
         return self.rows[-1] if self.rows else None
 
-    def commit(self, generation, parts, history) -> None:
+    def commit(self, generation, parts, history, evaluations=()) -> None:
         self.generation = generation
         self.parts |= parts
         self.rows.append(dict(history))

@@ -35,9 +35,11 @@ from es_service.loop.generation import (
 )
 from es_service.loop.history import (
     HistoryRow,
+    evaluated_row,
     evaluation_columns,
     fault_columns,
     map_columns,
+    norm,
     population_columns,
     search_columns,
     step_columns,
@@ -72,7 +74,9 @@ class Store(Protocol):
     """What the loop needs from a run store during a run."""
 
     def part(self, name: str) -> Arrays: ...
-    def commit(self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow) -> None: ...
+    def commit(
+        self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow, evaluations: Sequence[HistoryRow]
+    ) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -143,7 +147,7 @@ def spent(budget: BudgetConfig, state: RunState) -> str | None:
 
 def _first_generation(
     search: Search, evaluator: Evaluator, clock: Clock, map_: BehaviourMap | None, reachable: Reachable
-) -> tuple[RunState, HistoryRow]:
+) -> tuple[RunState, HistoryRow, list[HistoryRow]]:
     """Evaluate the initial centres, which is generation 0. Its row of the history describes the fittest of them."""
     config, algorithm = search.config, search.algorithm
     centres, observations = search.initial()
@@ -174,12 +178,27 @@ def _first_generation(
         **evaluation_columns(evaluations[shown], search.task),
         **fault_columns(evaluator.counts, since=DispatchCounts()),
     }
-    return state, row
+    rows = [
+        evaluated_row(
+            evaluation,
+            search.task,
+            learned.map,
+            generation=0,
+            centre=centre,
+            fitness_weight=algorithm.fitness_weight,
+            start_cell=None,
+            novelty=None,
+            update_norm=None,
+            env_steps=steps_of(evaluation),
+        )
+        for centre, evaluation in enumerate(evaluations)
+    ]
+    return state, row, rows
 
 
 def _next_generation(
     search: Search, evaluator: Evaluator, store: Store, clock: Clock, state: RunState, reachable: Reachable
-) -> tuple[RunState, HistoryRow]:
+) -> tuple[RunState, HistoryRow, list[HistoryRow]]:
     """One generation: a pure function of (search, state, elites in the store) but for its timings.
 
     It may ask for several populations. Each phase runs all of them side by side; results are taken in ask order.
@@ -225,14 +244,32 @@ def _next_generation(
     )
     learned = tell(algorithm, moved, told)
 
+    nearest = config.novelty
+    novelties = [
+        float(novelty(moved.archive, one.descriptor_B, neighbours=nearest.neighbours, distance=nearest.distance))
+        for one in told
+    ]
+    rows = [
+        evaluated_row(
+            evaluation,
+            search.task,
+            learned.map,
+            generation=generation,
+            centre=ask.centre,
+            fitness_weight=ask.fitness_weight,
+            start_cell=start_cells.get(ask.centre),
+            novelty=centre_novelty,
+            update_norm=norm(new_centre.parameters_D - ask.centre_D),
+            env_steps=steps_of(population) + steps_of(evaluation),
+        )
+        for ask, population, evaluation, new_centre, centre_novelty in zip(
+            asks, populations, evaluations, new_centres, novelties, strict=True
+        )
+    ]
     shown = fittest(told)  # the history's row is about this one
     asked, evaluation = asks[shown], evaluations[shown]
-    nearest = config.novelty
-    centre_novelty = novelty(
-        moved.archive, told[shown].descriptor_B, neighbours=nearest.neighbours, distance=nearest.distance
-    )
     row: HistoryRow = {
-        **search_columns(asked.centre, asked.fitness_weight, float(centre_novelty), learned.archive.size),
+        **search_columns(asked.centre, asked.fitness_weight, novelties[shown], learned.archive.size),
         **map_columns(
             learned.map,
             config.map.qd_offset,
@@ -259,7 +296,7 @@ def _next_generation(
         wall_clock_s=clock.total(),
         elites=entered(learned, told, new_centres, evaluations),
     )
-    return state, row
+    return state, row, rows
 
 
 def _keep(
@@ -269,6 +306,7 @@ def _keep(
     before: RunState | None,
     state: RunState,
     row: HistoryRow,
+    evaluations: list[HistoryRow],
 ) -> RunState:
     """Commit a finished generation, then report it."""
     clock.lap("seconds_driver")
@@ -284,7 +322,7 @@ def _keep(
         "steps_per_second": steps / seconds,
         **laps,
     }
-    store.commit(state.generation, state_parts(state, before), row)
+    store.commit(state.generation, state_parts(state, before), row, evaluations)
     clock.lap("seconds_store")
     report(row)
     return state

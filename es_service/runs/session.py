@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -123,7 +123,13 @@ class _OnPlatforms:
         self._workers: frozenset[str] | None = None
         self.part = store.part
 
-    def commit(self, generation: int, parts: Mapping[str, Arrays], history: driver.HistoryRow) -> None:
+    def commit(
+        self,
+        generation: int,
+        parts: Mapping[str, Arrays],
+        history: driver.HistoryRow,
+        evaluations: Sequence[driver.HistoryRow],
+    ) -> None:
         """Record the platform if it has changed, with a notice if the run becomes mixed by that; then commit."""
         workers = self._engine.platforms
         if workers != self._workers:
@@ -135,7 +141,7 @@ class _OnPlatforms:
                     f"{platform}. Its digest is now marked `mixed`."
                 )
             self._workers = workers
-        self._store.commit(generation, parts, history)
+        self._store.commit(generation, parts, history, evaluations)
 
 
 @contextmanager

@@ -75,8 +75,8 @@ class Remembering(MemoryStore):
         super().__init__()
         self.after = []
 
-    def commit(self, generation, parts, history):
-        super().commit(generation, parts, history)
+    def commit(self, generation, parts, history, evaluations=()):
+        super().commit(generation, parts, history, evaluations)
         self.after.append(dict(self.parts))
 
 
