@@ -29,8 +29,16 @@ def test_a_name_is_taken_where_no_such_file_exists(tmp_path, monkeypatch):
     assert config_file("configs/point_maze_me_es.yaml") == Path("configs/point_maze_me_es.yaml"), "a path is a path"
     Path("point_maze_me_es").write_text("search: {}")
     assert config_file("point_maze_me_es") == Path("point_maze_me_es")
-    with pytest.raises(ConfigError, match="no such file"):
-        load_config("point_maze_none")
+
+
+@pytest.mark.parametrize("missing", ["point_maze_mees", "point_maze_me_es.yml", "configs/point_maze_me_es.yaml"])
+def test_a_missing_file_with_a_similar_name_names_the_shipped_config(tmp_path, monkeypatch, missing):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"no such file; did you mean the shipped config point_maze_me_es\?") as caught:
+        load_config(missing)
+    assert caught.value.suggestion == "point_maze_me_es"
+    with pytest.raises(ConfigError, match="no such file$"):
+        load_config("another")
 
 
 def test_a_shipped_config_is_printed_to_be_edited(tmp_path):
