@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from es_service import load_config
+from es_service.api import default_folder
 from es_service.cli.main import app
 from es_service.config.shipped import config_file, shipped_configs, shipped_text
 from es_service.errors import ConfigError
@@ -39,6 +40,12 @@ def test_a_missing_file_with_a_similar_name_names_the_shipped_config(tmp_path, m
     assert caught.value.suggestion == "point_maze_me_es"
     with pytest.raises(ConfigError, match=r"no such file$"):
         load_config("another")
+
+
+def test_a_run_s_own_folder_has_no_colon_in_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    name = default_folder(load_config("brax_ant_es")).as_posix()
+    assert name.startswith("runs/brax_ant_es_seed0_"), "scp and `docker compose cp` would take it for HOST:PATH"
 
 
 def test_a_shipped_config_is_printed_to_be_edited(tmp_path):
