@@ -219,9 +219,10 @@ def fork(
 
 def default_folder(config: RunConfig) -> Path:
     """A new folder under `runs/`, named after task, algorithm, seed, time and process id, so that runs that start at
-    the same time get different folders."""
+    the same time get different folders. Colons become underscores, because scp and others read HOST:PATH."""
     when = datetime.now().strftime("%Y%m%d-%H%M%S")
-    name = f"{config.task.environment}_{config.search.algorithm}_seed{config.seed}_{when}-{os.getpid()}"
+    kind = f"{config.task.environment}_{config.search.algorithm}".replace(":", "_")
+    name = f"{kind}_seed{config.seed}_{when}-{os.getpid()}"
     names = (name if number == 1 else f"{name}-{number}" for number in count(1))
     return next(RUNS_FOLDER / name for name in names if not (RUNS_FOLDER / name).exists())
 

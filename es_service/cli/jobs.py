@@ -12,8 +12,7 @@ from es_service import api
 from es_service.cli.commands import command
 from es_service.cli.options import ConfigArgument, SeedOption, SetOption, WorkersOption, overrides, print_note
 from es_service.config.keys import parse_overrides
-from es_service.config.shipped import config_file
-from es_service.config.yaml_text import read_yaml_file
+from es_service.config.shipped import read_config
 from es_service.errors import ConfigError
 from es_service.runs import jobs
 
@@ -47,7 +46,7 @@ def submit(
 
 def _require_absolute_start(config: Path, wanted: list[str]) -> None:
     """Raise a ConfigError for a relative `search.init_from`, which would be another folder on the head node."""
-    in_file = read_yaml_file(config_file(config)).get("search")
+    in_file = read_config(config).get("search")
     named = {"search.init_from": in_file.get("init_from")} if isinstance(in_file, dict) else {}
     start = (named | parse_overrides(wanted)[0]).get("search.init_from")
     if isinstance(start, str) and not start.startswith("/"):

@@ -30,9 +30,9 @@ from es_service.config.resolution import (
     shape_problems,
     task_problems,
 )
-from es_service.config.shipped import config_file
+from es_service.config.shipped import read_config
 from es_service.config.start import folder_problems
-from es_service.config.yaml_text import parse_value, read_yaml_file, show
+from es_service.config.yaml_text import parse_value, show
 from es_service.errors import ConfigError, Problem
 from es_service.protocol.messages import TaskSpec
 
@@ -72,7 +72,7 @@ def left_out(source: Source, overrides: Overrides) -> list[str]:
 
     The other task gets its own default options. `source` and `overrides` must be ones that `load_config` accepts.
     """
-    mapping = source if isinstance(source, Mapping) else read_yaml_file(config_file(source))
+    mapping = source if isinstance(source, Mapping) else read_config(source)
     return foreign_options(sort_keys(mapping)[0], parse_overrides(overrides)[0])
 
 
@@ -110,7 +110,7 @@ def _load(
         name, mapping = "config", source
     else:
         name = os.fspath(source)
-        mapping = read_yaml_file(config_file(name))
+        mapping = read_config(name)
     values, unusable, problems = sort_keys(mapping)
     wanted, more = parse_overrides(overrides)
     problems += more

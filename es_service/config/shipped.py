@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 from es_service.config.problems import did_you_mean, nearest
+from es_service.config.yaml_text import read_yaml_file
 from es_service.errors import ConfigError, Problem
 
 PACKAGE = Path(__file__).parents[1]
@@ -25,6 +27,20 @@ def config_file(source: str | os.PathLike[str]) -> Path:
     if path.exists() or path.name != os.fspath(source):
         return path
     return shipped_configs().get(path.name.removesuffix(".yaml"), path)
+
+
+def read_config(source: str | os.PathLike[str]) -> Mapping[object, object]:
+    """The top-level mapping of a config file, given by its path or by the name of a shipped config.
+
+    Raises:
+        ConfigError: as `read_yaml_file`; if there is no such file, with the shipped config whose name is similar.
+    """
+    file = config_file(source)
+    near = None if file.exists() else nearest(file.name.removesuffix(".yaml"), shipped_configs())
+    if near is None:
+        return read_yaml_file(file)
+    problem = Problem(f"no such file; did you mean the shipped config {near}?", "config", str(file), suggestion=near)
+    raise ConfigError.listing(f"{file}: 1 problem", [problem])
 
 
 def shipped_text(name: str) -> str:

@@ -127,8 +127,9 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
         except Exception as error:  # of many classes: ConnectionError, RuntimeError, ValueError, TimeoutError ...
             if address is None:
                 raise EvaluationError(f"could not start Ray on this machine: {error}", ways_out=ways_out) from error
+            reason = str(error).rstrip(". ")
             raise EvaluationError(
-                f"could not connect to a Ray cluster at {address}: {error}. Check the address. Check also that "
+                f"could not connect to a Ray cluster at {address}: {reason}. Check the address. Check also that "
                 "RAY_AUTH_TOKEN is the token of the cluster (with RAY_AUTH_MODE=token), and that the cluster uses the "
                 f"same versions of Ray ({ray.__version__}) and Python ({platform.python_version()})",
                 field="compute.address",

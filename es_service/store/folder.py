@@ -118,6 +118,12 @@ def require_run_folder(folder: Path) -> None:
             ways_out=[WayOut("run", "start a run there", out=str(folder))],
         )
     if not holds_run(folder):
+        inside = sorted(path.parent for path in folder.glob(f"*/{DATABASE}"))
+        if inside:
+            runs = (
+                f"{len(inside)} run folders, such as {inside[-1]}" if len(inside) > 1 else f"the run folder {inside[0]}"
+            )
+            raise StoreError(f"{folder} is not a run folder, but contains {runs}", run=folder)
         raise StoreError(
             f"{folder} is not a run folder: it contains no {DATABASE}. If the creation of a run was interrupted here, "
             f"nothing was lost; start the run again.",

@@ -119,3 +119,12 @@ def test_a_run_outlives_the_run_it_started_from(tmp_path):
     assert changed_config(stored, tasks=TASKS, algorithms=ALGORITHMS).search.init_from == str(tmp_path / "old")
     with pytest.raises(ConfigError, match="old does not exist; must be the folder of another run, or null"):
         load(stored)
+
+
+def test_every_key_of_the_science_is_a_constant():
+    config = load()
+    sections = {name for name, value in config.model_dump().items() if isinstance(value, dict)} - {"budget"}
+    assert {name.split(".")[0] for name in config.constants() if "." in name} == sections
+    for section in sections - {"compute"}:
+        keys = {name.split(".")[1] for name in config.constants() if name.startswith(f"{section}.")}
+        assert keys >= {key for key, value in getattr(config, section).model_dump().items() if value != {}}

@@ -8,6 +8,7 @@ import pytest
 
 from es_service.api import open_run
 from es_service.errors import StoreError
+from es_service.loop.parts import cell_part, elite_part
 from es_service.store import schema as store_schema
 from es_service.store.codec import encode_part, table_bytes
 from es_service.store.digest import arrays_sha256, checked_parts, digest_at, digest_of, digest_parts
@@ -219,3 +220,15 @@ def test_a_run_is_mixed_from_the_first_generation_on_another_platform(tmp_path):
         store.record_platform(4, {"cpu": "a"})
         advance(store, 4)
     assert checked_parts(folder)[1]
+
+
+@pytest.mark.parametrize("part", ["map", cell_part(3), elite_part(3)])
+def test_every_part_of_the_map_counts(tmp_path, part):
+    found = []
+    for changed in (False, True):
+        parts = {name: {"x": np.zeros(3, np.float32)} for name in ("map", cell_part(3), elite_part(3))}
+        parts[part]["x"][1] = changed
+        with create(tmp_path / str(changed)) as store:
+            store.commit(0, state_at(0) | parts, history_row(0))
+        found.append(digest_parts(tmp_path / str(changed)))
+    assert {name for name in found[0] if found[0][name] != found[1][name]} == {"map"}

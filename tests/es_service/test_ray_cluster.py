@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from es_service.dispatch import ray_cluster
+from es_service.errors import EvaluationError
 
 
 def test_variables_that_nobody_changed_are_never_touched(monkeypatch):
@@ -23,6 +24,17 @@ def test_variables_that_nobody_changed_are_never_touched(monkeypatch):
         assert os.environ["OLD"] == os.environ["NEW"] == "new"
     assert dict(os.environ) == before
     assert set(touched) == {b"OLD", b"NEW", b"RAYS_OWN"}
+
+
+def test_a_sentence_of_ray_s_ends_with_one_full_stop(monkeypatch):
+    ray = pytest.importorskip("ray")
+
+    def refuse(**_):
+        raise ConnectionError("Could not find any running Ray instance. Please specify one.")
+
+    monkeypatch.setattr(ray, "init", refuse)
+    with pytest.raises(EvaluationError, match=r"at auto: Could not find .* specify one\. Check the address\."):
+        ray_cluster.connect("auto", ray_cluster.ONE_CORE, 1)
 
 
 @pytest.mark.parametrize("is_latest", [True, False])

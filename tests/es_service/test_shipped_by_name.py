@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from es_service import load_config
+from es_service.api import default_folder
 from es_service.cli.main import app
 from es_service.config.shipped import config_file, shipped_configs, shipped_text
 from es_service.errors import ConfigError
@@ -29,8 +30,22 @@ def test_a_name_is_taken_where_no_such_file_exists(tmp_path, monkeypatch):
     assert config_file("configs/point_maze_me_es.yaml") == Path("configs/point_maze_me_es.yaml"), "a path is a path"
     Path("point_maze_me_es").write_text("search: {}")
     assert config_file("point_maze_me_es") == Path("point_maze_me_es")
-    with pytest.raises(ConfigError, match="no such file"):
-        load_config("point_maze_none")
+
+
+@pytest.mark.parametrize("missing", ["point_maze_mees", "point_maze_me_es.yml", "configs/point_maze_me_es.yaml"])
+def test_a_missing_file_with_a_similar_name_names_the_shipped_config(tmp_path, monkeypatch, missing):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="did you mean the shipped config point_maze_me_es") as caught:
+        load_config(missing)
+    assert caught.value.suggestion == "point_maze_me_es"
+    with pytest.raises(ConfigError, match=r"no such file$"):
+        load_config("another")
+
+
+def test_a_run_s_own_folder_has_no_colon_in_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    name = default_folder(load_config("brax_ant_es")).as_posix()
+    assert name.startswith("runs/brax_ant_es_seed0_"), "scp and `docker compose cp` would take it for HOST:PATH"
 
 
 def test_a_shipped_config_is_printed_to_be_edited(tmp_path):

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import shutil
 import sqlite3
 import tempfile
@@ -84,6 +85,14 @@ def test_what_is_no_run_folder_is_called_that(tmp_path):
             with pytest.raises(StoreError, match="not a run folder"):
                 use(tmp_path / name)
     assert not (tmp_path / "other" / "run.lock").exists()
+
+
+def test_a_folder_of_runs_is_not_a_run_folder_but_its_runs_are_named(tmp_path):
+    for name, named in (("a", f"contains the run folder {tmp_path / 'a'}"), ("b", "contains 2 run folders, such as")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.db").touch()
+        with pytest.raises(StoreError, match=f"not a run folder, but {re.escape(named)}"):
+            read_meta(tmp_path)
 
 
 def test_a_log_that_cannot_be_opened_is_no_damage(tmp_path):

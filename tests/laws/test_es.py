@@ -21,7 +21,7 @@ from es_service.protocol.messages import (
 )
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.algorithms import ALGORITHMS
-from es_service.search.observation_statistics import no_observations
+from es_service.search.observation_statistics import merge_moments, no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
 from tests.laws.es_runs import SHAPE, run_in_memory, small_config
 from tests.twins import es as twin
@@ -282,3 +282,17 @@ def test_the_driver_holds_no_population_times_parameters_array():
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 2048 * shape.parameters * 4 / 10
+
+
+def test_statistics_are_merged_in_the_order_of_chunks():
+    state, _, evaluator, _ = run_in_memory(small_config())
+    total = no_observations(2)
+    for generation in range(1, 21):
+        of_chunk = {
+            chunk.chunk_id: result.moments
+            for _, chunk, result in evaluator.recorded
+            if isinstance(chunk, TrainingChunk) and chunk.generation == generation
+        }
+        total = merge_moments(total, [of_chunk[number] for number in sorted(of_chunk)])
+    np.testing.assert_array_equal(state.observations.mean_O, total.mean_O)
+    np.testing.assert_array_equal(state.observations.m2_O, total.m2_O)

@@ -1,4 +1,4 @@
-"""Who may import whom: the rooms of es_service are the floors of a tower, and imports go down its stairs.
+"""Which module may import which: the folders of es_service are layers, and a layer imports only layers below it.
 
 The rules keep the driver light and the workers free of the driver.
 """
@@ -14,12 +14,12 @@ import pytest
 from es_service.search.algorithms import OURS
 
 ROOT = Path(__file__).parents[2]
-ROOMS = ("cli", "api", "report", "runs", "dispatch", "store", "loop", "search", "config", "protocol", "errors", "logs")
-"""From what a person touches down to the ground. `report` is still to come."""
-GROUND = ("protocol", "errors", "logs")
-"""Rooms that import nothing of the project."""
+LAYERS = ("cli", "api", "report", "runs", "dispatch", "store", "loop", "search", "config", "protocol", "errors", "logs")
+"""From the user's side down. `report` does not exist yet."""
+LOWEST = ("protocol", "errors", "logs")
+"""Layers that import nothing of the project."""
 ENTRIES = {"es_service.__init__": "api", "es_service.__main__": "cli"}
-"""What stands at the door -> the highest room it may go to."""
+"""Module outside the layers -> the layer whose rules it follows."""
 JOINERS = {
     "es_service.runs.moment",
     "es_service.runs.session",
@@ -52,8 +52,8 @@ def files(package: str) -> list[Path]:
     return sorted((ROOT / package).rglob("*.py"))
 
 
-def room_of(module: str) -> str:
-    """The room that a module of es_service is in; empty for the package itself."""
+def layer_of(module: str) -> str:
+    """The layer that a module of es_service is in; empty for the package itself."""
     return module.split(".")[1] if "." in module else ""
 
 
@@ -61,20 +61,20 @@ def wrong_arrows(module: str, source: str) -> list[str]:
     """A sentence for every import that the law forbids to a module of the project."""
     found = []
     used = {name for name in imports(source) if name.split(".")[0] in ("es_service", "workers", "jax", "brax", "ray")}
-    here = ENTRIES.get(module) or (room_of(module) if module.startswith("es_service.") else "workers")
+    here = ENTRIES.get(module) or (layer_of(module) if module.startswith("es_service.") else "workers")
     for name in sorted(used):
-        package, there = name.split(".")[0], room_of(name)
-        if package == "es_service" and there in ROOMS:
+        package, there = name.split(".")[0], layer_of(name)
+        if package == "es_service" and there in LAYERS:
             if here == "workers":
                 if there != "protocol":
                     found.append(f"{module} imports {name}: workers import of es_service only protocol")
-            elif here in GROUND:
+            elif here in LOWEST:
                 if there != here:
                     found.append(f"{module} imports {name}: {here} imports nothing of the project")
-            elif ROOMS.index(there) < ROOMS.index(here):
-                found.append(f"{module} imports {name}: {there} is above {here}; a room imports only those below it")
+            elif LAYERS.index(there) < LAYERS.index(here):
+                found.append(f"{module} imports {name}: {there} is above {here}; a layer imports only those below it")
         elif package == "workers" and here != "workers":
-            if here in GROUND:
+            if here in LOWEST:
                 found.append(f"{module} imports {name}: {here} imports nothing of the project")
             elif module not in JOINERS:
                 found.append(f"{module} imports {name}: of es_service only {', '.join(sorted(JOINERS))} import workers")
@@ -117,7 +117,9 @@ def test_the_loop_knows_no_method_by_name():
 
 
 @pytest.mark.parametrize(
-    "path", [path for path in files("es_service") if room_of(module_of(path)) not in ("cli", "__main__")], ids=module_of
+    "path",
+    [path for path in files("es_service") if layer_of(module_of(path)) not in ("cli", "__main__")],
+    ids=module_of,
 )
 def test_no_message_below_the_command_line_shows_a_command(path):
     """An error has its way out as data, of which the command line makes a command."""
@@ -129,7 +131,7 @@ def test_no_message_below_the_command_line_shows_a_command(path):
     assert not list(filter(command.search, shown))
 
 
-def test_every_file_of_es_service_is_in_a_room():
+def test_every_file_of_es_service_is_in_a_layer():
     assert {path.name for path in (ROOT / "es_service").glob("*.py")} == {
         "__init__.py",
         "__main__.py",
@@ -137,8 +139,8 @@ def test_every_file_of_es_service_is_in_a_room():
         "errors.py",
         "logs.py",
     }
-    rooms = {path.name for path in (ROOT / "es_service").iterdir() if path.is_dir() and path.name != "__pycache__"}
-    assert rooms <= set(ROOMS)
+    layers = {path.name for path in (ROOT / "es_service").iterdir() if path.is_dir() and path.name != "__pycache__"}
+    assert layers <= set(LAYERS)
 
 
 def test_a_driver_process_loads_no_jax():

@@ -9,6 +9,7 @@ from hypothesis.extra import numpy as hnp
 from es_service.api import load_config
 from es_service.config.model import worker_spec
 from es_service.loop.generation import estimate_gradients, tree_sum
+from es_service.protocol.messages import GradientResult
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.optimizer import adam_ascent, fresh_adam
 from es_service.search.shaping import centred_ranks, pair_weights
@@ -86,3 +87,17 @@ def test_adam_by_hand():
     _, crept = adam_ascent(fresh_adam(3), np.zeros(3, np.float32), tiny, learning_rate=0.01, l2=0.0)
     expected = 0.01 * np.sqrt(0.001) / 0.1 * 0.1 * 1e-7 / (np.sqrt(0.001) * 1e-7 + 1e-8)
     assert crept[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_blocks_of_the_gradient_are_added_in_the_tree():
+    class Answers:
+        def evaluate(self, work):
+            return [GradientResult(np.float32([x])) for x in (1e8, 1.0, -1e8, 1.0, 3.0)]
+
+    (found,) = estimate_gradients(Answers(), [centre(np.zeros(1))], [np.ones(5, np.float32)], 1)
+    assert found[0] == np.float32(3.0) * np.float32(1 / 5)  # one by one it is 4 / 5
+
+
+@pytest.mark.parametrize("invalid", [np.inf, -np.inf])
+def test_infinities_share_the_lowest_rank(invalid):
+    np.testing.assert_allclose(centred_ranks([[invalid, 1.0], [np.nan, 2.0]]), [[-1 / 3, 1 / 6], [-1 / 3, 1 / 2]])

@@ -141,3 +141,18 @@ def test_a_run_that_starts_from_another_s_centre_starts_with_the_statistics_that
     np.testing.assert_array_equal(first.centre_D, centre.parameters_D)
     np.testing.assert_array_equal(first.observation_mean_O, centre.observation_mean_O)
     np.testing.assert_array_equal(first.observation_std_O, centre.observation_std_O)
+
+
+def test_policies_have_the_statistics_of_their_evaluation(tmp_path):
+    found = run(tmp_path / "run", "search.parent_statistics=global")
+    newest, others = found.policy("centre"), 0
+    map_, elites = found.elites()
+    for cell, elite in elites.items():
+        policy = found.policy(map_.geometry.index_of(cell))
+        np.testing.assert_array_equal(policy.observation_mean_O, elite.observation_mean_O)
+        np.testing.assert_array_equal(policy.observation_std_O, elite.observation_std_O)
+        others += not np.array_equal(policy.observation_mean_O, newest.observation_mean_O)
+    assert others
+    best, kept = found.policy("best"), found.parts()[1]["best"]
+    np.testing.assert_array_equal(best.observation_mean_O, kept["observation_mean_O"])
+    np.testing.assert_array_equal(best.observation_std_O, kept["observation_std_O"])

@@ -112,3 +112,18 @@ def test_the_dead_cost_nothing(noisy: bool, tmp_path: Path):
     assert (second_layer[4:-4] == UNTOUCHED).all()
     assert (second_layer[:4] != UNTOUCHED).any(axis=1).all()
     assert (second_layer[-4:] != UNTOUCHED).any(axis=1).all()
+
+
+@pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)
+@pytest.mark.parametrize("widths", [(2, 1), (2, 3, 1)])
+def test_a_sum_starts_with_its_bias(target, widths, tmp_path):
+    shape, wide = PolicyShape(widths), widths[1]
+    centre_D = np.zeros(shape.parameters, np.float32)
+    centre_D[: 3 * wide] = np.repeat(np.float32([1e8, -1e8, 1.0]), wide)  # weights of two inputs, then biases
+    centre_D[3 * wide :] = 1.0 if len(widths) == 3 else 0.0
+    if len(widths) == 3:
+        centre_D[-1] = 0.0
+    network = plan(shape, np.arange(2), target.width)
+    x, alive = np.ones((target.width, 2), np.float32), np.ones(target.width, np.int32)
+    found, _ = run(network, target, tmp_path, centre_D, x, alive, None)
+    np.testing.assert_array_equal(found, 0.0)  # with the bias last, 0 + 1

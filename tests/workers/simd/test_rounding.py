@@ -27,6 +27,7 @@ from workers.simd.backend.emit import emit
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import host_target
 from workers.simd.backend.words import aligned, pack
+from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.episodes.program import compile_episodes
 from workers.simd.episodes.rollout import always_zero
 from workers.simd.frontend.trace import trace_jaxpr
@@ -306,3 +307,15 @@ def test_bits_do_not_depend_on_what_else_a_kernel_computes(program: list, before
     for one, other in zip(wanted, found, strict=False):
         is_number = ~np.isnan(one)
         np.testing.assert_array_equal(one.view(np.uint32)[is_number], other.view(np.uint32)[is_number])
+
+
+def test_sums_are_added_one_by_one():
+    x = np.tile(np.float32([1e8, 1.0, -1e8, 1.0]), (16, 1))
+    ones = np.ones_like(x)
+    of = jax.ShapeDtypeStruct((4,), np.float32)
+    for function, arguments in (
+        (lambda a: a.sum(), [x]),
+        (lambda a, b: a @ b, [x, ones]),
+    ):
+        kernel = compile_kernel(function, *[of] * len(arguments))
+        np.testing.assert_array_equal(kernel(*arguments), np.ones(16, np.float32))  # a tree: 0; two halves: 2
