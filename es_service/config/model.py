@@ -82,7 +82,8 @@ class SearchConfig(Section):
         "literature", description="Which column of the preset table fills in the keys that the config leaves out."
     )
     pairs: Count = Field(
-        description="Antithetic pairs per generation; the population is twice as large. Set by the preset."
+        description="Antithetic pairs of a population, which has twice as many members. A generation has one "
+        "population, or one for each centre with search.emitters and search.update: all. Set by the preset."
     )
     sigma: Positive = Field(0.02, description="Standard deviation of the parameter noise, in parameter units.")
     learning_rate: Positive = Field(0.01, description="Step size of Adam, in parameter units.")
