@@ -201,12 +201,13 @@ class Engine(Generic[AnyTransport]):
         kind, limits = type(work[0][1]).__name__, self._state.limits
         sizes = item_sizes(len(work), self._state.wanted, usual_chunk_s(self._state, kind), limits.item_s)
         ends = list(itertools.accumulate(sizes))
-        parts = [work[end - size : end] for end, size in zip(ends, sizes, strict=True)]
-        return [(self._item_id(kind, part), part) for part in parts]
+        firsts = [end - size for end, size in zip(ends, sizes, strict=True)]
+        parts = [work[first:end] for first, end in zip(firsts, ends, strict=True)]
+        return [(self._item_id(first, kind, part), part) for first, part in zip(firsts, parts, strict=True)]
 
-    def _item_id(self, kind: str, part: Sequence[Work]) -> WorkItemId:
-        first = part[0][1]
-        return WorkItemId(self._phase, kind, first.generation, first.ask, first.chunk_id, len(part))
+    def _item_id(self, first: int, kind: str, part: Sequence[Work]) -> WorkItemId:
+        chunk = part[0][1]
+        return WorkItemId(self._phase, first, kind, chunk.generation, chunk.ask, chunk.chunk_id, len(part))
 
     def _handle(self, message: Message) -> None:
         if not isinstance(message, Answer):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +20,17 @@ def require_asks(asks: object, state: SearchState, chunk_pairs: int, generation:
 
     def wrong() -> str:
         if not isinstance(asks, tuple) or not asks or not all(isinstance(ask, Ask) for ask in asks):
-            return f"`ask` returned {asks!r:.100}; it must return a tuple of one or more Ask"
+            kinds = f" of {', '.join(type(ask).__name__ for ask in asks)}" if isinstance(asks, tuple) and asks else ""
+            returned = "an empty tuple" if asks == () else type(asks).__name__ + kinds
+            return f"`ask` returned {returned}; it must return a tuple of one or more Ask"
         indices = [ask.centre for ask in asks]
-        if len(set(indices)) < len(indices) or not set(indices) <= set(range(len(state.centres))):
+        known = all(isinstance(index, Integral) and 0 <= index < len(state.centres) for index in indices)
+        if not known or len(set(indices)) < len(indices):
             return f"the asks are for the centres {indices}; each of the {len(state.centres)} may occur once"
         for ask in asks:
-            if not (math.isfinite(ask.sigma) and ask.sigma > 0.0):
+            if not (isinstance(ask.sigma, Real) and math.isfinite(ask.sigma) and ask.sigma > 0.0):
                 return f"the sigma of centre {ask.centre} is {ask.sigma}; it must be positive"
-            if ask.pairs < 1 or ask.pairs % chunk_pairs:
+            if not isinstance(ask.pairs, Integral) or ask.pairs < 1 or ask.pairs % chunk_pairs:
                 return f"centre {ask.centre} has {ask.pairs} pairs; must be a multiple of chunk_pairs ({chunk_pairs})"
         return ""
 

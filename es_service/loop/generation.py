@@ -30,7 +30,7 @@ from es_service.protocol.messages import (
     TrainingChunk,
     around,
 )
-from es_service.search.algorithms.base import Algorithm, CentreEvaluation, CentreState, SearchState
+from es_service.search.algorithms.base import Algorithm, CentreEvaluation, CentreState, SearchState, read_only
 from es_service.search.maps.behaviour_map import Elite, make_elite
 
 Result = TypeVar("Result", EpisodesResult, GradientResult)
@@ -162,9 +162,7 @@ def centre_evaluation(
 def tell(algorithm: Algorithm, state: SearchState, told: tuple[CentreEvaluation, ...]) -> SearchState:
     """The state after the search is told a generation's evaluations; arrays of its own are read-only from now on."""
     state = algorithm.tell(state, told)
-    for array in state.own.values():
-        array.flags.writeable = False
-    return state
+    return replace(state, own=read_only(state.own))
 
 
 def fittest(told: Sequence[CentreEvaluation]) -> int:

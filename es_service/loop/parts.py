@@ -13,7 +13,7 @@ import numpy as np
 
 from es_service.loop.state import Best, RunState, require_successor
 from es_service.protocol.messages import Moments
-from es_service.search.algorithms.base import CentreState, FitnessWeight, SearchState
+from es_service.search.algorithms.base import CentreState, FitnessWeight, SearchState, read_only
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map
 from es_service.search.maps.geometry import Cvt, Geometry, Grid
 from es_service.search.novelty import NoveltyArchive, archive_of, empty_archive
@@ -95,7 +95,7 @@ def state_from_parts(parts: Parts, generation: int, wall_clock_s: float, dimensi
             archive_from_parts(parts, dimensions),
             weight_from_arrays(parts[WEIGHT]),
             map_from_parts(parts),
-            parts.get(OWN, {}),
+            read_only(parts.get(OWN, {})),
         ),
         observations=moments_from_arrays(parts[OBSERVATIONS]),
         best=best_from_arrays(parts[BEST]),

@@ -203,6 +203,8 @@ class WorkItemId(NamedTuple):
 
     phase: int
     """Number of the `evaluate` call. It distinguishes a late answer to an earlier call from an answer to this call."""
+    first: int
+    """Index of the first chunk in the call. Chunks of several centres may have the same generation, ask and id."""
     kind: str
     """Class name of the chunks."""
     generation: int

@@ -31,14 +31,16 @@ class Sent:
     """Chunks sent to a worker, and what the worker might say about them."""
 
     worker: int
-    centre: Any
     item_id: Any
     attempt: int
-    chunks: Any
+    work: Any
+
+    @property
+    def chunks(self) -> list[Any]:
+        return [chunk for _, chunk in self.work]
 
     def answer(self) -> Answer:
-        results = [expected(self.centre, chunk) for chunk in self.chunks]
-        return Answer(self.worker, self.item_id, self.attempt, results)
+        return Answer(self.worker, self.item_id, self.attempt, [expected(*one) for one in self.work])
 
     def failure(self) -> Failure:
         return Failure(self.worker, self.item_id, self.attempt, "no")
@@ -70,7 +72,7 @@ class Scripted:
         return self.last_words.get(worker, "")
 
     def send(self, worker, item_id, attempt, work):
-        self.sent.append(Sent(worker, work[0][0], item_id, attempt, [chunk for _, chunk in work]))
+        self.sent.append(Sent(worker, item_id, attempt, work))
         self.on_send(self.sent[-1])
 
     def silent(self):
@@ -111,6 +113,27 @@ def test_results_come_in_chunk_order_whatever_the_order_of_the_answers(seed):
             assert engine.evaluate(around(point, chunks)) == [expected(point, chunk) for chunk in chunks]
         assert (engine.counts.retries, engine.counts.lost_workers, engine.counts.workers) == (0, 0, 3)
     assert transport.closed
+
+
+@pytest.mark.parametrize("item_s", [0.0, 60.0])
+@pytest.mark.parametrize("seed", range(5))
+def test_results_of_several_centres_come_in_the_order_of_the_work(seed, item_s):
+    """Also if chunks of different centres are equal, as in `es-service evaluate`; and if a work item has both."""
+    rng, transport, held = random.Random(seed), Scripted(), []
+
+    def answer_one():
+        transport.inbox.append(held.pop(rng.randrange(len(held))).answer())
+
+    transport.on_send, transport.on_wait = held.append, answer_one
+    third = centre(random_parameters(2))
+    with Engine(transport, Limits(workers=2, item_s=item_s)) as engine:
+        for _ in range(3):
+            work = [(point, chunk) for point in (FIRST, SECOND, third) for chunk in CHUNKS]
+            assert engine.evaluate(work) == [expected(*one) for one in work]
+        assert engine.evaluate([]) == []
+    assert len({sent.item_id for sent in transport.sent}) == len(transport.sent)
+    mixed = [sent for sent in transport.sent if len({id(point) for point, _ in sent.work}) > 1]
+    assert bool(mixed) == (item_s > 0.0)
 
 
 @given(st.integers(1, 500), st.integers(1, 70), st.floats(1e-7, 10.0))

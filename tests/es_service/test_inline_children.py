@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from es_service.dispatch.events import Limits, StartWorker
+from es_service.dispatch.events import Limits, StartWorker, Submit
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError
 from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk, around
-from tests.helpers import SPEC, centre, random_parameters, spec
+from tests.helpers import SPEC, DirectEvaluator, centre, random_parameters, spec
 
 FIRST = centre(random_parameters(0))
 CHUNKS = [TrainingChunk(3, chunk_id) for chunk_id in range(8)]
@@ -144,3 +144,22 @@ def test_an_error_says_in_which_of_the_chunks_that_travelled_together_it_was():
         engine.evaluate(around(FIRST, CHUNKS))
         with pytest.raises(EvaluationError, match=r"(?s)item TrainingChunk 0 and 3 more of.*in TrainingChunk four of"):
             engine.evaluate(around(FIRST, broken))
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3])
+def test_two_hundred_centres_at_once_on_any_number_of_children(workers):
+    """More than a child keeps; one by one, then in work items of several centres, then the oldest again."""
+    short = spec(episode_steps=5)
+    points = [centre(random_parameters(number)) for number in range(200)]
+    work = [(point, EvaluationChunk(1, 0, number % 3)) for number, point in enumerate(points)]
+    expected = DirectEvaluator(short).evaluate(work)
+    assert len({result.fitness.tobytes() for result in expected}) == 200
+    items = []
+    log = lambda entry: items.extend(entry.items) if isinstance(entry, Submit) else None  # noqa: E731
+    with inline_engine(short, Limits(workers=workers, item_s=60.0), log=log) as engine:
+        assert_same(engine.evaluate(work), expected)
+        assert_same(engine.evaluate(work[::-1]), expected[::-1])
+        assert_same(engine.evaluate(work[:70] * 2), expected[:70] * 2)
+        assert engine.counts.lost_workers == engine.counts.retries == 0
+    assert {item.size for item in items[:200]} == {1}
+    assert max(item.size for item in items) == -(-200 // workers)

@@ -9,14 +9,15 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from es_service.dispatch.engine import Answer, Engine
 from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import ONE_CORE, Membership, look
-from es_service.dispatch.ray_engine import Actors
+from es_service.dispatch.ray_engine import IN_CALL_BYTES, Actors
 from es_service.errors import EvaluationError
-from es_service.protocol.messages import TrainingChunk, around
+from es_service.protocol.messages import KEPT_CENTRES, TrainingChunk, around
 from tests.helpers import SPEC, centre, random_parameters
 
 FIRST = centre(random_parameters())
@@ -63,6 +64,9 @@ class PretendedRay:
         self.actors: list[Actor] = []
         self.on_run: Callable[[Actor], Any] = lambda actor: None
         self.node_of: Callable[[int], str] = lambda number: "node"
+        self.calls: list[tuple[Any, ...]] = []
+        """Arguments of each call of `run`."""
+        self.stored: list[bytes] = []
 
     def remote(self, **_: Any) -> Callable[[type], Any]:
         return lambda cls: SimpleNamespace(remote=self._start)
@@ -77,6 +81,11 @@ class PretendedRay:
         if ref.error is not None:
             raise ref.error
         return ref.value
+
+    def put(self, value: bytes) -> int:
+        """Stores a value under its index, which stands for a reference."""
+        self.stored.append(value)
+        return len(self.stored) - 1
 
     def kill(self, actor: Any, no_restart: bool) -> None:
         self.end(actor.itself)
@@ -111,6 +120,8 @@ class PretendedRay:
         def call(*arguments: Any) -> Ref:
             ref = Ref(body(*arguments))
             actor.owed.append(ref)
+            if name == "run":
+                self.calls.append(arguments)
             if name == "run" and actor.state == "alive":
                 actor.ran += 1
                 self.on_run(actor)
@@ -296,3 +307,32 @@ def test_a_chunk_that_kills_its_workers_is_found_out_after_as_many_as_it_has_att
         with pytest.raises(EvaluationError, match="TrainingChunk 0 of generation 3 failed in 4 attempts"):
             engine.evaluate(around(FIRST, [CHUNK]))
         assert engine.counts.lost_workers == 4
+
+
+@pytest.mark.parametrize("size", [1, IN_CALL_BYTES // 4])
+def test_a_call_has_each_of_its_centres_once_and_a_large_one_is_stored_once_while_it_is_new(size):
+    ray = PretendedRay()
+    points = [centre(np.full(size, number)) for number in range(KEPT_CENTRES + 2)]
+
+    def evaluate(*numbers: int) -> int:
+        """Evaluates chunks of these centres; returns how many values were stored for that."""
+        work = [(points[number], TrainingChunk(3, number, position)) for position, number in enumerate(numbers)]
+        stored = len(ray.stored)
+        ray.calls.clear()
+        assert engine.evaluate(work) == [f"of {chunk}" for _, chunk in work]
+        for packed, *centres in ray.calls:
+            known = [pickle.loads(ray.stored[one] if isinstance(one, int) else one) for one in centres]
+            chunks = pickle.loads(packed)
+            assert [known[index].parameters_D[0] for index, _ in chunks] == [chunk.chunk_id for _, chunk in chunks]
+            assert sorted({index for index, _ in chunks}) == list(range(len(known)))
+            assert len({one.parameters_D[0] for one in known}) == len(known)
+        return len(ray.stored) - stored
+
+    with ray_engine(ray, Limits(2, item_s=60.0)) as engine:
+        found = [evaluate(0) for _ in range(3)]  # so that it is known how long a chunk takes
+        found += [evaluate(0, 1, 1, 0), evaluate(*range(KEPT_CENTRES)), evaluate(0, 1), evaluate(KEPT_CENTRES)]
+        found += [evaluate(1, 2), evaluate(0)]  # the oldest was forgotten
+        evaluate(1, 2, 3, 2)
+        assert max(len(centres) for _, *centres in ray.calls) > 1
+    large = [1, 0, 0, 1, KEPT_CENTRES - 2, 0, 1, 0, 1]
+    assert found == ([0] * 9 if size == 1 else large)

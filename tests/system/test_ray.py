@@ -83,8 +83,8 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
     faults = {4: signal.SIGKILL, 12: signal.SIGSTOP}
     send = Actors.send
 
-    def send_and_strike(self, worker, centre, key, attempt, chunks):
-        send(self, worker, centre, key, attempt, chunks)
+    def send_and_strike(self, worker, key, attempt, work):
+        send(self, worker, key, attempt, work)
         number = faults.pop(key.generation, None) if key.kind == "TrainingChunk" else None
         if number is not None:
             os.kill(self.places()[worker].pid, number)
@@ -140,7 +140,7 @@ def test_a_chunk_that_raises_everywhere_stops_the_run_with_its_error():
         pytest.raises(EvaluationError, match=r"TrainingChunk 0 of generation 1 failed in 2 attempts(.|\n)*TypeError"),
         ray_engine(spec(), Limits(1, max_attempts=2), actor=WorkerActor) as engine,
     ):
-        engine.evaluate(centre(wrong), [TrainingChunk(1, 0)])
+        engine.evaluate(around(centre(wrong), [TrainingChunk(1, 0)]))
 
 
 def test_a_cluster_without_room_is_named_with_what_it_has(monkeypatch):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -70,8 +71,20 @@ class SearchState:
     map: BehaviourMap | None = None
     """The behaviour map; None if `map.enabled` is false."""
     own: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """Arrays of the search's own, by name. They are stored and digested with the rest and read-only; to change one,
-    replace it. Names and types of the arrays must stay as they are in `Algorithm.own`, shapes may change."""
+    """Arrays of the search's own, by name. They are stored and digested with the rest. The mapping and the arrays are
+    read-only; to change one, return a state with another mapping. Names and types of the arrays must stay as they are
+    in `Algorithm.own`, shapes may change."""
+
+
+def read_only(own: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
+    """The same arrays, made read-only, in a read-only mapping; the same mapping if it is read-only already.
+
+    Otherwise a change in place would not be stored, since the store goes by whether the mapping is another one.
+    """
+    for array in own.values():
+        if isinstance(array, np.ndarray):  # a NumPy scalar is read-only; whatever else there is, the store refuses
+            array.flags.writeable = False
+    return own if isinstance(own, MappingProxyType) else MappingProxyType(dict(own))
 
 
 def from_elite(state: SearchState, index: int, cell: int, elite: Elite, *, own_statistics: bool = False) -> SearchState:

@@ -25,6 +25,7 @@ from es_service.search.algorithms.base import (
     CentreState,
     FitnessWeight,
     SearchState,
+    read_only,
     with_centre,
 )
 from es_service.search.maps.behaviour_map import BehaviourMap, insert, with_score
@@ -91,7 +92,7 @@ def first_state(
         own: initial arrays of the search's own, by name.
     """
     states = tuple(CentreState(centre_D, fresh_adam(centre_D.size)) for centre_D in centres)
-    return SearchState(states, empty_archive(dimensions), FitnessWeight(fitness_weight), map_, own or {})
+    return SearchState(states, empty_archive(dimensions), FitnessWeight(fitness_weight), map_, read_only(own or {}))
 
 
 def choose_centre(state: SearchState, generation: int, config: RunConfig) -> int:
