@@ -65,7 +65,7 @@ def ray_engine(
         if most is not None:
             limits = replace(limits, workers=max(1, min(room, most)))
         watch = None if address is None else Watch(ray, claim)
-        transport = Actors(ray, spec, actor, claim, watch, room, most, limits)
+        transport = Actors(ray, spec, actor, claim, watch, most, limits)
         return Engine(transport, limits, should_stop, log)
     except BaseException:
         disconnect(ray)
@@ -93,7 +93,6 @@ class Actors:
         actor: type,
         claim: Claim,
         watch: Watch | None,
-        room: int,
         most: int | None,
         limits: Limits,
     ) -> None:
@@ -101,8 +100,7 @@ class Actors:
 
         Args:
             watch: watch of the cluster that was joined; None in a Ray of our own, whose only node is this machine.
-            room: number of workers for which there is room now.
-            most: changes of the room become `SetWorkers` up to this number; None: no `SetWorkers`.
+            most: when the room for workers changes, `SetWorkers` follows it up to this number; None: no `SetWorkers`.
             limits: limits that contain the longest wait for the first place.
         """
         self._ray = ray
@@ -114,7 +112,7 @@ class Actors:
             max_task_retries=0,
             scheduling_strategy="SPREAD",
         )(actor)
-        self._watch, self._room, self._most = watch, room, most
+        self._watch, self._most, self._wanted = watch, most, limits.workers
         self._handles: dict[int, Any] = {}
         self._calls: dict[Any, _Call] = {}
         self._places: dict[int, WorkerPlace] = {}
@@ -279,9 +277,9 @@ class Actors:
             self._nodes |= now.alive
             for worker in [worker for worker, place in self._places.items() if place.node in gone]:
                 self._lose(worker, f"{self._places[worker]}: its node died")
-        if self._most is not None and now.room and min(now.room, self._most) != min(self._room, self._most):
-            self._inbox.append(SetWorkers(min(now.room, self._most)))
-        self._room = now.room or self._room
+        if self._most is not None and now.room and min(now.room, self._most) != self._wanted:
+            self._wanted = min(now.room, self._most)
+            self._inbox.append(SetWorkers(self._wanted))
 
     def _owed_first(self) -> dict[int, str]:
         """Worker id -> method of its first unanswered call: place, build or run."""

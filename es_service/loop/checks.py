@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +23,13 @@ def require_asks(asks: object, state: SearchState, chunk_pairs: int, generation:
             returned = "an empty tuple" if asks == () else type(asks).__name__ + kinds
             return f"`ask` returned {returned}; it must return a tuple of one or more Ask"
         indices = [ask.centre for ask in asks]
-        known = all(isinstance(index, Integral) and 0 <= index < len(state.centres) for index in indices)
+        known = all(isinstance(index, int | np.integer) and 0 <= index < len(state.centres) for index in indices)
         if not known or len(set(indices)) < len(indices):
             return f"the asks are for the centres {indices}; each of the {len(state.centres)} may occur once"
         for ask in asks:
-            if not (isinstance(ask.sigma, Real) and math.isfinite(ask.sigma) and ask.sigma > 0.0):
+            if not (isinstance(ask.sigma, int | float | np.floating) and 0.0 < ask.sigma < math.inf):
                 return f"the sigma of centre {ask.centre} is {ask.sigma}; it must be positive"
-            if not isinstance(ask.pairs, Integral) or ask.pairs < 1 or ask.pairs % chunk_pairs:
+            if not isinstance(ask.pairs, int | np.integer) or ask.pairs < 1 or ask.pairs % chunk_pairs:
                 return f"centre {ask.centre} has {ask.pairs} pairs; must be a multiple of chunk_pairs ({chunk_pairs})"
         return ""
 
