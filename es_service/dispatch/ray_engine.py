@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import pickle
-import re
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
@@ -19,10 +18,12 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
+from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import ONE_CORE, Claim, Watch, connect, demand, disconnect, look
+from es_service.dispatch.ray_faults import error_text, fault_reason
 from es_service.errors import EvaluationError
 from es_service.protocol.messages import Centre, Work, WorkerPlace, WorkerSpec, forget_oldest
 
@@ -38,7 +39,7 @@ def ray_engine(
     actor: type,
     address: str | None = None,
     claim: Claim = ONE_CORE,
-    elastic: bool = False,
+    most: int | None = None,
     log: Log = no_log,
 ) -> Engine[Actors]:
     """Engine whose workers are Ray actors, which are starting.
@@ -48,22 +49,23 @@ def ray_engine(
         address: "HOST:PORT" of a cluster, or "auto" for the one on this machine. None starts a Ray of our own here,
             regardless of any other Ray and of RAY_ADDRESS, and ends it with the engine.
         claim: what one worker needs of a node.
-        elastic: whether to run as many workers as there is room for, also when that changes, not `limits.workers`.
+        most: run as many workers as there is room for, up to this number and also when the room changes; None: run
+            `limits.workers`.
 
     Raises:
         EvaluationError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
         Interrupted: SIGTERM arrived during the call.
     """
-    ray = connect(address, claim, limits.workers if elastic else limits.workers * claim.cpus)
+    ray = connect(address, claim, limits.workers * claim.cpus if most is None else cores())
     try:
         room = look(ray, claim).room
         if address is None and not room:  # there will never be room
             text = f"this machine has no room for a worker. {demand(ray, claim)}. Lower compute.worker_resources."
             raise EvaluationError(text)
-        if elastic:
-            limits = replace(limits, workers=max(1, room))
+        if most is not None:
+            limits = replace(limits, workers=max(1, min(room, most)))
         watch = None if address is None else Watch(ray, claim)
-        transport = Actors(ray, spec, actor, claim, watch, limits.workers if elastic else None, limits)
+        transport = Actors(ray, spec, actor, claim, watch, most, limits)
         return Engine(transport, limits, should_stop, log)
     except BaseException:
         disconnect(ray)
@@ -91,14 +93,14 @@ class Actors:
         actor: type,
         claim: Claim,
         watch: Watch | None,
-        room: int | None,
+        most: int | None,
         limits: Limits,
     ) -> None:
         """Make a transport without workers.
 
         Args:
             watch: watch of the cluster that was joined; None in a Ray of our own, whose only node is this machine.
-            room: number of workers for which there is room now; changes become `SetWorkers`. None: no `SetWorkers`.
+            most: when the room for workers changes, `SetWorkers` follows it up to this number; None: no `SetWorkers`.
             limits: limits that contain the longest wait for the first place.
         """
         self._ray = ray
@@ -110,7 +112,7 @@ class Actors:
             max_task_retries=0,
             scheduling_strategy="SPREAD",
         )(actor)
-        self._watch, self._room = watch, room
+        self._watch, self._most, self._wanted = watch, most, limits.workers
         self._handles: dict[int, Any] = {}
         self._calls: dict[Any, _Call] = {}
         self._places: dict[int, WorkerPlace] = {}
@@ -175,7 +177,7 @@ class Actors:
                 self._calls[self._handles[worker].place.remote()] = _Call(worker, "place")
             ref = self._handles[worker].run.remote(chunks, *centres.values())
         except self._ray.exceptions.RayError as error:
-            self._lose(worker, _reason(error))
+            self._lose(worker, fault_reason(error))
             return
         self._calls[ref] = _Call(worker, "run", item_id, attempt)
 
@@ -245,12 +247,12 @@ class Actors:
             value = self._ray.get(ref)
         except errors.RayTaskError as error:  # the call raised an exception, and the actor is alive
             if call.what != "run":
-                return self._lost(call.worker, _text(error))
+                return self._lost(call.worker, error_text(error))
             del self._calls[ref]
-            return Failure(call.worker, call.item_id, call.attempt, _text(error))
+            return Failure(call.worker, call.item_id, call.attempt, error_text(error))
         except errors.RayError as error:
             where = self._places.get(call.worker)
-            return self._lost(call.worker, f"{where or 'before it had a place'}: {_reason(error)}")
+            return self._lost(call.worker, f"{where or 'before it had a place'}: {fault_reason(error)}")
         del self._calls[ref]
         if call.what == "run":
             return Answer(call.worker, call.item_id, call.attempt, pickle.loads(value))
@@ -275,9 +277,9 @@ class Actors:
             self._nodes |= now.alive
             for worker in [worker for worker, place in self._places.items() if place.node in gone]:
                 self._lose(worker, f"{self._places[worker]}: its node died")
-        if self._room is not None and now.room and now.room != self._room:
-            self._room = now.room
-            self._inbox.append(SetWorkers(now.room))
+        if self._most is not None and now.room and min(now.room, self._most) != self._wanted:
+            self._wanted = min(now.room, self._most)
+            self._inbox.append(SetWorkers(self._wanted))
 
     def _owed_first(self) -> dict[int, str]:
         """Worker id -> method of its first unanswered call: place, build or run."""
@@ -293,20 +295,3 @@ class Actors:
         has_begun = self._owed_first().get(worker) == "run"
         self.kill(worker)
         return WorkerLost(worker, reason, bystander=not has_begun)
-
-
-def _reason(error: Exception) -> str:
-    """Cause of an actor's fault, on one line."""
-    first = _text(error).strip().partition("\n")[0]
-    known = {
-        "OutOfMemoryError": "its node ran out of memory and Ray killed it",
-        "ActorUnavailableError": "its node does not answer",
-        "ActorDiedError": "its process or its node died",
-    }
-    kind = type(error).__name__
-    return f"{known.get(kind, kind)}: {first}"
-
-
-def _text(error: Exception) -> str:
-    """Text of an error without the colour codes that Ray adds."""
-    return re.sub(r"\x1b\[[0-9;]*m", "", str(error))

@@ -7,15 +7,15 @@ time the store has the last finished generation, and the next one depends only o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.model import BudgetConfig, RunConfig
+from es_service.config.model import BudgetConfig
 from es_service.loop import budget as budgets
+from es_service.loop.checks import invalidate, require_asks, require_finite, require_some_finite
 from es_service.loop.clock import Clock
 from es_service.loop.generation import (
     better,
@@ -25,11 +25,7 @@ from es_service.loop.generation import (
     evaluate_centres,
     evaluate_populations,
     fittest,
-    invalidate,
     make_centre,
-    require_asks,
-    require_finite,
-    require_some_finite,
     steps_of,
     tell,
 )
@@ -44,10 +40,10 @@ from es_service.loop.history import (
     search_columns,
     step_columns,
 )
-from es_service.loop.parts import ELITE_PREFIX, Arrays, elite_from_arrays, elite_part, state_from_parts, state_parts
+from es_service.loop.interfaces import Search, Store, Stored
+from es_service.loop.parts import ELITE_PREFIX, elite_from_arrays, elite_part, state_from_parts, state_parts
 from es_service.loop.state import Best, RunState
-from es_service.protocol.messages import DispatchCounts, Evaluator, FloatArray, Moments, TaskSpec
-from es_service.search.algorithms.base import Algorithm
+from es_service.protocol.messages import DispatchCounts, Evaluator, TaskSpec
 from es_service.search.algorithms.steps import first_state
 from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
 from es_service.search.maps.geometry import make_geometry, reachable_cells
@@ -56,39 +52,6 @@ from es_service.search.observation_statistics import merge_moments
 
 Reachable = NDArray[np.bool_] | None
 """Whether each cell of the map can be reached, [cells]; None if this is unknown."""
-
-
-class Stored(Protocol):
-    """What the loop reads from a run store: the state that earlier sessions have stored."""
-
-    @property
-    def generation(self) -> int | None:
-        """Newest committed generation; None before the first."""
-        ...
-
-    def load(self, without: str | None = None) -> Mapping[str, Arrays]: ...
-    def last_history(self) -> Mapping[str, Any] | None: ...
-
-
-class Store(Protocol):
-    """What the loop needs from a run store during a run."""
-
-    def part(self, name: str) -> Arrays: ...
-    def commit(
-        self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow, evaluations: Sequence[HistoryRow]
-    ) -> None: ...
-
-
-@dataclass(frozen=True)
-class Search:
-    """Definition of a run apart from where it runs: config, algorithm, starting point and task."""
-
-    config: RunConfig
-    algorithm: Algorithm
-    initial: Callable[[], tuple[Sequence[FloatArray], Moments]]
-    """Returns the initial centres [D] and their observation statistics, which are empty unless the centres are from
-    another run."""
-    task: TaskSpec
 
 
 def run(

@@ -131,11 +131,12 @@ def evaluate(
     overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": workers or "auto"}
     config = changed_config(run.present_config, overrides)
     geometry = run.behaviour_map.geometry if config.map.enabled else None
+    chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
+    limits = dispatch_limits(config, chunks * len(chosen))
     with (
         stop_on_signals() as should_stop,
-        inline_engine(worker_spec(config, task_of(config)), dispatch_limits(config), should_stop) as engine,
+        inline_engine(worker_spec(config, task_of(config)), limits, should_stop) as engine,
     ):
-        chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
         together = max(1, CHUNKS_PER_WORKER * engine.counts.workers // chunks)
         for first in range(0, len(chosen), together):
             group = chosen[first : first + together]

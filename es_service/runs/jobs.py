@@ -181,5 +181,5 @@ def _explained(address: str, job: str | None = None) -> Iterator[None]:
         first = text.partition("\n")[0]
         raise EvaluationError(
             f"the Ray job request to {address} failed: {first}. Check the address, that its dashboard runs there, and "
-            "that RAY_AUTH_TOKEN is the cluster's (with RAY_AUTH_MODE=token)"
+            "that RAY_AUTH_TOKEN is the token of the cluster (with RAY_AUTH_MODE=token)"
         ) from error

@@ -150,9 +150,9 @@ class PretendedWatch:
 
 
 def transport(
-    ray: PretendedRay, limits: Limits, watch: PretendedWatch | None = None, room: int | None = None
+    ray: PretendedRay, limits: Limits, watch: PretendedWatch | None = None, most: int | None = None
 ) -> Actors:
-    return Actors(ray, SPEC, type(None), ONE_CORE, watch, room, limits)
+    return Actors(ray, SPEC, type(None), ONE_CORE, watch, most, limits)
 
 
 def ray_engine(ray: PretendedRay, limits: Limits, watch: PretendedWatch | None = None) -> Engine[Actors]:
@@ -237,7 +237,7 @@ def test_a_node_that_dies_under_idle_workers_takes_none_of_the_others_along():
     was not seen yet, or when no node at all is seen."""
     ray, watch = PretendedRay(), PretendedWatch()
     ray.node_of = lambda number: "old" if number < 2 else "new"
-    actors = transport(ray, Limits(4), watch, room=4)
+    actors = transport(ray, Limits(4), watch, most=4)
     with Engine(actors, Limits(4)) as engine:
         for alive in ({"old"}, {"old", "new"}, set(), {"old", "new"}):
             watch.now = Membership(4, frozenset(), frozenset(alive))
@@ -267,7 +267,7 @@ def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
     """Those that leave with their node's consent, then those lost with theirs, then how many there should be."""
     ray, watch = PretendedRay(), PretendedWatch()
     ray.node_of = str
-    actors = transport(ray, Limits(3), watch, room=3)
+    actors = transport(ray, Limits(3), watch, most=3)
     watch.now = Membership(3, frozenset(), frozenset("012"))
     for worker in range(3):
         actors.start(worker)
@@ -280,6 +280,8 @@ def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
     assert isinstance(told[1], WorkerLost)
     assert (told[1].worker, told[1].bystander) == (0, False)
     assert told[2:] == [SetWorkers(1), None]
+    watch.now = Membership(7, frozenset("1"), frozenset("12"))
+    assert [actors.receive(0.0) for _ in range(2)] == [SetWorkers(3), None], "no more than there is work for"
 
 
 @pytest.mark.parametrize("error", [RayTaskError, ActorDiedError])

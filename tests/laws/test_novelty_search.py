@@ -6,7 +6,7 @@ import pytest
 from es_service.api import load_config
 from es_service.config.model import worker_spec
 from es_service.loop import driver
-from es_service.loop.generation import invalidate
+from es_service.loop.checks import invalidate
 from es_service.loop.parts import state_from_parts
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicyShape, TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms

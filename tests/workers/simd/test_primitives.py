@@ -59,7 +59,8 @@ def test_every_primitive_has_a_case() -> None:
             tested.update(primitives_of(jax.make_jaxpr(function)(*(x[0] for x in arguments))))
 
     collect()
-    assert set(PRIMITIVES) - tested == set()
+    newer = {"stack"} if jax.__version_info__ < (0, 10, 1) else set()
+    assert set(PRIMITIVES) - tested == newer
 
 
 @pytest.mark.parametrize(
