@@ -49,7 +49,7 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
             centre.observation_mean_O,
             centre.observation_std_O,
             stream_keys(spec.seed, Domain.PARAMETER_NOISE, chunk.generation, pairs_P, *population_id(chunk)),
-            *episode_keys(spec, chunk, pairs_P),
+            *episode_keys(spec, chunk.generation, pairs_P, population_id(chunk)),
         )
         return _training_result(episodes, centre.observation_mean_O)
 
@@ -97,7 +97,7 @@ def population_id(chunk: Chunk) -> tuple[int, ...]:
     return (chunk.ask,) if chunk.ask else ()
 
 
-def episode_keys(spec: WorkerSpec, chunk: TrainingChunk, pairs_P: Any) -> Keys:
+def episode_keys(spec: WorkerSpec, generation: int, pairs_P: Any, population: tuple[int, ...] = ()) -> Keys:
     """Stream keys of training episodes, with axes [resets or action noise, P, S, E, 4].
 
     With common random numbers, both members of a pair have the same keys.
@@ -105,8 +105,8 @@ def episode_keys(spec: WorkerSpec, chunk: TrainingChunk, pairs_P: Any) -> Keys:
     sign_S = np.zeros(2, int) if spec.common_random_numbers else np.arange(2)
     domains = (Domain.TRAINING_RESET, Domain.ACTION_NOISE)
     episode_E = np.arange(spec.episodes_per_member)
-    ids = (pairs_P[:, None, None], sign_S[None, :, None], episode_E, *population_id(chunk))
-    return stream_keys(spec.seed, domains, chunk.generation, *ids)
+    ids = (pairs_P[:, None, None], sign_S[None, :, None], episode_E, *population)
+    return stream_keys(spec.seed, domains, generation, *ids)
 
 
 def _training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
