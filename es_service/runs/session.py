@@ -208,4 +208,6 @@ def worker_count(config: RunConfig, most: int | None = None) -> int:
         most: number of workers for which there is work; None: as in a generation of a run.
     """
     workers = config.compute.workers
-    return min(cores(), chunks_at_once(config) if most is None else most) if workers == "auto" else workers
+    if workers != "auto":
+        return workers
+    return max(1, min(cores(), chunks_at_once(config) if most is None else most))
