@@ -21,7 +21,7 @@ from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.logs import in_run
 from es_service.loop.budget import REACHED, limits_of, raised
-from es_service.loop.history import history_columns
+from es_service.loop.history import evaluated_columns, history_columns
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.lineage import fork_config, forked, started
@@ -245,6 +245,7 @@ def _create_and_work(
         constants=config.constants(),
         task=asdict(task),
         columns=history_columns(task, config.map.enabled),
+        evaluation_columns=evaluated_columns(task, config.map.enabled),
         parent=parent,
     )
     with RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=hook) as store, in_run(meta.run_id):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from es_service.protocol.messages import Centre, Chunk, ChunkResult, DispatchCounts, PolicyShape, WorkerSpec
+from es_service.protocol.messages import Centre, Chunk, ChunkResult, DispatchCounts, PolicyShape, Work, WorkerSpec
 from workers.worker import make_worker
 
 SPEC = WorkerSpec(
@@ -49,9 +49,9 @@ class DirectEvaluator:
         self.counts = DispatchCounts(workers=1)
         self.recorded: list[tuple[Centre, Chunk, ChunkResult]] = []
 
-    def evaluate(self, centre: Centre, chunks: Sequence[Chunk]) -> list[ChunkResult]:
-        results = [self._run_chunk(centre, chunk) for chunk in chunks]
-        self.recorded += [(centre, chunk, result) for chunk, result in zip(chunks, results, strict=True)]
+    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
+        results = [self._run_chunk(centre, chunk) for centre, chunk in work]
+        self.recorded += [(centre, chunk, result) for (centre, chunk), result in zip(work, results, strict=True)]
         return results
 
 
@@ -72,7 +72,7 @@ class MemoryStore:
     def last_history(self) -> dict | None:
         return self.rows[-1] if self.rows else None
 
-    def commit(self, generation, parts, history) -> None:
+    def commit(self, generation, parts, history, evaluations=()) -> None:
         self.generation = generation
         self.parts |= parts
         self.rows.append(dict(history))

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from es_service.protocol.machine import platform_info, platform_text
-from es_service.protocol.messages import Centre, Chunk, ChunkResult, WorkerPlace
+from es_service.protocol.messages import ChunkResult, Work, WorkerPlace
 from es_service.protocol.process_environment import worker_environment
 from workers.xla_cache import xla_cache_settings
 
@@ -29,7 +29,7 @@ class WorkerActor:
             gpus: share of a GPU that Ray has assigned to this actor; 0 for the CPU.
         """
         self._spec, self._index, self._gpus = spec, index, gpus
-        self._run_chunks: Callable[[Centre, Sequence[Chunk]], list[ChunkResult]] | None = None
+        self._run_chunks: Callable[[Sequence[Work]], list[ChunkResult]] | None = None
 
     def __repr__(self) -> str:
         return f"worker-{self._index}@{socket.gethostname()}"
@@ -55,7 +55,14 @@ class WorkerActor:
 
         return platform_text(platform_info() | {"device": jax.devices()[0].device_kind})
 
-    def run(self, centre: bytes, chunks: bytes) -> bytes:
-        """Run chunks around a centre; returns the pickled results."""
+    def run(self, chunks: bytes, *centres: bytes) -> bytes:
+        """Run chunks; returns the pickled results.
+
+        Args:
+            chunks: pickled [(index of its centre in `centres`, Chunk)].
+            centres: each one pickled.
+        """
         assert self._run_chunks is not None, "run was called before build"
-        return pickle.dumps(self._run_chunks(pickle.loads(centre), pickle.loads(chunks)), pickle.HIGHEST_PROTOCOL)
+        known = [pickle.loads(centre) for centre in centres]
+        work = [(known[index], chunk) for index, chunk in pickle.loads(chunks)]
+        return pickle.dumps(self._run_chunks(work), pickle.HIGHEST_PROTOCOL)

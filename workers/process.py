@@ -17,6 +17,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from es_service.protocol.messages import Centre, forget_oldest
 from es_service.protocol.wire import framed, receive
 from workers.xla_cache import xla_cache_settings
 
@@ -28,9 +29,9 @@ def main(descriptor: int, parent: int) -> None:
     """Serve workers until the parent closes its end of the socket `descriptor`.
 
     The parent sends over this socket the WorkerSpec, and then for each worker one byte with the descriptor of the
-    worker's socket. A worker receives ("centre", Centre) and ("chunks", item, attempt, [Chunk]), where `item` names the
-    work item that the chunks belong to. It sends ("broken", text), or ("up",) and then for each work item
-    ("results", item, attempt, [ChunkResult]) or ("failure", item, attempt, text).
+    worker's socket. A worker receives ("centre", number, Centre) and ("chunks", item, attempt, [(number, Chunk)]);
+    `item` names their work item, and `number` the centre of each. It sends ("broken", text), or
+    ("up",) and then for each work item ("results", item, attempt, [ChunkResult]) or ("failure", item, attempt, text).
     """
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # do not outlive a driver that was killed
     if os.getppid() != parent:
@@ -87,18 +88,19 @@ def _serve(parent: socket.socket, run_chunks: Callable[..., Any] | str) -> None:
         parent.sendall(framed(("broken", run_chunks)))
         return
     parent.sendall(framed(("up",)))
-    centre = None
+    centres: dict[int, Centre] = {}
     while True:
         match receive(parent):
-            case ("centre", centre):
-                pass
+            case ("centre", number, centre):
+                centres[number] = centre
             case ("chunks", item, attempt, chunks):
                 try:
-                    assert centre is not None, "chunks were received before a centre"
-                    answer = ("results", item, attempt, run_chunks(centre, chunks))
+                    work = [(centres[number], chunk) for number, chunk in chunks]
+                    answer = ("results", item, attempt, run_chunks(work))
                 except BaseException:  # also sys.exit in an environment
                     answer = ("failure", item, attempt, traceback.format_exc())
                 parent.sendall(framed(answer))
+                forget_oldest(centres)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,9 @@ from es_service.protocol.messages import (
     GradientResult,
     Moments,
     TrainingChunk,
+    Work,
     WorkerSpec,
+    chunk_name,
 )
 from es_service.protocol.noise import NORMAL_STD, Domain, Keys, stream_keys
 from workers.environments import make_environment
@@ -46,8 +48,8 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
             np.float32(centre.sigma / NORMAL_STD),
             centre.observation_mean_O,
             centre.observation_std_O,
-            stream_keys(spec.seed, Domain.PARAMETER_NOISE, chunk.generation, pairs_P),
-            *episode_keys(spec, chunk.generation, pairs_P),
+            stream_keys(spec.seed, Domain.PARAMETER_NOISE, chunk.generation, pairs_P, *population_id(chunk)),
+            *episode_keys(spec, chunk.generation, pairs_P, population_id(chunk)),
         )
         return _training_result(episodes, centre.observation_mean_O)
 
@@ -57,13 +59,13 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
             centre.parameters_D,
             centre.observation_mean_O,
             centre.observation_std_O,
-            stream_keys(spec.seed, Domain.EVALUATION_RESET, chunk.generation, episodes_E),
+            stream_keys(spec.seed, Domain.EVALUATION_RESET, chunk.generation, episodes_E, *population_id(chunk)),
         )
         return _evaluation_result(episodes)
 
     def gradient(chunk: GradientChunk) -> GradientResult:
         pairs_P = chunk.chunk_id * spec.gradient_block_pairs + np.arange(spec.gradient_block_pairs)
-        keys_P = stream_keys(spec.seed, Domain.PARAMETER_NOISE, chunk.generation, pairs_P)
+        keys_P = stream_keys(spec.seed, Domain.PARAMETER_NOISE, chunk.generation, pairs_P, *population_id(chunk))
         return GradientResult(np.array(gradient_sum(chunk.weights_P, keys_P)))
 
     def run_chunk(centre: Centre, chunk: Chunk) -> ChunkResult:
@@ -78,21 +80,24 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
     return run_chunk
 
 
-def run_chunks(
-    run_chunk: Callable[[Centre, Chunk], ChunkResult], centre: Centre, chunks: Sequence[Chunk]
-) -> list[ChunkResult]:
+def run_chunks(run_chunk: Callable[[Centre, Chunk], ChunkResult], work: Sequence[Work]) -> list[ChunkResult]:
     """Results of the chunks of one work item; a note on an exception names the chunk that raised it."""
     results = []
-    for chunk in chunks:
+    for centre, chunk in work:
         try:
             results.append(run_chunk(centre, chunk))
         except BaseException as error:
-            error.add_note(f"raised in {type(chunk).__name__} {chunk.chunk_id} of generation {chunk.generation}")
+            error.add_note(f"raised in {chunk_name(chunk)}")
             raise
     return results
 
 
-def episode_keys(spec: WorkerSpec, generation: int, pairs_P: Any) -> Keys:
+def population_id(chunk: Chunk) -> tuple[int, ...]:
+    """What a population adds to the addresses of its random streams: nothing for the first of a generation."""
+    return (chunk.ask,) if chunk.ask else ()
+
+
+def episode_keys(spec: WorkerSpec, generation: int, pairs_P: Any, population: tuple[int, ...] = ()) -> Keys:
     """Stream keys of training episodes, with axes [resets or action noise, P, S, E, 4].
 
     With common random numbers, both members of a pair have the same keys.
@@ -100,7 +105,8 @@ def episode_keys(spec: WorkerSpec, generation: int, pairs_P: Any) -> Keys:
     sign_S = np.zeros(2, int) if spec.common_random_numbers else np.arange(2)
     domains = (Domain.TRAINING_RESET, Domain.ACTION_NOISE)
     episode_E = np.arange(spec.episodes_per_member)
-    return stream_keys(spec.seed, domains, generation, pairs_P[:, None, None], sign_S[None, :, None], episode_E)
+    ids = (pairs_P[:, None, None], sign_S[None, :, None], episode_E, *population)
+    return stream_keys(spec.seed, domains, generation, *ids)
 
 
 def _training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:

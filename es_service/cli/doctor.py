@@ -133,9 +133,9 @@ def _rollout() -> Iterator[Finding]:
     centre = Centre(0, initial_parameters(spec.policy, config.policy.init, 0), config.search.sigma, mean_O, std_O)
     started = time.perf_counter()
     with stop_on_signals() as should_stop, inline_engine(spec, Limits(workers=1), should_stop) as engine:
-        engine.evaluate(centre, [TrainingChunk(0, 0)])
+        engine.evaluate([(centre, TrainingChunk(0, 0))])
         ready = time.perf_counter()
-        results = engine.evaluate(centre, [TrainingChunk(1, chunk) for chunk in range(8)])
+        results = engine.evaluate([(centre, TrainingChunk(1, chunk)) for chunk in range(8)])
         seconds = time.perf_counter() - ready
     steps = sum(int(result.steps.sum()) for result in results if isinstance(result, EpisodesResult))
     yield "ok", f"a worker starts and compiles in {ready - started:.1f} s, then makes {steps / seconds:,.0f} steps/s"

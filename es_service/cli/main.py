@@ -33,6 +33,7 @@ from es_service.cli.options import (
     console,
     errors,
     overrides,
+    place_of,
     print_error,
     print_note,
 )
@@ -41,6 +42,7 @@ from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.progress import show_progress
 from es_service.cli.tables.status import follow_status, print_status, print_summary
 from es_service.config.loading import left_out
+from es_service.config.parallel import parallel_sentence
 from es_service.config.resolution import config_warnings
 from es_service.config.shipped import shipped_text
 from es_service.config.tasks import TASKS, no_vectors, task_of
@@ -98,6 +100,7 @@ def run(
         print_note(f"note: ignored {', '.join(foreign)} of {config}, since {task} replaces its task (default options)")
     for warning in config_warnings(loaded, task_of(loaded), no_vectors()):
         print_note(f"note: {warning}")
+    console.print(parallel_sentence(loaded), highlight=False, markup=False, soft_wrap=True)
     folder = out if out is not None else api.default_folder(loaded)
     _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder))
 
@@ -214,7 +217,7 @@ def evaluate(
         found,
         best=best or not (centre or cell or every),
         centre=centre,
-        cells=list(dict.fromkeys(_place(text) for text in cell or ())),
+        cells=list(dict.fromkeys(place_of(text) for text in cell or ())),
         every=every,
     )
     with csv_file(out, print_note) as write:
@@ -292,11 +295,3 @@ def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
         raise
     with contextlib.suppress(SystemExit):
         print_summary(console, outcome.run, outcome.reason)
-
-
-def _place(text: str) -> tuple[int, ...]:
-    """Place of a cell, parsed from text such as 3,17."""
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise ConfigError(f"--cell {text}: must be whole numbers separated by commas, such as 3,17") from None

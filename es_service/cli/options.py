@@ -12,7 +12,7 @@ from rich.console import Console
 
 from es_service.cli.commands import assignments, error_message
 from es_service.config.compute import ENGINE_IMPLIES
-from es_service.errors import ServiceError
+from es_service.errors import ConfigError, ServiceError
 from es_service.logs import FORMAT
 
 console = Console()
@@ -92,3 +92,11 @@ def print_error(error: ServiceError | str) -> None:
     """Print an error message and its ways out."""
     message = error_message(error) if isinstance(error, ServiceError) else error
     print_note(f"error: {message}", style="red")
+
+
+def place_of(text: str) -> tuple[int, ...]:
+    """Place of a cell, parsed from text such as 3,17."""
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--cell {text}: must be whole numbers separated by commas, such as 3,17") from None

@@ -37,6 +37,7 @@ _FOLLOWERS = {
     "map.kind": ("map.cells",),
     "policy.observation_normalization": ("policy.observation_clip",),
     "search.algorithm": ("search.centres",),
+    "search.emitters": ("search.centres",),
     "search.pairs": _SHAPES,
     "compute.chunk_pairs": _SHAPES[1:],
 }

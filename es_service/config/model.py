@@ -82,7 +82,8 @@ class SearchConfig(Section):
         "literature", description="Which column of the preset table fills in the keys that the config leaves out."
     )
     pairs: Count = Field(
-        description="Antithetic pairs per generation; the population is twice as large. Set by the preset."
+        description="Antithetic pairs of a population, which has twice as many members. A generation has one "
+        "population, or one for each centre with search.emitters and search.update: all. Set by the preset."
     )
     sigma: Positive = Field(0.02, description="Standard deviation of the parameter noise, in parameter units.")
     learning_rate: Positive = Field(0.01, description="Step size of Adam, in parameter units.")
@@ -90,13 +91,22 @@ class SearchConfig(Section):
         0.005, description="Weight decay, added to the gradient before Adam: lambda in -g + lambda x."
     )
     centres: Count = Field(
-        description="Number of centres searched side by side, each with its own optimiser; one is updated per "
-        "generation. auto: 1 for es and me_es, which allow no other number, and for a search of your own; else 5."
+        description="Number of centres searched side by side, each with its own optimiser. auto: 1 for es, "
+        "search.emitters for me_es (these allow no other number), 1 for a search of your own; else 5."
+    )
+    update: Literal["one", "all"] = Field(
+        "one",
+        description="ns_es, nsr_es, nsra_es: how many of the centres a generation updates. one: that of "
+        "search.centre_choice. all: every centre, with search.pairs pairs each.",
     )
     centre_choice: Literal["novelty", "round_robin", "uniform"] = Field(
         "novelty",
         description="How the centre to update is chosen. novelty: with probability proportional to its novelty. "
         "round_robin: in turn. uniform: all with the same probability.",
+    )
+    emitters: Count = Field(
+        1,
+        description="me_es: number of blocks that run side by side, with search.pairs pairs each in every generation.",
     )
     fitness_weight_start: Fraction = Field(
         description="nsra_es: weight of fitness beside novelty at the start. Set by the preset."

@@ -34,8 +34,6 @@ LEFT_OPEN: dict[str, str | None] = {
     "compute.gradient_block_pairs": "auto",
 }
 """Keys that this module resolves -> the value that asks for it. Leaving the key out has the same effect."""
-SINGLE_CENTRE = ("es", "me_es")
-"""Algorithms with a single centre."""
 CENTRES = 5
 """Default number of centres of the other algorithms (the meta-population of Conti et al. 2018). Source:
 deep-neuroevolution's Humanoid settings and the released ME-ES code."""
@@ -118,7 +116,7 @@ def resolve(
             values["map.qd_offset"] = default_qd_offset(values, task)
     if "search.centres" in left_open and "search.algorithm" in values:
         algorithm = values["search.algorithm"]
-        values["search.centres"] = 1 if algorithm in SINGLE_CENTRE or ":" in algorithm else CENTRES
+        values["search.centres"] = _centres_of(algorithm, values) or (1 if ":" in algorithm else CENTRES)
     if "compute.rollout" in left_open and task is not None:
         values["compute.rollout"] = "xla" if _on_gpu(values) or _why_no_simd(values, task, no_vectors) else "simd"
     pairs = values.get("search.pairs")
@@ -177,9 +175,16 @@ def _policy_shape(values: Mapping[str, Any], task: TaskSpec) -> PolicyShape:
 def centre_problems(values: Mapping[str, Any]) -> list[Problem]:
     """The problem of a number of centres that the algorithm does not support."""
     algorithm, centres = values.get("search.algorithm"), values.get("search.centres")
-    if algorithm not in SINGLE_CENTRE or centres in (None, 1):
+    fixed = _centres_of(algorithm, values)
+    if fixed is None or centres in (None, fixed):
         return []
-    return [not_allowed("search.centres", centres, "1 or auto", why=f" for {algorithm}, which has one centre")]
+    why = " for es, which has one centre" if algorithm == "es" else " for me_es, which has one centre per emitter"
+    return [not_allowed("search.centres", centres, f"{fixed} or auto", why=why)]
+
+
+def _centres_of(algorithm: object, values: Mapping[str, Any]) -> int | None:
+    """The only number of centres that an algorithm supports; None if it supports any."""
+    return {"es": 1, "me_es": values.get("search.emitters", 1)}.get(str(algorithm))
 
 
 def shape_problems(values: Mapping[str, Any]) -> list[Problem]:

@@ -19,7 +19,7 @@ from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, told_last_words, usual_chunk_s
 from es_service.errors import EvaluationError, Interrupted
 from es_service.logs import logger
-from es_service.protocol.messages import Centre, Chunk, ChunkResult, DispatchCounts, WorkItemId
+from es_service.protocol.messages import ChunkResult, DispatchCounts, Work, WorkItemId
 
 _LOG = logger(__name__)
 POLL_S = 0.1
@@ -61,8 +61,8 @@ class Transport(Protocol):
         """
         ...
 
-    def send(self, worker: int, centre: Centre, item_id: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
-        """Send chunks and their centre to a worker that is up; it runs them after those that it was sent before."""
+    def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
+        """Send chunks and their centres to a worker that is up; it runs them after those that it was sent before."""
         ...
 
     def platforms(self) -> frozenset[str]:
@@ -129,9 +129,8 @@ class Engine(Generic[AnyTransport]):
         self._should_stop = should_stop
         self._log = log
         self._state = initial_state(limits)
-        self._centre: Centre | None = None
         self._phase = 0
-        self._chunks: dict[Hashable, Sequence[Chunk]] = {}
+        self._work: dict[Hashable, Sequence[Work]] = {}
         self._results: dict[Hashable, list[ChunkResult]] = {}
         try:
             self._step(events.Tick())
@@ -155,8 +154,8 @@ class Engine(Generic[AnyTransport]):
         state = self._state
         return DispatchCounts(retries=state.retries, lost_workers=state.lost_workers, workers=state.wanted)
 
-    def evaluate(self, centre: Centre, chunks: Sequence[Chunk]) -> list[ChunkResult]:
-        """Results of chunks, all of one kind, around a centre, in the order of `chunks`.
+    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
+        """Results of chunks, all of one kind, in the order of `work`.
 
         They do not depend on the number of workers or on faults. After an exception, only `close` may be called.
 
@@ -169,8 +168,8 @@ class Engine(Generic[AnyTransport]):
             # may get one. Only one work item is charged for that, since all other workers are then asked first.
             self._handle(message)
         self._phase += 1
-        parts = self._parts(chunks)
-        self._centre, self._chunks, self._results = centre, dict(parts), {}
+        parts = self._parts(work)
+        self._work, self._results = dict(parts), {}
         self._step(events.Submit(tuple(events.WorkItem(item_id, item_id.kind, item_id.chunks) for item_id, _ in parts)))
         while pending(self._state):
             if (number := self._should_stop()) is not None:
@@ -192,17 +191,23 @@ class Engine(Generic[AnyTransport]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _parts(self, chunks: Sequence[Chunk]) -> list[tuple[WorkItemId, Sequence[Chunk]]]:
-        """Work items of chunks, all of one kind. Their sizes depend on measured durations, but results do not."""
-        if not chunks:
+    def _parts(self, work: Sequence[Work]) -> list[tuple[WorkItemId, Sequence[Work]]]:
+        """Work items of neighbouring chunks, which may belong to several centres.
+
+        Their sizes depend on measured durations, but results do not.
+        """
+        if not work:
             return []
-        kind, limits = type(chunks[0]).__name__, self._state.limits
-        sizes = item_sizes(len(chunks), self._state.wanted, usual_chunk_s(self._state, kind), limits.item_s)
+        kind, limits = type(work[0][1]).__name__, self._state.limits
+        sizes = item_sizes(len(work), self._state.wanted, usual_chunk_s(self._state, kind), limits.item_s)
         ends = list(itertools.accumulate(sizes))
-        parts = [chunks[end - size : end] for end, size in zip(ends, sizes, strict=True)]
-        return [
-            (WorkItemId(self._phase, kind, part[0].generation, part[0].chunk_id, len(part)), part) for part in parts
-        ]
+        firsts = [end - size for end, size in zip(ends, sizes, strict=True)]
+        parts = [work[first:end] for first, end in zip(firsts, ends, strict=True)]
+        return [(self._item_id(first, kind, part), part) for first, part in zip(firsts, parts, strict=True)]
+
+    def _item_id(self, first: int, kind: str, part: Sequence[Work]) -> WorkItemId:
+        chunk = part[0][1]
+        return WorkItemId(self._phase, first, kind, chunk.generation, chunk.ask, chunk.chunk_id, len(part))
 
     def _handle(self, message: Message) -> None:
         if not isinstance(message, Answer):
@@ -223,8 +228,7 @@ class Engine(Generic[AnyTransport]):
                 case events.StopWorker(worker, _):
                     self._state = told_last_words(self._state, worker, self.transport.kill(worker))
                 case events.Assign(worker, item_id, attempt):
-                    assert self._centre is not None
-                    self.transport.send(worker, self._centre, item_id, attempt, self._chunks[item_id])
+                    self.transport.send(worker, item_id, attempt, self._work[item_id])
         if self._state.failed is not None:
             raise EvaluationError(self._state.failed)
         return any(isinstance(command, events.Deliver) for command in commands)

@@ -18,14 +18,14 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import IO
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Failure, Limits, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
-from es_service.protocol.messages import Centre, Chunk, WorkerSpec
+from es_service.protocol.messages import Centre, Work, WorkerSpec, forget_oldest
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.wire import BUFFER_BYTES, Channel, framed
 
@@ -73,8 +73,8 @@ class _Worker:
 
     child: _Child
     channel: Channel
-    centre: Centre | None = None
-    """Centre that it was sent last."""
+    centres: dict[int, None] = field(default_factory=dict)
+    """Numbers of the centres that it has, in the order in which they were sent."""
     unanswered: int = 0
     """Number of work items that it was sent and has not answered."""
 
@@ -88,7 +88,9 @@ class ChildProcesses:
         self._by_descriptor: dict[int, int] = {}
         self._poll = select.poll()
         self._ready: deque[Message] = deque()
-        self._centre: tuple[Centre | None, bytes] = None, b""
+        self._centres: dict[int, tuple[Centre, int, bytes]] = {}
+        """By `id`, which the centre in the entry keeps from being reused."""
+        self._next_centre = 0
 
     def process_ids(self) -> dict[int, int]:
         """Worker id -> process id, for the workers that are not known to be lost; for diagnosis and tests."""
@@ -119,19 +121,21 @@ class ChildProcesses:
         child = self._forget(worker)
         return self._lose(child, f"worker {worker}, a thread of the same process, was killed", bystanders=True)
 
-    def send(self, worker: int, centre: Centre, item_id: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
-        """Send the chunks, after the centre if the worker does not have it yet."""
+    def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
+        """Send the chunks, after those of their centres that the worker does not have."""
         to = self._workers.get(worker)
         if to is None:
             return  # lost with another thread of its child, which `receive` is going to report
-        if self._centre[0] is not centre:
-            self._centre = centre, framed(("centre", centre))
-        frames = [framed(("chunks", item_id, attempt, chunks))]
-        if to.centre is not centre:
-            to.centre = centre
-            frames.insert(0, self._centre[1])
+        frames, numbered = [], []
+        for centre, chunk in work:
+            number, frame = self._framed_centre(centre)
+            if number not in to.centres:
+                to.centres[number] = None
+                frames.append(frame)
+            numbered.append((number, chunk))
+        forget_oldest(to.centres)
         to.unanswered += 1
-        to.channel.send(*frames)
+        to.channel.send(*frames, framed(("chunks", item_id, attempt, numbered)))
         self._watch(to.channel)
 
     def platforms(self) -> frozenset[str]:
@@ -163,6 +167,15 @@ class ChildProcesses:
             worker.child.process.kill()  # kill all before waiting, since each takes some time to free its memory
         for worker in list(self._workers):
             self.kill(worker)
+
+    def _framed_centre(self, centre: Centre) -> tuple[int, bytes]:
+        """Number and message of a centre. A centre that was forgotten meanwhile gets another number."""
+        if (known := self._centres.get(id(centre))) is None:
+            frame = framed(("centre", self._next_centre, centre))
+            known = self._centres[id(centre)] = centre, self._next_centre, frame
+            self._next_centre += 1
+            forget_oldest(self._centres)
+        return known[1:]
 
     def _add(self, number: int, child: _Child, ours: socket.socket) -> None:
         self._workers[number] = _Worker(child, Channel(ours))

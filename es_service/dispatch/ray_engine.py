@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import pickle
-import re
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
@@ -19,12 +18,14 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
+from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import ONE_CORE, Claim, Watch, connect, demand, disconnect, look
+from es_service.dispatch.ray_faults import error_text, fault_reason
 from es_service.errors import EvaluationError
-from es_service.protocol.messages import Centre, Chunk, WorkerPlace, WorkerSpec
+from es_service.protocol.messages import Centre, Work, WorkerPlace, WorkerSpec, forget_oldest
 
 IN_CALL_BYTES = 64 * 2**10
 """Largest size in bytes of a centre that is sent with every call; a larger one is stored, and fetched once per node."""
@@ -38,7 +39,7 @@ def ray_engine(
     actor: type,
     address: str | None = None,
     claim: Claim = ONE_CORE,
-    elastic: bool = False,
+    most: int | None = None,
     log: Log = no_log,
 ) -> Engine[Actors]:
     """Engine whose workers are Ray actors, which are starting.
@@ -48,22 +49,23 @@ def ray_engine(
         address: "HOST:PORT" of a cluster, or "auto" for the one on this machine. None starts a Ray of our own here,
             regardless of any other Ray and of RAY_ADDRESS, and ends it with the engine.
         claim: what one worker needs of a node.
-        elastic: whether to run as many workers as there is room for, also when that changes, not `limits.workers`.
+        most: run as many workers as there is room for, up to this number and also when the room changes; None: run
+            `limits.workers`.
 
     Raises:
         EvaluationError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
         Interrupted: SIGTERM arrived during the call.
     """
-    ray = connect(address, claim, limits.workers if elastic else limits.workers * claim.cpus)
+    ray = connect(address, claim, limits.workers * claim.cpus if most is None else cores())
     try:
         room = look(ray, claim).room
         if address is None and not room:  # there will never be room
             text = f"this machine has no room for a worker. {demand(ray, claim)}. Lower compute.worker_resources."
             raise EvaluationError(text)
-        if elastic:
-            limits = replace(limits, workers=max(1, room))
+        if most is not None:
+            limits = replace(limits, workers=max(1, min(room, most)))
         watch = None if address is None else Watch(ray, claim)
-        transport = Actors(ray, spec, actor, claim, watch, limits.workers if elastic else None, limits)
+        transport = Actors(ray, spec, actor, claim, watch, most, limits)
         return Engine(transport, limits, should_stop, log)
     except BaseException:
         disconnect(ray)
@@ -91,14 +93,14 @@ class Actors:
         actor: type,
         claim: Claim,
         watch: Watch | None,
-        room: int | None,
+        most: int | None,
         limits: Limits,
     ) -> None:
         """Make a transport without workers.
 
         Args:
             watch: watch of the cluster that was joined; None in a Ray of our own, whose only node is this machine.
-            room: number of workers for which there is room now; changes become `SetWorkers`. None: no `SetWorkers`.
+            most: when the room for workers changes, `SetWorkers` follows it up to this number; None: no `SetWorkers`.
             limits: limits that contain the longest wait for the first place.
         """
         self._ray = ray
@@ -110,7 +112,7 @@ class Actors:
             max_task_retries=0,
             scheduling_strategy="SPREAD",
         )(actor)
-        self._watch, self._room = watch, room
+        self._watch, self._most, self._wanted = watch, most, limits.workers
         self._handles: dict[int, Any] = {}
         self._calls: dict[Any, _Call] = {}
         self._places: dict[int, WorkerPlace] = {}
@@ -122,7 +124,8 @@ class Actors:
         self._to_ask: set[int] = set()
         """Workers that must be asked for their place again before the next chunks, because another worker was lost."""
         self._inbox: deque[Message] = deque()
-        self._centre: tuple[Centre, Any] | None = None
+        self._centres: dict[int, tuple[Centre, Any]] = {}
+        """By `id`, which the centre in the entry keeps from being reused."""
         # Ray would wait for ever. The scheduler's time with the same limit starts later, so the error is raised here,
         # where it can name the resources that are free in the cluster.
         self._placed_by_s = time.monotonic() + limits.no_worker_timeout_s
@@ -154,8 +157,8 @@ class Actors:
                 self._ray.kill(handle, no_restart=True)
         return ""
 
-    def send(self, worker: int, centre: Centre, item_id: Hashable, attempt: int, chunks: Sequence[Chunk]) -> None:
-        """Call the actor. A large centre is stored once for all calls that share it, until the next centre.
+    def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
+        """Call the actor. A large centre is stored once for all calls that share it.
 
         The loss of an idle actor shows only when it is called. So after a loss, perhaps of a node, each other actor is
         asked for its place before its next chunks, which are charged with its loss only if it has answered that call.
@@ -163,15 +166,18 @@ class Actors:
         if worker not in self._handles:
             return  # it has just been lost when it was sent other chunks, which `receive` is going to report
         try:
-            if self._centre is None or self._centre[0] is not centre:
-                pickled = pickle.dumps(centre, pickle.HIGHEST_PROTOCOL)
-                self._centre = centre, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
+            centres: dict[int, Any] = {}
+            for centre, _ in work:
+                if id(centre) not in centres:
+                    centres[id(centre)] = self._packed(centre)
+            index = {key: number for number, key in enumerate(centres)}
+            chunks = pickle.dumps([(index[id(centre)], chunk) for centre, chunk in work], pickle.HIGHEST_PROTOCOL)
             if worker in self._to_ask:
                 self._to_ask.discard(worker)
                 self._calls[self._handles[worker].place.remote()] = _Call(worker, "place")
-            ref = self._handles[worker].run.remote(self._centre[1], pickle.dumps(chunks, pickle.HIGHEST_PROTOCOL))
+            ref = self._handles[worker].run.remote(chunks, *centres.values())
         except self._ray.exceptions.RayError as error:
-            self._lose(worker, _reason(error))
+            self._lose(worker, fault_reason(error))
             return
         self._calls[ref] = _Call(worker, "run", item_id, attempt)
 
@@ -223,8 +229,17 @@ class Actors:
         for worker in list(self._handles):
             self.kill(worker)
         self._calls.clear()
-        self._centre = None
+        self._centres.clear()
         disconnect(self._ray, forget=forget)
+
+    def _packed(self, centre: Centre) -> Any:
+        """The centre as an argument of a call: pickled, or the reference under which Ray has stored that."""
+        if (known := self._centres.get(id(centre))) is None:
+            pickled = pickle.dumps(centre, pickle.HIGHEST_PROTOCOL)
+            known = centre, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
+            self._centres[id(centre)] = known
+            forget_oldest(self._centres)
+        return known[1]
 
     def _message(self, ref: Any) -> Message | None:
         call, errors = self._calls[ref], self._ray.exceptions
@@ -232,12 +247,12 @@ class Actors:
             value = self._ray.get(ref)
         except errors.RayTaskError as error:  # the call raised an exception, and the actor is alive
             if call.what != "run":
-                return self._lost(call.worker, _text(error))
+                return self._lost(call.worker, error_text(error))
             del self._calls[ref]
-            return Failure(call.worker, call.item_id, call.attempt, _text(error))
+            return Failure(call.worker, call.item_id, call.attempt, error_text(error))
         except errors.RayError as error:
             where = self._places.get(call.worker)
-            return self._lost(call.worker, f"{where or 'before it had a place'}: {_reason(error)}")
+            return self._lost(call.worker, f"{where or 'before it had a place'}: {fault_reason(error)}")
         del self._calls[ref]
         if call.what == "run":
             return Answer(call.worker, call.item_id, call.attempt, pickle.loads(value))
@@ -262,9 +277,9 @@ class Actors:
             self._nodes |= now.alive
             for worker in [worker for worker, place in self._places.items() if place.node in gone]:
                 self._lose(worker, f"{self._places[worker]}: its node died")
-        if self._room is not None and now.room and now.room != self._room:
-            self._room = now.room
-            self._inbox.append(SetWorkers(now.room))
+        if self._most is not None and now.room and min(now.room, self._most) != self._wanted:
+            self._wanted = min(now.room, self._most)
+            self._inbox.append(SetWorkers(self._wanted))
 
     def _owed_first(self) -> dict[int, str]:
         """Worker id -> method of its first unanswered call: place, build or run."""
@@ -280,20 +295,3 @@ class Actors:
         has_begun = self._owed_first().get(worker) == "run"
         self.kill(worker)
         return WorkerLost(worker, reason, bystander=not has_begun)
-
-
-def _reason(error: Exception) -> str:
-    """Cause of an actor's fault, on one line."""
-    first = _text(error).strip().partition("\n")[0]
-    known = {
-        "OutOfMemoryError": "its node ran out of memory and Ray killed it",
-        "ActorUnavailableError": "its node does not answer",
-        "ActorDiedError": "its process or its node died",
-    }
-    kind = type(error).__name__
-    return f"{known.get(kind, kind)}: {first}"
-
-
-def _text(error: Exception) -> str:
-    """Text of an error without the colour codes that Ray adds."""
-    return re.sub(r"\x1b\[[0-9;]*m", "", str(error))

@@ -7,81 +7,51 @@ time the store has the last finished generation, and the next one depends only o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.model import BudgetConfig, RunConfig
+from es_service.config.model import BudgetConfig
 from es_service.loop import budget as budgets
+from es_service.loop.checks import invalidate, require_asks, require_finite, require_some_finite
 from es_service.loop.clock import Clock
 from es_service.loop.generation import (
     better,
     centre_evaluation,
     entered,
-    estimate_gradient,
-    evaluate_centre,
-    evaluate_population,
-    invalidate,
+    estimate_gradients,
+    evaluate_centres,
+    evaluate_populations,
+    fittest,
     make_centre,
-    require_finite,
-    require_some_finite,
     steps_of,
+    tell,
 )
 from es_service.loop.history import (
     HistoryRow,
+    evaluated_row,
     evaluation_columns,
     fault_columns,
     map_columns,
+    norm,
     population_columns,
     search_columns,
     step_columns,
 )
-from es_service.loop.parts import ELITE_PREFIX, Arrays, elite_from_arrays, elite_part, state_from_parts, state_parts
+from es_service.loop.interfaces import Search, Store, Stored
+from es_service.loop.parts import ELITE_PREFIX, elite_from_arrays, elite_part, state_from_parts, state_parts
 from es_service.loop.state import Best, RunState
-from es_service.protocol.messages import DispatchCounts, Evaluator, FloatArray, Moments, TaskSpec
-from es_service.search.algorithms.base import Algorithm
+from es_service.protocol.messages import DispatchCounts, Evaluator, TaskSpec
 from es_service.search.algorithms.steps import first_state
-from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map
+from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
 from es_service.search.maps.geometry import make_geometry, reachable_cells
 from es_service.search.novelty import novelty
 from es_service.search.observation_statistics import merge_moments
 
 Reachable = NDArray[np.bool_] | None
 """Whether each cell of the map can be reached, [cells]; None if this is unknown."""
-
-
-class Stored(Protocol):
-    """What the loop reads from a run store: the state that earlier sessions have stored."""
-
-    @property
-    def generation(self) -> int | None:
-        """Newest committed generation; None before the first."""
-        ...
-
-    def load(self, without: str | None = None) -> Mapping[str, Arrays]: ...
-    def last_history(self) -> Mapping[str, Any] | None: ...
-
-
-class Store(Protocol):
-    """What the loop needs from a run store during a run."""
-
-    def part(self, name: str) -> Arrays: ...
-    def commit(self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow) -> None: ...
-
-
-@dataclass(frozen=True)
-class Search:
-    """Definition of a run apart from where it runs: config, algorithm, starting point and task."""
-
-    config: RunConfig
-    algorithm: Algorithm
-    initial: Callable[[], tuple[Sequence[FloatArray], Moments]]
-    """Returns the initial centres [D] and their observation statistics, which are empty unless the centres are from
-    another run."""
-    task: TaskSpec
 
 
 def run(
@@ -140,108 +110,156 @@ def spent(budget: BudgetConfig, state: RunState) -> str | None:
 
 def _first_generation(
     search: Search, evaluator: Evaluator, clock: Clock, map_: BehaviourMap | None, reachable: Reachable
-) -> tuple[RunState, HistoryRow]:
+) -> tuple[RunState, HistoryRow, list[HistoryRow]]:
     """Evaluate the initial centres, which is generation 0. Its row of the history describes the fittest of them."""
     config, algorithm = search.config, search.algorithm
     centres, observations = search.initial()
-    learned = first_state(centres, len(search.task.descriptor_names), algorithm.fitness_weight, map_)
+    learned = first_state(centres, len(search.task.descriptor_names), algorithm.fitness_weight, map_, algorithm.own)
     points = [make_centre(config, 0, centre_D, observations) for centre_D in centres]
-    episodes = config.search.evaluation_episodes
-    evaluations = [evaluate_centre(evaluator, point, episodes, index) for index, point in enumerate(points)]
+    evaluations = evaluate_centres(evaluator, points, config.search.evaluation_episodes, resets="by_chunk")
     clock.lap("seconds_evaluation")
     require_some_finite(evaluations, config.task.environment)
-    fittest = 0
-    best = Best(0, -math.inf, centres[0], points[0].observation_mean_O, points[0].observation_std_O)
-    elites: dict[int, Elite] = {}
-    for centre, (point, evaluation) in enumerate(zip(points, evaluations, strict=True)):
-        told = centre_evaluation(0, centre, evaluation)
-        learned = algorithm.tell(learned, told)
-        elites |= entered(learned, told, point, evaluation)
-        best_now = better(best, point, told)
-        best, fittest = best_now, fittest if best_now is best else centre
+    told = tuple(centre_evaluation(0, centre, evaluation) for centre, evaluation in enumerate(evaluations))
+    learned = tell(algorithm, learned, told)
+    shown = fittest(told)
+    first = Best(0, -math.inf, centres[0], points[0].observation_mean_O, points[0].observation_std_O)
     state = RunState(
         generation=0,
         search=learned,
         observations=observations,
-        best=best,
+        best=better(first, points, told),
         env_steps=sum(map(steps_of, evaluations)),
         episodes=sum(evaluation.fitness.size for evaluation in evaluations),
         wall_clock_s=clock.total(),
-        elites=elites,
+        elites=entered(learned, told, points, evaluations),
     )
     row: HistoryRow = {
-        **search_columns(fittest, algorithm.fitness_weight, None, learned.archive.size),
-        **map_columns(learned.map, config.map.qd_offset, reachable, generation=0, centre=fittest, start_cell=None),
-        **step_columns(None, centres[fittest]),
-        **population_columns(None, 0),
-        **evaluation_columns(evaluations[fittest], search.task),
+        **search_columns(shown, algorithm.fitness_weight, None, learned.archive.size),
+        **map_columns(learned.map, config.map.qd_offset, reachable, generation=0, centre=shown, start_cell=None),
+        **step_columns(None, centres[shown]),
+        **population_columns(()),
+        **evaluation_columns(evaluations[shown], search.task),
         **fault_columns(evaluator.counts, since=DispatchCounts()),
     }
-    return state, row
+    rows = [
+        evaluated_row(
+            evaluation,
+            search.task,
+            learned.map,
+            generation=0,
+            centre=centre,
+            fitness_weight=algorithm.fitness_weight,
+            start_cell=None,
+            novelty=None,
+            update_norm=None,
+            env_steps=steps_of(evaluation),
+        )
+        for centre, evaluation in enumerate(evaluations)
+    ]
+    return state, row, rows
 
 
 def _next_generation(
     search: Search, evaluator: Evaluator, store: Store, clock: Clock, state: RunState, reachable: Reachable
-) -> tuple[RunState, HistoryRow]:
-    """Compute one generation: a pure function of (search, state, elites in the store) apart from the timings."""
+) -> tuple[RunState, HistoryRow, list[HistoryRow]]:
+    """One generation: a pure function of (search, state, elites in the store) but for its timings.
+
+    It may ask for several populations. Each phase runs all of them side by side; results are taken in ask order.
+    """
     config, algorithm = search.config, search.algorithm
     settings, sizes = config.search, config.compute
     generation = state.generation + 1
     counts = evaluator.counts
 
     begun = state.search
-    start_cell = algorithm.start_cell(begun, generation)
-    if start_cell is not None:
-        begun = algorithm.restart(begun, start_cell, elite_from_arrays(store.part(elite_part(start_cell))))
-    asked = algorithm.ask(begun, generation)
-    centre = make_centre(config, generation, asked.centre_D, state.observations, begun.centres[asked.centre])
+    start_cells = algorithm.start_cells(begun, generation)
+    for index, cell in start_cells.items():
+        begun = algorithm.restart(begun, index, cell, elite_from_arrays(store.part(elite_part(cell))))
+    asks = algorithm.ask(begun, generation)
+    require_asks(asks, begun, sizes.chunk_pairs, generation)
+    centres = [
+        make_centre(config, generation, ask.centre_D, state.observations, begun.centres[ask.centre], ask.sigma)
+        for ask in asks
+    ]
     clock.lap("seconds_driver")
-    population, observed = evaluate_population(evaluator, centre, pairs=settings.pairs, chunk_pairs=sizes.chunk_pairs)
+    populations, observed = evaluate_populations(evaluator, centres, [ask.pairs for ask in asks], sizes.chunk_pairs)
     clock.lap("seconds_rollout")
-    population, invalid = invalidate(population, settings.max_invalid_fraction, generation)
-    weights_P = algorithm.weights(begun, asked, population)
+    populations = invalidate(populations, settings.max_invalid_fraction, generation)
+    weights = [algorithm.weights(begun, *told) for told in zip(asks, populations, strict=True)]
     clock.lap("seconds_driver")
-    gradient_D = estimate_gradient(evaluator, centre, weights_P, sizes.gradient_block_pairs)
+    gradients = estimate_gradients(evaluator, centres, weights, sizes.gradient_block_pairs)
     clock.lap("seconds_gradient")
-    moved = algorithm.step(begun, asked, gradient_D)
-    new_centre_D = moved.centres[asked.centre].centre_D
-    require_finite(new_centre_D, settings.learning_rate, generation)
+    moved = begun
+    for ask, gradient_D in zip(asks, gradients, strict=True):
+        moved = algorithm.step(moved, ask, gradient_D)
+    # New centres are evaluated with the observation statistics of the generation's start.
+    new_centres = [
+        replace(centre, parameters_D=moved.centres[ask.centre].centre_D)
+        for ask, centre in zip(asks, centres, strict=True)
+    ]
+    require_finite(new_centres, settings.learning_rate, generation)
     clock.lap("seconds_driver")
-    new_centre = replace(centre, parameters_D=new_centre_D)  # with the statistics of the generation's start
-    evaluation = evaluate_centre(evaluator, new_centre, settings.evaluation_episodes)
+    evaluations = evaluate_centres(evaluator, new_centres, settings.evaluation_episodes)
     clock.lap("seconds_evaluation")
-    told = centre_evaluation(generation, asked.centre, evaluation, population)
-    learned = algorithm.tell(moved, told)
-    nearest = config.novelty
-    centre_novelty = novelty(moved.archive, told.descriptor_B, neighbours=nearest.neighbours, distance=nearest.distance)
+    told = tuple(
+        centre_evaluation(generation, ask.centre, evaluation, population)
+        for ask, evaluation, population in zip(asks, evaluations, populations, strict=True)
+    )
+    learned = tell(algorithm, moved, told)
 
+    nearest = config.novelty
+    novelties = [
+        float(novelty(moved.archive, one.descriptor_B, neighbours=nearest.neighbours, distance=nearest.distance))
+        for one in told
+    ]
+    rows = [
+        evaluated_row(
+            evaluation,
+            search.task,
+            learned.map,
+            generation=generation,
+            centre=ask.centre,
+            fitness_weight=ask.fitness_weight,
+            start_cell=start_cells.get(ask.centre),
+            novelty=centre_novelty,
+            update_norm=norm(new_centre.parameters_D - ask.centre_D),
+            env_steps=steps_of(population) + steps_of(evaluation),
+        )
+        for ask, population, evaluation, new_centre, centre_novelty in zip(
+            asks, populations, evaluations, new_centres, novelties, strict=True
+        )
+    ]
+    shown = fittest(told)  # the history's row is about this one
+    asked, evaluation = asks[shown], evaluations[shown]
     row: HistoryRow = {
-        **search_columns(asked.centre, asked.fitness_weight, float(centre_novelty), learned.archive.size),
+        **search_columns(asked.centre, asked.fitness_weight, novelties[shown], learned.archive.size),
         **map_columns(
             learned.map,
             config.map.qd_offset,
             reachable,
             generation=generation,
             centre=asked.centre,
-            start_cell=start_cell,
+            start_cell=start_cells.get(asked.centre),
         ),
-        **step_columns(asked.centre_D, new_centre_D),
-        **population_columns(population, invalid),
+        **step_columns(asked.centre_D, new_centres[shown].parameters_D),
+        **population_columns(populations),
         **evaluation_columns(evaluation, search.task),
         **fault_columns(evaluator.counts, since=counts),
     }
-    trained = population.fitness.size * config.task.episodes_per_member
+    members = sum(population.fitness.size for population in populations)
     state = RunState(
         generation=generation,
         search=learned,
         observations=merge_moments(state.observations, observed),
-        best=better(state.best, new_centre, told),
-        env_steps=state.env_steps + steps_of(population) + steps_of(evaluation),
-        episodes=state.episodes + trained + evaluation.fitness.size,
+        best=better(state.best, new_centres, told),
+        env_steps=state.env_steps + sum(map(steps_of, populations)) + sum(map(steps_of, evaluations)),
+        episodes=state.episodes
+        + members * config.task.episodes_per_member
+        + sum(evaluation.fitness.size for evaluation in evaluations),
         wall_clock_s=clock.total(),
-        elites=entered(learned, told, new_centre, evaluation),
+        elites=entered(learned, told, new_centres, evaluations),
     )
-    return state, row
+    return state, row, rows
 
 
 def _keep(
@@ -251,6 +269,7 @@ def _keep(
     before: RunState | None,
     state: RunState,
     row: HistoryRow,
+    evaluations: list[HistoryRow],
 ) -> RunState:
     """Commit a finished generation, then report it."""
     clock.lap("seconds_driver")
@@ -266,7 +285,7 @@ def _keep(
         "steps_per_second": steps / seconds,
         **laps,
     }
-    store.commit(state.generation, state_parts(state, before), row)
+    store.commit(state.generation, state_parts(state, before), row, evaluations)
     clock.lap("seconds_store")
     report(row)
     return state

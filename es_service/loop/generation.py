@@ -9,17 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
+from itertools import islice
+from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from es_service.config.model import RunConfig
-from es_service.errors import EvaluationError, WayOut
+from es_service.loop.checks import valid_members
 from es_service.loop.state import Best, statistics_in_force
 from es_service.protocol.messages import (
     EVALUATION_EPISODES_PER_CHUNK,
     Centre,
+    Chunk,
     EpisodesResult,
     EvaluationChunk,
     Evaluator,
@@ -28,51 +29,104 @@ from es_service.protocol.messages import (
     GradientResult,
     Moments,
     TrainingChunk,
+    around,
 )
-from es_service.search.algorithms.base import CentreEvaluation, CentreState, SearchState
+from es_service.search.algorithms.base import Algorithm, CentreEvaluation, CentreState, SearchState, read_only
 from es_service.search.maps.behaviour_map import Elite, make_elite
 
 Result = TypeVar("Result", EpisodesResult, GradientResult)
 
 
 def make_centre(
-    config: RunConfig, generation: int, centre_D: FloatArray, observations: Moments, state: CentreState | None = None
+    config: RunConfig,
+    generation: int,
+    centre_D: FloatArray,
+    observations: Moments,
+    state: CentreState | None = None,
+    sigma: float | None = None,
 ) -> Centre:
-    """The centre as it is sent to the workers: its parameters and the observation statistics that it runs with."""
-    mean_O, std_O = statistics_in_force(observations, state, config.policy.observation_normalization)
-    return Centre(generation, centre_D, config.search.sigma, mean_O, std_O)
-
-
-def evaluate_population(
-    evaluator: Evaluator, centre: Centre, *, pairs: int, chunk_pairs: int
-) -> tuple[EpisodesResult, list[Moments]]:
-    """Roll out all pairs around the centre: (results with axes [P, S], observation moments in chunk order)."""
-    chunks = [TrainingChunk(centre.generation, chunk_id) for chunk_id in range(pairs // chunk_pairs)]
-    results = _all_of(EpisodesResult, evaluator.evaluate(centre, chunks))
-    return _concatenate(results, pairs), [result.moments for result in results if result.moments is not None]
-
-
-def evaluate_centre(evaluator: Evaluator, centre: Centre, episodes: int, index: int = 0) -> EpisodesResult:
-    """Roll out the unperturbed centre: results with axis [E]. Episodes beyond the wanted number are discarded.
+    """The centre as it is sent to the workers: its parameters and the observation statistics that it runs with.
 
     Args:
-        index: index of this centre among those evaluated in the same generation; each index has its own resets.
+        state: it may have statistics of its own; None for an initial centre.
+        sigma: of its population; None for an initial centre, which has none.
+    """
+    mean_O, std_O = statistics_in_force(observations, state, config.policy.observation_normalization)
+    return Centre(generation, centre_D, config.search.sigma if sigma is None else sigma, mean_O, std_O)
+
+
+def evaluate_populations(
+    evaluator: Evaluator, centres: Sequence[Centre], pairs: Sequence[int], chunk_pairs: int
+) -> tuple[list[EpisodesResult], list[Moments]]:
+    """Roll out each centre's number of pairs around it.
+
+    Returns:
+        The results of each population, with axes [P, S], and the observation moments in the order of the populations
+        and, within each, of its chunks.
+    """
+    asked = [
+        (centre, [TrainingChunk(centre.generation, chunk_id, ask) for chunk_id in range(count // chunk_pairs)])
+        for ask, (centre, count) in enumerate(zip(centres, pairs, strict=True))
+    ]
+    found = _evaluate(EpisodesResult, evaluator, asked)
+    moments = [result.moments for results in found for result in results if result.moments is not None]
+    return [_concatenate(results, count) for results, count in zip(found, pairs, strict=True)], moments
+
+
+def evaluate_centres(
+    evaluator: Evaluator,
+    centres: Sequence[Centre],
+    episodes: int,
+    *,
+    resets: Literal["by_ask", "by_chunk", "same"] = "by_ask",
+) -> list[EpisodesResult]:
+    """Roll out each unperturbed centre: results with axis [E]. Episodes beyond the wanted number are discarded.
+
+    Args:
+        resets: which random streams the episodes start from. Each centre has its own, addressed by its ask or, in
+            generation 0, by its chunk ids; or all have the same.
     """
     count = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
-    chunks = [EvaluationChunk(centre.generation, chunk_id) for chunk_id in range(index * count, (index + 1) * count)]
-    results = evaluator.evaluate(centre, chunks)
-    return _concatenate(_all_of(EpisodesResult, results), episodes)
+    asked = []
+    for index, centre in enumerate(centres):
+        first, ask = index * count if resets == "by_chunk" else 0, index if resets == "by_ask" else 0
+        asked.append((centre, [EvaluationChunk(centre.generation, first + i, ask) for i in range(count)]))
+    return [_concatenate(results, episodes) for results in _evaluate(EpisodesResult, evaluator, asked)]
 
 
-def estimate_gradient(evaluator: Evaluator, centre: Centre, weights_P: FloatArray, block_pairs: int) -> FloatArray:
-    """Gradient estimate [D]: (1 / pairs) * sum over pairs of weight * standard normal noise. Workers sum blocks."""
-    chunks = []
-    for chunk_id, first in enumerate(range(0, weights_P.size, block_pairs)):
-        block_P = weights_P[first : first + block_pairs]
-        padded_P = np.pad(block_P, (0, block_pairs - block_P.size))
-        chunks.append(GradientChunk(centre.generation, chunk_id, padded_P))
-    results = _all_of(GradientResult, evaluator.evaluate(centre, chunks))
-    return tree_sum([result.sum_D for result in results]) * np.float32(1.0 / weights_P.size)
+def estimate_gradients(
+    evaluator: Evaluator, centres: Sequence[Centre], weights: Sequence[FloatArray], block_pairs: int
+) -> list[FloatArray]:
+    """Gradient estimate [D] of each population: (1 / pairs) * sum over pairs of weight * standard normal noise.
+
+    Args:
+        weights: those of each population [P].
+        block_pairs: pairs whose products a worker sums.
+    """
+    asked = []
+    for ask, (centre, weights_P) in enumerate(zip(centres, weights, strict=True)):
+        chunks = []
+        for chunk_id, first in enumerate(range(0, weights_P.size, block_pairs)):
+            block_P = weights_P[first : first + block_pairs]
+            padded_P = np.pad(block_P, (0, block_pairs - block_P.size))
+            chunks.append(GradientChunk(centre.generation, chunk_id, padded_P, ask))
+        asked.append((centre, chunks))
+    found = _evaluate(GradientResult, evaluator, asked)
+    return [
+        tree_sum([result.sum_D for result in results]) * np.float32(1.0 / weights_P.size)
+        for results, weights_P in zip(found, weights, strict=True)
+    ]
+
+
+def _evaluate(
+    kind: type[Result], evaluator: Evaluator, asked: Sequence[tuple[Centre, Sequence[Chunk]]]
+) -> list[list[Result]]:
+    """The results of each centre's chunks; all are computed side by side."""
+    results = evaluator.evaluate([work for centre, chunks in asked for work in around(centre, chunks)])
+    checked = [result for result in results if isinstance(result, kind)]
+    assert len(checked) == len(results), f"an evaluator returned a result that is not a {kind.__name__}"
+    found = iter(checked)
+    return [list(islice(found, len(chunks))) for _, chunks in asked]
 
 
 def tree_sum(blocks: Sequence[FloatArray]) -> FloatArray:
@@ -85,69 +139,6 @@ def tree_sum(blocks: Sequence[FloatArray]) -> FloatArray:
         pairs = [level[i] + level[i + 1] for i in range(0, len(level) - 1, 2)]
         level = pairs + level[len(pairs) * 2 :]
     return level[0]
-
-
-def valid_members(result: EpisodesResult) -> NDArray[np.bool_]:
-    """Whether each member (or episode) has a finite fitness and a finite descriptor, with the axes of the fitness."""
-    return np.isfinite(result.fitness) & np.isfinite(result.descriptor).all(axis=-1)
-
-
-def invalidate(population: EpisodesResult, max_invalid_fraction: float, generation: int) -> tuple[EpisodesResult, int]:
-    """Set the fitness of every invalid member to NaN, which ranks last: (population, number of invalid members).
-
-    Raises:
-        EvaluationError: more than `max_invalid_fraction` of the members are invalid.
-    """
-    valid_P_S = valid_members(population)
-    invalid = int(np.count_nonzero(~valid_P_S))
-    if invalid > max_invalid_fraction * valid_P_S.size:
-        raise EvaluationError(
-            f"generation {generation}: {invalid} of {valid_P_S.size} members returned a fitness or descriptor that is "
-            f"not finite, more than search.max_invalid_fraction ({max_invalid_fraction}) allows. Everything up to "
-            f"generation {generation - 1} is saved; a smaller search.sigma or search.learning_rate may help.",
-            field="search.max_invalid_fraction",
-            value=max_invalid_fraction,
-        )
-    fitness_P_S = np.where(valid_P_S, population.fitness, np.float32(np.nan))
-    return replace(population, fitness=fitness_P_S), invalid
-
-
-def require_some_finite(evaluations: Sequence[EpisodesResult], environment: str) -> None:
-    """Raise an EvaluationError if no episode of any initial centre is valid; this is an error of the task."""
-    count = sum(evaluation.fitness.size for evaluation in evaluations)
-    if any(valid_members(evaluation).any() for evaluation in evaluations):
-        return
-    finite = {
-        "return": any(np.isfinite(evaluation.returns).any() for evaluation in evaluations),
-        "descriptor": any(np.isfinite(evaluation.descriptor).any() for evaluation in evaluations),
-    }
-    wrong = " and ".join(name for name, is_finite in finite.items() if not is_finite) or "fitness or descriptor"
-    steps = min(int(evaluation.steps.min()) for evaluation in evaluations)
-    raise EvaluationError(
-        f"generation 0: the {wrong} is NaN or infinite in each of the {count} episodes of the initial centres; the "
-        f"shortest episode has {steps} steps. The run cannot learn from this: look for a division by 0, a root or "
-        f"logarithm of a negative number, or physics that diverges, in the task {environment}",
-        field="task.environment",
-        value=environment,
-    )
-
-
-def require_finite(centre_D: FloatArray, learning_rate: float, generation: int) -> None:
-    """Raise an EvaluationError for a centre that is not finite after its update."""
-    if not np.isfinite(centre_D).all():
-        raise EvaluationError(
-            f"generation {generation}: the centre is not finite after its update with search.learning_rate = "
-            f"{learning_rate:g}, so it is not kept. Everything up to generation {generation - 1} is saved.",
-            field="search.learning_rate",
-            value=learning_rate,
-            ways_out=[
-                WayOut(
-                    "fork",
-                    "continue from there with a smaller learning rate",
-                    settings={"search.learning_rate": learning_rate / 10},
-                )
-            ],
-        )
 
 
 @np.errstate(invalid="ignore", over="ignore")  # an infinite fitness makes the centre invalid
@@ -169,23 +160,43 @@ def centre_evaluation(
     )
 
 
-def entered(state: SearchState, told: CentreEvaluation, centre: Centre, evaluation: EpisodesResult) -> dict[int, Elite]:
-    """The centre just evaluated as an elite, by its cell; empty if it did not enter the map.
+def tell(algorithm: Algorithm, state: SearchState, told: tuple[CentreEvaluation, ...]) -> SearchState:
+    """The state after the search is told a generation's evaluations; arrays of its own are read-only from now on."""
+    state = algorithm.tell(state, told)
+    return replace(state, own=read_only(state.own))
+
+
+def fittest(told: Sequence[CentreEvaluation]) -> int:
+    """Index in `told` of the valid centre with the highest fitness, the first of equal ones; 0 if none is valid."""
+    fitness = [one.fitness if one.valid else -math.inf for one in told]
+    return max(range(len(told)), key=fitness.__getitem__)
+
+
+def entered(
+    state: SearchState,
+    told: Sequence[CentreEvaluation],
+    centres: Sequence[Centre],
+    evaluations: Sequence[EpisodesResult],
+) -> dict[int, Elite]:
+    """The centres just evaluated that are elites now, by their cells.
 
     The map decides this and not `CentreState.cell`, which a search of the user need not set.
     """
-    if state.map is None or (cell := state.map.cell_of(told.generation, told.centre)) is None:
-        return {}
-    assert evaluation.trace_T_B is not None, "an evaluation has a trace"
-    return {cell: make_elite(centre, evaluation.trace_T_B)}
+    found: dict[int, Elite] = {}
+    for one, centre, evaluation in zip(told, centres, evaluations, strict=True):
+        if state.map is not None and (cell := state.map.cell_of(one.generation, one.centre)) is not None:
+            assert evaluation.trace_T_B is not None, "an evaluation has a trace"
+            found[cell] = make_elite(centre, evaluation.trace_T_B)
+    return found
 
 
-def better(best: Best, centre: Centre, told: CentreEvaluation) -> Best:
-    """The best centre after one more evaluation. An invalid centre, or one of equal fitness, does not replace it."""
-    if not told.valid or told.fitness <= best.fitness:
-        return best
-    mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
-    return Best(centre.generation, told.fitness, centre.parameters_D, mean_O, std_O)
+def better(best: Best, centres: Sequence[Centre], told: Sequence[CentreEvaluation]) -> Best:
+    """The best centre after more evaluations. An invalid centre, or one of equal fitness, does not replace it."""
+    for centre, one in zip(centres, told, strict=True):
+        if one.valid and one.fitness > best.fitness:
+            mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
+            best = Best(centre.generation, one.fitness, centre.parameters_D, mean_O, std_O)
+    return best
 
 
 def steps_of(result: EpisodesResult) -> int:
@@ -197,13 +208,6 @@ def _highest(fitness: FloatArray) -> float:
     """Highest finite value; NaN if there is none."""
     finite = fitness[np.isfinite(fitness)]
     return float(finite.max()) if finite.size else math.nan
-
-
-def _all_of(kind: type[Result], results: Sequence[object]) -> list[Result]:
-    """The same results, checked to be of one kind."""
-    checked = [result for result in results if isinstance(result, kind)]
-    assert len(checked) == len(results), f"an evaluator returned a result that is not a {kind.__name__}"
-    return checked
 
 
 def _concatenate(results: Sequence[EpisodesResult], count: int) -> EpisodesResult:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -30,7 +30,7 @@ class Column:
 
 
 _FITNESS = (
-    Column("generation", "INTEGER", True, "generations completed; 0 is the initial centre's evaluation"),
+    Column("generation", "INTEGER", True, "generations completed; 0 is the evaluation of the initial centres"),
     Column("env_steps", "INTEGER", True, "environment steps so far, evaluations counted, none after done"),
     Column("episodes", "INTEGER", True, "episodes so far, evaluations counted"),
     Column("centre_fitness_mean", "REAL", True, "mean fitness over the new centre's evaluation episodes"),
@@ -67,7 +67,7 @@ _MAP = (
     Column("qd_score", "REAL", True, "sum over elites of fitness less map.qd_offset"),
 )
 _SEARCH_AND_TIMES = (
-    Column("centre", "INTEGER", True, "which of the centres this row is about; of the initial ones, the fittest"),
+    Column("centre", "INTEGER", True, "centre that this row is about: the fittest of those that were evaluated"),
     Column("fitness_weight", "REAL", True, "weight of fitness beside novelty in this generation's utilities"),
     Column("centre_novelty", "REAL", True, "novelty of the mean descriptor in the archive before it entered"),
     Column("archive_size", "INTEGER", True, "entries of the novelty archive after this generation"),
@@ -100,6 +100,60 @@ def history_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
     return (*_FITNESS, *descriptor, *(_GOAL if task.has_goal else ()), *(_MAP if has_map else ()), *_SEARCH_AND_TIMES)
 
 
+def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
+    """Columns of the evaluated centres, of which a generation may have several; `generation` comes before them."""
+    return (
+        Column("centre", "INTEGER", True, "index of the centre"),
+        Column("fitness_weight", "REAL", True, "weight of fitness in its utilities; me_es: 0 explores, 1 exploits"),
+        *(
+            (
+                Column("start_cell", "INTEGER", True, "cell whose elite it started from in this generation"),
+                Column("cell", "INTEGER", True, "cell of which it is the elite after this generation"),
+            )
+            if has_map
+            else ()
+        ),
+        Column("fitness_mean", "REAL", True, "mean fitness over its evaluation episodes"),
+        Column("fitness_std", "REAL", True, "standard deviation of the same episodes (population formula)"),
+        Column("return_mean", "REAL", True, "mean return over the same episodes"),
+        *(Column(name, "REAL", True, "mean descriptor over the same episodes") for name in task.descriptor_names),
+        *((Column("goal_distance", "REAL", True, "mean distance to the goal at the end"),) if task.has_goal else ()),
+        Column("novelty", "REAL", True, "novelty of its mean descriptor in the archive before the generation"),
+        Column("update_norm", "REAL", True, "Euclidean norm of its step in this generation"),
+        Column("env_steps", "INTEGER", True, "environment steps of its population and of its evaluation"),
+    )
+
+
+def evaluated_row(
+    evaluation: EpisodesResult,
+    task: TaskSpec,
+    map_: BehaviourMap | None,
+    *,
+    generation: int,
+    centre: int,
+    fitness_weight: float,
+    start_cell: int | None,
+    novelty: float | None,
+    update_norm: float | None,
+    env_steps: int,
+) -> HistoryRow:
+    """The row of an evaluated centre; see `evaluated_columns`."""
+    whole = evaluation_columns(evaluation, task)
+    return {
+        "centre": centre,
+        "fitness_weight": fitness_weight,
+        **({} if map_ is None else {"start_cell": start_cell, "cell": map_.cell_of(generation, centre)}),
+        "fitness_mean": whole["centre_fitness_mean"],
+        "fitness_std": whole["centre_fitness_std"],
+        "return_mean": whole["centre_return_mean"],
+        **{name: whole[f"centre_{name}"] for name in task.descriptor_names},
+        **({"goal_distance": whole["goal_distance"]} if task.has_goal else {}),
+        "novelty": novelty,
+        "update_norm": update_norm,
+        "env_steps": env_steps,
+    }
+
+
 def search_columns(centre: int, fitness_weight: float, centre_novelty: float | None, archive_size: int) -> HistoryRow:
     """Columns about the search; `centre_novelty` is None in generation 0."""
     return {
@@ -112,20 +166,25 @@ def search_columns(centre: int, fitness_weight: float, centre_novelty: float | N
 
 def step_columns(old_D: FloatArray | None, new_D: FloatArray) -> HistoryRow:
     """Columns about the update of the centre; `old_D` is None for generation 0, which has no update."""
-    return {"update_norm": None if old_D is None else _norm(new_D - old_D), "parameter_norm": _norm(new_D)}
+    return {"update_norm": None if old_D is None else norm(new_D - old_D), "parameter_norm": norm(new_D)}
 
 
 @np.errstate(invalid="ignore", over="ignore")
-def population_columns(population: EpisodesResult | None, invalid_members: int) -> HistoryRow:
-    """Quartiles of the valid members' fitness and return; `population` is None for generation 0, which has none."""
-    columns: HistoryRow = {"invalid_members": invalid_members}
-    for quantity in ("fitness", "return"):
+def population_columns(populations: Sequence[EpisodesResult]) -> HistoryRow:
+    """Number of invalid members, and quartiles of the valid members' fitness and return, of all populations together.
+
+    Args:
+        populations: fitness is NaN for invalid members, which only these have; empty for generation 0.
+    """
+    fitness_N = np.concatenate([np.zeros(0, np.float32), *(one.fitness.ravel() for one in populations)])
+    returns_N = np.concatenate([np.zeros(0, np.float32), *(one.returns.ravel() for one in populations)])
+    columns: HistoryRow = {"invalid_members": int(np.isnan(fitness_N).sum())}
+    for quantity, values in (("fitness", fitness_N), ("return", returns_N)):
         names = [f"population_{quantity}_{name}" for name in ("min", "q25", "median", "q75", "max")]
-        if population is None:
+        if not populations:
             columns |= dict.fromkeys(names)
             continue
-        values = population.fitness if quantity == "fitness" else population.returns
-        values = values[np.isfinite(population.fitness) & np.isfinite(values)].astype(np.float64)
+        values = values[np.isfinite(fitness_N) & np.isfinite(values)].astype(np.float64)
         quartiles = np.quantile(values, [0.0, 0.25, 0.5, 0.75, 1.0]) if values.size else np.full(5, np.nan)
         columns |= dict(zip(names, quartiles.tolist(), strict=True))
     return columns
@@ -175,5 +234,6 @@ def fault_columns(now: DispatchCounts, *, since: DispatchCounts) -> HistoryRow:
     }
 
 
-def _norm(x_D: FloatArray) -> float:
+def norm(x_D: FloatArray) -> float:
+    """Euclidean norm."""
     return float(np.sqrt(np.sum(np.square(x_D, dtype=np.float64))))

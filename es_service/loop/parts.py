@@ -13,7 +13,7 @@ import numpy as np
 
 from es_service.loop.state import Best, RunState, require_successor
 from es_service.protocol.messages import Moments
-from es_service.search.algorithms.base import CentreState, FitnessWeight, SearchState
+from es_service.search.algorithms.base import CentreState, FitnessWeight, SearchState, read_only
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map
 from es_service.search.maps.geometry import Cvt, Geometry, Grid
 from es_service.search.novelty import NoveltyArchive, archive_of, empty_archive
@@ -24,6 +24,8 @@ Parts = Mapping[str, Mapping[str, np.ndarray]]
 """Name of a part -> name of an array -> array."""
 
 OBSERVATIONS, COUNTERS, WEIGHT, BEST, GEOMETRY_PART = "observations", "counters", "weight", "best", "map"
+OWN = "own"
+"""Name of the part with the arrays of a search's own."""
 CENTRE_PREFIX, CELL_PREFIX, ELITE_PREFIX, BLOCK_PREFIX = "centre_", "cell_", "elite_", "novelty_"
 """Prefixes of the names of numbered parts."""
 BLOCK_ENTRIES = 256
@@ -64,6 +66,8 @@ def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
             parts[centre_part(index)] = centre_to_arrays(centre)
     if earlier is None or search.weight != earlier.weight:
         parts[WEIGHT] = weight_to_arrays(search.weight)
+    if search.own and (earlier is None or search.own is not earlier.own):
+        parts[OWN] = dict(search.own)
     if earlier is None or search.archive is not earlier.archive:
         parts |= archive_to_parts(search.archive, earlier.archive.size if earlier is not None else 0)
     if search.map is not None:
@@ -91,6 +95,7 @@ def state_from_parts(parts: Parts, generation: int, wall_clock_s: float, dimensi
             archive_from_parts(parts, dimensions),
             weight_from_arrays(parts[WEIGHT]),
             map_from_parts(parts),
+            read_only(parts.get(OWN, {})),
         ),
         observations=moments_from_arrays(parts[OBSERVATIONS]),
         best=best_from_arrays(parts[BEST]),

@@ -48,7 +48,7 @@ def require_successor(before: RunState | None, state: RunState) -> None:
 
     A search of the user may return such a state; `SearchState` describes what a search may change.
     """
-    wrong = _not_followed(before.search, state.search) if before is not None else ""
+    wrong = _not_followed(before.search, state.search) if before is not None else _unkept(state.search)
     wrong = wrong or _foreign_elite(before.search.map if before is not None else None, state.search.map, state.elites)
     if wrong:
         saved = f"Everything up to generation {before.generation} is saved." if before is not None else ""
@@ -64,6 +64,8 @@ def _not_followed(before: SearchState, after: SearchState) -> str:
         return f"the search has {len(after.centres)} centres, but it had {len(before.centres)} before"
     if not extends(after.archive, before.archive):
         return "the novelty archive has lost or changed entries"
+    if (kinds := _kinds(after)) != (earlier := _kinds(before)):
+        return f"the search's own arrays are {kinds}, but they were {earlier} before"
     if (after.map is None) != (before.map is None):
         return "the behaviour map was added or removed"
     if after.map is None or before.map is None or after.map is before.map:
@@ -71,6 +73,17 @@ def _not_followed(before: SearchState, after: SearchState) -> str:
     if not np.array_equal(after.map.cell_N[: before.map.size], before.map.cell_N):
         return "the behaviour map has lost cells or changed their order"
     return ""
+
+
+def _unkept(first: SearchState) -> str:
+    """Why the store cannot keep the arrays of a search's own; empty if it can."""
+    wrong = [name for name, array in first.own.items() if getattr(array, "dtype", np.dtype(object)).kind not in "biuf"]
+    return f"its own array {wrong[0]!r} is no NumPy array of bool, integers or floats" if wrong else ""
+
+
+def _kinds(state: SearchState) -> dict[str, str]:
+    """Type of each of the search's own arrays, by name."""
+    return {name: str(getattr(array, "dtype", type(array).__name__)) for name, array in sorted(state.own.items())}
 
 
 def _foreign_elite(before: BehaviourMap | None, after: BehaviourMap | None, elites: Mapping[int, Elite]) -> str:

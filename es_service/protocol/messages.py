@@ -6,9 +6,9 @@ O observation, B descriptor dimensions, T points of a trace. Both sides import t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,6 +144,8 @@ class TrainingChunk:
 
     generation: int
     chunk_id: int
+    ask: int = 0
+    """Index of the population in its generation. Every population has random streams of its own."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,8 @@ class EvaluationChunk:
 
     generation: int
     chunk_id: int
+    ask: int = 0
+    """As for training. Each centre that is evaluated in a generation has resets of its own."""
 
 
 @dataclass(frozen=True)
@@ -163,9 +167,35 @@ class GradientChunk:
     weights_P: FloatArray
     """Utility of the + member minus utility of the - member, for each pair of the block; 0 for pairs beyond the end of
     the population."""
+    ask: int = 0
+    """As for training."""
 
 
 Chunk = TrainingChunk | EvaluationChunk | GradientChunk
+Work = tuple[Centre, Chunk]
+"""A chunk with the centre that it belongs to."""
+KEPT_CENTRES = 64
+"""Number of centres that a worker keeps after each work item, so that they need not be sent to it again."""
+
+
+def around(centre: Centre, chunks: Iterable[Chunk]) -> list[Work]:
+    """The chunks, each with the same centre."""
+    return [(centre, chunk) for chunk in chunks]
+
+
+def chunk_name(chunk: Chunk) -> str:
+    """Name of a chunk in messages, such as `TrainingChunk 3 of generation 5`."""
+    population = f" of population {chunk.ask}" if chunk.ask else ""
+    return f"{type(chunk).__name__} {chunk.chunk_id}{population} of generation {chunk.generation}"
+
+
+def forget_oldest(centres: dict[int, Any]) -> None:
+    """Remove all but the newest KEPT_CENTRES centres, in order of insertion.
+
+    A worker and its sender both do so after each work item, so that the sender knows which centres the worker has.
+    """
+    for number in list(centres)[:-KEPT_CENTRES]:
+        del centres[number]
 
 
 class WorkItemId(NamedTuple):
@@ -173,17 +203,22 @@ class WorkItemId(NamedTuple):
 
     phase: int
     """Number of the `evaluate` call. It distinguishes a late answer to an earlier call from an answer to this call."""
+    first: int
+    """Index of the first chunk in the call. Chunks of several centres may have the same generation, ask and id."""
     kind: str
     """Class name of the chunks."""
     generation: int
+    ask: int
+    """Population of the first chunk."""
     chunk_id: int
-    """Id of the first chunk."""
+    """Id of the first chunk in its population."""
     chunks: int
-    """Number of chunks."""
+    """Number of chunks, which may belong to several populations."""
 
     def __str__(self) -> str:
+        population = f" of population {self.ask}" if self.ask else ""
         others = f" and {self.chunks - 1} more" if self.chunks > 1 else ""
-        return f"{self.kind} {self.chunk_id}{others} of generation {self.generation}"
+        return f"{self.kind} {self.chunk_id}{population}{others} of generation {self.generation}"
 
 
 @dataclass(frozen=True)
@@ -254,8 +289,8 @@ class Evaluator(Protocol):
         """Numbers of workers and of faults so far."""
         ...
 
-    def evaluate(self, centre: Centre, chunks: Sequence[Chunk]) -> list[ChunkResult]:
-        """Results of chunks around a centre, in the order of `chunks`.
+    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
+        """Results of chunks, all of one kind, in the order of `work`.
 
         Raises:
             EvaluationError: the chunks cannot be computed.

@@ -19,15 +19,17 @@ from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
-from es_service.loop.generation import evaluate_centre
+from es_service.loop.generation import evaluate_centres
 from es_service.loop.parts import BEST
-from es_service.protocol.messages import Centre, Evaluator, FloatArray
+from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray
 from es_service.runs.checked_config import changed_config
 from es_service.runs.moment import Policy, make_policy
 from es_service.runs.session import dispatch_limits
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, is_no_elite
 
+CHUNKS_PER_WORKER = 8
+"""Chunks per worker that are evaluated side by side: enough to keep all busy, few enough to show results soon."""
 FRESH_GENERATION = 2**40
 """Generation number in the random streams of fresh episodes with seed 0; no run reaches it."""
 
@@ -129,21 +131,25 @@ def evaluate(
     overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": workers or "auto"}
     config = changed_config(run.present_config, overrides)
     geometry = run.behaviour_map.geometry if config.map.enabled else None
+    chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
+    limits = dispatch_limits(config, chunks * len(chosen))
     with (
         stop_on_signals() as should_stop,
-        inline_engine(worker_spec(config, task_of(config)), dispatch_limits(config), should_stop) as engine,
+        inline_engine(worker_spec(config, task_of(config)), limits, should_stop) as engine,
     ):
-        for candidate in chosen:
-            fitness_E, descriptor_E_B = _episodes(engine, candidate.policy, config.search.sigma, episodes, seed)
-            mean_B = descriptor_E_B.mean(axis=0, dtype=np.float64)
-            cell = None
-            if geometry is not None and np.isfinite(mean_B).all():
-                cell = int(geometry.cells_of(mean_B[None])[0])
-            yield Fresh(candidate, fitness_E, descriptor_E_B, cell)
+        together = max(1, CHUNKS_PER_WORKER * engine.counts.workers // chunks)
+        for first in range(0, len(chosen), together):
+            group = chosen[first : first + together]
+            centres = [_centre(candidate.policy, config.search.sigma, seed) for candidate in group]
+            results = evaluate_centres(engine, centres, episodes, resets="same")
+            for candidate, result in zip(group, results, strict=True):
+                mean_B = result.descriptor.mean(axis=0, dtype=np.float64)
+                cell = None
+                if geometry is not None and np.isfinite(mean_B).all():
+                    cell = int(geometry.cells_of(mean_B[None])[0])
+                yield Fresh(candidate, result.fitness, result.descriptor, cell)
 
 
-def _episodes(engine: Evaluator, policy: Policy, sigma: float, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+def _centre(policy: Policy, sigma: float, seed: int) -> Centre:
     mean_O, std_O = policy.observation_mean_O, policy.observation_std_O
-    centre = Centre(FRESH_GENERATION + seed, policy.parameters_D, sigma, mean_O, std_O)
-    result = evaluate_centre(engine, centre, count)
-    return result.fitness, result.descriptor
+    return Centre(FRESH_GENERATION + seed, policy.parameters_D, sigma, mean_O, std_O)

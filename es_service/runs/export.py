@@ -54,9 +54,13 @@ def export(run: Run, to: str, folder: Path) -> list[Path]:
 
 
 def tables(run: Run) -> dict[str, pd.DataFrame]:
-    """History, novelty archive and, where there is one, the map, as of one generation."""
+    """History, evaluated centres, novelty archive and, where there is one, the map, as of one generation."""
     moment = run.at(wanted=is_no_elite)
-    found = {"history": run.history_until(moment.generation).reset_index(), "novelty": moment.novelty}
+    found = {
+        "history": run.history_until(moment.generation).reset_index(),
+        "evaluations": run.evaluations_until(moment.generation),
+        "novelty": moment.novelty,
+    }
     return found | ({"map": moment.map} if run.constants["map.enabled"] else {})
 
 

@@ -113,7 +113,9 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
     if "search.parent_statistics" in changed and config.search.parent_statistics == "global":
         parts = _without_own_statistics(parts)
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
-    return _lineage(origin, at), Beginning(_history(origin, at), parts, platforms, newest=at)
+    return _lineage(origin, at), Beginning(
+        _history(origin, at), parts, platforms, newest=at, evaluations=_evaluations(origin, at)
+    )
 
 
 def _history(origin: Run, newest: int) -> Iterator[dict[str, int | float]]:
@@ -121,6 +123,12 @@ def _history(origin: Run, newest: int) -> Iterator[dict[str, int | float]]:
     driver cannot shorten its write-ahead log while a transaction reads it."""
     for first in range(0, newest + 1, ROWS_AT_ONCE):
         yield from reader.read_history(origin.folder, first, min(ROWS_AT_ONCE, newest + 1 - first))
+
+
+def _evaluations(origin: Run, newest: int) -> Iterator[reader.EvaluatedCentres]:
+    """The evaluated centres of each generation up to one, read like the history."""
+    for first in range(0, newest + 1, ROWS_AT_ONCE):
+        yield from reader.read_evaluations(origin.folder, first, min(ROWS_AT_ONCE, newest + 1 - first))
 
 
 def _without_fitness(parts: Parts) -> dict[str, Arrays]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from es_service.config.model import RunConfig, policy_shape, worker_spec
+from es_service.config.parallel import chunks_at_once, parallel_sentence
 from es_service.config.tasks import task_of
 from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log
@@ -79,13 +80,11 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
         task=task,
     )
     in_generation(0 if store.generation is None else store.generation + 1)
-    _LOG.info(
-        "working on %s: engine %s, %d workers, rollout %s",
-        store.folder,
-        config.compute.engine,
-        worker_count(config),
-        config.compute.rollout,
-    )
+    compute, most = config.compute, chunks_at_once(config)
+    _LOG.info("working on %s: engine %s, rollout %s", store.folder, compute.engine, compute.rollout)
+    _LOG.info(parallel_sentence(config))
+    if compute.workers != "auto" and compute.workers > most:
+        tell(f"compute.workers: {compute.workers} workers start, but {parallel_sentence(config)}")
     with (
         _naming_the_run(store.folder),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
@@ -123,7 +122,13 @@ class _OnPlatforms:
         self._workers: frozenset[str] | None = None
         self.part = store.part
 
-    def commit(self, generation: int, parts: Mapping[str, Arrays], history: driver.HistoryRow) -> None:
+    def commit(
+        self,
+        generation: int,
+        parts: Mapping[str, Arrays],
+        history: driver.HistoryRow,
+        evaluations: Sequence[driver.HistoryRow],
+    ) -> None:
         """Record the platform if it has changed, with a notice if the run becomes mixed by that; then commit."""
         workers = self._engine.platforms
         if workers != self._workers:
@@ -135,7 +140,7 @@ class _OnPlatforms:
                     f"{platform}. Its digest is now marked `mixed`."
                 )
             self._workers = workers
-        self._store.commit(generation, parts, history)
+        self._store.commit(generation, parts, history, evaluations)
 
 
 @contextmanager
@@ -151,11 +156,11 @@ def _naming_the_run(folder: Path) -> Iterator[None]:
         raise
 
 
-def dispatch_limits(config: RunConfig) -> Limits:
+def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
     """The engine's number of workers and time limits."""
     compute = config.compute
     return Limits(
-        workers=worker_count(config),
+        workers=worker_count(config, most),
         max_attempts=compute.max_attempts,
         start_deadline_s=compute.no_worker_timeout_s / 2,  # so that two attempts fit into it
         first_deadline_s=compute.compile_timeout_s,
@@ -180,7 +185,7 @@ def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) 
         actor=WorkerActor,
         address=compute.address,
         claim=Claim(compute.worker_resources.cpu, compute.worker_resources.gpu),
-        elastic=compute.workers == "auto",
+        most=chunks_at_once(config) if compute.workers == "auto" else None,
         log=log,
     )
 
@@ -196,7 +201,13 @@ def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Mome
     return centres, no_observations(task.observation_size)
 
 
-def worker_count(config: RunConfig) -> int:
-    """Number of workers: as configured, or one per core that this process may use."""
+def worker_count(config: RunConfig, most: int | None = None) -> int:
+    """Number of workers: as configured, or one per core that this process may use, as far as there is work for them.
+
+    Args:
+        most: number of workers for which there is work; None: as in a generation of a run.
+    """
     workers = config.compute.workers
-    return cores() if workers == "auto" else workers
+    if workers != "auto":
+        return workers
+    return max(1, min(cores(), chunks_at_once(config) if most is None else most))

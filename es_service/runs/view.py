@@ -88,6 +88,24 @@ class Run:
         """History as dictionaries, oldest first; only from `since_generation` on if given."""
         return reader.read_history(self.folder, since_generation)
 
+    @property
+    def evaluations(self) -> pd.DataFrame:
+        """One row per centre that was evaluated, in the order of evaluation: its generation, and the columns that
+        `es_service.loop.history.evaluated_columns` documents. Integer columns with missing values have pandas' type
+        Int64."""
+        return self.evaluations_until(None)
+
+    def evaluations_until(self, generation: int | None) -> pd.DataFrame:
+        """`evaluations` up to a generation, that one included."""
+        import pandas as pd
+
+        columns, count = self.meta.evaluation_columns, None if generation is None else generation + 1
+        found = reader.read_evaluations(self.folder, 0, count)
+        rows = [{"generation": at} | row for at, centres in enumerate(found) for row in centres]
+        table = pd.DataFrame(rows, columns=pd.Index(["generation", *(column.name for column in columns)]))
+        whole = [column.name for column in columns if column.type == "INTEGER"]
+        return table.astype({name: "Int64" for name in whole if table[name].hasnans})
+
     def parts(
         self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
     ) -> tuple[int, dict[str, dict[str, np.ndarray]]]:

@@ -23,6 +23,7 @@ from es_service.store.codec import (
     part_sha256,
     state_sha256,
     state_sum,
+    table_bytes,
     text_sha256,
 )
 from es_service.store.schema import RunMeta, history_insert
@@ -46,6 +47,8 @@ class Beginning:
     """Arrays from which generation 0 starts; `RunStore.start` returns them."""
     newest: int = -1
     """Last generation that is taken from the parent; -1 if there is none."""
+    evaluations: Iterable[Sequence[Mapping[str, int | float | None]]] = ()
+    """The centres that each of these generations evaluated, likewise; none if it ends early."""
 
 
 def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Beginning) -> None:
@@ -60,11 +63,15 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
         connection.execute("INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)", row)
     names = [column.name for column in meta.columns]
     insert = history_insert(meta.columns)
+    centre_names = [column.name for column in meta.evaluation_columns]
+    evaluations = iter(beginning.evaluations)
     for generation, given in enumerate(beginning.history):
         # The state of the newest generation is stored, but not those of the generations before it.
         state = state_sha256(state_sum(in_force if generation == newest else {}))
         values = {name: given.get(name) for name in names}
-        connection.execute(insert, history_row(meta.columns, generation, values, state))
+        rows = [{name: centre.get(name) for name in centre_names} for centre in next(evaluations, ())]
+        centres = table_bytes(meta.evaluation_columns, rows)
+        connection.execute(insert, history_row(meta.columns, generation, values, centres, state))
     for generation, platform in beginning.platforms:
         text = json.dumps(platform, sort_keys=True)
         row = (generation, text, text_sha256(f"platform {generation}", text))

@@ -173,26 +173,70 @@ def row_bytes(row: Row) -> bytes:
     return b"".join(parts)
 
 
+def table_bytes(columns: Sequence[Column], rows: Sequence[Mapping[str, int | float | None]]) -> bytes:
+    """Bytes of a few rows with the same columns, such as the centres that one generation evaluated.
+
+    Raises:
+        StoreError: a row has other columns, or a value has the wrong type.
+    """
+    names = {column.name for column in columns}
+    for row in rows:
+        if row.keys() != names:
+            raise StoreError(f"a row has the columns {sorted(row)}; it must have {sorted(names)}")
+    return b"".join(row_bytes(tuple(_value(column, row[column.name]) for column in columns)) for row in rows)
+
+
+def table_rows(columns: Sequence[Column], payload: bytes) -> list[dict[str, int | float]]:
+    """The rows that `table_bytes` encoded; NaN stands for no value.
+
+    Raises:
+        ValueError: `payload` does not consist of such rows.
+    """
+    values: list[int | float | None] = []
+    position = 0
+    try:
+        while position < len(payload):
+            mark = payload[position : position + 1]
+            if mark == b"N":
+                values.append(None)
+                position += 1
+            else:
+                kind = {b"I": _INTEGER, b"R": _REAL}[mark]
+                values.append(kind.unpack_from(payload, position)[1])
+                position += kind.size
+    except (KeyError, struct.error) as error:
+        raise ValueError(f"the evaluated centres are unreadable: {error!r}") from error
+    if columns and len(values) % len(columns):
+        raise ValueError(f"the evaluated centres have {len(values)} values, which {len(columns)} columns do not fit")
+    return [row_dict(columns, tuple(values[i : i + len(columns)])) for i in range(0, len(values), len(columns) or 1)]
+
+
 def column_bytes(columns: Sequence[Column]) -> bytes:
     """Bytes of the names and types of columns, which are hashed before the values."""
     return json.dumps([[column.name, column.type] for column in columns], separators=(",", ":")).encode()
 
 
-def row_sha256(columns: bytes, row: Row, state: str) -> str:
-    """SHA-256 of a history row: of its columns (`column_bytes`), its values and the `state_sha256` stored with it."""
-    return hashlib.sha256(b"".join((columns, row_bytes(row), state.encode()))).hexdigest()
+def row_sha256(columns: bytes, row: Row, evaluations: bytes, state: str) -> str:
+    """SHA-256 of a history row: of its columns (`column_bytes`), its values, and the `state_sha256` and the evaluated
+    centres stored with it."""
+    return hashlib.sha256(b"".join((columns, row_bytes(row), state.encode(), evaluations))).hexdigest()
 
 
 def history_row(
-    columns: Sequence[Column], generation: int, history: Mapping[str, int | float | None], state: str
-) -> tuple[int | float | str | None, ...]:
-    """A history row as it is stored, with the `state_sha256` of its generation and its own SHA-256 at the end.
+    columns: Sequence[Column],
+    generation: int,
+    history: Mapping[str, int | float | None],
+    evaluations: bytes,
+    state: str,
+) -> tuple[int | float | str | bytes | None, ...]:
+    """A history row as it is stored, with the evaluated centres (`table_bytes`), the `state_sha256` of its generation
+    and its own SHA-256 at the end.
 
     Raises:
         StoreError: as in `row_values`.
     """
     values = row_values(columns, generation, history)
-    return (*values, state, row_sha256(column_bytes(columns), values, state))
+    return (*values, evaluations, state, row_sha256(column_bytes(columns), values, evaluations, state))
 
 
 def row_dict(columns: Sequence[Column], row: Row) -> dict[str, int | float]:

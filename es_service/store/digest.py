@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.loop.parts import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.protocol.machine import is_mixed
-from es_service.store.codec import decode_part, row_bytes
+from es_service.store.codec import column_bytes, decode_part, row_bytes
 from es_service.store.folder import DATABASE
 from es_service.store.reader import kept_states, platforms, reading, state_payload
 from es_service.store.schema import RunMeta, history_select
@@ -42,7 +42,7 @@ def digest_parts(folder: Path) -> dict[str, str]:
     """The SHA-256s of which the digest is made, by name.
 
     `state/<part>` is that of the newest value of a state part, `map` that of all parts of the behaviour map, and
-    `history` that of the deterministic columns of the history.
+    `history` that of the deterministic columns of the history, `evaluations` that of the evaluated centres.
 
     Raises:
         StoreError: the run cannot be read.
@@ -83,7 +83,8 @@ def _is_mixed(connection: Connection) -> bool:
 
 def _parts(folder: Path, connection: Connection, meta: RunMeta, until: int = NEWEST) -> dict[str, str]:
     try:
-        return {**_state(connection, until), "history": _history(connection, meta, until)}
+        history, evaluations = _history(connection, meta, until)
+        return {**_state(connection, until), "history": history, "evaluations": evaluations}
     except ValueError as error:
         ways_out = [WayOut("resume", "repair it as far as possible", str(folder))]
         raise StoreError(f"{folder} has data that cannot be read: {error}", run=folder, ways_out=ways_out) from error
@@ -108,10 +109,13 @@ def arrays_sha256(arrays: dict[str, NDArray[Any]]) -> str:
     return total.hexdigest()
 
 
-def _history(connection: Connection, meta: RunMeta, until: int) -> str:
+def _history(connection: Connection, meta: RunMeta, until: int) -> tuple[str, str]:
+    """SHA-256s of the deterministic columns of the history, and of the evaluated centres."""
     columns = sorted((column for column in meta.columns if column.deterministic), key=lambda column: column.name)
     total = hashlib.sha256(json.dumps([[column.name, column.type] for column in columns]).encode() + b"\n")
     query = history_select(columns) + " WHERE history.generation <= ? ORDER BY history.generation"
-    for values in connection.execute(query, (until,)):
-        total.update(row_bytes(values[:-2]))
-    return total.hexdigest()
+    centres = hashlib.sha256(column_bytes(meta.evaluation_columns) + b"\n")
+    for *values, evaluations, _, _ in connection.execute(query, (until,)):
+        total.update(row_bytes(tuple(values)))
+        centres.update(len(evaluations).to_bytes(8, "little") + evaluations)
+    return total.hexdigest(), centres.hexdigest()

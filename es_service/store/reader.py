@@ -10,18 +10,27 @@ import json
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
-from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict
+from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict, table_rows
 from es_service.store.folder import COPY, DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.lock import lock_holder
 from es_service.store.schema import Damaged, RunMeta, history_select, load_meta, quoted
 from es_service.store.verify import KeptRows, is_no_damage, row_is_sound, rows_in_force, sound_platforms, state_in_force
 
 _BUSY_S = 5.0
+EvaluatedCentres = list[dict[str, int | float]]
+"""The centres that one generation evaluated, as values by column name; NaN stands for no value."""
+
+
+class _HistoryRow(NamedTuple):
+    """A history row whose SHA-256 was checked."""
+
+    values: dict[str, int | float]
+    evaluations: bytes
 
 
 @contextlib.contextmanager
@@ -108,7 +117,17 @@ def read_history(
         StoreError: a row is missing or does not match its SHA-256.
     """
     with reading(folder) as (connection, meta):
-        return _sound_rows(connection, meta, max(since_generation or 0, 0), limit)
+        return [row.values for row in _sound_rows(connection, meta, max(since_generation or 0, 0), limit)]
+
+
+def read_evaluations(folder: Path, since_generation: int = 0, limit: int | None = None) -> list[EvaluatedCentres]:
+    """The centres that each generation evaluated, in the order of the asks; arguments and errors as `read_history`."""
+    with reading(folder) as (connection, meta):
+        found = _sound_rows(connection, meta, since_generation, limit)
+        try:
+            return [table_rows(meta.evaluation_columns, row.evaluations) for row in found]
+        except ValueError as error:
+            raise Damaged(str(error)) from error
 
 
 def read_newest(folder: Path) -> dict[str, int | float] | None:
@@ -120,7 +139,7 @@ def read_newest(folder: Path) -> dict[str, int | float] | None:
     with reading(folder) as (connection, meta):
         newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
         rows = _sound_rows(connection, meta, newest or 0)
-        return rows[-1] if rows else None
+        return rows[-1].values if rows else None
 
 
 def read_totals(folder: Path, names: Sequence[str]) -> list[int | float]:
@@ -132,17 +151,17 @@ def read_totals(folder: Path, names: Sequence[str]) -> list[int | float]:
 
 def _sound_rows(
     connection: sqlite3.Connection, meta: RunMeta, first: int, limit: int | None = None
-) -> list[dict[str, int | float]]:
+) -> list[_HistoryRow]:
     """History rows from generation `first` on. Raises Damaged if a row is missing or does not match its SHA-256."""
     query = history_select(meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation LIMIT ?"
     columns = column_bytes(meta.columns)
-    rows: list[dict[str, int | float]] = []
-    for *values, state, sha256 in connection.execute(query, (first, -1 if limit is None else limit)):
+    rows: list[_HistoryRow] = []
+    for *values, evaluations, state, sha256 in connection.execute(query, (first, -1 if limit is None else limit)):
         row = tuple(values)
         named = row_dict(meta.columns, row)
-        if not row_is_sound(columns, row, state, sha256) or named["generation"] != first + len(rows):
+        if not row_is_sound(columns, row, evaluations, state, sha256) or named["generation"] != first + len(rows):
             raise Damaged(f"the history row of generation {first + len(rows)} is damaged or missing")
-        rows.append(named)
+        rows.append(_HistoryRow(named, evaluations))
     # Damage can hide the end of a table even from SQLite. The state shows it, since every generation has state rows.
     newest = connection.execute("SELECT max(generation) FROM state").fetchone()[0]
     if newest is not None and newest >= first + len(rows) and len(rows) != limit:

@@ -13,8 +13,8 @@ from es_service.errors import StoreError
 from es_service.loop.history import Column
 from es_service.store.codec import text_sha256
 
-SCHEMA_VERSION = 4
-READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0"}
+SCHEMA_VERSION = 5
+READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0", 4: "0.6.0"}
 """Older schema version -> newest version of es-service that reads it."""
 APPLICATION_ID = 0x45535256
 """Number in the header of the file, by which tools recognise the kind of a database."""
@@ -32,7 +32,9 @@ _STATE = (
     "payload BLOB NOT NULL, PRIMARY KEY (part, generation)) WITHOUT ROWID"
 )
 _PLATFORM = "CREATE TABLE platform (generation INTEGER PRIMARY KEY, platform TEXT NOT NULL, sha256 TEXT NOT NULL)"
-_OWN_HISTORY_COLUMNS = ("state_sha256", "sha256")
+_OWN_HISTORY_COLUMNS = {"evaluations": "BLOB", "state_sha256": "TEXT", "sha256": "TEXT"}
+"""Columns of the table history besides those of the run: the evaluated centres (`codec.table_bytes`), the SHA-256 of
+the state, and that of the row."""
 
 
 class Damaged(Exception):  # noqa: N818 (caught inside the store, which then repairs or reports the damage)
@@ -54,6 +56,8 @@ class RunMeta:
     """The task's `TaskSpec` as a dict, so that the run can be read without the task's package."""
     columns: tuple[Column, ...]
     """Columns of the history, including `generation`."""
+    evaluation_columns: tuple[Column, ...] = ()
+    """Columns of the evaluated centres, without `generation`."""
     parent: dict[str, Any] | None = None
     """Run from which this one was forked or took its first centre: run id, folder, generation, digest. None if there is
     none."""
@@ -75,12 +79,13 @@ def meta_text(meta: RunMeta) -> str:
 def meta_from_text(text: str) -> RunMeta:
     """The description of a run from its `meta_text`."""
     fields = json.loads(text)
-    return RunMeta(**{**fields, "columns": tuple(Column(**column) for column in fields["columns"])})
+    columns = {name: tuple(Column(**column) for column in fields[name]) for name in ("columns", "evaluation_columns")}
+    return RunMeta(**{**fields, **columns})
 
 
 def table_statements(columns: Sequence[Column]) -> dict[str, str]:
     """Table name -> its CREATE TABLE statement."""
-    own = ", ".join(f"{name} TEXT NOT NULL" for name in _OWN_HISTORY_COLUMNS)
+    own = ", ".join(f"{name} {kind} NOT NULL" for name, kind in _OWN_HISTORY_COLUMNS.items())
     history = ", ".join(
         f"{quoted(column.name)} {column.type}" + (" PRIMARY KEY" if column.name == "generation" else "")
         for column in columns
@@ -135,13 +140,13 @@ def load_meta(connection: sqlite3.Connection, file: Path) -> RunMeta:
 
 
 def history_insert(columns: Sequence[Column]) -> str:
-    """SQL statement that stores a history row: values in the order of `columns`, then state_sha256 and sha256."""
+    """SQL statement that stores a history row: values in the order of `columns`, then those of the store's own."""
     names = [column.name for column in columns] + list(_OWN_HISTORY_COLUMNS)
     return f"INSERT INTO history ({', '.join(map(quoted, names))}) VALUES ({', '.join('?' * len(names))})"
 
 
 def history_select(columns: Sequence[Column]) -> str:
-    """Beginning of an SQL query for history rows: values in the order of `columns`, then state_sha256 and sha256."""
+    """Beginning of an SQL query for history rows: values in the order of `columns`, then those of the store's own."""
     # Names are qualified by the table, because SQLite treats an unqualified quoted name that is no column as a text.
     names = [column.name for column in columns] + list(_OWN_HISTORY_COLUMNS)
     return f"SELECT {', '.join(f'history.{quoted(name)}' for name in names)} FROM history"

@@ -135,24 +135,24 @@ def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems
     at = [column.name for column in meta.columns].index("generation")
     states: list[str | None] = [""] * first
     query = history_select(meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation"
-    for *values, state, sha256 in connection.execute(query, (first,)):
+    for *values, evaluations, state, sha256 in connection.execute(query, (first,)):
         row = tuple(values)
         generation = len(states)
         if row[at] != generation:
             problems.append(f"history row of generation {generation} is missing")
             states.append(None)
             break
-        sound = row_is_sound(columns, row, state, sha256)
+        sound = row_is_sound(columns, row, evaluations, state, sha256)
         if not sound:
             problems.append(f"history row of generation {generation} does not match its SHA-256")
         states.append(state if sound else None)
     return states
 
 
-def row_is_sound(columns: bytes, row: tuple, state: object, sha256: object) -> bool:
+def row_is_sound(columns: bytes, row: tuple, evaluations: object, state: object, sha256: object) -> bool:
     """Whether a history row matches its SHA-256; `columns` comes from `column_bytes`."""
     try:
-        return row_sha256(columns, row, str(state)) == sha256
+        return isinstance(evaluations, bytes) and row_sha256(columns, row, evaluations, str(state)) == sha256
     except ValueError:
         return False
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sqlite3
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -31,6 +31,7 @@ from es_service.store.codec import (
     row_dict,
     state_sha256,
     state_sum,
+    table_bytes,
     text_sha256,
 )
 from es_service.store.create import create_run_folder
@@ -168,13 +169,16 @@ class RunStore:
                 )
             return decode_part(row[0])
 
-    def commit(self, generation: int, parts: Mapping[str, Part], history: Values) -> None:
+    def commit(
+        self, generation: int, parts: Mapping[str, Part], history: Values, evaluations: Sequence[Values] = ()
+    ) -> None:
         """Store a generation in one transaction. If this raises, the store is unchanged and can still be used.
 
         Args:
             generation: the generation after `self.generation`, or 0 if that is None.
             parts: parts of the state that have changed; the others keep their values.
             history: value of each column of the run; `generation` may be left out; NaN or None stands for no value.
+            evaluations: likewise for each centre that the generation evaluated, in the order of the asks.
 
         Raises:
             StoreError: the generation is not the next one, the history does not fit the columns, or the disk is full.
@@ -186,7 +190,8 @@ class RunStore:
         new = {part: (generation, part_sha256(part, generation, payload)) for part, payload in payloads.items()}
         old = {part: max(self._kept[part].items()) for part in new if part in self._kept}
         total = changed_sum(self._state_sum, old, new)
-        history_values = history_row(self.meta.columns, generation, history, state_sha256(total))
+        centres = table_bytes(self.meta.evaluation_columns, evaluations)
+        history_values = history_row(self.meta.columns, generation, history, centres, state_sha256(total))
         # The rows that remain make up the states of the newest generation and of the one before it.
         outdated = [(part, at) for part in self._doubled for at in self._kept[part] if at < max(self._kept[part])]
         self._hook("before_begin")
@@ -217,7 +222,7 @@ class RunStore:
         with self._explaining("reading the history"):
             query = history_select(self.meta.columns) + " WHERE history.generation = ?"
             row = self._connection.execute(query, (self.generation,)).fetchone()
-        return row_dict(self.meta.columns, row[:-2])
+        return row_dict(self.meta.columns, row[:-3])
 
     def record_platform(self, generation: int, platform: dict[str, Any]) -> bool:
         """Record the platform of a generation that is not stored yet, and of those after it.

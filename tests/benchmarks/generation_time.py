@@ -1,10 +1,12 @@
 """Where does a generation's time go, and what memory does a run take?
 
     python -m tests.benchmarks.generation_time [--task point_maze] [--algorithm es] [--engine inline ray]
+    python -m tests.benchmarks.generation_time --emitters 1 16      # ME-ES, 64 pairs for each emitter
 
 Two workers; PointMaze with 64, 512 and 4,096 pairs, ants with 64 and 5,000; medians over the generations, but for the
 first ten if there are more; the engines take turns. Memory is that of this process and everything it started, shared
-pages divided among those who share them.
+pages divided among those who share them. With --emitters each run is followed by a measurement of what rollouts alone
+make on the same cores (`es-service bench rollouts`), and its rate is also given as a share of that.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import time
 from pathlib import Path
 
 from es_service import api
+from es_service.cli.bench_rollouts import bench_rollouts
 
 POINT_MAZE_SIZES = ((64, 500), (512, 150), (4096, 40))
 ANT_SIZES = ((64, 20), (5000, 1))
@@ -47,13 +50,21 @@ def family_mib() -> dict[str, float]:
     return mib
 
 
-def measure(task: str, algorithm: str, engine: str, pairs: int, generations: int, folder: Path) -> dict[str, object]:
+def rollouts_alone(task: str) -> int:
+    """Environment steps per second of `bench rollouts` on all cores, with a policy and 64 episodes side by side."""
+    rows = bench_rollouts([task], policies=[True], rollouts=["simd"], batches=[64])
+    return max(row["steps_per_second"] for row in rows)
+
+
+def measure(
+    task: str, algorithm: str, engine: str, pairs: int, generations: int, folder: Path, emitters: int = 1
+) -> dict[str, object]:
     """One run; milliseconds by part, rates, memory of driver and workers."""
     config = api.load_config(
         {
             "task": {"environment": task},
             "policy": {"hidden": [64, 64] if task == "point_maze" else [256, 256]},
-            "search": {"algorithm": algorithm, "pairs": pairs},
+            "search": {"algorithm": algorithm, "pairs": pairs, "emitters": emitters},
             "budget": {"generations": generations},
             "compute": {"workers": 2, "engine": engine},
         }
@@ -77,6 +88,7 @@ def measure(task: str, algorithm: str, engine: str, pairs: int, generations: int
         "algorithm": algorithm,
         "engine": engine,
         "pairs": pairs,
+        "emitters": emitters,
         **{f"{part}_ms": round(value, 2) for part, value in parts.items()},
         "generation_ms": round(whole, 1),
         "outside_rollouts_ms": round(whole - parts["rollout"] - parts["evaluation"], 2),
@@ -93,9 +105,19 @@ def main() -> None:
     parser.add_argument("--task", default="point_maze")
     parser.add_argument("--algorithm", default="es")
     parser.add_argument("--engine", nargs="+", default=["inline", "ray"])
+    parser.add_argument("--emitters", nargs="*", type=int, default=[])
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         sizes = POINT_MAZE_SIZES if arguments.task == "point_maze" else ANT_SIZES
+        for emitters, engine in itertools.product(arguments.emitters, arguments.engine):
+            generations = 300 // emitters + 20 if arguments.task == "point_maze" else 3
+            run = Path(folder) / f"{engine}_emitters{emitters}"
+            row = measure(arguments.task, "me_es", engine, 64, generations, run, emitters)
+            alone = rollouts_alone(arguments.task)
+            share = round(100 * int(str(row["steps_per_second"])) / alone)
+            print(json.dumps(row | {"rollouts_alone": alone, "percent_of_rollouts_alone": share}), flush=True)
+        if arguments.emitters:
+            return
         for (pairs, generations), engine in itertools.product(sizes, arguments.engine):
             run = Path(folder) / f"{engine}{pairs}"
             row = measure(arguments.task, arguments.algorithm, engine, pairs, generations, run)

@@ -49,10 +49,10 @@ class Inventing:
         self._none, self._bounds, self._pairs = no_observations(observations), np.array(bounds).T, chunk_pairs
         self._rng, self._centres = np.random.default_rng(0), 0
 
-    def evaluate(self, centre, chunks):
+    def evaluate(self, work):
         place_2 = self._rng.uniform(*self._bounds)
-        self._centres += isinstance(chunks[0], GradientChunk)
-        return [self._answer(chunk, place_2) for chunk in chunks]
+        self._centres += isinstance(work[0][1], GradientChunk)
+        return [self._answer(chunk, place_2) for _, chunk in work]
 
     def _answer(self, chunk, place_2):
         if isinstance(chunk, GradientChunk):

@@ -25,7 +25,7 @@ from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.protocol.messages import EpisodesResult, Evaluator, TrainingChunk
+from es_service.protocol.messages import EpisodesResult, Evaluator, TrainingChunk, around
 from tests.helpers import centre
 from workers.policy import initial_parameters
 
@@ -38,7 +38,7 @@ def measure(engine: Evaluator, point: Any, chunks: int, seconds: float) -> float
     """Steps per second over whole populations for about `seconds`."""
     steps, start = 0, time.perf_counter()
     while time.perf_counter() - start < seconds:
-        results = engine.evaluate(point, [TrainingChunk(point.generation, chunk) for chunk in range(chunks)])
+        results = engine.evaluate(around(point, [TrainingChunk(point.generation, chunk) for chunk in range(chunks)]))
         steps += sum(int(result.steps.sum()) for result in results if isinstance(result, EpisodesResult))
     return steps / (time.perf_counter() - start)
 

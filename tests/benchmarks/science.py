@@ -34,7 +34,7 @@ from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
 from es_service.errors import Interrupted
 from es_service.protocol.machine import cpu_kind
-from es_service.protocol.messages import Centre, Chunk, ChunkResult, DispatchCounts
+from es_service.protocol.messages import ChunkResult, DispatchCounts, Work
 from es_service.protocol.process_environment import worker_environment
 from es_service.runs import session
 from es_service.runs.view import Policy, Run
@@ -109,10 +109,10 @@ class InThisProcess:
         self._run_chunk = make_worker(worker_spec(config, task_of(config)))
         self._should_stop = should_stop
 
-    def evaluate(self, centre: Centre, chunks: Sequence[Chunk]) -> list[ChunkResult]:
+    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
         if (number := self._should_stop()) is not None:
             raise Interrupted(number)
-        return [self._run_chunk(centre, chunk) for chunk in chunks]
+        return [self._run_chunk(centre, chunk) for centre, chunk in work]
 
 
 @contextmanager

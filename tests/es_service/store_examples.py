@@ -11,7 +11,7 @@ from es_service.loop.history import Column
 from es_service.store import upkeep as store_upkeep
 from es_service.store.digest import digest_of, digest_parts
 from es_service.store.folder import DATABASE
-from es_service.store.reader import read_history, read_parts, reading
+from es_service.store.reader import read_evaluations, read_history, read_parts, reading
 from es_service.store.schema import Damaged
 from es_service.store.verify import verify
 from es_service.store.writer import RunMeta, RunStore, no_hook
@@ -24,6 +24,11 @@ COLUMNS = (
     Column("goal_distance", "REAL", True, ""),
     Column("seconds_rollout", "REAL", False, ""),
 )
+EVALUATION_COLUMNS = (
+    Column("centre", "INTEGER", True, ""),
+    Column("cell", "INTEGER", True, ""),
+    Column("fitness_mean", "REAL", True, ""),
+)
 CENTRES = 3
 
 
@@ -35,6 +40,7 @@ def meta(**changes):
         "constants": {"search.pairs": 8},
         "task": {"name": "point_maze"},
         "columns": COLUMNS,
+        "evaluation_columns": EVALUATION_COLUMNS,
         "parent": None,
     }
     return RunMeta(**{**fields, **changes})
@@ -79,6 +85,15 @@ def history_row(generation):
     }
 
 
+def evaluated(generation):
+    """The centres that this generation evaluates: all of them at first, then one or two."""
+    centres = range(CENTRES) if generation == 0 else range(1 + generation % 2)
+    return [
+        {"centre": centre, "cell": math.nan if centre else generation, "fitness_mean": generation + centre / 7}
+        for centre in centres
+    ]
+
+
 def create(folder, *, seed=0, generations=0, hook=no_hook, run_meta=None):
     store = RunStore.create(Path(folder), CONFIG_YAML, run_meta or meta(), hook=hook)
     advance(store, generations - 1, seed=seed)
@@ -89,7 +104,7 @@ def advance(store, last, *, seed=0):
     """Commit generations up to and including `last`."""
     first = 0 if store.generation is None else store.generation + 1
     for generation in range(first, last + 1):
-        store.commit(generation, parts_of(generation, seed), history_row(generation))
+        store.commit(generation, parts_of(generation, seed), history_row(generation), evaluated(generation))
 
 
 def finished(folder, generations, seed=0):
@@ -117,11 +132,21 @@ def assert_same_state(found, expected):
 def assert_same_history(found, generations):
     assert len(found) == generations
     for generation, row in enumerate(found):
-        expected = history_row(generation)
-        assert row.keys() == expected.keys()
-        for name, value in expected.items():
-            assert type(row[name]) is type(value)
-            assert row[name] == value or (math.isnan(value) and math.isnan(row[name]))
+        assert_same_row(row, history_row(generation))
+
+
+def assert_same_evaluations(found, generations):
+    assert len(found) == generations
+    for generation, rows in enumerate(found):
+        for row, expected in zip(rows, evaluated(generation), strict=True):
+            assert_same_row(row, expected)
+
+
+def assert_same_row(row, expected):
+    assert row.keys() == expected.keys()
+    for name, value in expected.items():
+        assert type(row[name]) is type(value)
+        assert row[name] == value or (math.isnan(value) and math.isnan(row[name]))
 
 
 def flip_bit(file, position, bit=0):
@@ -146,6 +171,7 @@ def assert_sound(folder, generation):
     """The run opens with exactly this generation and nothing to report; reading it before that gave the same."""
     before = stored_bytes(folder)
     assert_same_history(read_history(folder), generation + 1)
+    assert_same_evaluations(read_evaluations(folder), generation + 1)
     if generation >= 0:
         assert_same_state(read_parts(folder)[1], state_at(generation))
     assert stored_bytes(folder) == before

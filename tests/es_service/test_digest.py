@@ -10,15 +10,17 @@ from es_service.api import open_run
 from es_service.errors import StoreError
 from es_service.loop.parts import cell_part, elite_part
 from es_service.store import schema as store_schema
-from es_service.store.codec import encode_part
+from es_service.store.codec import encode_part, table_bytes
 from es_service.store.digest import arrays_sha256, checked_parts, digest_at, digest_of, digest_parts
 from es_service.store.reader import read_generation
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     COLUMNS,
+    EVALUATION_COLUMNS,
     advance,
     create,
     digest,
+    evaluated,
     finished,
     flip_bit,
     history_row,
@@ -50,7 +52,14 @@ def changed_names(before, after):
 
 def test_names_are_the_state_parts_and_the_tables(folder):
     parts = digest_parts(folder)
-    assert list(parts) == ["state/centre_0", "state/centre_1", "state/centre_2", "state/observations", "history"]
+    assert list(parts) == [
+        "state/centre_0",
+        "state/centre_1",
+        "state/centre_2",
+        "state/observations",
+        "history",
+        "evaluations",
+    ]
     assert parts["state/centre_1"] == arrays_sha256(state_at(GENERATIONS - 1)["centre_1"])
     assert all(len(value) == 64 for value in (*parts.values(), digest(folder)))
 
@@ -71,7 +80,7 @@ def test_layout_does_not_count(folder, tmp_path, monkeypatch):
     with create(tmp_path / "other", run_meta=meta(columns=COLUMNS[::-1], run_id="other")) as store:
         for generation in range(GENERATIONS):
             parts = {part: dict(reversed(arrays.items())) for part, arrays in reversed(parts_of(generation).items())}
-            store.commit(generation, parts, history_row(generation))
+            store.commit(generation, parts, history_row(generation), evaluated(generation))
     assert digest(tmp_path / "other") == expected
     with contextlib.closing(sqlite3.connect(tmp_path / "other" / "run.db")) as connection:
         connection.execute("VACUUM")
@@ -80,7 +89,9 @@ def test_layout_does_not_count(folder, tmp_path, monkeypatch):
 
 def test_when_a_part_was_last_written_does_not_count(folder, tmp_path):
     with create(tmp_path / "all", generations=GENERATIONS - 1) as store:
-        store.commit(GENERATIONS - 1, state_at(GENERATIONS - 1), history_row(GENERATIONS - 1))
+        store.commit(
+            GENERATIONS - 1, state_at(GENERATIONS - 1), history_row(GENERATIONS - 1), evaluated(GENERATIONS - 1)
+        )
     assert digest(tmp_path / "all") == digest(folder)
 
 
@@ -128,6 +139,17 @@ def test_one_changed_deterministic_history_value_counts(folder, column):
     assert changed_names(before, digest_parts(folder)) == {"history"}
 
 
+@pytest.mark.parametrize("change_of", ["value", "row", "order"])
+def test_every_evaluated_centre_counts(folder, change_of):
+    before = digest_parts(folder)
+    rows = evaluated(0)
+    if change_of == "value":
+        rows[1]["fitness_mean"] = float(np.nextafter(rows[1]["fitness_mean"], np.inf))
+    rows = rows[:-1] if change_of == "row" else rows[::-1] if change_of == "order" else rows
+    change(folder, "UPDATE history SET evaluations = ? WHERE generation = 0", table_bytes(EVALUATION_COLUMNS, rows))
+    assert changed_names(before, digest_parts(folder)) == {"evaluations"}
+
+
 def test_no_value_is_not_zero(folder):
     before = digest(folder)
     change(folder, "UPDATE history SET goal_distance = 0.0 WHERE generation = 3")
@@ -138,7 +160,9 @@ def test_one_generation_less_or_another_seed_counts(folder, tmp_path):
     less = digest_parts(finished(tmp_path / "less", GENERATIONS - 1))
     assert {"history", "state/observations"} <= changed_names(digest_parts(folder), less)
     other = digest_parts(finished(tmp_path / "seed", GENERATIONS, seed=1))
-    assert changed_names(digest_parts(folder), other) == {name for name in other if name != "history"}
+    assert changed_names(digest_parts(folder), other) == {
+        name for name in other if name not in ("history", "evaluations")
+    }
     change(folder, "DELETE FROM history WHERE generation = 5")
     assert digest_parts(folder)["history"] == less["history"]
 
@@ -179,7 +203,7 @@ def test_parts_and_total_are_of_one_moment_and_of_a_sound_run(folder):
 
 def test_a_run_without_a_generation_has_a_digest(tmp_path):
     create(tmp_path / "run").close()
-    assert list(digest_parts(tmp_path / "run")) == ["history"]
+    assert list(digest_parts(tmp_path / "run")) == ["history", "evaluations"]
 
 
 def test_a_run_is_mixed_from_the_first_generation_on_another_platform(tmp_path):

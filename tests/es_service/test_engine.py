@@ -19,7 +19,7 @@ from es_service.dispatch import engine as engine_module
 from es_service.dispatch.engine import POLL_S, Answer, Engine, item_sizes
 from es_service.dispatch.events import Failure, Limits, WorkerLost, WorkerUp
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol.messages import TrainingChunk
+from es_service.protocol.messages import TrainingChunk, around
 from tests.helpers import centre, random_parameters
 
 FIRST, SECOND = centre(random_parameters(0)), centre(random_parameters(1))
@@ -31,14 +31,16 @@ class Sent:
     """Chunks sent to a worker, and what the worker might say about them."""
 
     worker: int
-    centre: Any
     item_id: Any
     attempt: int
-    chunks: Any
+    work: Any
+
+    @property
+    def chunks(self) -> list[Any]:
+        return [chunk for _, chunk in self.work]
 
     def answer(self) -> Answer:
-        results = [expected(self.centre, chunk) for chunk in self.chunks]
-        return Answer(self.worker, self.item_id, self.attempt, results)
+        return Answer(self.worker, self.item_id, self.attempt, [expected(*one) for one in self.work])
 
     def failure(self) -> Failure:
         return Failure(self.worker, self.item_id, self.attempt, "no")
@@ -69,8 +71,8 @@ class Scripted:
         self.killed.append(worker)
         return self.last_words.get(worker, "")
 
-    def send(self, worker, centre, item_id, attempt, chunks):
-        self.sent.append(Sent(worker, centre, item_id, attempt, chunks))
+    def send(self, worker, item_id, attempt, work):
+        self.sent.append(Sent(worker, item_id, attempt, work))
         self.on_send(self.sent[-1])
 
     def silent(self):
@@ -108,9 +110,30 @@ def test_results_come_in_chunk_order_whatever_the_order_of_the_answers(seed):
     with Engine(transport, Limits(workers=3)) as engine:
         for point in (FIRST, SECOND, FIRST):
             chunks = rng.sample(CHUNKS, len(CHUNKS))
-            assert engine.evaluate(point, chunks) == [expected(point, chunk) for chunk in chunks]
+            assert engine.evaluate(around(point, chunks)) == [expected(point, chunk) for chunk in chunks]
         assert (engine.counts.retries, engine.counts.lost_workers, engine.counts.workers) == (0, 0, 3)
     assert transport.closed
+
+
+@pytest.mark.parametrize("item_s", [0.0, 60.0])
+@pytest.mark.parametrize("seed", range(5))
+def test_results_of_several_centres_come_in_the_order_of_the_work(seed, item_s):
+    """Also if chunks of different centres are equal, as in `es-service evaluate`; and if a work item has both."""
+    rng, transport, held = random.Random(seed), Scripted(), []
+
+    def answer_one():
+        transport.inbox.append(held.pop(rng.randrange(len(held))).answer())
+
+    transport.on_send, transport.on_wait = held.append, answer_one
+    third = centre(random_parameters(2))
+    with Engine(transport, Limits(workers=2, item_s=item_s)) as engine:
+        for _ in range(3):
+            work = [(point, chunk) for point in (FIRST, SECOND, third) for chunk in CHUNKS]
+            assert engine.evaluate(work) == [expected(*one) for one in work]
+        assert engine.evaluate([]) == []
+    assert len({sent.item_id for sent in transport.sent}) == len(transport.sent)
+    mixed = [sent for sent in transport.sent if len({id(point) for point, _ in sent.work}) > 1]
+    assert bool(mixed) == (item_s > 0.0)
 
 
 @given(st.integers(1, 500), st.integers(1, 70), st.floats(1e-7, 10.0))
@@ -141,7 +164,7 @@ def test_short_chunks_travel_together_once_their_duration_is_known(monkeypatch):
         for count in (8, 6, 200):
             transport.sent.clear()
             chunks = [TrainingChunk(3, chunk_id) for chunk_id in range(count)]
-            assert engine.evaluate(FIRST, chunks) == [expected(FIRST, chunk) for chunk in chunks]
+            assert engine.evaluate(around(FIRST, chunks)) == [expected(FIRST, chunk) for chunk in chunks]
             assert [chunk for sent in transport.sent for chunk in sent.chunks] == chunks
             numbers.append([len(sent.chunks) for sent in transport.sent])
     assert numbers[:2] == [[1] * 8, [3, 3]]
@@ -164,21 +187,21 @@ def test_a_late_answer_of_an_earlier_call_is_not_taken_for_one_of_this(already_t
 
     transport.on_send = contradict
     with Engine(transport, Limits(workers=2)) as engine:
-        assert engine.evaluate(FIRST, CHUNKS) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        assert engine.evaluate(around(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
         if already_there:
             transport.inbox.append(late[0])
         transport.on_send = lambda sent: transport.inbox.extend([*late, sent.answer()])
-        assert engine.evaluate(SECOND, CHUNKS) == [expected(SECOND, chunk) for chunk in CHUNKS]
+        assert engine.evaluate(around(SECOND, CHUNKS)) == [expected(SECOND, chunk) for chunk in CHUNKS]
         assert transport.killed == []
 
 
 def test_a_worker_lost_between_two_calls_gets_no_chunk_and_no_chunk_is_blamed():
     transport = Scripted()
     with Engine(transport, Limits(workers=2)) as engine:
-        engine.evaluate(FIRST, CHUNKS)
+        engine.evaluate(around(FIRST, CHUNKS))
         transport.inbox.append(WorkerLost(0, "gone"))
         transport.sent.clear()
-        assert engine.evaluate(SECOND, CHUNKS) == [expected(SECOND, chunk) for chunk in CHUNKS]
+        assert engine.evaluate(around(SECOND, CHUNKS)) == [expected(SECOND, chunk) for chunk in CHUNKS]
         assert {sent.worker for sent in transport.sent} == {1, 2}
         assert {sent.attempt for sent in transport.sent} == {1}
         assert (engine.counts.retries, engine.counts.lost_workers) == (0, 1)
@@ -192,7 +215,7 @@ def test_the_chunk_of_a_worker_lost_in_mid_call_runs_elsewhere():
 
     transport.on_send = die_once
     with Engine(transport, Limits(workers=2)) as engine:
-        assert engine.evaluate(FIRST, CHUNKS) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        assert engine.evaluate(around(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
         assert (engine.counts.retries, engine.counts.lost_workers) == (2, 1)
 
 
@@ -210,7 +233,7 @@ def test_what_a_lost_worker_still_says_is_dropped(before):
 
     transport.on_send = contradict
     with Engine(transport, Limits(workers=2)) as engine:
-        assert engine.evaluate(FIRST, CHUNKS) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        assert engine.evaluate(around(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
         assert engine.counts.lost_workers == 1
 
 
@@ -222,7 +245,7 @@ def test_a_chunk_that_fails_everywhere_is_named_and_ends_the_engine():
     with Engine(transport, Limits(workers=2, restart_backoff_s=0.0)) as engine:
         for _ in range(2):  # and again, rather than wait for ever, if it is asked again
             with pytest.raises(EvaluationError, match=r"TrainingChunk 2 of generation 3 failed in 4 attempts.*: no"):
-                engine.evaluate(FIRST, CHUNKS)
+                engine.evaluate(around(FIRST, CHUNKS))
         assert sorted(transport.killed) == [0, 1]
 
 
@@ -240,7 +263,7 @@ def test_a_request_to_stop_is_noticed_at_the_next_message_or_poll(flood):
         transport.on_wait = lambda: transport.inbox.extend([WorkerUp(0)] * 1000)
     with Engine(transport, Limits(workers=2), should_stop) as engine:
         with pytest.raises(Interrupted) as caught:
-            engine.evaluate(FIRST, CHUNKS)
+            engine.evaluate(around(FIRST, CHUNKS))
         assert caught.value.signal_number == signal.SIGTERM
     assert len(asked) == 4
     assert len(transport.waits) - asked[0] == 3
@@ -260,7 +283,7 @@ def test_answers_that_wait_are_read_before_the_clock(monkeypatch, answered):
 
     transport.on_send = leap
     with Engine(transport, Limits(workers=2, first_deadline_s=1.0, min_deadline_s=1.0)) as engine:
-        assert engine.evaluate(FIRST, CHUNKS) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        assert engine.evaluate(around(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
         assert transport.killed == ([] if answered else [0, 1])
         assert engine.counts.lost_workers == (0 if answered else 2)
 
@@ -271,7 +294,7 @@ def test_the_next_deadline_bounds_the_wait(monkeypatch):
     transport = scripted_with_clock(monkeypatch, now)
     transport.on_send = lambda sent: transport.inbox.append(sent.answer()) if sent.worker else None
     with Engine(transport, Limits(workers=1, first_deadline_s=0.25, min_deadline_s=0.25)) as engine:
-        engine.evaluate(FIRST, CHUNKS)
+        engine.evaluate(around(FIRST, CHUNKS))
     assert transport.killed == [0]
     assert now[0] == pytest.approx(0.25)
 
@@ -286,7 +309,7 @@ def test_what_a_hung_worker_had_written_is_told_with_its_loss(monkeypatch, is_la
     with Engine(transport, limits) as engine:
         if is_last:
             with pytest.raises(EvaluationError, match=r"failed in 1 attempts.*its process:\nno licence; retrying$"):
-                engine.evaluate(FIRST, CHUNKS)
+                engine.evaluate(around(FIRST, CHUNKS))
         else:
-            engine.evaluate(FIRST, CHUNKS)
+            engine.evaluate(around(FIRST, CHUNKS))
         assert re.search(r"^worker 0: no answer .* output of its process:\nno licence; retrying$", engine.last_loss)

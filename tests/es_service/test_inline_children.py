@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from es_service.dispatch.events import Limits, StartWorker
+from es_service.dispatch.events import Limits, StartWorker, Submit
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError
-from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
-from tests.helpers import SPEC, centre, random_parameters, spec
+from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk, around
+from tests.helpers import SPEC, DirectEvaluator, centre, random_parameters, spec
 
 FIRST = centre(random_parameters(0))
 CHUNKS = [TrainingChunk(3, chunk_id) for chunk_id in range(8)]
@@ -47,7 +47,7 @@ def test_killed_children_change_no_result_and_leave_nothing_behind():
 
     limits = Limits(workers=1, item_s=0.0, restart_backoff_s=0.01)
     with inline_engine(SPEC, limits, kill_in_the_middle) as engine:
-        first = engine.evaluate(FIRST, chunks)
+        first = engine.evaluate(around(FIRST, chunks))
         settled = footprint()
         for kill in range(1, 9):
             (victim,) = engine.transport.process_ids().values()
@@ -55,7 +55,7 @@ def test_killed_children_change_no_result_and_leave_nothing_behind():
                 os.kill(victim, signal.SIGKILL)
             else:
                 countdown = 3  # asked once before each message, so two of the eight have been answered
-            assert_same(engine.evaluate(FIRST, chunks), first)
+            assert_same(engine.evaluate(around(FIRST, chunks)), first)
             assert engine.counts.lost_workers == kill
         assert footprint() == settled
     assert footprint() == before
@@ -71,12 +71,12 @@ def test_a_child_stopped_in_mid_message_blocks_nobody():
     chunks = [EvaluationChunk(1, chunk_id) for chunk_id in range(3)]
     before = footprint()
     with inline_engine(wide, Limits(workers=1, min_deadline_s=0.5)) as engine:
-        result = engine.evaluate(one, chunks)
+        result = engine.evaluate(around(one, chunks))
         with pytest.raises(AssertionError):
-            assert_same(engine.evaluate(other, chunks), result)
+            assert_same(engine.evaluate(around(other, chunks)), result)
         (victim,) = engine.transport.process_ids().values()
         os.kill(victim, signal.SIGSTOP)
-        assert_same(engine.evaluate(one, chunks), result)
+        assert_same(engine.evaluate(around(one, chunks)), result)
         assert engine.counts.lost_workers == 1
         assert victim not in engine.transport.process_ids().values()
     assert footprint() == before
@@ -92,7 +92,7 @@ def test_children_that_cannot_be_started_are_lost_workers_and_leave_nothing_behi
         inline_engine(SPEC, Limits(workers=1, restart_backoff_s=0.0)) as engine,
         pytest.raises(EvaluationError, match=r"(?s)3 consecutive attempts.*cannot be started.*Too many open files"),
     ):
-        engine.evaluate(FIRST, CHUNKS)
+        engine.evaluate(around(FIRST, CHUNKS))
     assert footprint() == before
 
 
@@ -100,7 +100,7 @@ def test_threads_that_are_lost_together_before_they_are_up_do_not_end_the_run():
     with inline_engine(SPEC, Limits(workers=6, restart_backoff_s=0.01), threads=True) as engine:
         (victim,) = set(engine.transport.process_ids().values())
         os.kill(victim, signal.SIGKILL)
-        assert len(engine.evaluate(FIRST, CHUNKS)) == len(CHUNKS)
+        assert len(engine.evaluate(around(FIRST, CHUNKS))) == len(CHUNKS)
         assert (engine.counts.lost_workers, engine.counts.retries) == (6, 0)
 
 
@@ -123,15 +123,15 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
     long = spec(rollout="simd", episode_steps=200_000)
     limits = Limits(workers=6, min_deadline_s=3.0, restart_backoff_s=0.01)
     with inline_engine(long, limits, threads=True) as engine:
-        expected = engine.evaluate(FIRST, CHUNKS[:1])
-        engine.evaluate(FIRST, CHUNKS[:1])  # so that it is known how long it takes
+        expected = engine.evaluate(around(FIRST, CHUNKS[:1]))
+        engine.evaluate(around(FIRST, CHUNKS[:1]))  # so that it is known how long it takes
         (victim,) = set(engine.transport.process_ids().values())
         timer = threading.Timer(0.02, os.kill, (victim, number))
         timer.start()
         for _ in range(3):
-            assert_same(engine.evaluate(FIRST, CHUNKS[:1]), expected)
+            assert_same(engine.evaluate(around(FIRST, CHUNKS[:1])), expected)
         timer.join()
-        assert_same(engine.evaluate(FIRST, CHUNKS[:4])[:1], expected)
+        assert_same(engine.evaluate(around(FIRST, CHUNKS[:4]))[:1], expected)
         assert engine.counts.lost_workers == 6
         assert victim not in engine.transport.process_ids().values()
         assert len(set(engine.transport.process_ids().values())) == 1
@@ -141,6 +141,25 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
 def test_an_error_says_in_which_of_the_chunks_that_travelled_together_it_was():
     broken = [*CHUNKS[:3], TrainingChunk(3, "four")]
     with inline_engine(SPEC, Limits(workers=1, item_s=60.0, restart_backoff_s=0.0)) as engine:
-        engine.evaluate(FIRST, CHUNKS)
+        engine.evaluate(around(FIRST, CHUNKS))
         with pytest.raises(EvaluationError, match=r"(?s)item TrainingChunk 0 and 3 more of.*in TrainingChunk four of"):
-            engine.evaluate(FIRST, broken)
+            engine.evaluate(around(FIRST, broken))
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3])
+def test_two_hundred_centres_at_once_on_any_number_of_children(workers):
+    """More than a child keeps; one by one, then in work items of several centres, then the oldest again."""
+    short = spec(episode_steps=5)
+    points = [centre(random_parameters(number)) for number in range(200)]
+    work = [(point, EvaluationChunk(1, 0, number % 3)) for number, point in enumerate(points)]
+    expected = DirectEvaluator(short).evaluate(work)
+    assert len({result.fitness.tobytes() for result in expected}) == 200
+    items = []
+    log = lambda entry: items.extend(entry.items) if isinstance(entry, Submit) else None  # noqa: E731
+    with inline_engine(short, Limits(workers=workers, item_s=60.0), log=log) as engine:
+        assert_same(engine.evaluate(work), expected)
+        assert_same(engine.evaluate(work[::-1]), expected[::-1])
+        assert_same(engine.evaluate(work[:70] * 2), expected[:70] * 2)
+        assert engine.counts.lost_workers == engine.counts.retries == 0
+    assert {item.size for item in items[:200]} == {1}
+    assert max(item.size for item in items) == -(-200 // workers)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import re
 import signal
 import socket
@@ -21,8 +22,8 @@ from es_service.dispatch.engine import Answer
 from es_service.dispatch.events import Limits, WorkerLost, WorkerUp
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol.messages import TrainingChunk
-from es_service.protocol.wire import framed
+from es_service.protocol.messages import KEPT_CENTRES, TrainingChunk, Work, around, forget_oldest
+from es_service.protocol.wire import framed, receive
 from tests.helpers import SPEC, centre, random_parameters, spec
 
 FIRST = centre(random_parameters(0))
@@ -57,6 +58,72 @@ def test_of_a_child_that_wrote_a_lot_only_the_end_is_read():
     assert how == "signal 9"
     assert last_words.endswith("ää the last words")
     assert 990 < len(last_words) <= 2000
+
+
+class Receiver:
+    """A worker's side of a socket, as in workers/process.py: the centres that it keeps, and what it was sent."""
+
+    def __init__(self, end: socket.socket) -> None:
+        self.end, self.centres, self.received = end, {}, 0
+
+    def item(self) -> list[tuple[float, int]]:
+        """(first parameter of the centre, id) of each chunk of the next work item."""
+        while (said := receive(self.end))[0] == "centre":
+            _, number, point = said
+            self.centres[number] = point
+            self.received += 1
+        found = [(float(self.centres[number].parameters_D[0]), chunk.chunk_id) for number, chunk in said[3]]
+        forget_oldest(self.centres)
+        return found
+
+
+POINTS = [centre(np.array([number], np.float32)) for number in range(200)]
+
+
+def work_of(*numbers: int) -> list[Work]:
+    return [(POINTS[number], TrainingChunk(3, position)) for position, number in enumerate(numbers)]
+
+
+def test_a_centre_is_sent_once_while_it_is_among_the_newest_and_again_when_it_was_forgotten(transport):
+    transport, (end, other) = transport
+    worker, second = Receiver(end), Receiver(other)
+    for numbers, received in (
+        ([0], 1),
+        ([0], 1),
+        ([0, 1, 0], 2),
+        ([2, 1], 3),
+        (range(3, KEPT_CENTRES), 64),
+        ([0], 64),  # still there
+        ([64], 65),
+        ([1], 65),
+        ([0], 66),  # the oldest of 65 was forgotten
+        (range(100), 66 + 99),  # of so many in turn, each is forgotten before its turn
+    ):
+        transport.send(0, "key", 1, work_of(*numbers))
+        assert worker.item() == [(number, position) for position, number in enumerate(numbers)]
+        assert worker.received == received
+        assert len(worker.centres) <= KEPT_CENTRES
+    transport.send(1, "key", 1, work_of(99, 98))  # what one worker has, another may not have
+    assert second.item() == [(99, 0), (98, 1)]
+    assert second.received == 2
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_worker_always_has_the_centres_of_its_chunks(transport, seed):
+    """Items of any number of centres, some of which were forgotten, more than one waiting at a time."""
+    transport, ends = transport
+    rng, workers = random.Random(seed), [Receiver(end) for end in ends]
+    waiting = [[], []]
+    for _ in range(150):
+        low, size = rng.randrange(200), rng.choice([1, 2, 5, 70])
+        numbers = [(low + rng.randrange(90)) % 200 for _ in range(size)]
+        at = rng.randrange(2)
+        transport.send(at, "key", 1, work_of(*numbers))
+        waiting[at].append([(number, position) for position, number in enumerate(numbers)])
+        for worker, items in zip(workers, waiting, strict=True):
+            while len(items) > rng.randrange(3):
+                assert worker.item() == items.pop(0)
+    assert min(worker.received for worker in workers) > 200, "most of them more than once"
 
 
 LARGE = np.arange(1_000_000)
@@ -98,7 +165,7 @@ def test_what_threads_have_said_is_heard_before_they_are_lost_with_another(trans
 def test_a_thread_that_has_answered_everything_is_a_bystander_of_its_child_s_end(transport):
     transport, ends = transport
     for worker in range(2):
-        transport.send(worker, FIRST, worker, 1, CHUNKS[:1])
+        transport.send(worker, worker, 1, around(FIRST, CHUNKS[:1]))
     ends[0].sendall(framed(("results", 0, 1, ["its own"])))
     ends[1].close()
     heard = [transport.receive(1.0) for _ in range(3)]
@@ -159,7 +226,7 @@ def test_a_signal_while_a_worker_is_heard_is_no_fault_of_the_worker(transport, m
 def test_a_worker_that_has_said_its_last_is_lost_while_messages_still_wait_for_it(transport):
     transport, ends = transport
     for key in range(40):
-        transport.send(0, centre(np.zeros(100_000, np.float32)), key, 1, CHUNKS[:1])
+        transport.send(0, key, 1, around(centre(np.zeros(100_000, np.float32)), CHUNKS[:1]))
     assert transport._workers[0].channel.is_full
     ends[0].shutdown(socket.SHUT_WR)
     assert isinstance(transport.receive(1.0), WorkerLost)
@@ -169,7 +236,7 @@ def test_a_default_timeout_of_sockets_is_not_the_workers():
     socket.setdefaulttimeout(0.001)
     try:
         with inline_engine(SPEC, Limits(workers=1)) as engine:
-            engine.evaluate(FIRST, CHUNKS[:2])
+            engine.evaluate(around(FIRST, CHUNKS[:2]))
             assert engine.counts.lost_workers == 0
     finally:
         socket.setdefaulttimeout(None)
@@ -181,4 +248,4 @@ def test_an_environment_that_exits_is_a_failure_with_its_traceback():
         inline_engine(exits, Limits(workers=1, max_failures_in_a_row=1, max_attempts=2)) as engine,
         pytest.raises(EvaluationError, match=r"(?s)SystemExit.*out of here"),
     ):
-        engine.evaluate(FIRST, CHUNKS[:1])
+        engine.evaluate(around(FIRST, CHUNKS[:1]))

@@ -21,7 +21,7 @@ ERRORS = [kind for kind in vars(errors).values() if isinstance(kind, type) and i
 def test_messages_survive_pickling_and_are_small(chunk):
     widest = spec(chunk_pairs=64, rollout_block_pairs=32)
     point = centre(random_parameters())
-    [result] = DirectEvaluator(widest).evaluate(point, [chunk])
+    [result] = DirectEvaluator(widest).evaluate([(point, chunk)])
     for message in (widest, point, chunk, result):
         text = pickle.dumps(message)
         assert pickle.dumps(pickle.loads(text)) == text

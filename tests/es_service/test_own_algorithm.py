@@ -38,7 +38,7 @@ def test_the_example_weighs_novelty_of_the_better_half_alone():
     descriptor = np.array([[(2.0, 0.0), (9.0, 0.0)], [(1.0, 0.0), (5.0, 0.0)]], np.float32)
     steps = np.ones((2, 2), np.int32)
     population = EpisodesResult(fitness, fitness, descriptor, steps, descriptor, no_observations(2))
-    weights_P = search.weights(state, Ask(0, state.centres[0].centre_D, 0.0), population)
+    weights_P = search.weights(state, Ask(0, state.centres[0].centre_D, 0.02, 4, 0.0), population)
     lowest, second, best = 0.5 / 3 - 0.5, 2 / 3 - 0.5, 0.5  # two share the ranks 0 and 1
     np.testing.assert_allclose(weights_P, [best - lowest, second - lowest], rtol=1e-6)
 
@@ -114,7 +114,8 @@ def emptying(config):
 def foreign(config):
     """An elite of a cell far away, which no centre of the run has been to."""
 
-    def tell(state, evaluation):
+    def tell(state, evaluations):
+        (evaluation,) = evaluations
         elsewhere = np.array([-0.9, 0.9])
         return replace(state, map=insert(state.map, elsewhere, 1.0 * evaluation.generation, 10**6, 0, 0.0)[0])
 
@@ -124,7 +125,8 @@ def foreign(config):
 def choosy(config):
     """Offers every third centre to the map, and does not tell its centre."""
 
-    def tell(state, evaluation):
+    def tell(state, evaluations):
+        (evaluation,) = evaluations
         if evaluation.generation % 3 != 1:
             return state
         fitness = 1.0 * evaluation.generation  # later ones are fitter, wherever they are
@@ -135,7 +137,7 @@ def choosy(config):
 
 def _telling(config, change):
     ours = ALGORITHMS["es"](config)
-    return replace(ours, tell=lambda state, evaluation: change(ours.tell(state, evaluation)))
+    return replace(ours, tell=lambda state, evaluations: change(ours.tell(state, evaluations)))
 
 
 def _newest(archive, count):
@@ -173,3 +175,80 @@ def test_elites_are_those_that_the_map_says_entered(tmp_path):
     for cell, generation in zip(map_.cell_N.tolist(), map_.generation_N.tolist(), strict=True):
         norm = np.linalg.norm(elites[cell].centre_D.astype(np.float64))
         assert norm == pytest.approx(norms[generation], rel=1e-6)
+
+
+# The other examples
+
+
+def started(folder, name, **settings):
+    """A run of an example in which every episode starts in one corner."""
+    search = {"pairs": 32, "sigma": 0.1, "learning_rate": 0.05, "evaluation_episodes": 4, "algorithm": name}
+    config = CONFIG | {
+        "task": {"environment": "point_maze", "episode_steps": 60, "options": {"start": "corner"}},
+        "policy": {"hidden": [8], "init": "small_columns"},
+        "search": search,
+    }
+    return api.run(api.load_config(config, settings), folder).run
+
+
+ADAPTIVE = "tests.examples.adaptive_sigma:adaptive_sigma"
+
+
+def test_sigma_rises_with_success_and_falls_without(tmp_path):
+    """And is stored: a run that was stopped has the same one, and the same bits."""
+    settings = {"search.learning_rate": 0.4, "budget.generations": 20}
+    whole = started(tmp_path / "whole", ADAPTIVE, **settings)
+    started(tmp_path / "parts", ADAPTIVE, **settings | {"budget.generations": 9})
+    assert api.resume(tmp_path / "parts", ["budget.generations=20"]).run.digest() == whole.digest()
+    fitness = whole.history["centre_fitness_mean"].to_numpy()
+    is_success = fitness[1:] > np.maximum.accumulate(fitness)[:-1]
+    assert 2 <= is_success.sum() <= 18
+    sigma = 0.1
+    for success in is_success:
+        sigma = min(1.0, max(0.01, sigma * (1.5 if success else 1.5**-0.25)))
+    own = whole.parts()[1]["own"]
+    assert own["sigma"] == pytest.approx(sigma, rel=1e-12)
+    assert own["sigma"] != pytest.approx(0.1, rel=0.01)
+    assert own["record"] == fitness.max()
+
+
+def test_an_adapted_sigma_is_the_one_that_is_asked_for():
+    search = ALGORITHMS[ADAPTIVE](api.load_config(CONFIG, {"search.algorithm": ADAPTIVE}))
+    state = first_state([np.zeros(3, np.float32)], 2, 1.0, own=search.own)
+    sigmas = []
+    for generation, (fitness, valid) in enumerate([(1, True), (2, True), (2, True), (9, False), (-9, True), (3, True)]):
+        told = CentreEvaluation(generation, 0, valid, fitness, np.zeros(2))
+        state = search.tell(state, (told,))
+        (asked,) = search.ask(state, generation + 1)
+        sigmas.append(asked.sigma)
+        assert (asked.centre, asked.pairs) == (0, 16)
+    exponents = np.array([0, 1, 0.75, 0.5, 0.25, 1.25])
+    np.testing.assert_allclose(sigmas, 0.2 * 1.5**exponents, rtol=1e-12)
+
+
+REPELLING = "tests.examples.repelling_centres:repelling_centres"
+
+
+def test_repelling_centres_end_apart_where_others_meet(tmp_path, monkeypatch):
+    def distances(name):
+        run = started(tmp_path / name, REPELLING, **{"search.centres": 2, "budget.generations": 30})
+        assert run.evaluations["centre"].tolist() == [0, 1] * 31
+        assert run.evaluations["generation"].tolist() == np.repeat(np.arange(31), 2).tolist()
+        place_C_G_2 = [run.evaluations.query(f"centre == {centre}")[["x", "y"]].to_numpy() for centre in (0, 1)]
+        return np.linalg.norm(np.subtract(*place_C_G_2), axis=-1)
+
+    apart = distances("apart")
+    assert apart[0] < 0.01
+    assert apart[10:].min() > 0.5
+    monkeypatch.setattr("tests.examples.repelling_centres.REACH", 0.0)
+    assert distances("together")[10:].max() < 0.1
+
+
+def test_repelling_centres_go_on_where_they_were_with_the_same_bits(tmp_path):
+    settings = {"search.centres": 3, "budget.generations": 6}
+    whole = started(tmp_path / "whole", REPELLING, **settings)
+    started(tmp_path / "parts", REPELLING, **settings | {"budget.generations": 3})
+    assert api.resume(tmp_path / "parts", ["budget.generations=6"]).run.digest() == whole.digest()
+    alone = started(tmp_path / "alone", REPELLING, **settings | {"search.centres": 1})
+    plain = started(tmp_path / "es", "es", **settings | {"search.centres": 1})
+    assert alone.digest() == plain.digest(), "one centre has nobody to repel"

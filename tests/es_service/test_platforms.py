@@ -62,10 +62,10 @@ def test_workers_of_several_kinds_make_a_run_mixed_from_the_generation_they_join
     class Cluster(InThisProcess):
         """Whose workers come up in the generations of `joins`."""
 
-        def evaluate(self, centre, chunks):
-            kind = joins.get(centre.generation, "" if joins and 0 in joins else platform_text(platform_info()))
+        def evaluate(self, work):
+            kind = joins.get(work[0][0].generation, "" if joins and 0 in joins else platform_text(platform_info()))
             self.platforms |= {kind} - {""}
-            return super().evaluate(centre, chunks)
+            return super().evaluate(work)
 
     @contextmanager
     def engine(config, should_stop, log):

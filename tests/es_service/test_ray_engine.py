@@ -9,14 +9,15 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from es_service.dispatch.engine import Answer, Engine
 from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import ONE_CORE, Membership, look
-from es_service.dispatch.ray_engine import Actors
+from es_service.dispatch.ray_engine import IN_CALL_BYTES, Actors
 from es_service.errors import EvaluationError
-from es_service.protocol.messages import TrainingChunk
+from es_service.protocol.messages import KEPT_CENTRES, TrainingChunk, around
 from tests.helpers import SPEC, centre, random_parameters
 
 FIRST = centre(random_parameters())
@@ -63,6 +64,9 @@ class PretendedRay:
         self.actors: list[Actor] = []
         self.on_run: Callable[[Actor], Any] = lambda actor: None
         self.node_of: Callable[[int], str] = lambda number: "node"
+        self.calls: list[tuple[Any, ...]] = []
+        """Arguments of each call of `run`."""
+        self.stored: list[bytes] = []
 
     def remote(self, **_: Any) -> Callable[[type], Any]:
         return lambda cls: SimpleNamespace(remote=self._start)
@@ -77,6 +81,11 @@ class PretendedRay:
         if ref.error is not None:
             raise ref.error
         return ref.value
+
+    def put(self, value: bytes) -> int:
+        """Stores a value under its index, which stands for a reference."""
+        self.stored.append(value)
+        return len(self.stored) - 1
 
     def kill(self, actor: Any, no_restart: bool) -> None:
         self.end(actor.itself)
@@ -102,7 +111,7 @@ class PretendedRay:
         methods = {
             "place": lambda: ("host", actor.number, self.node_of(actor.number)),
             "build": lambda: f"kind {actor.number % 2}",
-            "run": lambda centre, chunks: pickle.dumps([f"of {chunk}" for chunk in pickle.loads(chunks)]),
+            "run": lambda chunks, *centres: pickle.dumps([f"of {chunk}" for _, chunk in pickle.loads(chunks)]),
         }
         calls = {name: SimpleNamespace(remote=self._caller(actor, name, body)) for name, body in methods.items()}
         return SimpleNamespace(itself=actor, **calls)
@@ -111,6 +120,8 @@ class PretendedRay:
         def call(*arguments: Any) -> Ref:
             ref = Ref(body(*arguments))
             actor.owed.append(ref)
+            if name == "run":
+                self.calls.append(arguments)
             if name == "run" and actor.state == "alive":
                 actor.ran += 1
                 self.on_run(actor)
@@ -139,9 +150,9 @@ class PretendedWatch:
 
 
 def transport(
-    ray: PretendedRay, limits: Limits, watch: PretendedWatch | None = None, room: int | None = None
+    ray: PretendedRay, limits: Limits, watch: PretendedWatch | None = None, most: int | None = None
 ) -> Actors:
-    return Actors(ray, SPEC, type(None), ONE_CORE, watch, room, limits)
+    return Actors(ray, SPEC, type(None), ONE_CORE, watch, most, limits)
 
 
 def ray_engine(ray: PretendedRay, limits: Limits, watch: PretendedWatch | None = None) -> Engine[Actors]:
@@ -160,9 +171,9 @@ def test_a_node_that_dies_is_one_fault_of_what_it_ran_however_many_workers_it_he
 
     with ray_engine(ray, limits) as engine:
         while not all(actor.ran for actor in ray.actors):  # so that all are up
-            engine.evaluate(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)])
+            engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
         ray.on_run = node_dies
-        assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
+        assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert engine.counts.lost_workers == 5
 
 
@@ -183,9 +194,9 @@ def test_an_actor_that_waited_for_its_place_says_once_that_it_has_one():
     assert [actors.receive(0.0) for _ in range(3)] == [Placed(1), WorkerUp(1), None]
     ray.end(ray.actors[1])
     for worker in (1, 0):
-        actors.send(worker, FIRST, "key", 1, [CHUNK])
+        actors.send(worker, "key", 1, around(FIRST, [CHUNK]))
     assert isinstance(actors.receive(0.0), WorkerLost)
-    actors.send(0, FIRST, "other key", 1, [CHUNK])
+    actors.send(0, "other key", 1, around(FIRST, [CHUNK]))
     assert [type(actors.receive(0.0)) for _ in range(3)] == [Answer, Answer, type(None)]
 
 
@@ -199,7 +210,7 @@ def test_an_actor_that_is_given_no_place_is_not_lost():
 
     with ray_engine(ray, limits) as engine:
         ray.on_run = hang
-        assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
+        assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert len(ray.actors) > 8
         assert engine.counts.lost_workers == 1
         assert "no answer to work item" in engine.last_loss
@@ -217,7 +228,7 @@ def test_the_wait_for_a_first_place_is_the_policy_s(watch, message):
     since it has room for all: more nodes would not help."""
     limits = Limits(1, start_deadline_s=0.2, no_worker_timeout_s=0.4)
     with pytest.raises(EvaluationError, match=message) as caught, ray_engine(PretendedRay(0), limits, watch) as engine:
-        engine.evaluate(FIRST, [CHUNK])
+        engine.evaluate(around(FIRST, [CHUNK]))
     assert ("Add nodes" in str(caught.value)) == (watch is not None)
 
 
@@ -226,16 +237,16 @@ def test_a_node_that_dies_under_idle_workers_takes_none_of_the_others_along():
     was not seen yet, or when no node at all is seen."""
     ray, watch = PretendedRay(), PretendedWatch()
     ray.node_of = lambda number: "old" if number < 2 else "new"
-    actors = transport(ray, Limits(4), watch, room=4)
+    actors = transport(ray, Limits(4), watch, most=4)
     with Engine(actors, Limits(4)) as engine:
         for alive in ({"old"}, {"old", "new"}, set(), {"old", "new"}):
             watch.now = Membership(4, frozenset(), frozenset(alive))
-            engine.evaluate(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)])
+            engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
             assert engine.counts.lost_workers == 0
         for number in range(2):
             ray.end(ray.actors[number])
         watch.now = Membership(2, frozenset(), frozenset({"new"}))
-        assert engine.evaluate(FIRST, [CHUNK]) == [f"of {CHUNK}"]
+        assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert (engine.counts.lost_workers, engine.counts.workers, engine.counts.retries) == (2, 2, 0)
         assert "its node died" in engine.last_loss
         assert [actor.state for actor in ray.actors[:4]] == ["dead", "dead", "alive", "alive"]
@@ -256,19 +267,21 @@ def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
     """Those that leave with their node's consent, then those lost with theirs, then how many there should be."""
     ray, watch = PretendedRay(), PretendedWatch()
     ray.node_of = str
-    actors = transport(ray, Limits(3), watch, room=3)
+    actors = transport(ray, Limits(3), watch, most=3)
     watch.now = Membership(3, frozenset(), frozenset("012"))
     for worker in range(3):
         actors.start(worker)
     while actors.receive(0.0):
         pass
-    actors.send(0, FIRST, "key", 1, [CHUNK])
+    actors.send(0, "key", 1, around(FIRST, [CHUNK]))
     watch.now = Membership(1, frozenset("1"), frozenset("12"))
     told = [actors.receive(0.0) for _ in range(4)]
     assert told[0] == Drain(1)
     assert isinstance(told[1], WorkerLost)
     assert (told[1].worker, told[1].bystander) == (0, False)
     assert told[2:] == [SetWorkers(1), None]
+    watch.now = Membership(7, frozenset("1"), frozenset("12"))
+    assert [actors.receive(0.0) for _ in range(2)] == [SetWorkers(3), None], "no more than there is work for"
 
 
 @pytest.mark.parametrize("error", [RayTaskError, ActorDiedError])
@@ -278,7 +291,7 @@ def test_what_is_said_of_an_error_has_no_colours(error, call):
     ray = PretendedRay()
     actors = transport(ray, Limits(1))
     actors.start(0)
-    actors.send(0, FIRST, "key", 1, [CHUNK])
+    actors.send(0, "key", 1, around(FIRST, [CHUNK]))
     ray.actors[0].owed[call].error = error("\x1b[36mray::worker-0\x1b[39m: \x1b[1;31mno\x1b[0m")
     told = [actors.receive(0.0) for _ in range(3)]
     said = [message.reason for message in told if isinstance(message, WorkerLost)]
@@ -291,8 +304,37 @@ def test_a_chunk_that_kills_its_workers_is_found_out_after_as_many_as_it_has_att
     """Although all the others were asked whether they are still there: they are."""
     ray = PretendedRay()
     with ray_engine(ray, Limits(9)) as engine:
-        engine.evaluate(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)])
+        engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
         ray.on_run = ray.end
         with pytest.raises(EvaluationError, match="TrainingChunk 0 of generation 3 failed in 4 attempts"):
-            engine.evaluate(FIRST, [CHUNK])
+            engine.evaluate(around(FIRST, [CHUNK]))
         assert engine.counts.lost_workers == 4
+
+
+@pytest.mark.parametrize("size", [1, IN_CALL_BYTES // 4])
+def test_a_call_has_each_of_its_centres_once_and_a_large_one_is_stored_once_while_it_is_new(size):
+    ray = PretendedRay()
+    points = [centre(np.full(size, number)) for number in range(KEPT_CENTRES + 2)]
+
+    def evaluate(*numbers: int) -> int:
+        """Evaluates chunks of these centres; returns how many values were stored for that."""
+        work = [(points[number], TrainingChunk(3, number, position)) for position, number in enumerate(numbers)]
+        stored = len(ray.stored)
+        ray.calls.clear()
+        assert engine.evaluate(work) == [f"of {chunk}" for _, chunk in work]
+        for packed, *centres in ray.calls:
+            known = [pickle.loads(ray.stored[one] if isinstance(one, int) else one) for one in centres]
+            chunks = pickle.loads(packed)
+            assert [known[index].parameters_D[0] for index, _ in chunks] == [chunk.chunk_id for _, chunk in chunks]
+            assert sorted({index for index, _ in chunks}) == list(range(len(known)))
+            assert len({one.parameters_D[0] for one in known}) == len(known)
+        return len(ray.stored) - stored
+
+    with ray_engine(ray, Limits(2, item_s=60.0)) as engine:
+        found = [evaluate(0) for _ in range(3)]  # so that it is known how long a chunk takes
+        found += [evaluate(0, 1, 1, 0), evaluate(*range(KEPT_CENTRES)), evaluate(0, 1), evaluate(KEPT_CENTRES)]
+        found += [evaluate(1, 2), evaluate(0)]  # the oldest was forgotten
+        evaluate(1, 2, 3, 2)
+        assert max(len(centres) for _, *centres in ray.calls) > 1
+    large = [1, 0, 0, 1, KEPT_CENTRES - 2, 0, 1, 0, 1]
+    assert found == ([0] * 9 if size == 1 else large)

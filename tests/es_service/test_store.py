@@ -15,15 +15,24 @@ from es_service.loop.history import Column
 from es_service.store import create as store_create
 from es_service.store import upkeep as store_upkeep
 from es_service.store.beginning import Beginning
-from es_service.store.reader import read_generation, read_history, read_meta, read_parts, read_platforms
+from es_service.store.reader import (
+    read_evaluations,
+    read_generation,
+    read_history,
+    read_meta,
+    read_parts,
+    read_platforms,
+)
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     COLUMNS,
     CONFIG_YAML,
     advance,
+    assert_same_evaluations,
     assert_same_history,
     assert_same_state,
     create,
+    evaluated,
     finished,
     history_row,
     meta,
@@ -228,7 +237,7 @@ def test_the_log_is_emptied_by_bytes_and_by_time(tmp_path, monkeypatch):
 def test_a_fork_begins_with_its_parent_s_history_and_state(tmp_path):
     history = [history_row(generation) for generation in range(4)]
     platforms = [(0, {"jax": "1"}), (2, {"jax": "2"})]
-    beginning = Beginning(iter(history), state_at(3), platforms, newest=3)
+    beginning = Beginning(iter(history), state_at(3), platforms, newest=3, evaluations=map(evaluated, range(4)))
     with RunStore.create(tmp_path / "run", CONFIG_YAML, meta(), beginning) as run:
         assert run.generation == 3
         assert run.start is None
@@ -237,6 +246,8 @@ def test_a_fork_begins_with_its_parent_s_history_and_state(tmp_path):
         advance(run, 5)
     assert read_platforms(tmp_path / "run") == platforms
     assert_same_history(read_history(tmp_path / "run"), 6)
+    assert_same_evaluations(read_evaluations(tmp_path / "run"), 6)
+    assert_same_evaluations(read_evaluations(tmp_path / "run", 0, 4), 4)
     with RunStore.open(tmp_path / "run") as run:
         assert run.notices == []
         assert_same_state(run.load(), state_at(5))
@@ -251,6 +262,7 @@ def test_a_fork_s_columns_are_its_own(tmp_path):
     first = read_history(tmp_path / "run")[0]
     assert math.isnan(first["goal_distance"])
     assert "gone" not in first
+    assert [len(centres) for centres in read_evaluations(tmp_path / "run")] == [0, 2, 1], "the parent had none"
 
 
 def test_a_start_is_kept_with_the_run(tmp_path):

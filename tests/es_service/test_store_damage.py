@@ -12,7 +12,7 @@ import pytest
 from es_service.errors import StoreError
 from es_service.store.codec import encode_part
 from es_service.store.digest import digest_parts
-from es_service.store.reader import read_generation, read_history, read_parts, read_platforms
+from es_service.store.reader import read_evaluations, read_generation, read_history, read_parts, read_platforms
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     advance,
@@ -22,6 +22,7 @@ from tests.es_service.store_examples import (
     copy_at_every_commit,
     create,
     digest,
+    evaluated,
     finished,
     flip_bit,
     history_row,
@@ -59,6 +60,17 @@ def test_a_damaged_newest_history_row_falls_back_one_generation(tmp_path):
         read_history(folder)
     with RunStore.open(folder) as run:
         assert "history row of generation 5" in run.notices[0]
+        assert run.generation == 4
+    assert_sound(folder, 4)
+
+
+def test_a_damaged_record_of_evaluated_centres_falls_back_one_generation(tmp_path):
+    folder = finished(tmp_path / "run", 6)
+    value = np.asarray(evaluated(5)[1]["fitness_mean"], "<f8").tobytes()
+    flip_bit(folder / "run.db", position_of(folder / "run.db", value))
+    with pytest.raises(StoreError, match="history row of generation 5"):
+        read_evaluations(folder)
+    with RunStore.open(folder) as run:
         assert run.generation == 4
     assert_sound(folder, 4)
 

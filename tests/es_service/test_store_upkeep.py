@@ -82,9 +82,9 @@ def test_a_copy_checks_only_rows_that_the_former_one_has_not(tmp_path, monkeypat
     checked: list[int] = []
     sound = store_verify.row_is_sound
 
-    def counted(columns, row, state, sha256):
+    def counted(columns, row, *stored):
         checked.append(row[0])
-        return sound(columns, row, state, sha256)
+        return sound(columns, row, *stored)
 
     copy_at_every_commit(monkeypatch)
     copy = tmp_path / "run" / "run.db.copy"

@@ -1,4 +1,4 @@
-"""Small ME-ES runs in memory, and what was sent to and from their workers."""
+"""Small runs in memory, of ME-ES unless another search is named, and what was sent to and from their workers."""
 
 from functools import cache
 
@@ -8,6 +8,7 @@ from es_service.api import load_config
 from es_service.config.model import worker_spec
 from es_service.loop import driver
 from es_service.protocol.messages import EvaluationChunk, PolicyShape
+from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
@@ -23,7 +24,7 @@ PRESETS = {
 }
 
 
-def config_of(preset="literature", generations=30, seed=0, neighbours=3, **search):
+def config_of(preset="literature", generations=30, seed=0, neighbours=3, cells=CELLS, **search):
     return load_config(
         {
             "task": {"environment": "point_maze"},
@@ -40,7 +41,7 @@ def config_of(preset="literature", generations=30, seed=0, neighbours=3, **searc
                 **search,
             },
             "novelty": {"neighbours": neighbours},
-            "map": {"cells": list(CELLS)},
+            "map": {"cells": list(cells)},
             "budget": {"generations": generations},
             "compute": {"chunk_pairs": 16},
             "seed": seed,
@@ -60,42 +61,48 @@ class Sharing(DirectEvaluator):
         self.counts, self._run_chunk = compiled(preset).counts, compiled(preset)._run_chunk
         self.recorded, self.spoiled = [], spoiled
 
-    def evaluate(self, centre, chunks):
-        results = super().evaluate(centre, chunks)
-        for chunk, result in zip(chunks, results, strict=True):
+    def evaluate(self, work):
+        results = super().evaluate(work)
+        for (_, chunk), result in zip(work, results, strict=True):
             if isinstance(chunk, EvaluationChunk) and chunk.generation in self.spoiled:
                 result.descriptor[1] = np.nan
         return results
 
 
 class Remembering(MemoryStore):
-    """Keeps the parts as they were after each generation."""
+    """Keeps the parts as they were after each generation, and its evaluated centres."""
 
     def __init__(self):
         super().__init__()
-        self.after = []
+        self.after, self.evaluated = [], []
 
-    def commit(self, generation, parts, history):
-        super().commit(generation, parts, history)
+    def commit(self, generation, parts, history, evaluations=()):
+        super().commit(generation, parts, history, evaluations)
         self.after.append(dict(self.parts))
+        self.evaluated.append([dict(row) for row in evaluations])
 
 
-def run_in_memory(config, evaluator=None, store=None):
+def first_centres(config):
+    return [initial_parameters(SHAPE, config.policy.init, config.seed, i) for i in range(config.search.centres)]
+
+
+def run_in_memory(config, evaluator=None, store=None, algorithm=None):
     evaluator, store = evaluator or Sharing(config.search.preset), store or Remembering()
-    first = initial_parameters(SHAPE, config.policy.init, config.seed, 0)
+    algorithm = algorithm or ALGORITHMS[config.search.algorithm](config)
     search = driver.Search(
-        config, ALGORITHMS["me_es"](config), lambda: ([first], no_observations(2)), SHIPPED["point_maze"]
+        config, algorithm, lambda: (first_centres(config), no_observations(2)), SHIPPED["point_maze"]
     )
     state, _ = driver.run(search, evaluator, store, driver.stored_state(store, search.task), lambda row: None)
     return state, store, evaluator
 
 
-def points(evaluator, kind, generation):
-    """The centre that all chunks of a kind were sent around, and all their results in the order of their ids."""
+def points(evaluator, kind, generation, ask=0):
+    """The centre that all of an ask's chunks of a kind were sent around, and all their results in the order of ids."""
     found = [
         (chunk.chunk_id, point, result)
         for point, chunk, result in evaluator.recorded
         if isinstance(chunk, kind) and chunk.generation == generation
+        if (chunk.ask if generation else chunk.chunk_id // 2) == ask  # two chunks for each initial centre
     ]
     found.sort(key=lambda item: item[0])
     assert len({id(point) for _, point, _ in found}) == 1
@@ -103,14 +110,26 @@ def points(evaluator, kind, generation):
     return found[0][1], np.concatenate([r.fitness for r in results]), np.concatenate([r.descriptor for r in results])
 
 
-def evaluation(evaluator, generation):
+def evaluation(evaluator, generation, ask=0):
     """Mean fitness and descriptor over the 20 episodes of an evaluated centre."""
-    _, fitness, descriptor = points(evaluator, EvaluationChunk, generation)
+    _, fitness, descriptor = points(evaluator, EvaluationChunk, generation, ask)
     return fitness[:20].astype(float).mean(), descriptor[:20].astype(float).mean(axis=0)
 
 
-def number(index):
-    return None if index is None else cell_number(CELLS, index)
+def noise_of(generation, ask=0, pairs=32):
+    """The noise of an ask's pairs; only asks after the first are part of its address."""
+    ids = (np.arange(pairs), ask) if ask else (np.arange(pairs),)
+    return [normals(key, SHAPE.parameters) for key in stream_keys(0, Domain.PARAMETER_NOISE, generation, *ids)]
+
+
+def drawn(generation, last, emitter, count):
+    """Random numbers for a choice of an emitter; only emitters after the first are part of their address."""
+    key = stream_keys(0, Domain.SELECTION, generation, last, *((emitter,) if emitter else ()))
+    return uniforms(key, np.arange(count, dtype=np.uint32)).tolist()
+
+
+def number(index, cells=CELLS):
+    return None if index is None else cell_number(cells, index)
 
 
 def assert_near(ours, theirs):

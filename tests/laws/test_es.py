@@ -156,9 +156,9 @@ class Tampering(DirectEvaluator):
         super().__init__(worker_spec)
         self.spoil = spoil
 
-    def evaluate(self, centre, chunks):
-        results = super().evaluate(centre, chunks)
-        return [self.spoil(c, r) if isinstance(r, EpisodesResult) else r for c, r in zip(chunks, results, strict=True)]
+    def evaluate(self, work):
+        found = zip(work, super().evaluate(work), strict=True)
+        return [self.spoil(c, r) if isinstance(r, EpisodesResult) else r for (_, c), r in found]
 
 
 def test_invalid_members_rank_last_are_counted_and_do_not_stop_the_run():
@@ -195,7 +195,7 @@ def test_a_centre_that_is_not_finite_stops_the_run_before_it_is_kept():
     search = driver.Search(
         config, ALGORITHMS["es"](config), lambda: ([first], no_observations(2)), SHIPPED["point_maze"]
     )
-    with pytest.raises(EvaluationError, match=r"generation 1: the centre is not finite.*learning_rate = 1e\+300"):
+    with pytest.raises(EvaluationError, match=r"generation 1: a centre is not finite.*learning_rate = 1e\+300"):
         driver.run(search, evaluator, store, None, lambda row: None)
     assert store.generation == 0
 
@@ -253,8 +253,8 @@ class Inventing:
         self.sum_D = np.ones(parameters, np.float32)
         self.rng = np.random.default_rng(0)
 
-    def evaluate(self, centre, chunks):
-        return [self.answer(chunk) for chunk in chunks]
+    def evaluate(self, work):
+        return [self.answer(chunk) for _, chunk in work]
 
     def answer(self, chunk):
         if isinstance(chunk, GradientChunk):

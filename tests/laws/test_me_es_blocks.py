@@ -152,8 +152,8 @@ def state_at(map_):
 def test_cells_are_drawn_in_these_proportions(mode, sampling, expected):
     map_ = line(SPREAD, fitness=[9, 8, 1, 5, 2, 3, 4], scores=[19, 2, 11, 12, 7, 5, 8])
     config = config_of(mode=mode, cell_sampling=sampling, neighbours=1)
-    start_cell = ALGORITHMS["me_es"](config).start_cell
-    drawn = [start_cell(state_at(map_), generation) for generation in range(1, 3 * 3000, BLOCK)]
+    start_cells = ALGORITHMS["me_es"](config).start_cells
+    drawn = [start_cells(state_at(map_), generation)[0] for generation in range(1, 3 * 3000, BLOCK)]
     share = [drawn.count(cell) / 3000 for cell in SPREAD]
     assert sum(share) == pytest.approx(1.0)
     np.testing.assert_allclose(share, expected, atol=4 * np.sqrt(0.25 / 3000))
@@ -161,9 +161,10 @@ def test_cells_are_drawn_in_these_proportions(mode, sampling, expected):
 
 
 def test_a_cell_is_drawn_only_where_a_block_begins_and_an_elite_is_there():
-    start_cell = ALGORITHMS["me_es"](config_of()).start_cell
-    assert [start_cell(state_at(line([7])), generation) for generation in range(1, 8)] == [7, None, None] * 2 + [7]
-    assert start_cell(state_at(line([])), 1) is None
+    start_cells = ALGORITHMS["me_es"](config_of()).start_cells
+    begun = [start_cells(state_at(line([7])), generation) for generation in range(1, 8)]
+    assert begun == [{0: 7}, {}, {}] * 2 + [{0: 7}]
+    assert start_cells(state_at(line([])), 1) == {}
 
 
 # What an evaluation changes

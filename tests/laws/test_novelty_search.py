@@ -6,7 +6,7 @@ import pytest
 from es_service.api import load_config
 from es_service.config.model import worker_spec
 from es_service.loop import driver
-from es_service.loop.generation import invalidate
+from es_service.loop.checks import invalidate
 from es_service.loop.parts import state_from_parts
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicyShape, TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
@@ -122,8 +122,8 @@ def test_a_state_put_together_again_is_the_same_and_only_the_moved_centre_is_wri
     config = config_of("nsra_es")
 
     class Recording(MemoryStore):
-        def commit(self, generation, parts, history):
-            super().commit(generation, parts, history)
+        def commit(self, generation, parts, history, evaluations=()):
+            super().commit(generation, parts, history, evaluations)
             centres = {name for name in parts if name.startswith("centre_")}
             wanted = range(5) if generation == 0 else [history["centre"]]
             assert centres == {f"centre_{centre}" for centre in wanted}
@@ -221,7 +221,7 @@ def weights_of(fitnesses, start, **rule):
     weight, values = FitnessWeight(start), []
     for generation, fitness in enumerate(fitnesses, 1):
         valid = fitness is not None
-        weight = adapted_weight(search, weight, CentreEvaluation(generation, 0, valid, fitness or 0.0, np.zeros(2)))
+        weight = adapted_weight(search, weight, (CentreEvaluation(generation, 0, valid, fitness or 0.0, np.zeros(2)),))
         values.append(round(weight.value, 10))
     return values, weight
 
@@ -268,8 +268,8 @@ def test_invalid_members_are_last_whatever_is_climbed(weight):
     fitness = np.array([[1.0, np.nan], [9.0, 2.0]], np.float32)
     descriptor = np.array([[(1.0, 0.0), (50.0, 0.0)], [(np.inf, 0.0), (2.0, 0.0)]], np.float32)
     population = EpisodesResult(fitness, fitness, descriptor, np.ones((2, 2), np.int32), fitness, no_observations(2))
-    population, invalid = invalidate(population, 0.5, 1)
-    assert invalid == 2
+    (population,) = invalidate([population], 0.5, 1)
+    assert np.isnan(population.fitness).sum() == 2
     state = archived(first_state([np.zeros(1, np.float32)], 2, weight), CentreEvaluation(0, 0, True, 0.0, np.zeros(2)))
     utility = mixed_utilities(state, weight, population, config_of("nsr_es").novelty)
     assert utility[0, 1] == utility[1, 0] == utility.min() < utility[0, 0] < utility[1, 1] == utility.max()
@@ -278,9 +278,9 @@ def test_invalid_members_are_last_whatever_is_climbed(weight):
 class Spoiling(DirectEvaluator):
     """Evaluations of some generations end nowhere."""
 
-    def evaluate(self, centre, chunks):
-        results = super().evaluate(centre, chunks)
-        for chunk, result in zip(chunks, results, strict=True):
+    def evaluate(self, work):
+        results = super().evaluate(work)
+        for (_, chunk), result in zip(work, results, strict=True):
             if isinstance(chunk, EvaluationChunk) and chunk.generation in (0, 3):
                 result.descriptor[1] = np.nan
             if isinstance(chunk, TrainingChunk):

@@ -228,7 +228,9 @@ def test_what_a_resume_has_changed_is_so_for_a_fork_and_an_evaluation(parent, tm
     config = lineage.fork_config(folder, ["search.sigma=0.1"])
     assert (config.budget.generations, config.compute.engine, config.compute.compile_timeout_s) == (7, "inline", 77.0)
     seen = []
-    monkeypatch.setattr(evaluation, "dispatch_limits", lambda config: seen.append(config) or dispatch_limits(config))
+    monkeypatch.setattr(
+        evaluation, "dispatch_limits", lambda config, most: seen.append(config) or dispatch_limits(config, most)
+    )
     list(evaluation.evaluate(run, [], episodes=1, workers=1))
     assert seen[0].compute.compile_timeout_s == 77.0
     recorded.unlink()

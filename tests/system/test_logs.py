@@ -19,7 +19,7 @@ def test_every_record_of_a_run_carries_its_id_and_its_generation(tmp_path, caplo
         outcome = api.run(SHORT, tmp_path / "run")
     assert {record.run for record in caplog.records} == {outcome.run.run_id}
     generations = [record.generation for record in caplog.records if record.name == "es_service.runs.session"]
-    assert generations == [0, 0, 1, 2, 3]  # the session begins; generations 0 to 2; the session ends before 3
+    assert generations == [0, 0, 0, 1, 2, 3]  # twice at the beginning; generations 0 to 2; the end, before 3
     committed = [record for record in caplog.records if record.name == "es_service.store.writer"]
     assert [record.generation for record in committed] == [0, 1, 2]
     assert all(record.getMessage().startswith(f"stored generation {record.generation}:") for record in committed)

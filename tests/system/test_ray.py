@@ -19,7 +19,7 @@ from es_service.dispatch.events import Limits
 from es_service.dispatch.ray_cluster import Claim
 from es_service.dispatch.ray_engine import Actors, ray_engine
 from es_service.errors import EvaluationError
-from es_service.protocol.messages import TrainingChunk, WorkerPlace
+from es_service.protocol.messages import TrainingChunk, WorkerPlace, around
 from es_service.protocol.process_environment import worker_environment
 from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation
@@ -83,8 +83,8 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
     faults = {4: signal.SIGKILL, 12: signal.SIGSTOP}
     send = Actors.send
 
-    def send_and_strike(self, worker, centre, key, attempt, chunks):
-        send(self, worker, centre, key, attempt, chunks)
+    def send_and_strike(self, worker, key, attempt, work):
+        send(self, worker, key, attempt, work)
         number = faults.pop(key.generation, None) if key.kind == "TrainingChunk" else None
         if number is not None:
             os.kill(self.places()[worker].pid, number)
@@ -131,7 +131,7 @@ def test_workers_that_raise_while_starting_stop_the_run_with_their_error():
         pytest.raises(EvaluationError, match=r"no worker started in 3 consecutive attempts(.|\n)*no_such_task"),
         ray_engine(spec(environment="no_such_task"), Limits(1, restart_backoff_s=0.0), actor=WorkerActor) as engine,
     ):
-        engine.evaluate(centre(random_parameters()), [TrainingChunk(1, 0)])
+        engine.evaluate(around(centre(random_parameters()), [TrainingChunk(1, 0)]))
 
 
 def test_a_chunk_that_raises_everywhere_stops_the_run_with_its_error():
@@ -140,7 +140,7 @@ def test_a_chunk_that_raises_everywhere_stops_the_run_with_its_error():
         pytest.raises(EvaluationError, match=r"TrainingChunk 0 of generation 1 failed in 2 attempts(.|\n)*TypeError"),
         ray_engine(spec(), Limits(1, max_attempts=2), actor=WorkerActor) as engine,
     ):
-        engine.evaluate(centre(wrong), [TrainingChunk(1, 0)])
+        engine.evaluate(around(centre(wrong), [TrainingChunk(1, 0)]))
 
 
 def test_a_cluster_without_room_is_named_with_what_it_has(monkeypatch):
@@ -204,7 +204,7 @@ def with_two_pretended_gpus(monkeypatch):
 
 def mirrored(workers: int, claim: Claim) -> list[tuple[int, list[str], dict[str, str]]]:
     with ray_engine(spec(), Limits(workers), actor=Mirror, claim=claim) as engine:
-        answers = engine.evaluate(centre(random_parameters()), [TrainingChunk(1, chunk) for chunk in range(16)])
+        answers = engine.evaluate(around(centre(random_parameters()), [TrainingChunk(1, chunk) for chunk in range(16)]))
     return list({answer[0]: answer for answer in answers}.values())
 
 

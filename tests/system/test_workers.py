@@ -76,9 +76,9 @@ def test_order_of_chunks(tmp_path, reference, monkeypatch):
     rng = random.Random(0)
     evaluate = Engine.evaluate
 
-    def shuffled(self, centre, chunks):
-        order = rng.sample(range(len(chunks)), len(chunks))
-        results = evaluate(self, centre, [chunks[i] for i in order])
+    def shuffled(self, work):
+        order = rng.sample(range(len(work)), len(work))
+        results = evaluate(self, [work[i] for i in order])
         return [result for _, result in sorted(zip(order, results, strict=True), key=lambda item: item[0])]
 
     monkeypatch.setattr(Engine, "evaluate", shuffled)
@@ -137,10 +137,11 @@ def test_a_chunk_that_fails_everywhere_ends_the_run_with_its_error(tmp_path, mon
     """A poison chunk: the message names it and carries the worker's own traceback; what is committed stays."""
     evaluate = Engine.evaluate
 
-    def poisoned(self, centre, chunks):
-        if centre.generation == 3 and isinstance(chunks[0], TrainingChunk):
-            chunks = [type(chunk)(chunk.generation, "two") if chunk.chunk_id == 2 else chunk for chunk in chunks]
-        return evaluate(self, centre, chunks)
+    def poisoned(self, work):
+        if work[0][0].generation == 3 and isinstance(work[0][1], TrainingChunk):
+            poison = TrainingChunk(3, "two")
+            work = [(centre, poison if chunk.chunk_id == 2 else chunk) for centre, chunk in work]
+        return evaluate(self, work)
 
     monkeypatch.setattr(Engine, "evaluate", poisoned)
     with pytest.raises(

@@ -44,6 +44,7 @@ class Elite:
     score: float
     """Highest fitness in the population that led to it or, later, that it led; NaN without one."""
     centre: Any = None
+    emitter: int = 0
 
 
 class GridMap:

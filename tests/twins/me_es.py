@@ -58,13 +58,17 @@ def roulette(share_of, cells, uniform):
 
 
 class MapElitesES:
-    def __init__(self, centre, map_, learning_rate, l2, *, mode, first_block, length, sampling, neighbours, squared):
+    def __init__(
+        self, centre, map_, learning_rate, l2, *, mode, first_block, length, sampling, neighbours, squared, emitter=0
+    ):
         """map_: an empty GridMap; length: generations in a block; mode: explore, exploit or explore_exploit."""
         self.map, self.archive, self.evaluated_in = map_, [], []
         self.learning_rate, self.l2 = learning_rate, l2
-        self.mode, self.first_block, self.length, self.sampling = mode, first_block, length, sampling
+        self.mode, self.length, self.sampling = mode, length, sampling
+        self.first_block = other(first_block) if emitter % 2 else first_block
         self.neighbours, self.squared = neighbours, squared
-        self.es, self.climbs, self.left, self.cell = ES(centre, learning_rate, l2), None, 0, None
+        self.es, self.climbs, self.left, self.elite = ES(centre, learning_rate, l2), None, 0, None
+        self.emitter = emitter
 
     def start(self, first, second):
         """Begin a generation, and with it a block where one is due: the cell it starts from, else None."""
@@ -72,17 +76,15 @@ class MapElitesES:
         if self.left == 0:
             self.climbs, self.left = self.next_objective(), self.length
             start_cell = self.drawn_cell(first, second)
-            self.es = ES(self.map.elites[start_cell].centre, self.learning_rate, self.l2)
-            self.cell = start_cell
+            self.elite = self.map.elites[start_cell]
+            self.es = ES(self.elite.centre, self.learning_rate, self.l2)
         self.left -= 1
         return start_cell
 
     def next_objective(self):
         if self.mode != "explore_exploit":
             return self.mode
-        if self.climbs is None:
-            return self.first_block
-        return "exploit" if self.climbs == "explore" else "explore"
+        return self.first_block if self.climbs is None else other(self.climbs)
 
     def drawn_cell(self, first, second):
         elites = self.map.elites
@@ -94,7 +96,7 @@ class MapElitesES:
 
     def elite_novelty(self, elite):
         """In today's archive, without the entry that the elite itself made."""
-        own = self.evaluated_in.index(elite.generation)
+        own = self.evaluated_in.index((elite.generation, elite.emitter))
         return novelty(self.archive, elite.descriptor, self.neighbours, self.squared, without=own)
 
     def climb(self, noise_P_D, fitness_P_S, descriptor_P_S_B):
@@ -106,9 +108,24 @@ class MapElitesES:
 
     def evaluated(self, generation, fitness, descriptor, population_max=math.nan):
         """Learn from a centre's evaluation: the cell it entered, or None."""
-        if self.cell is not None and generation > 0:
-            self.map.elites[self.cell].score = population_max
-        self.cell = self.map.insert(Elite(fitness, descriptor, generation, population_max, self.es.centre))
+        if self.elite is not None and generation > 0:
+            self.elite.score = population_max  # which no one will see if another elite has taken its cell
+        self.elite = Elite(fitness, descriptor, generation, population_max, self.es.centre, self.emitter)
+        cell = self.map.insert(self.elite)
+        if cell is None:
+            self.elite = None
         self.archive.append(descriptor)
-        self.evaluated_in.append(generation)
-        return self.cell
+        self.evaluated_in.append((generation, self.emitter))
+        return cell
+
+
+def other(climbs):
+    return "exploit" if climbs == "explore" else "explore"
+
+
+def side_by_side(centres, map_, *settings, **more):
+    """Emitters that share a map and an archive: one twin for each centre."""
+    emitters = [MapElitesES(centre, map_, *settings, emitter=i, **more) for i, centre in enumerate(centres)]
+    for emitter in emitters:
+        emitter.archive, emitter.evaluated_in = emitters[0].archive, emitters[0].evaluated_in
+    return emitters

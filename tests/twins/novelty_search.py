@@ -58,13 +58,19 @@ class NoveltySearch:
         self.archive.append(descriptor)
 
     def evaluated(self, centre, fitness, descriptor):
-        self.initial(centre, descriptor)
+        self.told([(centre, fitness, descriptor)])
+
+    def told(self, evaluations):
+        """Learn from all evaluations of one generation: (centre, fitness, descriptor) in their order."""
+        for centre, _, descriptor in evaluations:
+            self.initial(centre, descriptor)
         if self.rule is None:
             return
         step, patience, gain = self.rule
-        if self.record is None or fitness > self.record + gain * abs(self.record):
-            self.record, self.stagnant, self.weight = fitness, 0, min(1.0, self.weight + step)
-        else:
-            self.stagnant += 1
-            if self.stagnant == patience:
-                self.stagnant, self.weight = 0, max(0.0, self.weight - step)
+        beaten = False
+        for _, fitness, _ in evaluations:
+            if self.record is None or fitness > self.record + gain * abs(self.record):
+                self.record, self.weight, beaten = fitness, min(1.0, self.weight + step), True
+        self.stagnant = 0 if beaten else self.stagnant + 1
+        if self.stagnant == patience:
+            self.stagnant, self.weight = 0, max(0.0, self.weight - step)

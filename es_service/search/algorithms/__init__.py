@@ -1,8 +1,9 @@
 """Search algorithms by name. Each method has a short file of its own; the steps that they share are functions.
 
 An algorithm is a few pure functions of a `SearchState`; it does not run episodes itself. In each generation the driver
-asks it whether to restart from an elite (`start_cell`), which centre to perturb (`ask`), how to weight the noise
-(`weights`) and what the new centre is (`step`), and then tells it the evaluation of the new centre (`tell`).
+asks it which centres restart from elites (`start_cells`) and which centres to perturb (`ask`), then for each of these
+how to weight the noise (`weights`) and what the new centre is (`step`), and tells it the evaluations of the new centres
+(`tell`).
 """
 
 from __future__ import annotations

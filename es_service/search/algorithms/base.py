@@ -5,8 +5,10 @@ Axes: D policy parameters, O observation, B descriptor dimensions, P antithetic 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +28,8 @@ NO_CELL = -1
 class CentreState:
     """One centre with its optimiser.
 
-    NS-ES, NSR-ES and NSRA-ES search with several centres side by side (the meta-population of Conti et al. 2018),
-    ES and ME-ES with one.
+    NS-ES, NSR-ES and NSRA-ES search with several centres side by side (the meta-population of Conti et al. 2018), ME-ES
+    with one centre per emitter, ES with one.
     """
 
     centre_D: FloatArray
@@ -68,12 +70,28 @@ class SearchState:
     weight: FitnessWeight
     map: BehaviourMap | None = None
     """The behaviour map; None if `map.enabled` is false."""
+    own: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Arrays of the search's own, by name. They are stored and digested with the rest. The mapping and the arrays are
+    read-only; to change one, return a state with another mapping. Names and types of the arrays must stay as they are
+    in `Algorithm.own`, shapes may change."""
 
 
-def from_elite(state: SearchState, cell: int, elite: Elite, *, own_statistics: bool = False) -> SearchState:
-    """The state in which an elite replaces centre 0, with a fresh optimiser.
+def read_only(own: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
+    """The same arrays, made read-only, in a read-only mapping; the same mapping if it is read-only already.
+
+    Otherwise a change in place would not be stored, since the store goes by whether the mapping is another one.
+    """
+    for array in own.values():
+        if isinstance(array, np.ndarray):  # a NumPy scalar is read-only; whatever else there is, the store refuses
+            array.flags.writeable = False
+    return own if isinstance(own, MappingProxyType) else MappingProxyType(dict(own))
+
+
+def from_elite(state: SearchState, index: int, cell: int, elite: Elite, *, own_statistics: bool = False) -> SearchState:
+    """The state in which an elite replaces a centre, with a fresh optimiser.
 
     Args:
+        index: index of the centre.
         cell: cell of the elite.
         own_statistics: whether the centre keeps the observation statistics with which the elite was evaluated; else it
             uses those of the whole run.
@@ -81,21 +99,30 @@ def from_elite(state: SearchState, cell: int, elite: Elite, *, own_statistics: b
     centre = CentreState(
         elite.centre_D,
         fresh_adam(elite.centre_D.size),
-        state.centres[0].entry,
+        state.centres[index].entry,
         cell,
         elite.observation_mean_O if own_statistics else None,
         elite.observation_std_O if own_statistics else None,
     )
-    return replace(state, centres=(centre, *state.centres[1:]))
+    return with_centre(state, index, centre)
+
+
+def with_centre(state: SearchState, index: int, centre: CentreState) -> SearchState:
+    """The state with another centre at an index."""
+    return replace(state, centres=(*state.centres[:index], centre, *state.centres[index + 1 :]))
 
 
 @dataclass(frozen=True)
 class Ask:
-    """What to evaluate in a generation: the population around one centre."""
+    """A population to evaluate in a generation: mirrored pairs around one centre."""
 
     centre: int
-    """Index of the centre."""
+    """Index of the centre. A generation asks for each centre at most once."""
     centre_D: FloatArray
+    sigma: float
+    """Standard deviation of the parameter noise, in parameter units."""
+    pairs: int
+    """Number of antithetic pairs: a multiple of `compute.chunk_pairs`."""
     fitness_weight: float
     """Weight of fitness relative to novelty in this generation, from 0 to 1."""
 
@@ -122,17 +149,22 @@ class CentreEvaluation:
 class Algorithm:
     """The functions of one method. All are pure."""
 
-    ask: Callable[[SearchState, int], Ask]
-    """(state, generation) -> what to evaluate in that generation."""
+    ask: Callable[[SearchState, int], tuple[Ask, ...]]
+    """(state, generation) -> populations to evaluate in that generation, side by side."""
     weights: Callable[[SearchState, Ask, EpisodesResult], NDArray[np.float32]]
     """(state, asked, the whole population's results with axes P, S) -> weight of each pair's noise [P]."""
     step: Callable[[SearchState, Ask, FloatArray], SearchState]
-    """(state, asked, gradient estimate [D]) -> state with the asked centre moved up the gradient."""
-    tell: Callable[[SearchState, CentreEvaluation], SearchState]
-    """(state, evaluation of a centre) -> state updated with it. Initial centres are told first, in their order."""
+    """(state, asked, gradient estimate [D]) -> state with the asked centre moved up the gradient. Called for each ask,
+    in order."""
+    tell: Callable[[SearchState, tuple[CentreEvaluation, ...]], SearchState]
+    """(state, evaluations of a generation's centres in the order of the asks) -> state updated with them. The first
+    call has all initial centres."""
     fitness_weight: float
     """Initial value of the state's `weight`."""
-    start_cell: Callable[[SearchState, int], int | None] = lambda state, generation: None
-    """(state, generation) -> cell whose elite the generation starts from; None to continue from the present centre."""
-    restart: Callable[[SearchState, int, Elite], SearchState] = from_elite
-    """(state, start cell, its elite) -> state that the generation starts from."""
+    start_cells: Callable[[SearchState, int], Mapping[int, int]] = lambda state, generation: {}
+    """(state, generation) -> index of a centre -> cell whose elite takes its place at the start of the generation; the
+    other centres continue."""
+    restart: Callable[[SearchState, int, int, Elite], SearchState] = from_elite
+    """(state, index of a centre, start cell, its elite) -> state in which that centre has restarted."""
+    own: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Initial arrays of the search's own, by name; `SearchState.own` holds them."""

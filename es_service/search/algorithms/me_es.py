@@ -4,6 +4,11 @@ A block has `block_generations` generations. At its start an elite is drawn from
 fresh optimiser. In the following generations the ES continues from its latest centre, whether or not its centres
 entered the map. A block either explores, which climbs novelty, or exploits, which climbs fitness.
 
+`emitters` blocks run side by side, each with a centre, an optimiser, a mode and a start cell of its own. All draw from
+the map and the novelty archive as they were before the generation. Block b of emitter e has the mode of block b + e of
+a single one, so that with `alternation: round_robin` half of the emitters explore at any time. (MEMES, Flageat et al.
+2024, arXiv:2303.06137, runs blocks side by side, too.)
+
 The sources differ in how the elite is drawn (`cell_sampling`):
 
 * `top`, as in QDax, whose authors say they follow the paper. Exploring: one of the 5 most novel elites. Exploiting:
@@ -31,7 +36,7 @@ from numpy.typing import NDArray
 from es_service.config.model import NoveltyConfig, RunConfig, SearchConfig
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import Algorithm, Ask, SearchState, from_elite
-from es_service.search.algorithms.steps import novelty_search
+from es_service.search.algorithms.steps import novelty_search, population
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.novelty import NoveltyArchive, novelty
 
@@ -48,33 +53,44 @@ def me_es(config: RunConfig) -> Algorithm:
     search = config.search
     shared = novelty_search(config, fitness_weight=_weight(block_mode(search, config.seed, 1)))
 
-    def start_cell(state: SearchState, generation: int) -> int | None:
+    def start_cells(state: SearchState, generation: int) -> dict[int, int]:
         if (generation - 1) % search.block_generations or state.map is None or not state.map.size:
-            return None
-        key = stream_keys(config.seed, Domain.SELECTION, generation, CELL_CHOICE)
-        first, second = (float(u) for u in uniforms(key, np.arange(2, dtype=np.uint32)))
-        mode = block_mode(search, config.seed, generation)
-        share_N = cell_shares(state.map, state.archive, config.novelty, mode, search.cell_sampling, first)
-        cumulative_N = np.add.accumulate(share_N)
-        return int(state.map.cell_N[np.searchsorted(cumulative_N, second * cumulative_N[-1], side="right")])
+            return {}
+        map_, found = state.map, {}
+        for emitter in range(len(state.centres)):
+            key = stream_keys(config.seed, Domain.SELECTION, generation, CELL_CHOICE, *_emitter_id(emitter))
+            first, second = (float(u) for u in uniforms(key, np.arange(2, dtype=np.uint32)))
+            mode = block_mode(search, config.seed, generation, emitter)
+            share_N = cell_shares(map_, state.archive, config.novelty, mode, search.cell_sampling, first)
+            cumulative_N = np.add.accumulate(share_N)
+            found[emitter] = int(map_.cell_N[np.searchsorted(cumulative_N, second * cumulative_N[-1], side="right")])
+        return found
 
-    def ask(state: SearchState, generation: int) -> Ask:
-        return Ask(0, state.centres[0].centre_D, _weight(block_mode(search, config.seed, generation)))
+    def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
+        modes: list[Mode] = [
+            block_mode(search, config.seed, generation, emitter) for emitter in range(len(state.centres))
+        ]
+        return tuple(population(state, emitter, search, _weight(mode)) for emitter, mode in enumerate(modes))
 
     restart = partial(from_elite, own_statistics=search.parent_statistics == "elite")
-    return replace(shared, ask=ask, start_cell=start_cell, restart=restart)
+    return replace(shared, ask=ask, start_cells=start_cells, restart=restart)
 
 
-def block_mode(search: SearchConfig, seed: int, generation: int) -> Mode:
-    """Whether the block of a generation (counted from 1) explores or exploits."""
+def block_mode(search: SearchConfig, seed: int, generation: int, emitter: int = 0) -> Mode:
+    """Whether an emitter's block in a generation (counted from 1) explores or exploits."""
     if search.mode != "explore_exploit":
         return search.mode
     block = (generation - 1) // search.block_generations
     if search.alternation == "coin":
-        key = stream_keys(seed, Domain.SELECTION, block, MODE_CHOICE)
+        key = stream_keys(seed, Domain.SELECTION, block, MODE_CHOICE, *_emitter_id(emitter))
         return "explore" if float(uniforms(key, np.zeros(1, np.uint32))[0]) < 0.5 else "exploit"
     other: Mode = "exploit" if search.first_block == "explore" else "explore"
-    return other if block % 2 else search.first_block
+    return other if (block + emitter) % 2 else search.first_block
+
+
+def _emitter_id(emitter: int) -> tuple[int, ...]:
+    """What an emitter adds to the addresses of its random streams: nothing for the first."""
+    return (emitter,) if emitter else ()
 
 
 def cell_shares(
@@ -133,7 +149,7 @@ def elite_novelty(map_: BehaviourMap, archive: NoveltyArchive, settings: Novelty
 def _own_entries(map_: BehaviourMap, archive: NoveltyArchive) -> NDArray[np.int64]:
     """Index of each elite's own entry in the novelty archive, [N]; -1 for an elite without one.
 
-    The search relies on the order of the entries: by generation and, within generation 0, by centre.
+    The search relies on the order of the entries: by generation and, within a generation, by centre.
     """
     centres = 1 + max(map_.centre_N.max(initial=0), archive.centre_N.max(initial=0))
     entry_N, elite_N = (one.generation_N * centres + one.centre_N for one in (archive, map_))

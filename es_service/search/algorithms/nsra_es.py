@@ -1,9 +1,9 @@
 """NSRA-ES: novelty and fitness, with a weight that adapts to progress. Conti et al. 2018 (arXiv:1712.06560).
 
 w is the weight of fitness. If an evaluated centre beats the record, w rises by `fitness_weight_step` (to at most 1).
-After `fitness_weight_patience` consecutive centres that do not, w falls by one step (to at least 0), and the count
-starts again. All centres share one record and one count. Initial centres set no record, so the first valid centre after
-them always does, as in the released code.
+After `fitness_weight_patience` consecutive generations without such a centre, w falls by one step (to at least 0), and
+the count starts again. All centres share one record and one count. Initial centres set no record, so the first valid
+centre after them always does, as in the released code.
 """
 
 from __future__ import annotations
@@ -22,19 +22,21 @@ def nsra_es(config: RunConfig) -> Algorithm:
     return novelty_search(config, config.search.fitness_weight_start, partial(adapted_weight, config.search))
 
 
-def adapted_weight(search: SearchConfig, weight: FitnessWeight, evaluation: CentreEvaluation) -> FitnessWeight:
-    """The weight of fitness after one more evaluated centre.
+def adapted_weight(
+    search: SearchConfig, weight: FitnessWeight, evaluations: tuple[CentreEvaluation, ...]
+) -> FitnessWeight:
+    """The weight of fitness after the centres evaluated in one more generation, in the order of the asks.
 
-    The centre is an improvement if it is valid and its fitness exceeds record + fitness_weight_min_gain * |record|; a
-    fitness equal to this is not.
+    A centre is an improvement if it is valid and its fitness exceeds record + fitness_weight_min_gain * |record|; a
+    fitness equal to this is not. Its fitness is then the record for the next one.
     """
-    bar = (
-        weight.record + search.fitness_weight_min_gain * abs(weight.record)
-        if math.isfinite(weight.record)
-        else -math.inf
-    )
-    if evaluation.valid and evaluation.fitness > bar:
-        return FitnessWeight(min(1.0, weight.value + search.fitness_weight_step), evaluation.fitness, 0)
+    before = weight
+    for evaluation in evaluations:
+        gain = search.fitness_weight_min_gain * abs(weight.record) if math.isfinite(weight.record) else 0.0
+        if evaluation.valid and evaluation.fitness > weight.record + gain:
+            weight = FitnessWeight(min(1.0, weight.value + search.fitness_weight_step), evaluation.fitness, 0)
+    if weight is not before:
+        return weight
     if weight.stagnant + 1 < search.fitness_weight_patience:
         return replace(weight, stagnant=weight.stagnant + 1)
     return replace(weight, value=max(0.0, weight.value - search.fitness_weight_step), stagnant=0)

@@ -6,8 +6,9 @@ pairs, S signs [+, -], B descriptor dimensions, D policy parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ from es_service.search.algorithms.base import (
     CentreState,
     FitnessWeight,
     SearchState,
+    read_only,
+    with_centre,
 )
 from es_service.search.maps.behaviour_map import BehaviourMap, insert, with_score
 from es_service.search.novelty import empty_archive, extended, novelty
@@ -33,7 +36,7 @@ from es_service.search.shaping import centred_ranks, pair_weights
 CENTRE_CHOICE = 0
 """Last id of the random streams of Domain.SELECTION that choose the centre to update."""
 
-AdaptWeight = Callable[[FitnessWeight, CentreEvaluation], FitnessWeight]
+AdaptWeight = Callable[[FitnessWeight, tuple[CentreEvaluation, ...]], FitnessWeight]
 
 
 def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight | None = None) -> Algorithm:
@@ -41,12 +44,14 @@ def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight 
 
     Args:
         fitness_weight: initial value of w.
-        adapt: (weight, evaluation of a centre that is not an initial one) -> new weight; None for a constant w.
+        adapt: (weight, evaluations of a generation after 0) -> new weight; None for a constant w.
     """
+    search = config.search
 
-    def ask(state: SearchState, generation: int) -> Ask:
-        centre = choose_centre(state, generation, config)
-        return Ask(centre, state.centres[centre].centre_D, state.weight.value)
+    def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
+        every = range(len(state.centres))
+        chosen = every if search.update == "all" else [choose_centre(state, generation, config)]
+        return tuple(population(state, index, search, state.weight.value) for index in chosen)
 
     def weights(state: SearchState, asked: Ask, population: EpisodesResult) -> NDArray[np.float32]:
         return pair_weights(mixed_utilities(state, asked.fitness_weight, population, config.novelty))
@@ -54,17 +59,28 @@ def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight 
     def step(state: SearchState, asked: Ask, gradient_D: FloatArray) -> SearchState:
         return moved(state, asked, gradient_D, config.search)
 
-    def tell(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
+    def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
         weight = state.weight
-        if adapt is not None and evaluation.generation > 0:
-            weight = adapt(weight, evaluation)
-        return replace(mapped(archived(state, evaluation), evaluation), weight=weight)
+        if adapt is not None and evaluations[0].generation > 0:
+            weight = adapt(weight, evaluations)
+        for evaluation in evaluations:
+            state = mapped(archived(state, evaluation), evaluation)
+        return replace(state, weight=weight)
 
     return Algorithm(ask, weights, step, tell, fitness_weight)
 
 
+def population(state: SearchState, index: int, search: SearchConfig, fitness_weight: float) -> Ask:
+    """The population around a centre, with the settings of the config."""
+    return Ask(index, state.centres[index].centre_D, search.sigma, search.pairs, fitness_weight)
+
+
 def first_state(
-    centres: Sequence[FloatArray], dimensions: int, fitness_weight: float, map_: BehaviourMap | None = None
+    centres: Sequence[FloatArray],
+    dimensions: int,
+    fitness_weight: float,
+    map_: BehaviourMap | None = None,
+    own: Mapping[str, NDArray[Any]] | None = None,
 ) -> SearchState:
     """The state before any evaluation: initial centres, fresh optimisers and an empty novelty archive.
 
@@ -73,9 +89,10 @@ def first_state(
         dimensions: number of descriptor dimensions.
         fitness_weight: initial weight of fitness.
         map_: the empty behaviour map; None for a run without one.
+        own: initial arrays of the search's own, by name.
     """
     states = tuple(CentreState(centre_D, fresh_adam(centre_D.size)) for centre_D in centres)
-    return SearchState(states, empty_archive(dimensions), FitnessWeight(fitness_weight), map_)
+    return SearchState(states, empty_archive(dimensions), FitnessWeight(fitness_weight), map_, read_only(own or {}))
 
 
 def choose_centre(state: SearchState, generation: int, config: RunConfig) -> int:
@@ -144,7 +161,7 @@ def moved(state: SearchState, asked: Ask, gradient_D: FloatArray, search: Search
     adam, centre_D = adam_ascent(
         centre.adam, centre.centre_D, gradient_D, learning_rate=search.learning_rate, l2=search.l2
     )
-    return _with_centre(state, asked.centre, replace(centre, centre_D=centre_D, adam=adam))
+    return with_centre(state, asked.centre, replace(centre, centre_D=centre_D, adam=adam))
 
 
 def archived(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
@@ -153,20 +170,21 @@ def archived(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
         return state
     archive = extended(state.archive, evaluation.descriptor_B, evaluation.generation, evaluation.centre)
     centre = replace(state.centres[evaluation.centre], entry=archive.size - 1)
-    return replace(_with_centre(state, evaluation.centre, centre), archive=archive)
+    return replace(with_centre(state, evaluation.centre, centre), archive=archive)
 
 
 def mapped(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
     """The state with a valid centre inserted into the behaviour map, if it is better than the elite of its cell.
 
     `CentreState.cell` is then the cell whose elite the centre is, or NO_CELL. If the centre was an elite before this
-    generation, that elite first gets a new score: the highest fitness of the population around it.
+    generation, that elite first gets a new score: the highest fitness of the population around it. A centre whose elite
+    is replaced is no elite any more.
     """
     centre, map_ = state.centres[evaluation.centre], state.map
     if map_ is None:
         return state
     if centre.cell != NO_CELL and np.isfinite(evaluation.population_max):
-        map_ = with_score(map_, centre.cell, evaluation.centre, evaluation.population_max)
+        map_ = with_score(map_, centre.cell, evaluation.population_max)
     cell = NO_CELL
     if evaluation.valid:
         map_, offered, entered = insert(
@@ -178,8 +196,6 @@ def mapped(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
             evaluation.population_max,
         )
         cell = offered if entered else NO_CELL
-    return replace(_with_centre(state, evaluation.centre, replace(centre, cell=cell)), map=map_)
-
-
-def _with_centre(state: SearchState, index: int, centre: CentreState) -> SearchState:
-    return replace(state, centres=(*state.centres[:index], centre, *state.centres[index + 1 :]))
+    centres = [replace(one, cell=NO_CELL) if cell != NO_CELL and one.cell == cell else one for one in state.centres]
+    centres[evaluation.centre] = replace(centre, cell=cell)
+    return replace(state, centres=tuple(centres), map=map_)

@@ -116,10 +116,10 @@ def insert(
     )
 
 
-def with_score(map_: BehaviourMap, cell: int, centre: int, score: float) -> BehaviourMap:
-    """The map with a new score for a cell's elite; unchanged if the elite is not from the centre with this index."""
+def with_score(map_: BehaviourMap, cell: int, score: float) -> BehaviourMap:
+    """The map with a new score for a cell's elite; unchanged if the cell is empty."""
     row = map_.row_of(cell)
-    if row is None or map_.centre_N[row] != centre:
+    if row is None:
         return map_
     return replace(map_, score_N=_with(map_.score_N, row, score))
 

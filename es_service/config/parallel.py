@@ -1,0 +1,41 @@
+"""How many chunks a generation has at a time, and so how many workers it can keep busy."""
+
+from __future__ import annotations
+
+from es_service.config.model import RunConfig
+from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK
+
+
+def populations(config: RunConfig) -> int:
+    """Number of populations that a generation asks for; for a search of your own, the most it can ask for."""
+    search = config.search
+    return search.centres if search.algorithm == "me_es" or search.update == "all" or ":" in search.algorithm else 1
+
+
+def chunks_at_once(config: RunConfig) -> int:
+    """Number of chunks that can be computed at the same time, in the larger of rollout and evaluation.
+
+    More workers than that have nothing to do.
+    """
+    search = config.search
+    evaluation = -(-search.evaluation_episodes // EVALUATION_EPISODES_PER_CHUNK)
+    return populations(config) * max(search.pairs // config.compute.chunk_pairs, evaluation)
+
+
+def parallel_sentence(config: RunConfig) -> str:
+    """How much work there is at a time, and the two keys that change it."""
+    chunks, several = chunks_at_once(config), populations(config)
+    around = "one centre" if several == 1 else f"{several} centres"
+    return (
+        f"a generation has {chunks} chunks of work at a time ({config.search.pairs} pairs around {around}), enough for "
+        f"{chunks} workers; {' and '.join(_keys(config))} change that"
+    )
+
+
+def _keys(config: RunConfig) -> tuple[str, str]:
+    algorithm = config.search.algorithm
+    if algorithm == "me_es":
+        return "search.pairs", "search.emitters"
+    if algorithm == "es" or ":" in algorithm:
+        return "search.pairs", "compute.chunk_pairs"
+    return "search.pairs", "search.centres" if config.search.update == "all" else "search.update"

@@ -1,0 +1,104 @@
+"""Checks of what a generation asks for and gets; each raises an error that names the generation and the way out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.errors import EvaluationError, WayOut
+from es_service.protocol.messages import Centre, EpisodesResult
+from es_service.search.algorithms.base import Ask, SearchState
+
+
+def require_asks(asks: object, state: SearchState, chunk_pairs: int, generation: int) -> None:
+    """Raise an EvaluationError if what a search asks for, a user's perhaps, cannot be evaluated."""
+
+    def wrong() -> str:
+        if not isinstance(asks, tuple) or not asks or not all(isinstance(ask, Ask) for ask in asks):
+            kinds = f" of {', '.join(type(ask).__name__ for ask in asks)}" if isinstance(asks, tuple) and asks else ""
+            returned = "an empty tuple" if asks == () else type(asks).__name__ + kinds
+            return f"`ask` returned {returned}; it must return a tuple of one or more Ask"
+        indices = [ask.centre for ask in asks]
+        known = all(isinstance(index, int | np.integer) and 0 <= index < len(state.centres) for index in indices)
+        if not known or len(set(indices)) < len(indices):
+            return f"the asks are for the centres {indices}; each of the {len(state.centres)} may occur once"
+        for ask in asks:
+            if not (isinstance(ask.sigma, int | float | np.floating) and 0.0 < ask.sigma < math.inf):
+                return f"the sigma of centre {ask.centre} is {ask.sigma}; it must be positive"
+            if not isinstance(ask.pairs, int | np.integer) or ask.pairs < 1 or ask.pairs % chunk_pairs:
+                return f"centre {ask.centre} has {ask.pairs} pairs; must be a multiple of chunk_pairs ({chunk_pairs})"
+        return ""
+
+    if problem := wrong():
+        raise EvaluationError(f"generation {generation}: {problem}", field="search.algorithm")
+
+
+def valid_members(result: EpisodesResult) -> NDArray[np.bool_]:
+    """Whether each member (or episode) has a finite fitness and a finite descriptor, with the axes of the fitness."""
+    return np.isfinite(result.fitness) & np.isfinite(result.descriptor).all(axis=-1)
+
+
+def invalidate(
+    populations: Sequence[EpisodesResult], max_invalid_fraction: float, generation: int
+) -> list[EpisodesResult]:
+    """The populations with fitness NaN, which ranks last, for every invalid member.
+
+    Raises:
+        EvaluationError: more than `max_invalid_fraction` of a generation's members are invalid.
+    """
+    valid = [valid_members(population) for population in populations]
+    invalid, members = sum(int(np.count_nonzero(~one)) for one in valid), sum(one.size for one in valid)
+    if invalid > max_invalid_fraction * members:
+        raise EvaluationError(
+            f"generation {generation}: {invalid} of {members} members returned a fitness or descriptor that is "
+            f"not finite, more than search.max_invalid_fraction ({max_invalid_fraction}) allows. Everything up to "
+            f"generation {generation - 1} is saved; a smaller search.sigma or search.learning_rate may help.",
+            field="search.max_invalid_fraction",
+            value=max_invalid_fraction,
+        )
+    return [
+        replace(population, fitness=np.where(valid_P_S, population.fitness, np.float32(np.nan)))
+        for population, valid_P_S in zip(populations, valid, strict=True)
+    ]
+
+
+def require_some_finite(evaluations: Sequence[EpisodesResult], environment: str) -> None:
+    """Raise an EvaluationError if no episode of any initial centre is valid; this is an error of the task."""
+    count = sum(evaluation.fitness.size for evaluation in evaluations)
+    if any(valid_members(evaluation).any() for evaluation in evaluations):
+        return
+    finite = {
+        "return": any(np.isfinite(evaluation.returns).any() for evaluation in evaluations),
+        "descriptor": any(np.isfinite(evaluation.descriptor).any() for evaluation in evaluations),
+    }
+    wrong = " and ".join(name for name, is_finite in finite.items() if not is_finite) or "fitness or descriptor"
+    steps = min(int(evaluation.steps.min()) for evaluation in evaluations)
+    raise EvaluationError(
+        f"generation 0: the {wrong} is NaN or infinite in each of the {count} episodes of the initial centres; the "
+        f"shortest episode has {steps} steps. The run cannot learn from this: look for a division by 0, a root or "
+        f"logarithm of a negative number, or physics that diverges, in the task {environment}",
+        field="task.environment",
+        value=environment,
+    )
+
+
+def require_finite(centres: Sequence[Centre], learning_rate: float, generation: int) -> None:
+    """Raise an EvaluationError if a centre is not finite after its update."""
+    if not all(np.isfinite(centre.parameters_D).all() for centre in centres):
+        raise EvaluationError(
+            f"generation {generation}: a centre is not finite after its update with search.learning_rate = "
+            f"{learning_rate:g}, so it is not kept. Everything up to generation {generation - 1} is saved.",
+            field="search.learning_rate",
+            value=learning_rate,
+            ways_out=[
+                WayOut(
+                    "fork",
+                    "continue from there with a smaller learning rate",
+                    settings={"search.learning_rate": learning_rate / 10},
+                )
+            ],
+        )

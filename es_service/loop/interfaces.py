@@ -1,0 +1,46 @@
+"""What the loop needs of the rest: a run's search, and the store in which it is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from es_service.config.model import RunConfig
+from es_service.loop.history import HistoryRow
+from es_service.loop.parts import Arrays
+from es_service.protocol.messages import FloatArray, Moments, TaskSpec
+from es_service.search.algorithms.base import Algorithm
+
+
+class Stored(Protocol):
+    """What the loop reads from a run store: the state that earlier sessions have stored."""
+
+    @property
+    def generation(self) -> int | None:
+        """Newest committed generation; None before the first."""
+        ...
+
+    def load(self, without: str | None = None) -> Mapping[str, Arrays]: ...
+    def last_history(self) -> Mapping[str, Any] | None: ...
+
+
+class Store(Protocol):
+    """What the loop needs from a run store during a run."""
+
+    def part(self, name: str) -> Arrays: ...
+    def commit(
+        self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow, evaluations: Sequence[HistoryRow]
+    ) -> None: ...
+
+
+@dataclass(frozen=True)
+class Search:
+    """Definition of a run apart from where it runs: config, algorithm, starting point and task."""
+
+    config: RunConfig
+    algorithm: Algorithm
+    initial: Callable[[], tuple[Sequence[FloatArray], Moments]]
+    """Returns the initial centres [D] and their observation statistics, which are empty unless the centres are from
+    another run."""
+    task: TaskSpec

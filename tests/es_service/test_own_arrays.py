@@ -1,0 +1,208 @@
+"""Arrays of a search's own: stored and digested with the rest, read-only, and refused if they could not be kept."""
+
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from es_service import api
+from es_service.errors import StoreError
+from es_service.search.algorithms import ALGORITHMS
+from es_service.store.digest import digest_parts
+
+CONFIG = {
+    "task": {"environment": "point_maze", "episode_steps": 20},
+    "policy": {"hidden": [8]},
+    "search": {"algorithm": f"{__name__}:counting", "pairs": 16, "sigma": 0.2, "learning_rate": 0.1},
+    "budget": {"generations": 6},
+    "compute": {"engine": "inline", "workers": 1},
+}
+SEEN: list = []
+"""States that `watching` was asked with and told."""
+
+
+def begin(folder, name="counting", generations=6):
+    settings = [f"search.algorithm={__name__}:{name}", f"budget.generations={generations}"]
+    return api.run(api.load_config(CONFIG, settings), folder).run
+
+
+def telling(config, own, change):
+    """ES that has arrays of its own and changes them when it is told: `change(own, evaluation) -> own`."""
+    ours = ALGORITHMS["es"](config)
+
+    def tell(state, evaluations):
+        return replace(ours.tell(state, evaluations), own=change(state.own, evaluations[0]))
+
+    return replace(ours, tell=tell, own=own)
+
+
+def counting(config, extra=0.0):
+    """Sigma depends on what it remembers: a count, a list that grows, and a scalar that NumPy makes of a sum."""
+
+    def change(own, evaluation):
+        heard = np.append(own["heard"], evaluation.fitness)
+        return {"count": own["count"] + 1, "heard": heard, "sum": own["sum"] + evaluation.fitness, "x": own["x"]}
+
+    own = {"count": np.array(0), "heard": np.zeros(0), "sum": np.array(0.0, np.float32), "x": np.array(extra)}
+    search = telling(config, own, change)
+
+    def ask(state, generation):
+        assert state.own["count"] == generation == state.own["heard"].size
+        (asked,) = ALGORITHMS["es"](config).ask(state, generation)
+        return (replace(asked, sigma=0.2 / (1 + float(state.own["sum"]) ** 2)),)
+
+    return replace(search, ask=ask)
+
+
+def counting_otherwise(config):
+    """The same, with another number that nothing depends on."""
+    return counting(config, extra=-0.0)
+
+
+def test_they_outlive_a_stop_and_a_fork_to_the_bit(tmp_path):
+    whole = begin(tmp_path / "whole")
+    begin(tmp_path / "parts", generations=3)
+    assert api.resume(tmp_path / "parts", ["budget.generations=6"]).run.digest() == whole.digest()
+    begin(tmp_path / "parent", generations=4)
+    forked = api.fork(tmp_path / "parent", ["budget.generations=6"], out=tmp_path / "fork", generation=3).run
+    assert forked.digest() == whole.digest()
+    for run in (whole, forked, api.open_run(tmp_path / "parts")):
+        own = run.parts()[1]["own"]
+        assert (own["count"], own["heard"].size, own["sum"].dtype) == (7, 7, np.float32)
+        np.testing.assert_array_equal(own["heard"], run.history["centre_fitness_mean"])
+        assert own["sum"] == pytest.approx(own["heard"].sum(), rel=1e-5)
+
+
+def test_they_are_in_the_digest(tmp_path):
+    parts = [digest_parts(begin(tmp_path / name, name).folder) for name in ("counting", "counting_otherwise")]
+    assert {name for name in parts[0] if parts[0][name] != parts[1][name]} == {"state/own"}
+    assert "state/own" not in digest_parts(begin(tmp_path / "es", "watching").folder), "a search without any has none"
+
+
+def watching(config):
+    """ES that shows every state, of a search without arrays of its own."""
+    return _watching(ALGORITHMS["es"](config))
+
+
+def watching_own(config):
+    return _watching(counting(config))
+
+
+def _watching(ours):
+    def ask(state, generation):
+        SEEN.append(state)
+        return ours.ask(state, generation)
+
+    def tell(state, evaluations):
+        SEEN.append(state)
+        return ours.tell(state, evaluations)
+
+    return replace(ours, ask=ask, tell=tell)
+
+
+def test_they_cannot_be_changed_in_place_also_after_a_resume(tmp_path):
+    """A change in place would be lost with the process, since only another mapping is stored."""
+    SEEN.clear()
+    begin(tmp_path / "run", "watching_own", generations=2)
+    assert len(SEEN) == 5
+    api.resume(tmp_path / "run", ["budget.generations=3"])
+    assert len(SEEN) == 7
+    for state in SEEN:
+        with pytest.raises(ValueError, match="read-only"):
+            state.own["x"][...] = 1.0
+        with pytest.raises(TypeError, match="does not support item assignment"):
+            state.own["x"] = np.array(1.0)
+
+
+def test_a_part_that_nothing_changes_is_written_once(tmp_path):
+    folder = begin(tmp_path / "run", "idle").folder
+    api.resume(folder, ["budget.generations=8"])
+    with sqlite3.connect(folder / "run.db") as connection:
+        written = connection.execute("SELECT generation FROM state WHERE part = 'own'").fetchall()
+    assert written == [(0,)]
+
+
+def idle(config):
+    return telling(config, {"x": np.arange(3)}, lambda own, evaluation: own)
+
+
+def from_generation_2(own, evaluation, **changes):
+    return {**own, **changes} if evaluation.generation == 2 else own
+
+
+OWN = {"x": np.zeros(2), "n": np.array(1)}
+CHANGES = {
+    "other_type": lambda own, told: from_generation_2(own, told, x=np.zeros(2, np.float32)),
+    "another": lambda own, told: from_generation_2(own, told, y=np.zeros(2)),
+    "fewer": lambda own, told: {"x": own["x"]} if told.generation == 2 else own,
+    "no_array": lambda own, told: from_generation_2(own, told, x=[0.0, 0.0]),
+    "later_objects": lambda own, told: from_generation_2(own, told, x=np.array([None, 0.0])),
+    "longer": lambda own, told: from_generation_2(own, told, x=np.zeros((3, 4))),
+}
+
+
+def other_type(config):
+    return telling(config, OWN, CHANGES["other_type"])
+
+
+def another(config):
+    return telling(config, OWN, CHANGES["another"])
+
+
+def fewer(config):
+    return telling(config, OWN, CHANGES["fewer"])
+
+
+def no_array(config):
+    return telling(config, OWN, CHANGES["no_array"])
+
+
+def later_objects(config):
+    return telling(config, OWN, CHANGES["later_objects"])
+
+
+def longer(config):
+    return telling(config, OWN, CHANGES["longer"])
+
+
+@pytest.mark.parametrize(
+    ("name", "now"),
+    [
+        ("other_type", "{'n': 'int64', 'x': 'float32'}"),
+        ("another", "{'n': 'int64', 'x': 'float64', 'y': 'float64'}"),
+        ("fewer", "{'x': 'float64'}"),
+        ("no_array", "{'n': 'int64', 'x': 'list'}"),
+        ("later_objects", "{'n': 'int64', 'x': 'object'}"),
+    ],
+)
+def test_other_names_and_types_end_the_run(tmp_path, name, now):
+    with pytest.raises(StoreError, match="generation 2 cannot be stored") as error:
+        begin(tmp_path / "run", name)
+    assert f"own arrays are {now}, but they were {{'n': 'int64', 'x': 'float64'}} before" in str(error.value)
+    assert "Everything up to generation 1 is saved" in str(error.value)
+    assert api.open_run(tmp_path / "run").generation == 1
+
+
+def test_other_shapes_do_not(tmp_path):
+    assert begin(tmp_path / "run", "longer").parts()[1]["own"]["x"].shape == (3, 4)
+
+
+def objects(config):
+    return telling(config, {"x": np.array([None, 1.0]), "n": np.array(1)}, lambda own, told: own)
+
+
+def lists(config):
+    return telling(config, {"x": [0.0, 1.0]}, lambda own, told: own)
+
+
+def words(config):
+    return telling(config, {"x": np.array(["a", "b"])}, lambda own, told: own)
+
+
+@pytest.mark.parametrize("name", ["objects", "lists", "words"])
+def test_what_cannot_be_stored_is_refused_before_the_first_generation(tmp_path, name):
+    with pytest.raises(StoreError, match=r"its own array 'x' is no NumPy array of bool, integers or floats"):
+        begin(tmp_path / "run", name)

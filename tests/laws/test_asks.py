@@ -1,0 +1,111 @@
+"""What a search asks for: populations with sigmas, sizes and random streams of their own; and what it may not ask."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from es_service.errors import EvaluationError
+from es_service.protocol.messages import EvaluationChunk, GradientChunk, TrainingChunk
+from es_service.protocol.noise import Domain, normals, stream_keys
+from es_service.search.algorithms import ALGORITHMS
+from es_service.search.algorithms.base import Ask
+from tests.helpers import DirectEvaluator, centre, random_parameters, spec
+from tests.laws.me_es_runs import SHAPE, assert_near, config_of, first_centres, noise_of, points, run_in_memory
+from tests.twins import es as twin
+
+# Random streams
+
+
+@pytest.mark.parametrize(
+    ("what", "sigma", "changes"),
+    [
+        ("noise", 0.1, {"action_noise": 0.0, "environment_options": {"start": "corner"}}),
+        ("resets", 1e-30, {"action_noise": 0.0}),
+        ("action noise", 1e-30, {"action_noise": 0.1, "environment_options": {"start": "corner"}}),
+        ("nothing", 1e-30, {"action_noise": 0.0, "environment_options": {"start": "corner"}}),
+    ],
+)
+def test_each_population_has_streams_of_its_own(what, sigma, changes):
+    evaluator = DirectEvaluator(spec(episode_steps=20, **changes))
+    point = centre(random_parameters(), sigma=sigma)
+    chunks = [TrainingChunk(3, 0), *(TrainingChunk(3, 0, ask) for ask in range(3)), TrainingChunk(3, 0, 1)]
+    found = [r.fitness.tobytes() + r.descriptor.tobytes() for r in evaluator.evaluate([(point, c) for c in chunks])]
+    assert found[0] == found[1]
+    assert found[2] == found[4]
+    assert len(set(found)) == (1 if what == "nothing" else 3)
+    tests = [EvaluationChunk(3, 0), *(EvaluationChunk(3, 0, ask) for ask in range(3))]
+    found = [r.fitness.tobytes() for r in evaluator.evaluate([(point, c) for c in tests])]
+    assert found[0] == found[1]
+    assert len(set(found)) == (3 if what == "resets" else 1)
+
+
+def test_the_gradient_is_of_the_noise_of_its_population():
+    evaluator, point = DirectEvaluator(spec()), centre(random_parameters())
+    weights_P = np.arange(1.0, 9.0, dtype=np.float32)
+    for ask in range(3):
+        (result,) = evaluator.evaluate([(point, GradientChunk(1, 2, weights_P, ask))])
+        ids = (np.arange(16, 24), ask) if ask else (np.arange(16, 24),)
+        keys = stream_keys(3, Domain.PARAMETER_NOISE, 1, *ids)
+        expected = sum(w * normals(k, SHAPE.parameters) for w, k in zip(weights_P, keys, strict=True))
+        np.testing.assert_allclose(result.sum_D, expected, rtol=1e-4, atol=1e-4)
+
+
+# Sigma, pairs, centres
+
+
+def asking(config, *asks):
+    """ES with several centres that asks for what it is told to: functions of a state."""
+    return replace(ALGORITHMS["es"](config), ask=lambda state, generation: tuple(one(state) for one in asks))
+
+
+def test_sigma_and_pairs_are_those_of_the_ask():
+    config = config_of(generations=1, algorithm="nsr_es", centres=3, learning_rate=0.05)
+    sizes = {2: (0.05, 16), 0: (0.4, 48)}
+    asks = [lambda s, i=i, said=said: Ask(i, s.centres[i].centre_D, *said, 1.0) for i, said in sizes.items()]
+    state, store, evaluator = run_in_memory(config, algorithm=asking(config, *asks))
+    assert [row["centre"] for row in store.evaluated[1]] == [2, 0]
+    first = first_centres(config)
+    for ask, (index, (sigma, pairs)) in enumerate(sizes.items()):
+        point, fitness, _ = points(evaluator, TrainingChunk, 1, ask)
+        assert (point.sigma, len(fitness)) == (sigma, pairs)
+        np.testing.assert_array_equal(point.parameters_D, first[index])
+        other = twin.ES(first[index], 0.05, config.search.l2)
+        other.generation(noise_of(1, ask, pairs), fitness)
+        assert_near(state.search.centres[index].centre_D, other.centre)
+    np.testing.assert_array_equal(state.search.centres[1].centre_D, first[1])
+
+
+GOOD = Ask(0, np.zeros(SHAPE.parameters, np.float32), 0.1, 16, 1.0)
+BAD_SIGMA, BAD_PAIRS = "it must be positive", r"must be a multiple of chunk_pairs \(16\)"
+
+
+@pytest.mark.parametrize(
+    ("asks", "sentence"),
+    [
+        ([GOOD], "`ask` returned list; it must return a tuple of one or more Ask"),
+        (GOOD, "`ask` returned Ask; it must return a tuple of one or more Ask"),
+        ((), "`ask` returned an empty tuple; it must"),
+        ((GOOD, None), "`ask` returned tuple of Ask, NoneType; it must"),
+        ((GOOD, GOOD), r"the asks are for the centres \[0, 0\]; each of the 2 may occur once"),
+        ((replace(GOOD, centre=2),), r"the centres \[2\]; each of the 2 may occur once"),
+        ((GOOD, replace(GOOD, centre=-1)), r"the centres \[0, -1\]"),
+        ((replace(GOOD, centre=1.0),), r"the centres \[1\.0\]"),
+        ((replace(GOOD, centre=[0]),), r"the centres \[\[0\]\]"),
+        ((replace(GOOD, sigma=0.0),), f"the sigma of centre 0 is 0.0; {BAD_SIGMA}"),
+        ((GOOD, replace(GOOD, centre=1, sigma=-0.1)), f"the sigma of centre 1 is -0.1; {BAD_SIGMA}"),
+        ((replace(GOOD, sigma=np.nan),), f"the sigma of centre 0 is nan; {BAD_SIGMA}"),
+        ((replace(GOOD, sigma=np.inf),), f"the sigma of centre 0 is inf; {BAD_SIGMA}"),
+        ((replace(GOOD, sigma="0.1"),), f"the sigma of centre 0 is 0.1; {BAD_SIGMA}"),
+        ((replace(GOOD, pairs=24),), f"centre 0 has 24 pairs; {BAD_PAIRS}"),
+        ((replace(GOOD, pairs=0),), f"centre 0 has 0 pairs; {BAD_PAIRS}"),
+        ((replace(GOOD, pairs=-16),), f"centre 0 has -16 pairs; {BAD_PAIRS}"),
+        ((replace(GOOD, pairs=16.0),), f"centre 0 has 16.0 pairs; {BAD_PAIRS}"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_an_error_with_a_sentence(asks, sentence):
+    config = config_of(generations=1, algorithm="nsr_es", centres=2)
+    algorithm = replace(ALGORITHMS["es"](config), ask=lambda state, generation: asks)
+    with pytest.raises(EvaluationError, match=f"generation 1: .*{sentence}") as error:
+        run_in_memory(config, algorithm=algorithm)
+    assert error.value.field == "search.algorithm"

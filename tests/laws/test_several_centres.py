@@ -1,0 +1,248 @@
+"""Generations that ask for several populations: equal to the twins; what their history says and counts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from es_service.loop.generation import fittest
+from es_service.loop.parts import elite_part, map_from_parts
+from es_service.protocol.messages import EvaluationChunk, TrainingChunk
+from es_service.search.algorithms.base import NO_CELL, CentreEvaluation
+from es_service.search.algorithms.me_es import CELL_CHOICE, block_mode
+from es_service.search.algorithms.nsra_es import adapted_weight
+from es_service.search.algorithms.steps import first_state, mapped
+from es_service.search.maps.behaviour_map import empty_map
+from es_service.search.maps.geometry import Grid
+from tests.laws.me_es_runs import (
+    BLOCK,
+    PRESETS,
+    Sharing,
+    assert_near,
+    config_of,
+    drawn,
+    evaluation,
+    first_centres,
+    noise_of,
+    number,
+    points,
+    run_in_memory,
+)
+from tests.twins import me_es as me_es_twin
+from tests.twins import novelty_search as novelty_twin
+from tests.twins.behaviour_map import GridMap
+
+EMITTERS, CELLS = 3, (8, 8)
+NSRA = {"fitness_weight_start": 0.5, "fitness_weight_step": 0.125, "fitness_weight_patience": 2}
+
+
+@pytest.mark.parametrize("preset", ["literature", "uber"])
+def test_blocks_side_by_side_equal_the_twin(preset):
+    config = config_of(preset, generations=18, cells=CELLS, emitters=EMITTERS)
+    state, store, evaluator = run_in_memory(config)
+    emitters = me_es_twin.side_by_side(
+        first_centres(config),
+        GridMap(((-1.0, 1.0), (-1.0, 1.0)), CELLS),
+        config.search.learning_rate,
+        config.search.l2,
+        mode="explore_exploit",
+        length=BLOCK,
+        neighbours=3,
+        **PRESETS[preset],
+    )
+    elites, archive = emitters[0].map.elites, emitters[0].archive
+    for ask, emitter in enumerate(emitters):
+        emitter.evaluated(0, *evaluation(evaluator, 0, ask))
+    shared, robbed = 0, 0
+    for generation in range(1, 19):
+        rows = store.evaluated[generation]
+        begun = [emitter.start(*drawn(generation, CELL_CHOICE, i, 2)) for i, emitter in enumerate(emitters)]
+        assert [row["start_cell"] for row in rows] == [number(cell, CELLS) for cell in begun]
+        assert [row["fitness_weight"] for row in rows] == [float(one.climbs == "exploit") for one in emitters]
+        shared += None not in begun and len(set(begun)) < EMITTERS
+        highest = []
+        for ask, emitter in enumerate(emitters):
+            start, fitness, descriptor = points(evaluator, TrainingChunk, generation, ask)
+            assert_near(start.parameters_D, emitter.es.centre)
+            emitter.climb(noise_of(generation, ask), fitness, descriptor)
+            assert_near(points(evaluator, EvaluationChunk, generation, ask)[0].parameters_D, emitter.es.centre)
+            highest.append(float(fitness.max()))
+        before = list(archive)
+        for ask, emitter in enumerate(emitters):
+            mean, place = evaluation(evaluator, generation, ask)
+            robbed += emitter.elite is not None and emitter.elite not in elites.values()
+            emitter.evaluated(generation, mean, place, highest[ask])
+            found = novelty_twin.novelty(before, place, 3, PRESETS[preset]["squared"])
+            assert rows[ask]["novelty"] == pytest.approx(found, rel=1e-12)
+        mine = [[cell for cell, elite in elites.items() if elite is one.elite] for one in emitters]
+        assert [row["cell"] for row in rows] == [number(cells[0], CELLS) if cells else None for cells in mine]
+        map_ = map_from_parts(store.after[generation])
+        assert map_ is not None
+        assert map_.cell_N.tolist() == [number(index, CELLS) for index in elites]
+        for ours, name in ((map_.generation_N, "generation"), (map_.centre_N, "emitter")):
+            assert ours.tolist() == [getattr(elite, name) for elite in elites.values()]
+        for ours, name in ((map_.fitness_N, "fitness"), (map_.score_N, "score"), (map_.descriptor_N_B, "descriptor")):
+            np.testing.assert_allclose(ours, [getattr(elite, name) for elite in elites.values()], rtol=1e-12)
+    for index, elite in elites.items():
+        assert_near(store.part(elite_part(number(index, CELLS)))["centre_D"], elite.centre)
+    np.testing.assert_allclose(state.search.archive.descriptor_N_B, archive, rtol=1e-12)
+    assert shared >= 1, "some blocks began from the same elite"
+    assert robbed >= 1, "an elite was replaced while a block that led from it was to be told"
+
+
+def test_the_mode_of_a_block_is_that_of_a_later_one_of_the_emitters_before():
+    settings = config_of(emitters=EMITTERS).search
+    modes = [[block_mode(settings, 0, 1 + BLOCK * block, e) for e in range(EMITTERS)] for block in range(4)]
+    assert modes == [["explore", "exploit", "explore"], ["exploit", "explore", "exploit"]] * 2
+    coin = config_of(emitters=EMITTERS, alternation="coin").search
+    thrown = [tuple(block_mode(coin, 0, 1 + BLOCK * block, e) for e in range(EMITTERS)) for block in range(60)]
+    assert len(set(thrown)) == 8, "each emitter has a coin of its own"
+
+
+def test_scores_of_centres_side_by_side_by_hand():
+    """(centre, population's best, fitness, place) told in this order -> scores of the cells; cells of the centres."""
+    state = first_state([np.zeros(3, np.float32)] * 2, 1, 0.0, empty_map(Grid(((0.0, 9.0),), (9,))))
+    for centre_, best, fitness, place, scores, cells in (
+        (0, 10, 1, 2.5, {2: 10}, [2, NO_CELL]),
+        (1, 20, 2, 2.5, {2: 20}, [NO_CELL, 2]),  # replaces the elite that the other centre was
+        (0, 30, 0, 4.5, {2: 20, 4: 30}, [4, 2]),  # which therefore scores nothing
+        (1, 40, 0, 2.5, {2: 40, 4: 30}, [4, NO_CELL]),
+    ):
+        told = CentreEvaluation(1, centre_, True, fitness, np.array([place]), best)
+        state = mapped(state, told)
+        assert state.map is not None
+        assert dict(zip(state.map.cell_N.tolist(), state.map.score_N.tolist(), strict=True)) == scores
+        assert [one.cell for one in state.centres] == cells
+
+
+@pytest.mark.parametrize(("algorithm", "weight"), [("ns_es", 0.0), ("nsr_es", 0.5), ("nsra_es", 0.5)])
+def test_every_centre_at_once_equals_the_twin(algorithm, weight):
+    config = config_of(generations=14, algorithm=algorithm, centres=3, update="all", learning_rate=0.05, **NSRA)
+    state, store, evaluator = run_in_memory(config)
+    other = novelty_twin.NoveltySearch(
+        first_centres(config),
+        config.search.learning_rate,
+        config.search.l2,
+        neighbours=3,
+        weight=weight,
+        rule=(0.125, 2, 0.0) if algorithm == "nsra_es" else None,
+    )
+    for index in range(3):
+        other.initial(index, evaluation(evaluator, 0, index)[1])
+    for generation in range(1, 15):
+        rows = store.evaluated[generation]
+        assert [row["centre"] for row in rows] == [0, 1, 2]
+        assert [row["fitness_weight"] for row in rows] == [other.weight] * 3
+        for ask in range(3):
+            start, *found = points(evaluator, TrainingChunk, generation, ask)
+            assert_near(start.parameters_D, other.centres[ask].centre)
+            other.generation(ask, noise_of(generation, ask), *found)
+        told = [(ask, *evaluation(evaluator, generation, ask)) for ask in range(3)]
+        expected = [novelty_twin.novelty(other.archive, place, 3) for *_, place in told]
+        assert [row["novelty"] for row in rows] == pytest.approx(expected, rel=1e-12)
+        other.told(told)
+        assert store.rows[generation]["archive_size"] == len(other.archive) == 3 + 3 * generation
+    for ours, theirs in zip(state.search.centres, other.centres, strict=True):
+        assert_near(ours.centre_D, theirs.centre)
+        assert ours.adam.step == 14
+    np.testing.assert_allclose(state.search.archive.descriptor_N_B, other.archive, rtol=1e-12)
+    assert state.search.archive.centre_N.tolist() == [0, 1, 2] * 15
+    weights = [row["fitness_weight"] for row in store.rows]
+    if algorithm == "nsra_es":  # it rose by more than a step at once, and it fell
+        assert max(np.diff(weights)) > 0.125 > 0.0 > min(np.diff(weights))
+    else:
+        assert set(weights) == {weight}
+
+
+def test_patience_counts_generations_and_the_record_is_told_centre_by_centre():
+    search = config_of(algorithm="nsra_es", fitness_weight_min_gain=0.0, **NSRA).search
+    weight, values = replace(first_state([], 1, 0.5).weight, record=0.0), []
+    for fitnesses in ([-1, -1, -1], [-1, -1, -1], [1, 3, 2], [-1, 4, -1], [4, 4, None], [None] * 3, [-1, -1, -1]):
+        told = [CentreEvaluation(1, i, f is not None, f or 0.0, np.zeros(1)) for i, f in enumerate(fitnesses)]
+        weight = adapted_weight(search, weight, tuple(told))
+        values.append((weight.value, weight.record, weight.stagnant))
+    #  1 without; 2 without: down; two records; one; 1 without; 2 without: down; 1 without
+    assert values == [
+        (0.5, 0.0, 1),
+        (0.375, 0.0, 0),
+        (0.625, 3, 0),
+        (0.75, 4, 0),
+        (0.75, 4, 1),
+        (0.625, 4, 0),
+        (0.625, 4, 1),
+    ]
+
+
+# The history and the evaluated centres
+
+SAME = {
+    "centre": "centre",
+    "fitness_weight": "fitness_weight",
+    "start_cell": "start_cell",
+    "cell": "cell",
+    "fitness_mean": "centre_fitness_mean",
+    "fitness_std": "centre_fitness_std",
+    "return_mean": "centre_return_mean",
+    "x": "centre_x",
+    "y": "centre_y",
+    "novelty": "centre_novelty",
+    "update_norm": "update_norm",
+}
+"""Column of an evaluated centre -> that of the history, whose row is about the fittest of them."""
+
+
+@pytest.mark.parametrize(
+    "search", [{}, {"algorithm": "nsra_es"}, {"emitters": 3}, {"algorithm": "nsr_es", "centres": 4, "update": "all"}]
+)
+def test_the_row_of_a_generation_is_that_of_its_fittest_centre(search):
+    config = config_of(generations=9, **search)
+    _, store, _ = run_in_memory(config)
+    several = config.search.centres if "emitters" in search or "update" in search else 1
+    assert [len(rows) for rows in store.evaluated] == [config.search.centres] + [several] * 9
+    for row, rows in zip(store.rows, store.evaluated, strict=True):
+        best = max(rows, key=lambda one: one["fitness_mean"])
+        assert {name: best.get(name) for name in SAME} == {name: row[theirs] for name, theirs in SAME.items()}
+    if several > 1:
+        assert len({row["centre"] for row in store.rows[1:]}) > 1
+    steps = [sum(one["env_steps"] for one in rows) for rows in store.evaluated]
+    assert np.cumsum(steps).tolist() == [row["env_steps"] for row in store.rows]
+
+
+class Spoiling(Sharing):
+    """As many members of each population are invalid as its number says, and one more."""
+
+    def evaluate(self, work):
+        results = super().evaluate(work)
+        for (_, chunk), result in zip(work, results, strict=True):
+            if isinstance(chunk, TrainingChunk) and chunk.chunk_id == 1:
+                result.fitness[: chunk.ask + 1, 0] = np.nan
+        return results
+
+
+def test_counts_of_a_generation_are_sums_over_its_populations():
+    _, store, evaluator = run_in_memory(config_of(generations=4, emitters=3), Spoiling())
+    for generation in range(1, 5):
+        row, before = store.rows[generation], store.rows[generation - 1]
+        results = {
+            kind: [r for _, c, r in evaluator.recorded if isinstance(c, kind) and c.generation == generation]
+            for kind in (TrainingChunk, EvaluationChunk)
+        }
+        assert len(results[TrainingChunk]) == len(results[EvaluationChunk]) == 6
+        trained = sum(int(r.steps.sum()) for r in results[TrainingChunk])
+        kept = sum(int(r.steps[: 4 if i % 2 else 16].sum()) for i, r in enumerate(results[EvaluationChunk]))
+        assert row["env_steps"] - before["env_steps"] == trained + kept
+        assert row["episodes"] - before["episodes"] == 3 * (64 + 20)
+        assert row["invalid_members"] == 1 + 2 + 3
+        fitness = np.concatenate([r.fitness.ravel() for r in results[TrainingChunk]])
+        assert row["population_fitness_max"] == np.nanmax(fitness)
+        assert row["population_fitness_min"] == np.nanmin(fitness)
+
+
+def test_the_fittest_valid_centre_is_shown_and_of_equal_ones_the_first():
+    def shown(*fitness):
+        return fittest([CentreEvaluation(1, 0, f is not None, 99.0 if f is None else f, np.zeros(1)) for f in fitness])
+
+    assert shown(1.0, 3.0, 2.0) == 1
+    assert shown(-2.0, -1.0, -1.0) == 1
+    assert shown(None, -3.0, -2.0) == 2
+    assert shown(None, None) == 0

@@ -1,0 +1,161 @@
+"""Generations of several populations from the outside: placement, kills, the table of evaluated centres, evaluate."""
+
+from __future__ import annotations
+
+import csv
+import signal
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from es_service import api
+from es_service.store.digest import digest_parts
+from tests.system.command_line import command
+from tests.system.processes import committed
+from tests.system.session import SMALL, finish
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),  # Ray leaves files and processes to the garbage collector
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+SEARCHES = {
+    "me_es": {"algorithm": "me_es", "emitters": 3, "pairs": 16, "evaluation_episodes": 4, "block_generations": 4},
+    "nsra_es": SMALL["search"] | {"update": "all"},
+}
+GENERATIONS = 14
+
+
+def config_of(name, **compute):
+    budget = {"generations": GENERATIONS}
+    return SMALL | {"search": SEARCHES[name], "budget": budget, "compute": SMALL["compute"] | compute}
+
+
+@pytest.fixture(scope="module", params=SEARCHES)
+def undisturbed(request, tmp_path_factory):
+    """A search's name, and its finished run on one worker, for reading only."""
+    folder = tmp_path_factory.mktemp(request.param) / "run"
+    api.run(api.load_config(config_of(request.param)), folder)
+    return request.param, folder
+
+
+@pytest.fixture(scope="module")
+def emitters(tmp_path_factory):
+    """A finished run of ME-ES, for reading only; many elites, and resets that differ."""
+    folder = tmp_path_factory.mktemp("emitters") / "run"
+    search = {**SEARCHES["me_es"], "sigma": 0.2, "learning_rate": 0.3}
+    return api.run(api.load_config(config_of("me_es") | {"search": search}), folder).run
+
+
+@pytest.mark.parametrize("compute", [{"workers": 2}, {"workers": 3}, {"workers": 2, "engine": "ray"}], ids=str)
+def test_number_and_kind_of_workers(tmp_path, undisturbed, compute):
+    name, folder = undisturbed
+    other = api.run(api.load_config(config_of(name, **compute)), tmp_path / "run", on_notice=pytest.fail).run
+    assert digest_parts(other.folder) == digest_parts(folder)
+    assert set(other.history["workers"]) == {compute["workers"]}
+
+
+def test_killed_at_three_points_in_three_generations(tmp_path, undisturbed):
+    name, reference = undisturbed
+    folder = tmp_path / "run"
+    for at, nth, newest in (("mid_transaction", 3, 1), ("before_commit", 4, 4), ("after_commit", 4, 8)):
+        kill, config = {"at": at, "nth": nth}, None if folder.exists() else config_of(name)
+        assert finish(folder, config=config, kill=kill) == -signal.SIGKILL
+        assert committed(folder) == newest
+    assert finish(folder) == 0
+    assert digest_parts(folder) == digest_parts(reference)
+
+
+def test_resumed_and_forked_in_the_middle(tmp_path, undisturbed):
+    name, reference = undisturbed
+    part = api.run(api.load_config(config_of(name), ["budget.generations=6"]), tmp_path / "part").run
+    assert len(part.evaluations) == 7 * part.constants["search.centres"]
+    fork = api.fork(part.folder, [f"budget.generations={GENERATIONS}"], out=tmp_path / "fork", generation=5).run
+    api.resume(part.folder, [f"budget.generations={GENERATIONS}"])
+    whole = api.open_run(reference)
+    for run in (part, fork):
+        assert digest_parts(run.folder) == digest_parts(reference)
+        pd.testing.assert_frame_equal(run.evaluations, whole.evaluations)
+
+
+# The table of evaluated centres
+
+
+def test_the_table_has_its_columns_and_a_row_for_each_centre(undisturbed):
+    run = api.open_run(undisturbed[1])
+    table, centres = run.evaluations, run.constants["search.centres"]
+    assert list(table) == [
+        "generation",
+        "centre",
+        "fitness_weight",
+        "start_cell",
+        "cell",
+        "fitness_mean",
+        "fitness_std",
+        "return_mean",
+        "x",
+        "y",
+        "goal_distance",
+        "novelty",
+        "update_norm",
+        "env_steps",
+    ]
+    assert table["generation"].tolist() == np.repeat(np.arange(GENERATIONS + 1), centres).tolist()
+    assert table["centre"].tolist() == list(range(centres)) * (GENERATIONS + 1)
+    first = table["generation"] == 0
+    for name in ("novelty", "update_norm"):
+        assert table[name].isna().tolist() == first.tolist()
+    begins = (table["generation"] % 4 == 1) & (centres == 3)  # blocks of four generations
+    assert table["start_cell"].notna().tolist() == begins.tolist()
+    history = run.history
+    np.testing.assert_array_equal(table.groupby("generation")["env_steps"].sum().cumsum(), history["env_steps"])
+    best = table.loc[table.groupby("generation")["fitness_mean"].idxmax()].set_index("generation")
+    np.testing.assert_array_equal(best["fitness_mean"], history["centre_fitness_mean"])
+    np.testing.assert_array_equal(best["centre"], history["centre"])
+    np.testing.assert_array_equal(
+        table["fitness_mean"].cummax().to_numpy()[centres - 1 :: centres], history["best_fitness"]
+    )
+    assert len(run.evaluations_until(3)) == 4 * centres
+    np.testing.assert_allclose(run.novelty[["x", "y"]], table[["x", "y"]], rtol=1e-12)
+
+
+def test_the_cell_of_a_row_is_the_one_it_entered_and_kept(emitters):
+    """The newest row of a cell is its elite in the map."""
+    entered = emitters.evaluations.dropna(subset="cell").groupby("cell").last()
+    map_ = emitters.map.set_index("cell").sort_index()
+    assert entered.index.tolist() == map_.index.tolist()
+    assert entered["generation"].tolist() == map_["generation"].tolist()
+    assert entered["centre"].tolist() == map_["centre"].tolist()
+    assert entered["fitness_mean"].tolist() == map_["fitness"].tolist()
+    assert set(map_["centre"]) == {0, 1, 2}
+
+
+@pytest.mark.parametrize("to", ["csv", "parquet"])
+def test_an_export_has_the_table(tmp_path, undisturbed, to):
+    folder = undisturbed[1]
+    result = command("export", folder, "--to", to, "--out", tmp_path)
+    assert result.returncode == 0, result.stderr
+    read = pd.read_csv if to == "csv" else pd.read_parquet
+    exported = read(tmp_path / f"evaluations.{to}")
+    pd.testing.assert_frame_equal(exported, api.open_run(folder).evaluations, check_dtype=False)
+
+
+# Fresh episodes
+
+
+def test_evaluating_all_cells_together_equals_one_by_one(tmp_path, emitters):
+    """Every policy gets the same episodes, however many are evaluated side by side."""
+
+    def rows(*arguments):
+        out = tmp_path / "rows.csv"
+        result = command("evaluate", emitters.folder, *arguments, "--episodes", 20, "--workers", 2, "--out", out)
+        assert result.returncode == 0, result.stderr
+        return {row["policy"]: row for row in csv.DictReader(out.read_text().splitlines())}
+
+    together = rows("--all", "--best")
+    assert len(together) == len(emitters.map) + 1 >= 12, "more than are evaluated side by side"
+    assert len({row["fresh_fitness"] for row in together.values()}) >= 10
+    names = list(together)
+    for name in (names[1], names[7], names[-1]):
+        assert rows("--cell", name) == {name: together[name]}
+    assert rows("--best") == {"best": together["best"]}
