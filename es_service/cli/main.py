@@ -100,7 +100,8 @@ def run(
         print_note(f"note: ignored {', '.join(foreign)} of {config}, since {task} replaces its task (default options)")
     for warning in config_warnings(loaded, task_of(loaded), no_vectors()):
         print_note(f"note: {warning}")
-    console.print(parallel_sentence(loaded), highlight=False, markup=False, soft_wrap=True)
+    with contextlib.suppress(SystemExit):  # rich's answer to a closed output
+        console.print(parallel_sentence(loaded), highlight=False, markup=False, soft_wrap=True)
     folder = out if out is not None else api.default_folder(loaded)
     _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder))
 

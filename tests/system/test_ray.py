@@ -186,7 +186,7 @@ class Mirror:
     def build(self) -> str:
         return "a mirror's"
 
-    def run(self, centre: bytes, chunks: bytes) -> bytes:
+    def run(self, chunks: bytes, *centres: bytes) -> bytes:
         import ray
 
         ids = ray.get_runtime_context().get_accelerator_ids()["GPU"]

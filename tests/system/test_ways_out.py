@@ -118,6 +118,7 @@ def test_an_interruption_names_a_command_that_is_there(config, tmp_path):
     arguments = ["run", config, "--out", folder, "--set", "budget.generations=10000"]
     with running(PROGRAM, *arguments, env=os.environ | {"PATH": os.defpath}) as run:
         assert run.stdout is not None
+        assert run.stdout.readline().startswith("a generation has ")
         assert run.stdout.readline().startswith("generation 0")
         run.send_signal(signal.SIGINT)
         assert run.communicate(timeout=60)[1].endswith(f"Continue with: {PROGRAM} resume {folder}\n")
@@ -180,6 +181,7 @@ def test_a_run_goes_on_where_nobody_reads_its_output(tmp_path, errors):
     config.write_text(api.load_config(SMALL | {"budget": {"generations": 10**6}}).resolved_yaml())
     with running(sys.executable, "-m", "es_service", "run", config, "--out", folder, stderr=errors) as run:
         assert run.stdout is not None
+        assert run.stdout.readline().startswith("a generation has ")
         assert run.stdout.readline().startswith("generation 0")
         run.stdout.close()
         time.sleep(2.5)  # it prints once a second
