@@ -32,6 +32,7 @@ def check(function: Callable, arguments: list[np.ndarray]) -> None:
             np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow  # all of them together
 @pytest.mark.parametrize("name", CASES)
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large,
           HealthCheck.function_scoped_fixture])  # fmt: skip
