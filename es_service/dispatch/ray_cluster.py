@@ -15,13 +15,13 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from es_service.config.compute import ENGINE_IMPLIES
+from es_service.dispatch.ray_side_effects import environment_kept, signal_handlers_kept
 from es_service.errors import EvaluationError, Interrupted, WayOut
 from es_service.logs import logger
 
@@ -107,7 +107,7 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
             "object_store_memory": OBJECT_STORE_BYTES,
         }
         settings |= LOCAL_SETTINGS | {"RAY_AUTH_TOKEN": os.environ.get("RAY_AUTH_TOKEN", TOKEN)}
-    with _signal_handlers_kept(), _environment_kept(settings):
+    with signal_handlers_kept() as arrived, environment_kept(settings):
         try:
             import ray
         except ImportError as error:
@@ -136,6 +136,9 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
                 value=address,
                 ways_out=ways_out,
             ) from error
+    if signal.SIGTERM in arrived:
+        ray.shutdown()
+        raise Interrupted(signal.SIGTERM)
     _let_print(ray, False)
     _LOG.info("joined a Ray cluster (%s), Ray %s", address or "one of our own on this machine", ray.__version__)
     return ray
@@ -149,7 +152,7 @@ def disconnect(ray: ModuleType, *, forget: bool = False) -> None:
     """
     _let_print(ray, True)
     folder = _session_folder(ray) if forget else None
-    with _signal_handlers_kept():
+    with signal_handlers_kept():
         ray.shutdown()
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
@@ -258,33 +261,3 @@ def _knock(address: str) -> None:
     if not colon or not port.isdigit():
         raise ValueError(f"{address!r} is neither HOST:PORT nor auto")
     socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
-
-
-@contextlib.contextmanager
-def _signal_handlers_kept() -> Iterator[None]:
-    """Context manager that restores the signal handlers that Ray replaces; Ray can do so only in the main thread."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def _environment_kept(settings: dict[str, str]) -> Iterator[None]:
-    """Context manager that sets environment variables for processes that Ray starts, and restores ours at its end."""
-    before = dict(os.environ)
-    os.environ.update(settings)
-    try:
-        yield
-    finally:
-        # Restore only the variables that differ, because threads of Ray may be reading the others.
-        for name in os.environ.keys() - before.keys():
-            del os.environ[name]
-        for name, value in before.items():
-            if os.environ.get(name) != value:
-                os.environ[name] = value

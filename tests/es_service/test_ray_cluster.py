@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import signal
+import sys
 from types import SimpleNamespace
 
 import pytest
+from test.support import catch_unraisable_exception
 
-from es_service.dispatch import ray_cluster
-from es_service.errors import EvaluationError
+from es_service.dispatch import ray_cluster, ray_side_effects
+from es_service.errors import EvaluationError, Interrupted
 
 
 def test_variables_that_nobody_changed_are_never_touched(monkeypatch):
@@ -19,7 +22,7 @@ def test_variables_that_nobody_changed_are_never_touched(monkeypatch):
     before, touched = dict(os.environ), []
     for function in ("putenv", "unsetenv"):
         monkeypatch.setattr(os, function, lambda name, *_: touched.append(name))
-    with ray_cluster._environment_kept({"OLD": "new", "NEW": "new"}):
+    with ray_side_effects.environment_kept({"OLD": "new", "NEW": "new"}):
         os.environ["RAYS_OWN"] = "1"
         assert os.environ["OLD"] == os.environ["NEW"] == "new"
     assert dict(os.environ) == before
@@ -35,6 +38,28 @@ def test_a_sentence_of_ray_s_ends_with_one_full_stop(monkeypatch):
     monkeypatch.setattr(ray, "init", refuse)
     with pytest.raises(EvaluationError, match=r"at auto: Could not find .* specify one\. Check the address\."):
         ray_cluster.connect("auto", ray_cluster.ONE_CORE, 1)
+
+
+def test_sigterm_is_not_lost_where_python_ignores_the_exception_of_ray_s_handler(monkeypatch):
+    ray = pytest.importorskip("ray")
+    ended, before = [], signal.getsignal(signal.SIGTERM)
+
+    class Finalized:
+        def __del__(self):
+            signal.raise_signal(signal.SIGTERM)
+
+    def start(**_):
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(number))
+        Finalized()
+
+    monkeypatch.setattr(ray, "init", start)
+    monkeypatch.setattr(ray, "shutdown", lambda: ended.append(True))
+    with catch_unraisable_exception() as shown:
+        with pytest.raises(Interrupted):
+            ray_cluster.connect("auto", ray_cluster.ONE_CORE, 1)
+        assert shown.unraisable is None
+    assert ended == [True]
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 @pytest.mark.parametrize("is_latest", [True, False])
