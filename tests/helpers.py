@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,16 +41,22 @@ def random_parameters(seed: int = 0, size: int = PARAMETERS, scale: float = 0.7)
     return (np.random.default_rng(seed).normal(size=size) * scale).astype(np.float32)
 
 
+def chunk_runner(worker_spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
+    """A worker that runs one chunk at a time."""
+    run = make_worker(worker_spec)
+    return lambda centre, chunk: run([(centre, chunk)])[0]
+
+
 class DirectEvaluator:
     """An Evaluator in this process: one worker function, chunks in the order given. Records all it returned."""
 
     def __init__(self, worker_spec: WorkerSpec) -> None:
-        self._run_chunk = make_worker(worker_spec)
+        self.run = make_worker(worker_spec)
         self.counts = DispatchCounts(workers=1)
         self.recorded: list[tuple[Centre, Chunk, ChunkResult]] = []
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
-        results = [self._run_chunk(centre, chunk) for centre, chunk in work]
+        results = self.run(work)
         self.recorded += [(centre, chunk, result) for (centre, chunk), result in zip(work, results, strict=True)]
         return results
 

@@ -9,7 +9,6 @@ import os
 import pickle
 import socket
 from collections.abc import Callable, Sequence
-from functools import partial
 
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import ChunkResult, Work, WorkerPlace
@@ -46,9 +45,9 @@ class WorkerActor:
         for name in set(os.environ) - set(environment):
             del os.environ[name]
         os.environ.update(environment | xla_cache_settings())
-        from workers.worker import make_worker, run_chunks
+        from workers.worker import make_worker
 
-        self._run_chunks = partial(run_chunks, make_worker(pickle.loads(self._spec)))
+        self._run_chunks = make_worker(pickle.loads(self._spec))
         if not self._gpus:
             return platform_text(platform_info())
         import jax

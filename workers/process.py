@@ -14,7 +14,6 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from es_service.protocol.messages import Centre, forget_oldest
@@ -64,9 +63,9 @@ def _make_run_chunks(spec: Any) -> Callable[..., Any] | str:
     """Function that runs chunks, or the traceback of the error that prevented making it."""
     os.environ.update(xla_cache_settings())
     try:
-        from workers.worker import make_worker, run_chunks
+        from workers.worker import make_worker
 
-        return partial(run_chunks, make_worker(spec))
+        return make_worker(spec)
     except Exception:
         return traceback.format_exc()
 

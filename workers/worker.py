@@ -30,8 +30,13 @@ from workers.environments import make_environment
 from workers.episode import Episodes
 
 
-def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
-    """Function (centre, chunk) -> result of a run; the functions that it uses are compiled at their first call."""
+def make_worker(spec: WorkerSpec) -> Callable[[Sequence[Work]], list[ChunkResult]]:
+    """Function from the chunks of a work item to their results; what it uses is compiled at its first call.
+
+    With simd the episodes of neighbouring chunks around one centre run in one call of the kernel, since an episode's
+    bits do not depend on the others. With xla they might, so each chunk runs alone. A note on an exception names the
+    chunks that raised it.
+    """
     environment = make_environment(spec.environment, spec.environment_options)
     if spec.rollout == "simd":
         from workers.simd.episodes import rollout as made_by
@@ -41,55 +46,81 @@ def make_worker(spec: WorkerSpec) -> Callable[[Centre, Chunk], ChunkResult]:
     evaluation_rollout = made_by.make_evaluation_rollout(environment, spec)
     gradient_sum = made_by.make_gradient_sum(spec.policy.parameters)
 
-    def train(centre: Centre, chunk: TrainingChunk) -> EpisodesResult:
-        pairs_P = chunk.chunk_id * spec.chunk_pairs + np.arange(spec.chunk_pairs)
+    def train(centre: Centre, chunks: Sequence[TrainingChunk]) -> list[ChunkResult]:
+        first, pairs_P = chunks[0], _ids(chunks, spec.chunk_pairs)
         episodes = training_rollout(
             centre.parameters_D,
             np.float32(centre.sigma / NORMAL_STD),
             centre.observation_mean_O,
             centre.observation_std_O,
-            stream_keys(spec.seed, Domain.PARAMETER_NOISE, chunk.generation, pairs_P, *population_id(chunk)),
-            *episode_keys(spec, chunk.generation, pairs_P, population_id(chunk)),
+            stream_keys(spec.seed, Domain.PARAMETER_NOISE, first.generation, pairs_P, *population_id(first)),
+            *episode_keys(spec, first.generation, pairs_P, population_id(first)),
         )
-        return _training_result(episodes, centre.observation_mean_O)
+        return [_training_result(part, centre.observation_mean_O) for part in _split(episodes, spec.chunk_pairs)]
 
-    def evaluate(centre: Centre, chunk: EvaluationChunk) -> EpisodesResult:
-        episodes_E = chunk.chunk_id * EVALUATION_EPISODES_PER_CHUNK + np.arange(EVALUATION_EPISODES_PER_CHUNK)
+    def evaluate(centre: Centre, chunks: Sequence[EvaluationChunk]) -> list[ChunkResult]:
+        first, episodes_E = chunks[0], _ids(chunks, EVALUATION_EPISODES_PER_CHUNK)
         episodes = evaluation_rollout(
             centre.parameters_D,
             centre.observation_mean_O,
             centre.observation_std_O,
-            stream_keys(spec.seed, Domain.EVALUATION_RESET, chunk.generation, episodes_E, *population_id(chunk)),
+            stream_keys(spec.seed, Domain.EVALUATION_RESET, first.generation, episodes_E, *population_id(first)),
         )
-        return _evaluation_result(episodes)
+        return [_evaluation_result(part) for part in _split(episodes, EVALUATION_EPISODES_PER_CHUNK)]
 
-    def gradient(chunk: GradientChunk) -> GradientResult:
-        pairs_P = chunk.chunk_id * spec.gradient_block_pairs + np.arange(spec.gradient_block_pairs)
-        keys_P = stream_keys(spec.seed, Domain.PARAMETER_NOISE, chunk.generation, pairs_P, *population_id(chunk))
-        return GradientResult(np.array(gradient_sum(chunk.weights_P, keys_P)))
+    def gradient(_: Centre, chunks: Sequence[GradientChunk]) -> list[ChunkResult]:
+        first = chunks[0]
+        pairs_C_P = _ids(chunks, spec.gradient_block_pairs).reshape(len(chunks), -1)
+        keys_C_P = stream_keys(spec.seed, Domain.PARAMETER_NOISE, first.generation, pairs_C_P, *population_id(first))
+        return [
+            GradientResult(np.array(gradient_sum(chunk.weights_P, keys_P)))
+            for chunk, keys_P in zip(chunks, keys_C_P, strict=True)
+        ]
 
-    def run_chunk(centre: Centre, chunk: Chunk) -> ChunkResult:
-        match chunk:
-            case TrainingChunk():
-                return train(centre, chunk)
-            case EvaluationChunk():
-                return evaluate(centre, chunk)
-            case GradientChunk():
-                return gradient(chunk)
+    functions: dict[type[Chunk], Callable[[Centre, Any], list[ChunkResult]]] = {
+        TrainingChunk: train,
+        EvaluationChunk: evaluate,
+        GradientChunk: gradient,
+    }
 
-    return run_chunk
+    def run(work: Sequence[Work]) -> list[ChunkResult]:
+        results: list[ChunkResult] = []
+        for centre, chunks in _groups(work, together=spec.rollout == "simd"):
+            try:
+                results += functions[type(chunks[0])](centre, chunks)
+            except BaseException as error:
+                error.add_note(f"raised in {', '.join(map(chunk_name, chunks))}")
+                raise
+        return results
+
+    return run
 
 
-def run_chunks(run_chunk: Callable[[Centre, Chunk], ChunkResult], work: Sequence[Work]) -> list[ChunkResult]:
-    """Results of the chunks of one work item; a note on an exception names the chunk that raised it."""
-    results = []
+def _groups(work: Sequence[Work], *, together: bool) -> list[tuple[Centre, list[Chunk]]]:
+    """Neighbouring chunks of one kind around the same centre; if not `together`, every chunk alone."""
+    groups: list[tuple[Centre, list[Chunk]]] = []
+    last = None
     for centre, chunk in work:
-        try:
-            results.append(run_chunk(centre, chunk))
-        except BaseException as error:
-            error.add_note(f"raised in {chunk_name(chunk)}")
-            raise
-    return results
+        key = (id(centre), type(chunk), chunk.generation, chunk.ask)
+        if together and key == last:
+            groups[-1][1].append(chunk)
+        else:
+            groups.append((centre, [chunk]))
+        last = key
+    return groups
+
+
+def _ids(chunks: Sequence[Chunk], size: int) -> Any:
+    """Ids of the pairs or the episodes of chunks, `size` in each."""
+    return np.concatenate([chunk.chunk_id * size + np.arange(size) for chunk in chunks])
+
+
+def _split(episodes: Episodes, size: int) -> list[Episodes]:
+    """Episodes of several chunks as those of each, `size` along the first axis; in JAX's memory if they were."""
+    count = len(episodes.fitness) // size
+    if count == 1:
+        return [episodes]
+    return [Episodes(*(leaf[i * size : (i + 1) * size] for leaf in episodes)) for i in range(count)]
 
 
 def population_id(chunk: Chunk) -> tuple[int, ...]:

@@ -208,10 +208,8 @@ def _next_generation(
     learned = tell(algorithm, moved, told)
 
     nearest = config.novelty
-    novelties = [
-        float(novelty(moved.archive, one.descriptor_B, neighbours=nearest.neighbours, distance=nearest.distance))
-        for one in told
-    ]
+    descriptors = [one.descriptor_B for one in told]
+    novelties = novelty(moved.archive, descriptors, neighbours=nearest.neighbours, distance=nearest.distance).tolist()
     rows = [
         evaluated_row(
             evaluation,

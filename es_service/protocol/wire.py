@@ -11,12 +11,16 @@ import socket
 import struct
 from collections import deque
 from contextlib import suppress
+from itertools import islice
 from typing import Any
 
 _LENGTH = struct.Struct("!Q")
 _READ_BYTES = 1 << 18
 BUFFER_BYTES = 1 << 20
 """Send buffer requested for each socket, so that most messages are sent at once; the system may grant less."""
+
+FRAMES_AT_ONCE = 512
+"""Number of frames in one call to the system, which takes at most 1,024."""
 
 
 def framed(message: Any) -> bytes:
@@ -72,14 +76,17 @@ class Channel:
         self.flush()
 
     def flush(self) -> None:
-        """Send as much as the socket takes now. If that fails, shut the connection down, which `receive` reports."""
+        """Send as much as the socket takes now. If that fails, shut the connection down, which `receive` reports.
+
+        All frames are sent in one call, since each call wakes the receiver, which would compete with the sender.
+        """
         try:
             while self._to_send:
-                sent = self._end.send(self._to_send[0])
-                if sent < len(self._to_send[0]):
+                sent = self._end.sendmsg(islice(self._to_send, FRAMES_AT_ONCE))
+                while self._to_send and sent >= len(self._to_send[0]):
+                    sent -= len(self._to_send.popleft())
+                if sent:
                     self._to_send[0] = self._to_send[0][sent:]
-                else:
-                    self._to_send.popleft()
         except BlockingIOError:
             pass
         except OSError:  # part of a message may have been sent, so no other message can follow

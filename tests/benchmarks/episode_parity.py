@@ -59,7 +59,7 @@ def episodes(spec: WorkerSpec, centre: Centre, pairs: int) -> dict[str, np.ndarr
     worker = make_worker(spec)
     found = []
     for chunk in range(pairs // spec.chunk_pairs):
-        result = worker(centre, TrainingChunk(1, chunk))
+        result = worker([(centre, TrainingChunk(1, chunk))])[0]
         assert isinstance(result, EpisodesResult)
         found.append(result)
     descriptor = np.concatenate([result.descriptor.reshape(-1, 2) for result in found])

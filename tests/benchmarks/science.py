@@ -106,13 +106,13 @@ class InThisProcess:
     def __init__(self, config: RunConfig, should_stop: Callable[[], int | None]) -> None:
         from workers.worker import make_worker
 
-        self._run_chunk = make_worker(worker_spec(config, task_of(config)))
+        self._run = make_worker(worker_spec(config, task_of(config)))
         self._should_stop = should_stop
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
         if (number := self._should_stop()) is not None:
             raise Interrupted(number)
-        return [self._run_chunk(centre, chunk) for centre, chunk in work]
+        return self._run(work)
 
 
 @contextmanager

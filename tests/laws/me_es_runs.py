@@ -58,7 +58,7 @@ class Sharing(DirectEvaluator):
     """Runs the functions that were compiled for its preset; evaluations of some generations end nowhere."""
 
     def __init__(self, preset="literature", spoiled=()):
-        self.counts, self._run_chunk = compiled(preset).counts, compiled(preset)._run_chunk
+        self.counts, self.run = compiled(preset).counts, compiled(preset).run
         self.recorded, self.spoiled = [], spoiled
 
     def evaluate(self, work):

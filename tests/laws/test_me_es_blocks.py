@@ -39,7 +39,8 @@ def archive_of(map_, *others):
 
 def shares(map_, mode, sampling, drawn, *others):
     settings = config_of(neighbours=1).novelty
-    return cell_shares(map_, archive_of(map_, *others), settings, mode, sampling, drawn).tolist()
+    novelty_N = elite_novelty(map_, archive_of(map_, *others), settings)
+    return cell_shares(map_, novelty_N, mode, sampling, drawn).tolist()
 
 
 SPREAD = [0, 1, 3, 6, 10, 15, 21]

@@ -12,9 +12,8 @@ from es_service.errors import ConfigError
 from es_service.protocol.messages import PolicyShape, with_options
 from es_service.protocol.noise import Domain, stream_keys
 from tests.examples.ant_slalom import AntSlalom
-from tests.helpers import centre, random_parameters, spec
+from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import TaskError, brax_parts, brax_task, describe_environment, make_environment, user_task
-from workers.worker import make_worker
 
 pytestmark = [
     pytest.mark.slow,
@@ -166,7 +165,7 @@ def test_a_worker_runs_the_example():
     from es_service.protocol.messages import TrainingChunk
 
     point = centre(random_parameters(size=shape.parameters), observation_size=task.observation_size)
-    result = make_worker(worker_spec)(point, TrainingChunk(1, 0))
+    result = chunk_runner(worker_spec)(point, TrainingChunk(1, 0))
     assert result.descriptor.shape == (2, 2, 2)
     assert np.isfinite(result.fitness).all()
     environment = make_environment(EXAMPLE, {})

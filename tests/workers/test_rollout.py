@@ -19,12 +19,12 @@ from es_service.protocol.messages import (
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys
 from es_service.runs.view import Policy
 from tests import helpers
-from tests.helpers import PARAMETERS, centre, random_parameters
+from tests.helpers import PARAMETERS, centre, chunk_runner, random_parameters
 from tests.twins import noise as noise_twin
 from tests.twins import point_maze as maze_twin
 from workers.environments import Environment, make_environment
 from workers.rollout import make_training_rollout
-from workers.worker import episode_keys, make_worker
+from workers.worker import episode_keys
 
 SHAPE = PolicyShape((2, 8, 8, 2))
 MEAN, STD = np.float32([0.1, -0.4]), np.float32([0.3, 0.6])
@@ -51,7 +51,7 @@ def numpy_episode(parameters_D, reset_key, action_key, action_noise, steps=200):
 def run(chunk, worker_spec, parameters_D, sigma=0.1):
     point = centre(parameters_D, sigma=sigma)
     point = type(point)(point.generation, point.parameters_D, sigma, MEAN, STD)
-    return make_worker(worker_spec)(point, chunk)
+    return chunk_runner(worker_spec)(point, chunk)
 
 
 def test_training_chunk_equals_numpy_episodes(spec):
@@ -134,7 +134,7 @@ def test_episodes_per_member_average(spec):
 
 def test_results_do_not_alias_each_other(spec):
     """The fault this guards: descriptors that are views of memory which the next rollout overwrites."""
-    worker = make_worker(spec())
+    worker = chunk_runner(spec())
     first = worker(centre(random_parameters(1)), TrainingChunk(1, 0))
     assert isinstance(first, EpisodesResult)
     kept = first.descriptor.copy()
@@ -144,7 +144,7 @@ def test_results_do_not_alias_each_other(spec):
 
 
 def test_running_a_chunk_again_gives_the_same_bits(spec):
-    worker, point = make_worker(spec()), centre(random_parameters(1))
+    worker, point = chunk_runner(spec()), centre(random_parameters(1))
     for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
         first, second = worker(point, chunk), worker(point, chunk)
         assert isinstance(first, EpisodesResult)
@@ -179,7 +179,7 @@ def test_every_function_is_traced_once(spec, monkeypatch):
 
     counted = dataclasses.replace(original, step=step)
     monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: counted)
-    worker = make_worker(spec())
+    worker = chunk_runner(spec())
     for generation in range(1, 4):
         for chunk in (0, 1):
             worker(centre(random_parameters(generation), generation), TrainingChunk(generation, chunk))

@@ -53,23 +53,25 @@ def me_es(config: RunConfig) -> Algorithm:
     search = config.search
     shared = novelty_search(config, fitness_weight=_weight(block_mode(search, config.seed, 1)))
 
+    def block_modes(state: SearchState, generation: int) -> list[Mode]:
+        return [block_mode(search, config.seed, generation, emitter) for emitter in range(len(state.centres))]
+
     def start_cells(state: SearchState, generation: int) -> dict[int, int]:
         if (generation - 1) % search.block_generations or state.map is None or not state.map.size:
             return {}
         map_, found = state.map, {}
-        for emitter in range(len(state.centres)):
+        modes = block_modes(state, generation)
+        novelty_N = elite_novelty(map_, state.archive, config.novelty) if "explore" in modes else np.zeros(map_.size)
+        for emitter, mode in enumerate(modes):
             key = stream_keys(config.seed, Domain.SELECTION, generation, CELL_CHOICE, *_emitter_id(emitter))
             first, second = (float(u) for u in uniforms(key, np.arange(2, dtype=np.uint32)))
-            mode = block_mode(search, config.seed, generation, emitter)
-            share_N = cell_shares(map_, state.archive, config.novelty, mode, search.cell_sampling, first)
+            share_N = cell_shares(map_, novelty_N, mode, search.cell_sampling, first)
             cumulative_N = np.add.accumulate(share_N)
             found[emitter] = int(map_.cell_N[np.searchsorted(cumulative_N, second * cumulative_N[-1], side="right")])
         return found
 
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
-        modes: list[Mode] = [
-            block_mode(search, config.seed, generation, emitter) for emitter in range(len(state.centres))
-        ]
+        modes = block_modes(state, generation)
         return tuple(population(state, emitter, search, _weight(mode)) for emitter, mode in enumerate(modes))
 
     restart = partial(from_elite, own_statistics=search.parent_statistics == "elite")
@@ -95,8 +97,7 @@ def _emitter_id(emitter: int) -> tuple[int, ...]:
 
 def cell_shares(
     map_: BehaviourMap,
-    archive: NoveltyArchive,
-    settings: NoveltyConfig,
+    novelty_N: NDArray[np.float64],
     mode: Mode,
     sampling: Literal["top", "score"],
     drawn: float,
@@ -104,13 +105,13 @@ def cell_shares(
     """Relative probability with which each filled cell of the map is drawn, [N] in the order of the map.
 
     Args:
+        novelty_N: `elite_novelty` of the map; used only if the block explores.
         mode: what the block does.
         sampling: `search.cell_sampling`.
         drawn: a uniform random number in [0, 1), which decides where there are two ways of drawing.
     """
     share_N = np.zeros(map_.size)
     if mode == "explore":
-        novelty_N = elite_novelty(map_, archive, settings)
         top = _best(novelty_N, MOST_NOVEL)
         if not novelty_N.any() or (sampling == "score" and drawn < ANYWHERE):
             share_N[:] = 1.0

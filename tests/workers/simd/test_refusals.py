@@ -13,12 +13,11 @@ import pytest
 import workers.simd.episodes.program
 from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
 from es_service.protocol.noise import Domain, normal_integers, stream_keys
-from tests.helpers import centre, random_parameters, spec
+from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import SHIPPED, describe_environment, make_environment
 from workers.simd.episodes import noise, rollout
 from workers.simd.episodes.program import compile_episodes
 from workers.simd.graph.unsupported import UnsupportedError
-from workers.worker import make_worker
 
 
 def test_another_generator_is_not_what_was_compiled(monkeypatch: pytest.MonkeyPatch):
@@ -70,7 +69,7 @@ def test_what_the_compiler_refuses_after_tracing_is_refused_beforehand():
     task = describe_environment(f"{__name__}:Heat")
     why = rollout.why_not(task)
     assert why == "loops carry and read 9,216 values; simd supports at most 8,192"
-    worker = make_worker(spec(environment=task.name, policy=PolicyShape((1, 8, 1)), episode_steps=5, rollout="simd"))
+    worker = chunk_runner(spec(environment=task.name, policy=PolicyShape((1, 8, 1)), episode_steps=5, rollout="simd"))
     point = centre(random_parameters(size=25), observation_size=1)
     for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
         with pytest.raises(UnsupportedError, match=why):

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
-from tests.helpers import centre, random_parameters, spec
+from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import describe_environment
 from workers.simd.episodes import rollout
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.primitives import PRIMITIVES
 from workers.simd.graph.unsupported import UnsupportedError
-from workers.worker import make_worker
 
 
 class Drift:
@@ -63,7 +62,9 @@ def test_a_reset_that_the_compiler_chokes_on_is_jaxs(task: type) -> None:
     name = f"{__name__}:{task.__name__}"
     assert rollout.why_not(describe_environment(name)) == ""
     worker_spec = spec(environment=name, policy=PolicyShape((2, 8, 2)), episode_steps=10)
-    simd, xla = (make_worker(spec(**vars(worker_spec) | {"rollout": rollout_name})) for rollout_name in ("simd", "xla"))
+    simd, xla = (
+        chunk_runner(spec(**vars(worker_spec) | {"rollout": rollout_name})) for rollout_name in ("simd", "xla")
+    )
     point = centre(random_parameters(size=worker_spec.policy.parameters))
     for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
         ours, theirs = simd(point, chunk), xla(point, chunk)

@@ -22,6 +22,9 @@ from workers.simd.episodes.program import EpisodeKernel, compile_episodes, write
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.unsupported import UnsupportedError
 
+KEPT_PACKED = 4
+"""Number of centres whose packed weights are kept, for work items that share centres."""
+
 
 def why_not(task: TaskSpec) -> str:
     """Reason why simd cannot run a task's episodes; empty if it can.
@@ -101,7 +104,7 @@ class _Kernels:
             self._zero_O[0] = False
         self._compiled: dict[bool, EpisodeKernel] = {}
         self._lock = threading.Lock()
-        self._packed: tuple[bool, np.ndarray, np.ndarray] | None = None
+        self._packed: tuple[tuple[bool, np.ndarray, np.ndarray], ...] = ()
 
     def _kernel(self, omit_zero_inputs: bool) -> EpisodeKernel:
         with self._lock:  # threads share the kernels
@@ -117,12 +120,15 @@ class _Kernels:
         return self._compiled[omit_zero_inputs]
 
     def for_centre(self, centre_D: np.ndarray, mean_O: np.ndarray) -> tuple[EpisodeKernel, np.ndarray]:
-        """(kernel, packed weights) of a centre; the packed weights of the last centre are reused."""
+        """(kernel, packed weights) of a centre; the packed weights of the last KEPT_PACKED centres are kept."""
         omit_zero_inputs = not mean_O[self._zero_O].any()  # then (0 - mean) / std is 0 and contributes nothing
-        kernel, last = self._kernel(omit_zero_inputs), self._packed
-        if last is None or last[0] != omit_zero_inputs or not np.array_equal(last[1], centre_D):
-            last = self._packed = (omit_zero_inputs, centre_D.copy(), kernel.network.pack(centre_D))
-        return kernel, last[2]
+        kernel, kept = self._kernel(omit_zero_inputs), self._packed
+        for omitted, packed_D, weights in kept:
+            if omitted == omit_zero_inputs and np.array_equal(packed_D, centre_D):
+                return kernel, weights
+        weights = kernel.network.pack(centre_D)
+        self._packed = ((omit_zero_inputs, centre_D.copy(), weights), *kept[: KEPT_PACKED - 1])
+        return kernel, weights
 
 
 def make_gradient_sum(parameters: int, target: Target | None = None) -> Callable:
