@@ -28,7 +28,7 @@ from es_service.runs.session import dispatch_limits
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, is_no_elite
 
-CHUNKS_PER_WORKER = 8
+CHUNKS_PER_WORKER = 16
 """Chunks per worker that are evaluated side by side: enough to keep all busy, few enough to show results soon."""
 FRESH_GENERATION = 2**40
 """Generation number in the random streams of fresh episodes with seed 0; no run reaches it."""
