@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from es_service.protocol.messages import Centre, Chunk, ChunkResult, DispatchCounts, PolicyShape, Work, WorkerSpec
+from es_service.protocol.evaluator import DispatchCounts
+from es_service.protocol.messages import Centre, Chunk, ChunkResult, PolicyShape, Work, WorkerSpec
 from workers.worker import make_worker
 
 SPEC = WorkerSpec(

@@ -19,15 +19,16 @@ from workers.xla_cache import xla_cache_settings
 class WorkerActor:
     """One worker of a run. Its methods are called one at a time, in the order of the requests."""
 
-    def __init__(self, spec: bytes, index: int, gpus: float = 0.0) -> None:
+    def __init__(self, spec: bytes, index: int, gpus: float = 0.0, cores: int = 1) -> None:
         """Keep the arguments; `build` makes the worker.
 
         Args:
             spec: the pickled WorkerSpec.
             index: number of this worker within its run.
             gpus: share of a GPU that Ray has assigned to this actor; 0 for the CPU.
+            cores: number of cores that it may use at a time.
         """
-        self._spec, self._index, self._gpus = spec, index, gpus
+        self._spec, self._index, self._gpus, self._cores = spec, index, gpus, cores
         self._run_chunks: Callable[[Sequence[Work]], list[ChunkResult]] | None = None
 
     def __repr__(self) -> str:
@@ -45,9 +46,9 @@ class WorkerActor:
         for name in set(os.environ) - set(environment):
             del os.environ[name]
         os.environ.update(environment | xla_cache_settings())
-        from workers.worker import make_worker
+        from workers.cores import make_worker_with_cores
 
-        self._run_chunks = make_worker(pickle.loads(self._spec))
+        self._run_chunks = make_worker_with_cores(pickle.loads(self._spec), self._cores)
         if not self._gpus:
             return platform_text(platform_info())
         import jax

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from es_service.protocol.gradient_tree import with_neighbours_added
 from es_service.protocol.messages import (
     EVALUATION_EPISODES_PER_CHUNK,
     Centre,
@@ -35,7 +36,7 @@ def make_worker(spec: WorkerSpec) -> Callable[[Sequence[Work]], list[ChunkResult
 
     With simd the episodes of neighbouring chunks around one centre run in one call of the kernel, since an episode's
     bits do not depend on the others. With xla they might, so each chunk runs alone. A note on an exception names the
-    chunks that raised it.
+    chunks that raised it. Gradient blocks are added as far as the work item has the neighbours.
     """
     environment = make_environment(spec.environment, spec.environment_options)
     if spec.rollout == "simd":
@@ -91,7 +92,7 @@ def make_worker(spec: WorkerSpec) -> Callable[[Sequence[Work]], list[ChunkResult
             except BaseException as error:
                 error.add_note(f"raised in {', '.join(map(chunk_name, chunks))}")
                 raise
-        return results
+        return with_neighbours_added(work, results)
 
     return run
 

@@ -10,12 +10,16 @@ from es_service.config.fields import Count, NotNegative, Positive, Section, Swit
 
 
 class WorkerResources(Section):
-    """Resources that Ray reserves for one worker (engine ray)."""
+    """Resources that Ray reserves for one actor (engine ray)."""
 
-    cpu: Count = Field(1, description="CPU cores that Ray reserves for each worker; a worker uses one core.")
+    cpu: Literal["auto"] | Count = Field(
+        "auto",
+        description="Cores of each Ray actor, all of which it uses. auto: those of a node if the nodes are equal, so "
+        "that a node needs few messages, else 1; with a GPU 1. It never changes results.",
+    )
     gpu: NotNegative = Field(
         0.0,
-        description="GPUs that Ray reserves for each worker. With a fraction below 1, workers share a GPU; with 0, "
+        description="GPUs that Ray reserves for each actor. With a fraction below 1, actors share a GPU; with 0, "
         "episodes run on the CPU.",
     )
 
@@ -24,9 +28,9 @@ class ComputeConfig(Section):
     """How the work is divided and where it runs. Only `rollout` and the three `*_pairs` are constants of the run."""
 
     engine: Literal["ray", "inline"] = Field(
-        "ray",
-        description="How the workers run. ray: as Ray actors, on this machine or in a cluster. inline: as child "
-        "processes of this program.",
+        description="How the workers run. inline: as child processes of this program. ray: as Ray actors, on this "
+        "machine or in a cluster. auto: ray if an address is given or workers need a GPU, else inline, which starts "
+        "sooner and sends messages faster."
     )
     inline_workers: Literal["processes", "threads"] = Field(
         "processes",
@@ -40,12 +44,12 @@ class ComputeConfig(Section):
     )
     workers: Literal["auto"] | Count = Field(
         "auto",
-        description="Number of workers. auto: one for each core of the machine or cluster. The number of workers never "
-        "changes results.",
+        description="Number of workers, each of which is a core. auto: every core of the machine or cluster that has "
+        "work. The number of workers never changes results.",
     )
     worker_resources: WorkerResources = Field(
-        default_factory=lambda: WorkerResources(cpu=1, gpu=0.0),
-        description="With engine ray: resources that Ray reserves for one worker.",
+        default_factory=lambda: WorkerResources(cpu="auto", gpu=0.0),
+        description="With engine ray: resources that Ray reserves for one actor.",
     )
     rollout: Literal["xla", "simd"] = Field(
         description="How episodes are computed. simd: by code compiled for this kind of processor, about twenty times "
@@ -88,7 +92,7 @@ class ComputeConfig(Section):
 COMPUTE_CONSTANTS = ("rollout", "chunk_pairs", "rollout_block_pairs", "gradient_block_pairs")
 """Keys of `compute` that affect floating-point results and are therefore constants of the run."""
 ENGINE_IMPLIES: dict[str, dict[str, Any]] = {
-    "inline": {"compute.address": None, "compute.worker_resources.cpu": 1, "compute.worker_resources.gpu": 0},
+    "inline": {"compute.address": None, "compute.worker_resources.cpu": "auto", "compute.worker_resources.gpu": 0},
     "ray": {"compute.inline_workers": "processes"},
 }
 """Engine -> settings that only the other engine uses, with the values that they must have with this one."""

@@ -28,6 +28,7 @@ LEFT_OPEN: dict[str, str | None] = {
     "map.bounds": "auto",
     "map.cells": "auto",
     "map.qd_offset": "auto",
+    "compute.engine": "auto",
     "compute.rollout": "auto",
     "compute.chunk_pairs": "auto",
     "compute.rollout_block_pairs": "auto",
@@ -117,6 +118,10 @@ def resolve(
     if "search.centres" in left_open and "search.algorithm" in values:
         algorithm = values["search.algorithm"]
         values["search.centres"] = _centres_of(algorithm, values) or (1 if ":" in algorithm else CENTRES)
+    if "compute.engine" in left_open:
+        has_actor_cores = _value(values, f"{RESOURCES}cpu") not in ("auto", 1)
+        for_ray = _value(values, "compute.address") is not None or has_actor_cores or _on_gpu(values)
+        values["compute.engine"] = "ray" if for_ray else "inline"
     if "compute.rollout" in left_open and task is not None:
         values["compute.rollout"] = "xla" if _on_gpu(values) or _why_no_simd(values, task, no_vectors) else "simd"
     pairs = values.get("search.pairs")
@@ -221,7 +226,7 @@ def engine_problems(values: Mapping[str, Any]) -> list[Problem]:
                 suggestion=FIELDS[name].default,
             )
             for name in ("compute.address", f"{RESOURCES}cpu", f"{RESOURCES}gpu")
-            if _value(values, name) != FIELDS[name].default
+            if _value(values, name) not in (FIELDS[name].default, *([1] if name == f"{RESOURCES}cpu" else []))
         ]
     inline, threads = values.get("compute.engine") == "inline", values.get("compute.inline_workers") == "threads"
     if threads and not (inline and values.get("compute.rollout", "simd") == "simd"):
@@ -230,6 +235,10 @@ def engine_problems(values: Mapping[str, Any]) -> list[Problem]:
             "several threads at once; must be processes"
         )
         problems.append(unfit("compute.inline_workers", "threads", what, allowed="processes"))
+    workers, cpus = values.get("compute.workers", "auto"), _value(values, f"{RESOURCES}cpu")
+    if "auto" not in (workers, cpus) and workers % cpus:
+        what = f"{workers} is not a multiple of {RESOURCES}cpu ({cpus}), the cores of each actor"
+        problems.append(unfit("compute.workers", workers, what, suggestion=-(-workers // cpus) * cpus))
     gpus = _value(values, f"{RESOURCES}gpu")
     if gpus > 1 and gpus != int(gpus):
         problems.append(not_allowed(f"{RESOURCES}gpu", gpus, "a whole number or a fraction below 1"))

@@ -19,7 +19,8 @@ from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, told_last_words, usual_chunk_s
 from es_service.errors import EvaluationError, Interrupted
 from es_service.logs import logger
-from es_service.protocol.messages import ChunkResult, DispatchCounts, Work, WorkItemId
+from es_service.protocol.evaluator import DispatchCounts
+from es_service.protocol.messages import ChunkResult, Work, WorkItemId
 
 _LOG = logger(__name__)
 POLL_S = 0.1
@@ -89,18 +90,20 @@ class Transport(Protocol):
 AnyTransport = TypeVar("AnyTransport", bound=Transport)
 
 
-def item_sizes(chunks: int, workers: int, chunk_s: float | None, item_s: float) -> list[int]:
+def item_sizes(chunks: int, workers: int, chunk_s: float | None, item_s: float, cores: int = 1) -> list[int]:
     """Number of chunks in each work item.
 
-    A work item takes about `item_s` seconds, sizes differ by at most one, and each worker gets equally many items.
+    A work item takes about `item_s` seconds, sizes differ by at most one, and each worker gets equally many items. An
+    item has at least one chunk for each core of a worker, if there are enough.
 
     Args:
         chunks: number of chunks to divide.
         workers: number of workers.
-        chunk_s: seconds that one chunk takes; None if unknown, which makes one chunk per work item.
+        chunk_s: seconds of a worker per chunk; None if unknown, which makes one chunk per core in a work item.
         item_s: seconds that a work item should take.
+        cores: cores of each worker.
     """
-    most = 1 if chunk_s is None else max(1, int(item_s / max(chunk_s, 1e-9)))
+    most = cores if chunk_s is None else cores * max(1, int(item_s / max(chunk_s * cores, 1e-9)))
     rounds = -(-chunks // (most * workers))
     count = min(chunks, rounds * workers)
     return [chunks // count + (item < chunks % count) for item in range(count)]
@@ -152,7 +155,9 @@ class Engine(Generic[AnyTransport]):
     def counts(self) -> DispatchCounts:
         """Numbers of workers and of faults so far."""
         state = self._state
-        return DispatchCounts(retries=state.retries, lost_workers=state.lost_workers, workers=state.wanted)
+        return DispatchCounts(
+            retries=state.retries, lost_workers=state.lost_workers, workers=state.wanted * state.limits.cores
+        )
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
         """Results of chunks, all of one kind, in the order of `work`.
@@ -199,7 +204,7 @@ class Engine(Generic[AnyTransport]):
         if not work:
             return []
         kind, limits = type(work[0][1]).__name__, self._state.limits
-        sizes = item_sizes(len(work), self._state.wanted, usual_chunk_s(self._state, kind), limits.item_s)
+        sizes = item_sizes(len(work), self._state.wanted, usual_chunk_s(self._state, kind), limits.item_s, limits.cores)
         ends = list(itertools.accumulate(sizes))
         firsts = [end - size for end, size in zip(ends, sizes, strict=True)]
         parts = [work[first:end] for first, end in zip(firsts, ends, strict=True)]

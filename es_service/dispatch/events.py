@@ -23,6 +23,8 @@ class Limits:
 
     workers: int
     """Workers wanted at the start; `SetWorkers` changes this number."""
+    cores: int = 1
+    """Cores of each worker. A work item has at least one chunk for each, as far as there are enough chunks."""
     in_flight: int = 2
     """Work items assigned to one worker at a time: the one that it runs, and those that wait behind it."""
     item_s: float = 0.03
@@ -61,7 +63,7 @@ class Limits:
         return self.names.get(limit, limit)
 
     def __post_init__(self) -> None:
-        for name in ("workers", "in_flight", "max_attempts", "max_failures_in_a_row", "max_start_failures"):
+        for name in ("workers", "cores", "in_flight", "max_attempts", "max_failures_in_a_row", "max_start_failures"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} ({getattr(self, name)}) must be at least 1")
 

@@ -15,6 +15,7 @@ import signal
 import socket
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -82,12 +83,36 @@ class Membership:
     """Ids of the nodes that are alive, including those that are being drained."""
 
 
-def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
+def actor_cores(nodes: Sequence[int], workers: int | None, most: int | None) -> int:
+    """Cores that each actor owns if they are not configured: all of a node, so that a node needs few messages.
+
+    If the nodes differ, or if there is none yet, it is one core, which leaves no core of any node idle.
+
+    Args:
+        nodes: cores of each node.
+        workers: number of cores that the run uses, which the result divides; None: as many as there are.
+        most: number of cores that have work; None: no limit.
+    """
+    if not nodes or len(set(nodes)) > 1:
+        return 1
+    size = max(1, min(nodes[0], most or nodes[0]))
+    if workers is None:
+        return size
+    return max(cores for cores in range(1, min(size, workers) + 1) if workers % cores == 0)
+
+
+def cores_of_nodes(ray: ModuleType) -> list[int]:
+    """Cores of each node that is alive and has any."""
+    cpus = [node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]]
+    return [int(count) for count in cpus if count >= 1.0]
+
+
+def connect(address: str | None, *, gpus: bool, cpus: int) -> ModuleType:
     """The `ray` module, connected to a cluster.
 
     Args:
         address: "HOST:PORT" of the cluster, "auto" for the one on this machine, or None to start one here.
-        claim: what one worker needs; a new cluster has GPUs only if a worker needs them.
+        gpus: whether a new cluster has the GPUs of this machine.
         cpus: number of CPUs of a new cluster.
 
     Raises:
@@ -102,7 +127,7 @@ def connect(address: str | None, claim: Claim, cpus: int) -> ModuleType:
         options = {
             "address": "local",
             "num_cpus": cpus,
-            "num_gpus": None if claim.gpus else 0,  # None means all GPUs that Ray finds
+            "num_gpus": None if gpus else 0,  # None means all GPUs that Ray finds
             "include_dashboard": False,
             "object_store_memory": OBJECT_STORE_BYTES,
         }

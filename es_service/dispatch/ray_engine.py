@@ -22,7 +22,7 @@ from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
-from es_service.dispatch.ray_cluster import ONE_CORE, Claim, Watch, connect, demand, disconnect, look
+from es_service.dispatch.ray_cluster import Claim, Watch, actor_cores, connect, cores_of_nodes, demand, disconnect, look
 from es_service.dispatch.ray_faults import error_text, fault_reason
 from es_service.errors import EvaluationError
 from es_service.protocol.messages import Centre, Work, WorkerPlace, WorkerSpec, forget_oldest
@@ -38,34 +38,44 @@ def ray_engine(
     *,
     actor: type,
     address: str | None = None,
-    claim: Claim = ONE_CORE,
+    cpus: int | None = 1,
+    gpus: float = 0.0,
     most: int | None = None,
     log: Log = no_log,
 ) -> Engine[Actors]:
     """Engine whose workers are Ray actors, which are starting.
 
     Args:
+        limits: with the number of cores of all workers together as the number of workers.
         actor: class of a worker, with the methods of `workers.actor.WorkerActor`.
         address: "HOST:PORT" of a cluster, or "auto" for the one on this machine. None starts a Ray of our own here,
             regardless of any other Ray and of RAY_ADDRESS, and ends it with the engine.
-        claim: what one worker needs of a node.
-        most: run as many workers as there is room for, up to this number and also when the room changes; None: run
-            `limits.workers`.
+        cpus: cores of each worker, which must divide the number of cores in `limits`; None: in a cluster that is
+            joined as many as each node has, see `actor_cores`, else 1.
+        gpus: GPUs of each worker, or the share of one.
+        most: use as many cores as there is room for, up to this number and also when the room changes; None: use the
+            number in `limits`.
 
     Raises:
         EvaluationError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
         Interrupted: SIGTERM arrived during the call.
     """
-    ray = connect(address, claim, limits.workers * claim.cpus if most is None else cores())
+    here = limits.workers if most is None else cores()
+    ray = connect(address, gpus=bool(gpus), cpus=here)
     try:
+        if cpus is None:  # on this machine alone, actors with one core were measured to be as fast or faster
+            nodes = [] if gpus or address is None else cores_of_nodes(ray)
+            cpus = actor_cores(nodes, limits.workers if most is None else None, most)
+        claim = Claim(cpus, gpus)
         room = look(ray, claim).room
         if address is None and not room:  # there will never be room
             text = f"this machine has no room for a worker. {demand(ray, claim)}. Lower compute.worker_resources."
             raise EvaluationError(text)
-        if most is not None:
-            limits = replace(limits, workers=max(1, min(room, most)))
+        most_workers = None if most is None else -(-most // cpus)
+        workers = limits.workers // cpus if most_workers is None else max(1, min(room, most_workers))
+        limits = replace(limits, workers=workers, cores=cpus)
         watch = None if address is None else Watch(ray, claim)
-        transport = Actors(ray, spec, actor, claim, watch, most, limits)
+        transport = Actors(ray, spec, actor, claim, watch, most_workers, limits)
         return Engine(transport, limits, should_stop, log)
     except BaseException:
         disconnect(ray)
@@ -137,7 +147,9 @@ class Actors:
     def start(self, worker: int) -> None:
         """Ask Ray for an actor. It is up when it has a place and has built its functions."""
         try:
-            handle = self._class.remote(self._spec, worker, self._claim.gpus)
+            handle = self._class.remote(
+                self._spec, worker, self._claim.gpus, 1 if self._claim.gpus else self._claim.cpus
+            )
             self._handles[worker] = handle
             self._calls[handle.place.remote()] = _Call(worker, "place")
             self._calls[handle.build.remote()] = _Call(worker, "build")

@@ -43,7 +43,8 @@ from es_service.loop.history import (
 from es_service.loop.interfaces import Search, Store, Stored
 from es_service.loop.parts import ELITE_PREFIX, elite_from_arrays, elite_part, state_from_parts, state_parts
 from es_service.loop.state import Best, RunState
-from es_service.protocol.messages import DispatchCounts, Evaluator, TaskSpec
+from es_service.protocol.evaluator import DispatchCounts, Evaluator
+from es_service.protocol.messages import TaskSpec
 from es_service.search.algorithms.steps import first_state
 from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
 from es_service.search.maps.geometry import make_geometry, reachable_cells
@@ -187,7 +188,7 @@ def _next_generation(
     populations = invalidate(populations, settings.max_invalid_fraction, generation)
     weights = [algorithm.weights(begun, *told) for told in zip(asks, populations, strict=True)]
     clock.lap("seconds_driver")
-    gradients = estimate_gradients(evaluator, centres, weights, sizes.gradient_block_pairs)
+    gradients = estimate_gradients(evaluator, generation, weights, sizes.gradient_block_pairs)
     clock.lap("seconds_gradient")
     moved = begun
     for ask, gradient_D in zip(asks, gradients, strict=True):

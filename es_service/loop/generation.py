@@ -17,13 +17,15 @@ import numpy as np
 from es_service.config.model import RunConfig
 from es_service.loop.checks import valid_members
 from es_service.loop.state import Best, statistics_in_force
+from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.gradient_tree import tree_sum
 from es_service.protocol.messages import (
     EVALUATION_EPISODES_PER_CHUNK,
+    NO_CENTRE,
     Centre,
     Chunk,
     EpisodesResult,
     EvaluationChunk,
-    Evaluator,
     FloatArray,
     GradientChunk,
     GradientResult,
@@ -95,26 +97,27 @@ def evaluate_centres(
 
 
 def estimate_gradients(
-    evaluator: Evaluator, centres: Sequence[Centre], weights: Sequence[FloatArray], block_pairs: int
+    evaluator: Evaluator, generation: int, weights: Sequence[FloatArray], block_pairs: int
 ) -> list[FloatArray]:
     """Gradient estimate [D] of each population: (1 / pairs) * sum over pairs of weight * standard normal noise.
+
+    Workers need no centre for this.
 
     Args:
         weights: those of each population [P].
         block_pairs: pairs whose products a worker sums.
     """
     asked = []
-    for ask, (centre, weights_P) in enumerate(zip(centres, weights, strict=True)):
+    for ask, weights_P in enumerate(weights):
         chunks = []
         for chunk_id, first in enumerate(range(0, weights_P.size, block_pairs)):
             block_P = weights_P[first : first + block_pairs]
             padded_P = np.pad(block_P, (0, block_pairs - block_P.size))
-            chunks.append(GradientChunk(centre.generation, chunk_id, padded_P, ask))
-        asked.append((centre, chunks))
+            chunks.append(GradientChunk(generation, chunk_id, padded_P, ask))
+        asked.append((NO_CENTRE, chunks))
     found = _evaluate(GradientResult, evaluator, asked)
     return [
-        tree_sum([result.sum_D for result in results]) * np.float32(1.0 / weights_P.size)
-        for results, weights_P in zip(found, weights, strict=True)
+        tree_sum(results) * np.float32(1.0 / weights_P.size) for results, weights_P in zip(found, weights, strict=True)
     ]
 
 
@@ -127,18 +130,6 @@ def _evaluate(
     assert len(checked) == len(results), f"an evaluator returned a result that is not a {kind.__name__}"
     found = iter(checked)
     return [list(islice(found, len(chunks))) for _, chunks in asked]
-
-
-def tree_sum(blocks: Sequence[FloatArray]) -> FloatArray:
-    """Sum by adding neighbours level by level: ((0 + 1) + (2 + 3)) + ...; an odd last one moves up unchanged.
-
-    The tree depends only on the number of blocks, so any of its nodes may be computed anywhere.
-    """
-    level = list(blocks)
-    while len(level) > 1:
-        pairs = [level[i] + level[i + 1] for i in range(0, len(level) - 1, 2)]
-        level = pairs + level[len(pairs) * 2 :]
-    return level[0]
 
 
 @np.errstate(invalid="ignore", over="ignore")  # an infinite fitness makes the centre invalid

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.messages import DispatchCounts, EpisodesResult, FloatArray, TaskSpec
+from es_service.protocol.evaluator import DispatchCounts
+from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
 from es_service.search.maps.behaviour_map import BehaviourMap, map_statistics
 
 HistoryRow = dict[str, int | float | None]

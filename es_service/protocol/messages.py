@@ -6,9 +6,9 @@ O observation, B descriptor dimensions, T points of a trace. Both sides import t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,6 +137,11 @@ class Centre:
     normalisation is off."""
 
 
+_NOTHING = np.zeros(0, np.float32)
+NO_CENTRE = Centre(0, _NOTHING, 0.0, _NOTHING, _NOTHING)
+"""Stands for the centre of chunks that need none."""
+
+
 @dataclass(frozen=True)
 class TrainingChunk:
     """Request to roll out `chunk_pairs` pairs around the centre with action noise, from pair `chunk_id * chunk_pairs`
@@ -262,38 +267,10 @@ class EpisodesResult:
 class GradientResult:
     """One partial sum of the gradient estimate."""
 
-    sum_D: FloatArray
-    """Sum over the pairs of the block of weight x standard normal noise."""
+    sum_D: FloatArray | None
+    """Sum over the pairs of the blocks of weight x standard normal noise; None if an earlier result contains it."""
+    blocks: int = 1
+    """Number of blocks in the sum, from its chunk's block on: a node of the tree of `protocol.gradient_tree`."""
 
 
 ChunkResult = EpisodesResult | GradientResult
-
-
-@dataclass(frozen=True)
-class DispatchCounts:
-    """Numbers of workers and of faults of an evaluator since it was made."""
-
-    retries: int = 0
-    """Chunks that were sent again, including those that a lost worker had not begun."""
-    lost_workers: int = 0
-    """Workers that were lost, or stopped because of a fault."""
-    workers: int = 0
-    """Workers that the evaluator is to keep running."""
-
-
-class Evaluator(Protocol):
-    """Interface by which the driver has chunks run. Results do not depend on where, in what order or how often."""
-
-    @property
-    def counts(self) -> DispatchCounts:
-        """Numbers of workers and of faults so far."""
-        ...
-
-    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
-        """Results of chunks, all of one kind, in the order of `work`.
-
-        Raises:
-            EvaluationError: the chunks cannot be computed.
-            Interrupted: a stop was requested.
-        """
-        ...

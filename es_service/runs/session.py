@@ -175,7 +175,6 @@ def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) 
     spec, compute, limits = worker_spec(config, task_of(config)), config.compute, dispatch_limits(config)
     if compute.engine == "inline":
         return inline_engine(spec, limits, should_stop, threads=compute.inline_workers == "threads", log=log)
-    from es_service.dispatch.ray_cluster import Claim
     from es_service.dispatch.ray_engine import ray_engine
 
     return ray_engine(
@@ -184,7 +183,8 @@ def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) 
         should_stop,
         actor=WorkerActor,
         address=compute.address,
-        claim=Claim(compute.worker_resources.cpu, compute.worker_resources.gpu),
+        cpus=None if compute.worker_resources.cpu == "auto" else compute.worker_resources.cpu,
+        gpus=compute.worker_resources.gpu,
         most=chunks_at_once(config) if compute.workers == "auto" else None,
         log=log,
     )

@@ -26,7 +26,8 @@ from es_service.config.tasks import task_of
 from es_service.loop import driver
 from es_service.loop.history import history_columns
 from es_service.loop.parts import Arrays, cell_part, elite_part, elite_to_arrays
-from es_service.protocol.messages import DispatchCounts, EpisodesResult, GradientChunk, GradientResult, TrainingChunk
+from es_service.protocol.evaluator import DispatchCounts
+from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult, TrainingChunk
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.maps.behaviour_map import Elite
 from es_service.search.observation_statistics import no_observations

@@ -27,6 +27,8 @@ import numpy as np
 CONFIGS = Path(__file__).parents[2] / "configs"
 NOT_REPEATED = ("retries", "lost_workers", "workers", "wall_clock_s", "steps_per_second")
 """History columns that two equal runs may differ in; so may those that begin with "seconds_"."""
+ONE_EMITTER = ("search.emitters=1", "search.pairs=64")
+"""What the config of ME-ES on PointMaze had before version 0.7."""
 SMALL_ANT = ("search.pairs=16", "search.evaluation_episodes=8", "budget.generations=6")
 
 
@@ -48,9 +50,13 @@ REFERENCES = {
     "ns_es": Reference("point_maze_ns_es", "ray", ("budget.generations=60",)),
     "nsr_es_xla": Reference("point_maze_nsr_es", "inline", ("budget.generations=20", "compute.rollout=xla")),
     "nsra_es_resumed": Reference("point_maze_nsra_es", "inline", ("budget.generations=200",), killed_at=40),
-    "me_es": Reference("point_maze_me_es", "ray", ("budget.generations=200",)),
+    "me_es": Reference("point_maze_me_es", "ray", (*ONE_EMITTER, "budget.generations=200")),
     "me_es_resumed": Reference(
-        "point_maze_me_es", "inline", ("budget.generations=300", "seed=7"), killed_at=33, resumed_with="ray"
+        "point_maze_me_es",
+        "inline",
+        (*ONE_EMITTER, "budget.generations=300", "seed=7"),
+        killed_at=33,
+        resumed_with="ray",
     ),
     "me_es_fork": Reference(
         "point_maze_me_es", "inline", ("budget.generations=260", "search.learning_rate=0.02"), parent="me_es"

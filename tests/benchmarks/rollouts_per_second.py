@@ -25,7 +25,8 @@ from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.protocol.messages import EpisodesResult, Evaluator, TrainingChunk, around
+from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.messages import EpisodesResult, TrainingChunk, around
 from tests.helpers import centre
 from workers.policy import initial_parameters
 

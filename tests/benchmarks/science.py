@@ -33,8 +33,9 @@ from es_service import api
 from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
 from es_service.errors import Interrupted
+from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.machine import cpu_kind
-from es_service.protocol.messages import ChunkResult, DispatchCounts, Work
+from es_service.protocol.messages import ChunkResult, Work
 from es_service.protocol.process_environment import worker_environment
 from es_service.runs import session
 from es_service.runs.view import Policy, Run

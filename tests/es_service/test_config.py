@@ -36,7 +36,7 @@ def test_minimal_config_resolves_every_value():
     assert (config.policy.init, config.policy.observation_clip) == ("unit_columns", 5.0)
     assert (config.search.pairs, config.search.common_random_numbers) == (512, True)
     assert (config.search.sigma, config.search.learning_rate, config.search.l2) == (0.02, 0.01, 0.005)
-    assert (config.compute.rollout, config.compute.workers, config.compute.engine) == ("simd", "auto", "ray")
+    assert (config.compute.rollout, config.compute.workers, config.compute.engine) == ("simd", "auto", "inline")
     assert (config.compute.chunk_pairs, config.compute.rollout_block_pairs) == (64, 32)
     assert config.compute.gradient_block_pairs == 512
     assert config.seed == 0
@@ -117,6 +117,20 @@ def test_auto_chooses_simd_by_this_machine_unless_a_cluster_runs_the_workers():
     assert warning == f"compute.rollout: xla is used because simd cannot run point_maze: {why}"
     there = load_config(MINIMAL, {"compute.address": "auto", "compute.engine": "ray"}, no_vectors=why, **of)
     assert (there.compute.rollout, config_warnings(there, POINT_MAZE, why)) == ("simd", [])
+
+
+def test_the_engine_is_ray_where_something_needs_it():
+    assert load().compute.engine == "inline"
+    for needs in ("compute.address=auto", "compute.worker_resources.gpu=1", "compute.worker_resources.cpu=4"):
+        assert load(MINIMAL, needs).compute.engine == "ray", needs
+    with pytest.raises(ConfigError, match=r"compute.address: auto needs compute.engine = ray"):
+        load(MINIMAL, "compute.address=auto", "compute.engine=inline")
+
+
+def test_workers_are_whole_actors():
+    assert load(MINIMAL, "compute.worker_resources.cpu=4", "compute.workers=8").compute.workers == 8
+    with pytest.raises(ConfigError, match=r"workers: 6 is not a multiple of compute.worker_resources.cpu \(4\)"):
+        load(MINIMAL, "compute.worker_resources.cpu=4", "compute.workers=6")
 
 
 def test_simd_is_what_auto_chooses_where_it_can_be_had():

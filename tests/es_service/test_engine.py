@@ -136,6 +136,19 @@ def test_results_of_several_centres_come_in_the_order_of_the_work(seed, item_s):
     assert bool(mixed) == (item_s > 0.0)
 
 
+@given(st.integers(1, 500), st.integers(1, 70), st.integers(1, 64), st.none() | st.floats(1e-7, 10.0))
+def test_every_core_of_a_worker_has_a_chunk_if_there_are_enough(chunks, workers, cores, chunk_s):
+    """`chunk_s` is the time of the whole worker."""
+    sizes = item_sizes(chunks, workers, chunk_s, 0.03, cores)
+    assert sum(sizes) == chunks
+    assert max(sizes) - min(sizes) <= 1
+    if chunks >= workers * cores:
+        assert 2 * min(sizes) + 1 >= cores
+    assert len(sizes) >= min(chunks, workers)
+    if chunk_s is None:
+        assert max(sizes) <= cores
+
+
 @given(st.integers(1, 500), st.integers(1, 70), st.floats(1e-7, 10.0))
 def test_tasks_are_of_equal_size_as_many_for_each_worker_and_none_takes_too_long(chunks, workers, chunk_s):
     sizes = item_sizes(chunks, workers, chunk_s, 0.01)

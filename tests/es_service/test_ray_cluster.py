@@ -37,7 +37,7 @@ def test_a_sentence_of_ray_s_ends_with_one_full_stop(monkeypatch):
 
     monkeypatch.setattr(ray, "init", refuse)
     with pytest.raises(EvaluationError, match=r"at auto: Could not find .* specify one\. Check the address\."):
-        ray_cluster.connect("auto", ray_cluster.ONE_CORE, 1)
+        ray_cluster.connect("auto", gpus=False, cpus=1)
 
 
 def test_sigterm_is_not_lost_where_python_ignores_the_exception_of_ray_s_handler(monkeypatch):
@@ -56,7 +56,7 @@ def test_sigterm_is_not_lost_where_python_ignores_the_exception_of_ray_s_handler
     monkeypatch.setattr(ray, "shutdown", lambda: ended.append(True))
     with catch_unraisable_exception() as shown:
         with pytest.raises(Interrupted):
-            ray_cluster.connect("auto", ray_cluster.ONE_CORE, 1)
+            ray_cluster.connect("auto", gpus=False, cpus=1)
         assert shown.unraisable is None
     assert ended == [True]
     assert signal.getsignal(signal.SIGTERM) is before
@@ -78,3 +78,26 @@ def test_a_session_is_forgotten_with_the_link_to_it_and_with_no_other(tmp_path, 
     node.get_session_dir_path = lambda: str(other)
     ray_cluster.disconnect(ray)
     assert other.exists()
+
+
+@pytest.mark.parametrize(
+    ("nodes", "workers", "most", "cores"),
+    [
+        ([64, 64, 64], None, 10_000, 64),
+        ([64, 64], None, 24, 24),  # there is no work for more
+        ([64, 64], 128, None, 64),
+        ([64, 64], 96, None, 48),  # two actors
+        ([4, 4], 7, None, 1),  # a prime
+        ([64, 32], None, 10_000, 1),  # nodes that differ
+        ([], None, 10_000, 1),  # none yet
+        ([1, 1], None, 10_000, 1),
+    ],
+)
+def test_an_actor_owns_a_whole_node_where_nodes_are_equal(nodes, workers, most, cores):
+    assert ray_cluster.actor_cores(nodes, workers, most) == cores
+
+
+def test_nodes_without_cores_and_dead_ones_do_not_count():
+    nodes = [({"CPU": 8.0}, True), ({}, True), ({"CPU": 0.0}, True), ({"CPU": 4.0}, False)]
+    ray = SimpleNamespace(nodes=lambda: [{"Resources": has, "Alive": alive} for has, alive in nodes])
+    assert ray_cluster.cores_of_nodes(ray) == [8]

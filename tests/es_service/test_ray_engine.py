@@ -104,7 +104,7 @@ class PretendedRay:
         for ref in actor.owed:
             self._settle(actor, ref)
 
-    def _start(self, spec: bytes, index: int, gpus: float) -> Any:
+    def _start(self, spec: bytes, index: int, gpus: float, cores: int) -> Any:
         placed = sum(actor.state in ("alive", "hung") for actor in self.actors)
         actor = Actor(index, "alive" if placed < self.room else "pending")
         self.actors.append(actor)

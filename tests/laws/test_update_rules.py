@@ -8,12 +8,12 @@ from hypothesis.extra import numpy as hnp
 
 from es_service.api import load_config
 from es_service.config.model import worker_spec
-from es_service.loop.generation import estimate_gradients, tree_sum
+from es_service.loop.generation import estimate_gradients
 from es_service.protocol.messages import GradientResult
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.optimizer import adam_ascent, fresh_adam
 from es_service.search.shaping import centred_ranks, pair_weights
-from tests.helpers import DirectEvaluator, centre
+from tests.helpers import DirectEvaluator
 from tests.laws.es_runs import SHAPE, small_config
 from tests.twins import es as twin
 from workers.environments import SHIPPED
@@ -47,9 +47,8 @@ def test_swapping_signs_negates_the_gradient_estimate_exactly():
     config = small_config()
     evaluator = DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
     fitness = np.random.default_rng(0).normal(size=(48, 2))
-    point = centre(np.zeros(SHAPE.parameters))
     estimates = [
-        estimate_gradients(evaluator, [point], [pair_weights(centred_ranks(values))], 20)[0]
+        estimate_gradients(evaluator, 1, [pair_weights(centred_ranks(values))], 20)[0]
         for values in (fitness, fitness[:, ::-1])
     ]
     assert np.abs(estimates[0]).max() > 0
@@ -64,15 +63,9 @@ def test_gradient_by_hand_three_pairs():
     )
     weights = np.float32([1.0, -0.5, 0.25])
     evaluator = DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
-    (found,) = estimate_gradients(evaluator, [centre(np.zeros(SHAPE.parameters))], [weights], 2)
+    (found,) = estimate_gradients(evaluator, 1, [weights], 2)
     noise = [normals(key, SHAPE.parameters) for key in stream_keys(0, Domain.PARAMETER_NOISE, 1, np.arange(3))]
     np.testing.assert_allclose(found, (noise[0] - 0.5 * noise[1] + 0.25 * noise[2]) / 3, rtol=1e-5, atol=1e-6)
-
-
-def test_tree_sum_adds_neighbours_level_by_level():
-    a, b, c, d, e = (np.float32([x]) for x in (1e8, 1.0, -1e8, 1.0, 3.0))
-    assert tree_sum([a, b, c, d, e])[0] == ((a + b) + (c + d) + e)[0] == 3.0
-    assert tree_sum([a])[0] == a[0]
 
 
 def test_adam_by_hand():
@@ -94,7 +87,7 @@ def test_blocks_of_the_gradient_are_added_in_the_tree():
         def evaluate(self, work):
             return [GradientResult(np.float32([x])) for x in (1e8, 1.0, -1e8, 1.0, 3.0)]
 
-    (found,) = estimate_gradients(Answers(), [centre(np.zeros(1))], [np.ones(5, np.float32)], 1)
+    (found,) = estimate_gradients(Answers(), 1, [np.ones(5, np.float32)], 1)
     assert found[0] == np.float32(3.0) * np.float32(1 / 5)  # one by one it is 4 / 5
 
 

@@ -16,7 +16,6 @@ from es_service import api
 from es_service.cli.commands import error_message
 from es_service.dispatch import ray_engine as module
 from es_service.dispatch.events import Limits
-from es_service.dispatch.ray_cluster import Claim
 from es_service.dispatch.ray_engine import Actors, ray_engine
 from es_service.errors import EvaluationError
 from es_service.protocol.messages import TrainingChunk, WorkerPlace, around
@@ -104,6 +103,31 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
     assert counts["repeated"] == outcome.run.history["retries"].sum() >= 2
 
 
+@pytest.mark.parametrize("rollout", ["simd", "xla"])
+def test_an_actor_with_two_cores_gives_the_same_bits_and_is_replaced_as_a_whole(tmp_path, monkeypatch, rollout):
+    """It is killed in mid-generation. With simd its cores are threads, with xla child processes, which end with it."""
+    straight = tmp_path / "straight"
+    run(straight, engine="inline", workers=1, rollout=rollout)
+    strikes, send, children = [5], Actors.send, []
+
+    def send_and_strike(self, worker, key, attempt, work):
+        send(self, worker, key, attempt, work)
+        if strikes and key.kind == "TrainingChunk" and key.generation == strikes[0]:
+            strikes.pop()
+            pid = self.places()[worker].pid
+            children.extend(Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
+            os.kill(pid, signal.SIGKILL)
+
+    monkeypatch.setattr(Actors, "send", send_and_strike)
+    cores = {"worker_resources": {"cpu": 2}, "workers": 2}
+    outcome = run(tmp_path / "run", on_notice=lambda notice: None, rollout=rollout, **cores)
+    assert digest_parts(tmp_path / "run") == digest_parts(straight)
+    assert outcome.run.history["lost_workers"].sum() == 1
+    assert set(outcome.run.history["workers"]) == {2}, "cores, not actors"
+    assert len(children) >= (2 if rollout == "xla" else 0)
+    assert not any(Path(f"/proc/{pid}").exists() for pid in children)
+
+
 def test_a_run_that_began_inline_goes_on_with_ray_where_home_cannot_be_written(tmp_path, reference):
     """As a user would, from the shell; SIGTERM stops it with its own exit code, although Ray has a handler too."""
     program = [sys.executable, "-m", "es_service"]
@@ -145,7 +169,7 @@ def test_a_chunk_that_raises_everywhere_stops_the_run_with_its_error():
 
 def test_a_cluster_without_room_is_named_with_what_it_has(monkeypatch):
     connect = module.connect
-    monkeypatch.setattr(module, "connect", lambda address, claim, workers: connect(address, claim, 0))
+    monkeypatch.setattr(module, "connect", lambda address, *, gpus, cpus: connect(address, gpus=gpus, cpus=0))
     start = time.monotonic()
     with pytest.raises(
         EvaluationError, match=r"this machine has no room for a worker\. Each worker needs 1 CPU; .*has 0 CPU, 0 GPU"
@@ -177,7 +201,7 @@ def test_it_works_in_a_thread_where_signals_cannot_be_set(tmp_path, reference):
 class Mirror:
     """An actor that answers each chunk with the environment its worker would have, and Ray's name for its GPU."""
 
-    def __init__(self, spec: bytes, index: int, gpus: float) -> None:
+    def __init__(self, spec: bytes, index: int, gpus: float, cores: int) -> None:
         self.gpus = gpus
 
     def place(self) -> WorkerPlace:
@@ -202,22 +226,22 @@ def with_two_pretended_gpus(monkeypatch):
     monkeypatch.setattr(ray, "init", lambda **options: start(**options | {"num_gpus": 2}))
 
 
-def mirrored(workers: int, claim: Claim) -> list[tuple[int, list[str], dict[str, str]]]:
-    with ray_engine(spec(), Limits(workers), actor=Mirror, claim=claim) as engine:
+def mirrored(workers: int, gpus: float = 0.0) -> list[tuple[int, list[str], dict[str, str]]]:
+    with ray_engine(spec(), Limits(workers), actor=Mirror, gpus=gpus) as engine:
         answers = engine.evaluate(around(centre(random_parameters()), [TrainingChunk(1, chunk) for chunk in range(16)]))
     return list({answer[0]: answer for answer in answers}.values())
 
 
 def test_workers_without_a_gpu_see_none_and_use_the_cpu(monkeypatch):
     with_two_pretended_gpus(monkeypatch)
-    for _, ids, environment in mirrored(2, Claim(cpus=1)):
+    for _, ids, environment in mirrored(2):
         assert ids == []
         assert (environment["CUDA_VISIBLE_DEVICES"], environment["JAX_PLATFORMS"]) == ("", "cpu")
 
 
 def test_two_workers_share_one_gpu_and_its_memory(monkeypatch):
     with_two_pretended_gpus(monkeypatch)
-    found = mirrored(4, Claim(cpus=1, gpus=0.5))
+    found = mirrored(4, gpus=0.5)
     assert found
     for _, ids, environment in found:
         assert ids == [environment["CUDA_VISIBLE_DEVICES"]]
@@ -227,4 +251,4 @@ def test_two_workers_share_one_gpu_and_its_memory(monkeypatch):
 
 def test_a_gpu_that_is_not_there_is_named():
     with pytest.raises(EvaluationError, match=r"needs 1 CPU and 1 GPU; the cluster has 1 CPU, 0 GPU in total"):
-        ray_engine(spec(), Limits(1), actor=WorkerActor, claim=Claim(gpus=1))
+        ray_engine(spec(), Limits(1), actor=WorkerActor, gpus=1.0)

@@ -1,0 +1,39 @@
+"""The interface by which the driver has chunks run; engines implement it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from es_service.protocol.messages import ChunkResult, Work
+
+
+@dataclass(frozen=True)
+class DispatchCounts:
+    """Numbers of workers and of faults of an evaluator since it was made."""
+
+    retries: int = 0
+    """Chunks that were sent again, including those that a lost worker had not begun."""
+    lost_workers: int = 0
+    """Workers that were lost, or stopped because of a fault."""
+    workers: int = 0
+    """Workers that the evaluator is to keep running."""
+
+
+class Evaluator(Protocol):
+    """Interface by which the driver has chunks run. Results do not depend on where, in what order or how often."""
+
+    @property
+    def counts(self) -> DispatchCounts:
+        """Numbers of workers and of faults so far."""
+        ...
+
+    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
+        """Results of chunks, all of one kind, in the order of `work`.
+
+        Raises:
+            EvaluationError: the chunks cannot be computed.
+            Interrupted: a stop was requested.
+        """
+        ...

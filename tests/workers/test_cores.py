@@ -1,0 +1,107 @@
+"""A worker with several cores: the same results as with one, whichever way its cores are made."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+from collections import Counter
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.helpers import spec
+from tests.system.processes import ROOT
+from tests.workers.test_worker import bits, work
+from workers import cores as module
+from workers.cores import make_worker_with_cores, parts
+from workers.worker import make_worker
+
+
+@given(st.integers(1, 300), st.integers(1, 64))
+def test_parts_are_even_in_order_and_enough_for_each_core(chunks, cores):
+    found = parts(range(chunks), cores)
+    assert [chunk for part in found for chunk in part] == list(range(chunks))
+    sizes = [len(part) for part in found]
+    assert max(sizes) - min(sizes) <= 1
+    assert len(found) == min(chunks, cores) or len(found) == 2 * cores
+
+
+def test_threads_with_simd_give_the_results_of_one_core(monkeypatch):
+    worker_spec, threads = spec(rollout="simd", episode_steps=30), Counter()
+    run = make_worker(worker_spec)
+
+    def watched(part):
+        threads[threading.get_ident()] += 1
+        return run(part)
+
+    monkeypatch.setattr(module, "make_worker", lambda _: watched)
+    found = make_worker_with_cores(worker_spec, 3)(work())
+    assert list(map(bits, found)) == list(map(bits, run(work())))
+    assert len(threads) == 3
+    assert threading.get_ident() not in threads
+
+
+PROGRAM = """
+import os, pickle, sys
+from es_service.protocol.process_environment import worker_environment
+
+if __name__ == "__main__":
+    os.environ.update(worker_environment(os.environ))
+    from tests.helpers import spec
+    from tests.workers.test_worker import work
+    from workers.cores import make_worker_with_cores
+
+    run = make_worker_with_cores(spec(rollout="xla", episode_steps=30), 2)
+    results = run(work())
+    if len(sys.argv) > 1:
+        import multiprocessing
+        children = multiprocessing.active_children()
+        print(*(child.pid for child in children), flush=True)
+        if sys.argv[1] == "end":
+            os.kill(os.getpid(), 9)
+        os.kill(children[0].pid, 9)
+        children[0].join()
+        run(work())
+    sys.stdout.buffer.write(pickle.dumps(results))
+"""
+
+
+def child_program(tmp_path, *arguments):
+    file = tmp_path / "program.py"
+    file.write_text(textwrap.dedent(PROGRAM))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run([sys.executable, file, *arguments], env=environment, capture_output=True, timeout=120)
+
+
+@pytest.mark.slow
+def test_child_processes_with_xla_give_the_results_of_one_core(tmp_path):
+    import pickle
+
+    done = child_program(tmp_path)
+    assert done.returncode == 0, done.stderr.decode()
+    alone = make_worker(spec(rollout="xla", episode_steps=30))(work())
+    assert list(map(bits, pickle.loads(done.stdout))) == list(map(bits, alone))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("how", "code"), [("lose", 1), ("end", -signal.SIGKILL)])
+def test_a_worker_and_its_child_processes_end_together(tmp_path, how, code):
+    done = child_program(tmp_path, how)
+    assert done.returncode == code, done.stderr.decode()
+    assert (b"a child process of this worker has ended" in done.stderr) == (how == "lose")
+    children = [int(word) for word in done.stdout.split()]
+    assert len(children) == 2
+    assert not any(is_running(pid) for pid in children)
+
+
+def is_running(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
