@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from es_service.cli.options import ConfigArgument, SetOption, overrides
 from es_service.config.problems import one_of
 from es_service.errors import ConfigError
 
@@ -15,7 +16,7 @@ bench = typer.Typer(help="Measure the speed of this machine.", no_args_is_help=T
 
 @bench.callback()
 def _bench() -> None:
-    """Do nothing; this callback keeps `rollouts` a subcommand although it is the only one."""
+    """Do nothing; this callback keeps the commands subcommands."""
 
 
 @bench.command()
@@ -57,3 +58,37 @@ def rollouts(
     print(measured.HEADER)
     for row in rows:
         print(measured.line(row), flush=True)
+
+
+SCALING_WORKERS = "1,2,8,64,512,4096"
+SCALING_HEADER = f"{'workers':>8}{'s/generation':>14}{'steps/s':>16}{'efficiency':>12}  limited by"
+
+
+@bench.command()
+def scaling(
+    config: ConfigArgument,
+    workers: Annotated[
+        str, typer.Option("--workers", help="Numbers of workers (cores), separated by commas.")
+    ] = SCALING_WORKERS,
+    cores_per_node: Annotated[int, typer.Option("--cores-per-node", min=1, help="Cores of each node.")] = 64,
+    set_: SetOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a list of rows as JSON.")] = False,
+) -> None:
+    """Predict how fast a config runs on a cluster, from measurements on this machine. It takes half a minute."""
+    from es_service.runs.checked_config import load_config
+    from es_service.runs.scaling import bench_scaling
+
+    counts = workers.split(",")
+    if not all(count.strip().isdigit() and int(count) for count in counts):
+        raise ConfigError(f"--workers {workers}: must be whole numbers, each at least 1, such as {SCALING_WORKERS}")
+    rows = bench_scaling(load_config(config, overrides(set_)), [int(count) for count in counts], cores_per_node)
+    if as_json:
+        print(json.dumps(list(rows), indent=1))
+        return
+    print(SCALING_HEADER)
+    for row in rows:
+        print(
+            f"{row['workers']:>8}{row['seconds_per_generation']:>14.4g}{row['steps_per_second']:>16,}"
+            f"{row['efficiency']:>12.0%}  {row['limit']}",
+            flush=True,
+        )

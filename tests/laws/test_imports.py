@@ -22,6 +22,7 @@ ENTRIES = {"es_service.__init__": "api", "es_service.__main__": "cli"}
 """Module outside the layers -> the layer whose rules it follows."""
 JOINERS = {
     "es_service.runs.moment",
+    "es_service.runs.scaling",
     "es_service.runs.session",
     "es_service.config.tasks",
     "es_service.cli.doctor",

@@ -49,6 +49,25 @@ def test_bench_rollouts_prints_a_row_per_policy_batch_and_number_of_cores():
         assert message in printed
 
 
+def test_bench_scaling_predicts_a_row_per_number_of_workers():
+    config = ("point_maze_es", "--set", "search.pairs=512")
+    code, printed = es("bench", "scaling", *config, "--workers", "1,4,128", "--cores-per-node", 32, "--json")
+    assert code == 0, printed
+    rows = json.loads(printed)
+    assert [row["workers"] for row in rows] == [1, 4, 128]
+    assert all(
+        set(row) == {"workers", "seconds_per_generation", "steps_per_second", "efficiency", "limit"} for row in rows
+    )
+    one, four, many = rows
+    assert 0.5 < one["efficiency"] <= 1.0
+    assert one["seconds_per_generation"] > four["seconds_per_generation"]
+    assert four["steps_per_second"] > 1.5 * one["steps_per_second"] > 0
+    assert many["efficiency"] < 0.3, "there are eight chunks of rollouts"
+    assert many["limit"] in ("too few items", "the driver", "evaluation")
+    code, printed = es("bench", "scaling", "point_maze_es", "--workers", "1,none")
+    assert (code, "--workers 1,none: must be whole numbers" in printed) == (2, True)
+
+
 def test_what_simd_cannot_compile_is_said_in_one_line_and_runs_on_xla():
     task = "tests.examples.sorting:Sorting"
     code, printed = es("bench", "rollouts", "--task", task, "--policy", "off", "--batch", 8, "--seconds", 0)

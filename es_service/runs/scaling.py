@@ -1,0 +1,227 @@
+"""What a generation would take on more cores than there are: costs measured on this machine, then a simulation."""
+
+from __future__ import annotations
+
+import pickle
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from es_service.config.model import RunConfig, worker_spec
+from es_service.config.parallel import populations
+from es_service.config.tasks import task_of
+from es_service.dispatch.events import Limits
+from es_service.dispatch.inline_engine import inline_engine
+from es_service.dispatch.ray_cluster import actor_cores
+from es_service.dispatch.ray_engine import ray_engine
+from es_service.dispatch.simulation import Costs, Phase, predict
+from es_service.loop import driver
+from es_service.loop.history import evaluated_columns, history_columns
+from es_service.protocol.evaluator import DispatchCounts, Evaluator
+from es_service.protocol.machine import platform_text
+from es_service.protocol.messages import (
+    EVALUATION_EPISODES_PER_CHUNK,
+    NO_CENTRE,
+    Centre,
+    Chunk,
+    ChunkResult,
+    EpisodesResult,
+    EvaluationChunk,
+    GradientChunk,
+    TrainingChunk,
+    Work,
+    WorkerPlace,
+    WorkerSpec,
+)
+from es_service.search.algorithms import ALGORITHMS
+from es_service.search.observation_statistics import no_observations
+from es_service.store.beginning import Beginning
+from es_service.store.schema import RunMeta
+from es_service.store.writer import RunStore
+from workers.cores import parts
+from workers.policy import initial_parameters
+
+MEASURE_S = 1.0
+"""Time for the measurement of each kind of chunk."""
+GENERATIONS = 12
+"""Generations of the loop with replayed results; the first third does not count."""
+ECHOES, ECHO_ITEMS, ALONE = 4, 200, 20
+"""Actors and work items in the measurement of messages, and items that are sent one at a time."""
+
+
+def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int) -> Iterator[dict[str, Any]]:
+    """Yield a row per number of workers: workers, seconds_per_generation, steps_per_second, efficiency, limit.
+
+    Measured are the duration of each kind of chunk on one core, with the initial policy; a generation of the driver and
+    the store with such results; and messages between the Ray engine and actors on this machine. A network makes
+    messages slower. Raises EvaluationError if Ray or the task cannot be used.
+    """
+    task = task_of(config)
+    spec = worker_spec(config, task)
+    parameters = initial_parameters(spec.policy, config.policy.init, config.seed, 0)
+    zeros_O = np.zeros(task.observation_size, np.float32)
+    centre = Centre(1, parameters, config.search.sigma, zeros_O, zeros_O + 1.0)
+    kinds: dict[str, Work] = {
+        "rollout": (centre, TrainingChunk(1, 0)),
+        "gradient": (NO_CENTRE, GradientChunk(1, 0, np.ones(spec.gradient_block_pairs, np.float32))),
+        "evaluation": (centre, EvaluationChunk(1, 0)),
+    }
+    chunk_s, answers = _chunk_costs(spec, kinds)
+    message_s, way_s = _message_costs(spec, kinds, answers)
+    costs = Costs(chunk_s, message_s, way_s, _driver_cost(config, answers))
+    phases = _phases(config)
+    steps = sum(
+        phase.chunks * int(answer.steps.sum())
+        for phase in phases
+        if isinstance(answer := answers[phase.kind], EpisodesResult)
+    )
+    for count in workers:
+        cores = actor_cores([cores_per_node], count, None)
+
+        def longest_part(chunks: int, cores: int = cores) -> float:
+            return _longest_part(chunks, cores)
+
+        found = predict(phases, costs, count // cores, cores, longest_part)
+        yield {
+            "workers": count,
+            "seconds_per_generation": round(found.seconds, 6),
+            "steps_per_second": round(steps / found.seconds),
+            "efficiency": round(found.efficiency, 3),
+            "limit": found.limit,
+        }
+
+
+def _phases(config: RunConfig) -> list[Phase]:
+    """The chunks of a generation."""
+    search, sizes, several = config.search, config.compute, populations(config)
+    evaluation = -(-search.evaluation_episodes // EVALUATION_EPISODES_PER_CHUNK)
+    blocks = -(-search.pairs // sizes.gradient_block_pairs)
+    return [
+        Phase("rollout", "TrainingChunk", several * (search.pairs // sizes.chunk_pairs)),
+        Phase("gradient", "GradientChunk", several * blocks),
+        Phase("evaluation", "EvaluationChunk", several * evaluation),
+    ]
+
+
+def _longest_part(chunks: int, cores: int) -> float:
+    """Number of chunks that the busiest core of an actor runs, when cores take the next part as they become free."""
+    free = [0] * cores
+    for part in parts(range(chunks), cores):
+        free[free.index(min(free))] += len(part)
+    return max(free)
+
+
+def _kind(work: Work) -> str:
+    return type(work[1]).__name__
+
+
+def _chunk_costs(spec: WorkerSpec, kinds: Mapping[str, Work]) -> tuple[dict[str, float], dict[str, ChunkResult]]:
+    """(seconds of one core per chunk, a result) of each kind."""
+    seconds: dict[str, float] = {}
+    answers: dict[str, ChunkResult] = {}
+    with inline_engine(spec, Limits(1)) as engine:
+        for work in kinds.values():
+            answers[_kind(work)] = engine.evaluate([work])[0]  # which compiles
+            count, took_s = 1, 0.0
+            while took_s < MEASURE_S:
+                began = time.perf_counter()
+                engine.evaluate([work] * count)
+                took_s = time.perf_counter() - began
+                seconds[_kind(work)] = took_s / count
+                count = 1 + int(1.2 * MEASURE_S / seconds[_kind(work)])
+    return seconds, answers
+
+
+class EchoActor:
+    """In the place of a worker's actor: it answers at once, with an answer for as many chunks as it is sent."""
+
+    def __init__(self, spec: bytes, index: int, gpus: float, cores: int) -> None:
+        self._answers: dict[str, ChunkResult] = pickle.loads(pickle.loads(spec))
+
+    def place(self) -> WorkerPlace:
+        """As `WorkerActor.place`."""
+        return WorkerPlace("", 0, "")
+
+    def build(self) -> str:
+        """As `WorkerActor.build`."""
+        return platform_text({})
+
+    def run(self, chunks: bytes, *centres: bytes) -> bytes:
+        """As `WorkerActor.run`."""
+        asked: list[tuple[int, Chunk]] = pickle.loads(chunks)
+        return pickle.dumps([self._answers[type(chunk).__name__] for _, chunk in asked], pickle.HIGHEST_PROTOCOL)
+
+
+def _message_costs(
+    spec: WorkerSpec, kinds: Mapping[str, Work], answers: Mapping[str, ChunkResult]
+) -> tuple[dict[str, float], float]:
+    """(seconds of the driver per work item by kind, seconds of an item's way to a worker) through Ray."""
+    message_s: dict[str, float] = {}
+    alone_s: list[float] = []
+    packed: Any = pickle.dumps(dict(answers))
+    with ray_engine(packed, Limits(ECHOES, item_s=0.0), actor=EchoActor) as engine:
+        for work in kinds.values():
+            engine.evaluate([work] * ECHOES)
+            began = time.perf_counter()
+            engine.evaluate([work] * ECHO_ITEMS)
+            message_s[_kind(work)] = (time.perf_counter() - began) / ECHO_ITEMS
+        for _ in range(ALONE):
+            began = time.perf_counter()
+            engine.evaluate([kinds["rollout"]])
+            alone_s.append(time.perf_counter() - began)
+    way_s = (statistics.median(alone_s) - message_s["TrainingChunk"]) / 2
+    return message_s, max(0.0, way_s)
+
+
+class _Replay:
+    """Evaluator that answers each chunk at once with the recorded result of its kind."""
+
+    counts = DispatchCounts(workers=1)
+
+    def __init__(self, answers: Mapping[str, ChunkResult]) -> None:
+        self._answers = answers
+
+    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
+        return [self._answers[_kind(one)] for one in work]
+
+
+def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float:
+    """Seconds of a generation in which only the driver and the store work."""
+    task = task_of(config)
+    config = config.model_copy(update={"budget": config.budget.model_copy(update=_budget())})
+    shape = worker_spec(config, task).policy
+    centres = [initial_parameters(shape, config.policy.init, config.seed, i) for i in range(config.search.centres)]
+    search = driver.Search(
+        config=config,
+        algorithm=ALGORITHMS[config.search.algorithm](config),
+        initial=lambda: (centres, no_observations(task.observation_size)),
+        task=task,
+    )
+    ends: list[float] = []
+    meta = RunMeta(
+        run_id="measurement",
+        created="",
+        config=config.model_dump(mode="json"),
+        constants=config.constants(),
+        task=asdict(task),
+        columns=history_columns(task, config.map.enabled),
+        evaluation_columns=evaluated_columns(task, config.map.enabled),
+    )
+    replay: Evaluator = _Replay(answers)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        RunStore.create(Path(folder) / "run", config.resolved_yaml(), meta, Beginning()) as store,
+    ):
+        driver.run(search, replay, store, None, lambda _: ends.append(time.perf_counter()))
+    seconds = np.diff(ends)[GENERATIONS // 3 :]
+    return float(np.median(seconds))
+
+
+def _budget() -> dict[str, Any]:
+    return {"generations": GENERATIONS, "env_steps": None, "wall_clock_s": None, "target_fitness": None}
