@@ -15,7 +15,7 @@ from es_service.config.tasks import TASKS
 from es_service.search.algorithms import ALGORITHMS
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-EACH = pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
+EACH = pytest.mark.parametrize("path", sorted(CONFIGS.rglob("*.yaml")), ids=lambda path: str(path.relative_to(CONFIGS)))
 
 
 @EACH
@@ -28,8 +28,8 @@ def test_shipped_configs_load_and_are_named_after_task_and_algorithm(path):
 @EACH
 def test_shipped_configs_hide_no_preset_key(path):
     """But the size of the population: or `--set search.preset=uber` would do nothing."""
-    uber = preset_values("uber") | {"search.pairs": 64}
     config = load_config(path, ["search.preset=uber"], tasks=TASKS, algorithms=ALGORITHMS)
+    uber = preset_values("uber") | {"search.pairs": config.search.pairs}
     assert config.constants().items() >= uber.items()
 
 
@@ -43,7 +43,8 @@ def test_comments_of_shipped_configs_say_the_numbers_that_are_used(path):
     assert said["hidden"].endswith(f"; here {spec.policy.parameters:,} parameters")
     assert said["episode_steps"].endswith(f", here {spec.episode_steps:,}")
     assert f"auto: here {list(config.map.cells)}" in said["cells"]
-    assert said.get("centres", "auto: 1").endswith(f"auto: {config.search.centres}")
+    centres = config.search.emitters if config.search.algorithm == "me_es" else 1
+    assert said.get("centres", f"auto: {centres}").endswith(f"auto: {config.search.centres}")
     assert said["chunk_pairs"].endswith(f"auto: {compute.chunk_pairs} for {config.search.pairs}")
     block = compute.rollout_block_pairs
     assert said["rollout_block_pairs"].endswith((f"auto: here {block}", f"auto: {block} for {compute.chunk_pairs}"))
