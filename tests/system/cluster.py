@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Self
 
 ROOT = Path(__file__).parents[2]
 MARK = "ES_TEST_NODE"
@@ -35,8 +36,11 @@ def missing() -> str | None:
     return None
 
 
-class Cluster:
-    """Nodes by name; the first is the head, with the dashboard and no CPU for workers. Use as a context manager."""
+class Hosts:
+    """Hosts by name, each in namespaces of its own. Use as a context manager."""
+
+    namespaces: tuple[str, ...] = ("--mount", "--uts")
+    """Those besides the network's that a host has, as options of unshare."""
 
     def __init__(self, log_folder: Path) -> None:
         self.log_folder = log_folder
@@ -45,17 +49,12 @@ class Cluster:
         self._id = f"es{os.getpid()}x{time.monotonic_ns() % 10**6}"
         self._switch = f"{self._id}sw"
 
-    @property
-    def address(self) -> str:
-        """Where a driver joins."""
-        return f"{self._ip(0)}:{PORT}"
-
-    def __enter__(self) -> Cluster:
+    def __enter__(self) -> Self:
         _ip("netns", "add", self._switch)
         _ip("-n", self._switch, "link", "add", "bridge", "type", "bridge")
         _ip("-n", self._switch, "link", "set", "bridge", "up")
         try:
-            self.start("head", 0)
+            self.begin()
         except BaseException:
             self.__exit__()
             raise
@@ -67,43 +66,39 @@ class Cluster:
         for name in (*map(self._namespace, self.nodes), self._switch):
             _ip("netns", "delete", name)
 
-    def start(self, node: str, cpus: int, **environment: str) -> None:
-        """Start a node, and wait for it."""
+    def begin(self) -> None:
+        """Start the hosts that are there from the beginning."""
+
+    def add(self, node: str, *command: object, setup: str = "true", **environment: str) -> None:
+        """Make a host that lives as long as a command, which is started there after a line of shell."""
         number = len(self.nodes)
         namespace, ours, theirs = self._namespace(node), f"v{number}", "eth0"
         _ip("netns", "add", namespace)
+        self.nodes.append(node)
         _ip("-n", self._switch, "link", "add", ours, "type", "veth", "peer", "name", theirs, "netns", namespace)
         _ip("-n", self._switch, "link", "set", ours, "master", "bridge", "up")
-        _ip("-n", namespace, "address", "add", f"{self._ip(number)}/24", "dev", theirs)
+        _ip("-n", namespace, "address", "add", f"{self.ip(number)}/24", "dev", theirs)
         for device in ("lo", theirs):
             _ip("-n", namespace, "link", "set", device, "up")
-        role = (
-            ["--head", f"--port={PORT}", "--dashboard-host=127.0.0.1"] if number == 0 else [f"--address={self.address}"]
-        )
-        ray = [Path(sys.executable).parent / "ray", "start", "--block", f"--node-ip-address={self._ip(number)}"]
-        ray += [f"--num-cpus={cpus}", "--object-store-memory=100000000", "--disable-usage-stats", *role]
         shell = (
             f"mkdir -p /tmp/ray && mount -t tmpfs tmpfs /tmp/ray && mount -t tmpfs tmpfs /dev/shm && "
-            f'hostname {node} && exec "$@"'
+            f'hostname {node} && {setup} && exec "$@"'
         )
-        enter = ["ip", "netns", "exec", namespace, "unshare", "--mount", "--uts", "sh", "-c", shell, "sh"]
+        enter = ["ip", "netns", "exec", namespace, "unshare", *self.namespaces, "sh", "-c", shell, "sh"]
         with (self.log_folder / f"{node}.log").open("wb") as log:
             self._entries[node] = subprocess.Popen(
-                [*enter, *ray],
+                [*enter, *map(str, command)],
                 env=self._environment(node) | environment,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
                 start_new_session=True,
             )
-        self.nodes.append(node)
-        self._wait_until_joined(node)
 
     def popen(self, node: str, *command: object, **environment: str) -> subprocess.Popen[str]:
         """Start a command on a node; what it prints is to be read."""
-        enter = ["nsenter", f"--target={self._entries[node].pid}", "--mount", "--net", "--uts", f"--wd={ROOT}"]
         return subprocess.Popen(
-            [*enter, *map(str, command)],
+            [*self.enter(node), *map(str, command)],
             env=self._environment(node) | environment,
             cwd=ROOT,
             stdin=subprocess.DEVNULL,
@@ -111,6 +106,10 @@ class Cluster:
             stderr=subprocess.STDOUT,
             text=True,
         )
+
+    def enter(self, node: str) -> list[str]:
+        """Command whose arguments are run on a node."""
+        return ["nsenter", f"--target={self._entries[node].pid}", "--mount", "--net", "--uts", f"--wd={ROOT}"]
 
     def run(self, node: str, *command: object, timeout: float = 60.0, **environment: str) -> tuple[int, str]:
         """Run a command on a node to its end: exit code, and all it printed."""
@@ -131,12 +130,10 @@ class Cluster:
                 continue
         return found
 
-    def worker(self, node: str) -> int:
-        """Process id of a worker on a node."""
-        return next(pid for pid, command in self.processes(node).items() if "WorkerActor" in command)
-
     def end(self, node: str) -> None:
         """Kill everything on a node, and see it gone."""
+        if node not in self._entries:
+            return
         while left := self.processes(node):
             for pid in left:
                 with contextlib.suppress(ProcessLookupError):
@@ -145,23 +142,55 @@ class Cluster:
             self._entries[node].poll()  # a child of ours stays in the list until it is asked for
         self._entries[node].wait()
 
+    def ip(self, number: int) -> str:
+        """Address of a host by its number."""
+        return f"10.77.0.{number + 1}"
+
+    def _namespace(self, node: str) -> str:
+        return f"{self._id}{node}"
+
+    def _environment(self, node: str) -> dict[str, str]:
+        kept = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "JAX_", "PJRT_"))}
+        path = f"{Path(sys.executable).parent}{os.pathsep}{kept.get('PATH', '')}"
+        return kept | {MARK: f"{self._id}.{node}", "PATH": path, "PYTHONPATH": str(ROOT)}
+
+
+class Cluster(Hosts):
+    """Nodes by name; the first is the head, with the dashboard and no CPU for workers. Use as a context manager."""
+
+    @property
+    def address(self) -> str:
+        """Where a driver joins."""
+        return f"{self.ip(0)}:{PORT}"
+
+    def begin(self) -> None:
+        """Start the head."""
+        self.start("head", 0)
+
+    def start(self, node: str, cpus: int, **environment: str) -> None:
+        """Start a node, and wait for it."""
+        number = len(self.nodes)
+        role = (
+            ["--head", f"--port={PORT}", "--dashboard-host=127.0.0.1"] if number == 0 else [f"--address={self.address}"]
+        )
+        ray = [Path(sys.executable).parent / "ray", "start", "--block", f"--node-ip-address={self.ip(number)}"]
+        ray += [f"--num-cpus={cpus}", "--object-store-memory=100000000", "--disable-usage-stats", *role]
+        self.add(node, *ray, **environment)
+        self._wait_until_joined(node)
+
+    def worker(self, node: str) -> int:
+        """Process id of a worker on a node."""
+        return next(pid for pid, command in self.processes(node).items() if "WorkerActor" in command)
+
     def _wait_until_joined(self, node: str) -> None:
         until = time.monotonic() + 60
         while "Ray runtime started" not in (self.log_folder / f"{node}.log").read_text():
             assert time.monotonic() < until, (self.log_folder / f"{node}.log").read_text()
             time.sleep(0.1)
 
-    def _namespace(self, node: str) -> str:
-        return f"{self._id}{node}"
-
-    def _ip(self, number: int) -> str:
-        return f"10.77.0.{number + 1}"
-
     def _environment(self, node: str) -> dict[str, str]:
-        kept = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "JAX_", "PJRT_"))}
-        path = f"{Path(sys.executable).parent}{os.pathsep}{kept.get('PATH', '')}"
-        mark = {MARK: f"{self._id}.{node}", "PATH": path, "PYTHONPATH": str(ROOT)}
-        return kept | mark | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN, "RAY_USAGE_STATS_ENABLED": "0"}
+        token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN, "RAY_USAGE_STATS_ENABLED": "0"}
+        return super()._environment(node) | token
 
 
 def _ip(*arguments: str) -> None:

@@ -196,7 +196,12 @@ def test_a_job_is_submitted_followed_stopped_and_goes_on_in_another_cluster(tmp_
         assert "seed: 0 -> 1" in printed
 
         stopped_at = read_generation(run)
-        submit(hosts)
+        by_ray = ("ray", "job", "submit", "--address", url, "--no-wait", "--working-dir", tmp_path / "sent", "--")
+        (tmp_path / "sent").mkdir()
+        (tmp_path / "sent" / config.name).write_text(config.read_text())
+        entry = ("es-service", "run", config.name, "--or-resume", "--out", run, "--address", "auto")
+        code, printed = hosts.run("head", *by_ray, *entry)
+        assert code == 0, printed
         wait_for(lambda: read_generation(run) > stopped_at + 3)
         lost_at = time.time()
         for node in reversed(hosts.nodes):  # the head with the driver last
