@@ -80,7 +80,7 @@ trap stop TERM
 wait_for_driver() {
     until [ -s "$state/code" ] || ! kill -0 "$srun" 2> /dev/null; do
         if [ -n "$stop_at" ] && { [ ! -s "$state/pid" ] || [ "$SECONDS" -ge "$stop_at" ]; }; then return; fi
-        sleep 1
+        sleep 0.2
     done
 }
 wait_for_driver

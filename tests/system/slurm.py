@@ -66,7 +66,13 @@ class Slurm(Hosts):
         self._hosts, self._cpus = hosts, cpus
         self._commands = write_commands(folder, srun=SRUN, squeue=SQUEUE, scontrol=SCONTROL)
         self._tasks: dict[Path, list[subprocess.Popen[bytes]]] = {}
+        self._started: list[subprocess.Popen[bytes]] = []
         self.restarts = 0
+
+    def __exit__(self, *_: object) -> None:
+        super().__exit__()
+        for started in self._started:
+            started.wait()
 
     def begin(self) -> None:
         """Make the hosts. Each knows the others' names, and has a first process that collects orphans."""
@@ -90,7 +96,7 @@ class Slurm(Hosts):
         self._job = ["bash", script, *arguments]
         self._start()
 
-    def wait_for(self, what: Callable[[], Any], timeout_s: float = 60.0) -> None:
+    def wait_for(self, what: Callable[[], Any], timeout_s: float = 120.0) -> None:
         """Serve the job until something is true."""
         until = time.monotonic() + timeout_s
         while not what():
@@ -149,11 +155,16 @@ class Slurm(Hosts):
         """End every process of the job."""
         for node in self.nodes:
             subprocess.run([*self.enter(node), "bash", "-c", "kill -KILL -1"], check=False, capture_output=True)
+        for started in self._started:
+            started.wait()
+        self._started.clear()
 
     def _popen(self, node: str, *command: object, environment: dict[str, str]) -> subprocess.Popen[bytes]:
         with (self.log_folder / "slurm.out").open("ab") as log:  # --open-mode=append
             words = [*self.enter(node), *map(str, command)]
-            return subprocess.Popen(words, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+            started = subprocess.Popen(words, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        self._started.append(started)
+        return started
 
     def _mark(self, node: str) -> dict[str, str]:
         """The variables in which the nodes differ."""

@@ -93,7 +93,11 @@ def main(paths: list[str]) -> None:
     result = shared(dict(of_definition(yaml.safe_load(Path(path).read_text())) for path in paths))
     definitions = result.pop("definitions")
     lines = [f'"{kind}": {json.dumps(schema)},' for kind, schema in result.items()]
-    lines += ['"definitions": {', ",\n".join(f'"{name}": {json.dumps(part)}' for name, part in definitions.items()), "}"]
+    lines += [
+        '"definitions": {',
+        ",\n".join(f'"{name}": {json.dumps(part)}' for name, part in definitions.items()),
+        "}",
+    ]
     print("\n".join(["{", *lines, "}"]))
 
 
