@@ -77,16 +77,24 @@ stop() {
 }
 trap stop TERM
 
+runs() { [ -n "$1" ] && kill -0 "$1" 2> /dev/null; }
+
 wait_for_driver() {
-    until [ -s "$state/code" ] || ! kill -0 "$srun" 2> /dev/null; do
-        if [ -n "$stop_at" ] && { [ ! -s "$state/pid" ] || [ "$SECONDS" -ge "$stop_at" ]; }; then return; fi
+    until [ -s "$state/code" ]; do
+        pid=$(cat "$state/pid" 2> /dev/null)
+        if ! runs "$srun" && ! runs "$pid"; then break; fi
+        if [ -n "$stop_at" ] && { [ -z "$pid" ] || [ "$SECONDS" -ge "$stop_at" ]; }; then break; fi
         sleep 0.2
     done
+    code=$(cat "$state/code" 2> /dev/null)
+    if [ -z "$code" ] && ! runs "$srun"; then
+        wait "$srun"
+        if [ $? = 143 ]; then code=143; fi    # SIGTERM to all tasks, as Slurm sends it on preemption
+    fi
 }
 wait_for_driver
 
 # When this script ends, Slurm ends what still runs on the nodes.
-code=$(cat "$state/code" 2> /dev/null)
 if [ "$code" = 143 ] || { [ -z "$code" ] && [ -n "$stop_at" ]; }; then
     # A job that was cancelled is not RUNNING, nor is one that Slurm itself has put back into the queue.
     if [ "$(squeue --noheader --jobs="$SLURM_JOB_ID" --format=%T)" = RUNNING ]; then

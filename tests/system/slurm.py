@@ -143,7 +143,8 @@ class Slurm(Hosts):
                     self._popen(node, *words, environment=dict(pairs) | self._mark(node)) for node in self.nodes
                 ]
             elif step in self._tasks and all(task.poll() is not None for task in self._tasks[step]):
-                (step / "ended").write_text(str(max(task.returncode for task in self._tasks[step])))
+                codes = [task.returncode for task in self._tasks[step]]
+                (step / "ended").write_text(str(max(code if code >= 0 else 128 - code for code in codes)))
         if self._script.poll() is not None:
             self._kill()
             if "requeue" in self.options and (self.log_folder / "requeued").exists():
