@@ -40,16 +40,11 @@ RAY_AUTH_TOKEN=$(od -An -N32 -tx1 /dev/urandom | tr -d ' \n')
 export RAY_AUTH_TOKEN RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0
 export RAY_SYMMETRIC_RUN_CLUSTER_WAIT_TIMEOUT=300    # seconds that the other nodes wait for the first one
 
-# This script runs on the first node, which becomes the head. Its address must be the one that the other nodes reach.
-head=${HEAD_IP:-$(hostname --ip-address | cut -d' ' -f1)}
+# This script runs on the first node, which becomes the head. The other nodes must reach it at this address: what its
+# name means, or its first address if the name means 127.0.1.1, as on Debian.
+head=$(hostname --ip-address 2> /dev/null | cut -d' ' -f1)
 case $head in
-127.*)
-    if [ "$SLURM_JOB_NUM_NODES" -gt 1 ]; then
-        echo "the name of this node means $head, which other nodes cannot reach; set HEAD_IP to its address" >&2
-        exit 2
-    fi
-    head=127.0.0.1
-    ;;
+'' | 127.*) head=$(hostname --all-ip-addresses | cut -d' ' -f1) ;;
 esac
 
 # `ray symmetric-run` does not pass SIGTERM on, and its exit code is 0 if Ray could not be started. So the driver leaves

@@ -88,7 +88,7 @@ def test_it_requeues_a_job_that_was_told_to_stop_and_no_other(tmp_path, driver, 
     driver, srun = (text if text.startswith("#!") else f"#!/bin/bash\n{text}\n" for text in (driver, srun))
     programs = {"es_service": driver, "srun": srun, "squeue": STATE.format(state), "scontrol": REQUEUES}
     path = f"{write_commands(tmp_path, **programs)}{os.pathsep}{os.environ['PATH']}"
-    job = {"SLURM_JOB_ID": "7", "SLURM_JOB_NUM_NODES": "1", "SLURM_CPUS_PER_TASK": "1", "HEAD_IP": "127.0.0.1"}
+    job = {"SLURM_JOB_ID": "7", "SLURM_JOB_NUM_NODES": "1", "SLURM_CPUS_PER_TASK": "1"}
     environment = os.environ | job | {"PATH": path, "STAND_IN": str(tmp_path), "TMPDIR": str(tmp_path)}
     with (
         (tmp_path / "printed").open("wb") as log,
