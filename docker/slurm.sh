@@ -58,12 +58,6 @@ code=$?
 echo "$code" > "$0/code"
 exit "$code"'
 
-srun --cpus-per-task="$SLURM_CPUS_PER_TASK" --no-kill --kill-on-bad-exit=0 \
-    ray symmetric-run --address "$head:6379" --num-cpus="$SLURM_CPUS_PER_TASK" --object-store-memory=200000000 \
-    --disable-usage-stats -- \
-    bash -c "$driver" "$state" "$config" --or-resume --out "$run" --address auto "$@" &
-srun=$!
-
 stop_at=
 stop() {
     [ -n "$stop_at" ] && return
@@ -71,6 +65,12 @@ stop() {
     if [ -s "$state/pid" ]; then kill -TERM "$(cat "$state/pid")"; fi    # it finishes the transaction in hand
 }
 trap stop TERM
+
+srun --cpus-per-task="$SLURM_CPUS_PER_TASK" --no-kill --kill-on-bad-exit=0 \
+    ray symmetric-run --address "$head:6379" --num-cpus="$SLURM_CPUS_PER_TASK" --object-store-memory=200000000 \
+    --disable-usage-stats -- \
+    bash -c "$driver" "$state" "$config" --or-resume --out "$run" --address auto "$@" &
+srun=$!
 
 runs() { [ -n "$1" ] && kill -0 "$1" 2> /dev/null; }
 
