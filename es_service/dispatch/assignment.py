@@ -9,8 +9,10 @@ limit applies if the worker must compile for it, or if its usual duration is not
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 
 from es_service.dispatch.events import Assign, Command
+from es_service.dispatch.scheduler_changes import put_worker, take_item
 from es_service.dispatch.scheduler_state import SchedulerState, Slot, Worker, usual_chunk_s
 
 
@@ -18,20 +20,18 @@ def assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
     """Assign queued items to workers that can take more, idle workers first; this changes the containers of `s`."""
     retries = s.retries
     for load in range(s.limits.in_flight):
-        if not s.queue:
-            break
-        for worker in [worker for worker, record in s.up.items() if len(record.slots) == load]:
-            index = _next_for(s, worker)
-            if index is None:
+        for slots, _, worker in s.free:  # as they are before this round
+            if slots > load or not s.places:
+                break
+            found = _next_for(s, worker) if slots == load else None
+            if found is None:
                 continue
-            item_id = s.queue[index]
-            del s.queue[index]
-            waiting, record = s.items[item_id], s.up[worker]
-            s.items[item_id] = waiting._replace(holder=worker)
+            place, item_id = found
+            waiting, record = take_item(s, place, item_id, worker), s.up[worker]
             retries += waiting.item.size if waiting.last_holder is not None else 0
             slot = Slot(waiting.item, waiting.faults + 1)
             record = record._replace(slots=(*record.slots, slot))
-            s.up[worker] = begin_first_slot(s, record, now) if load == 0 else record
+            put_worker(s, s.up, worker, begin_first_slot(s, record, now) if load == 0 else record)
             out.append(Assign(worker, item_id, slot.attempt))
     return s if retries == s.retries else s._replace(retries=retries)
 
@@ -49,9 +49,9 @@ def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worke
     return worker._replace(started_s=now, deadline_s=now + limit_s, limit=limit)
 
 
-def _next_for(state: SchedulerState, worker: int) -> int | None:
-    """Index in the queue of the first item that may be assigned to a worker, or None."""
-    for index, item_id in enumerate(state.queue):
-        if state.items[item_id].last_holder != worker or len(state.up) == 1:
-            return index
+def _next_for(s: SchedulerState, worker: int) -> tuple[int, Hashable] | None:
+    """(place, id) of the first item in the queue that may be assigned to a worker, or None."""
+    for place, item_id in s.places:
+        if s.items[item_id].last_holder != worker or len(s.up) == 1:
+            return place, item_id
     return None

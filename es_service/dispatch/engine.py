@@ -23,6 +23,8 @@ from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import ChunkResult, Work, WorkItemId
 
 _LOG = logger(__name__)
+_RARE = (events.WorkerUp, events.WorkerLost, events.Failure, events.StopWorker)
+"""Events and commands that `logging` reports at level INFO."""
 POLL_S = 0.1
 """Longest time in seconds until a request to stop is noticed."""
 
@@ -241,5 +243,4 @@ class Engine(Generic[AnyTransport]):
     def _tell(self, entry: events.Event | events.Command) -> None:
         """Write an event or a command to the dispatch log and to `logging`, faults and losses at level INFO."""
         self._log(entry)
-        is_rare = isinstance(entry, events.WorkerUp | events.WorkerLost | events.Failure | events.StopWorker)
-        _LOG.log(logging.INFO if is_rare else logging.DEBUG, "%s", entry)
+        _LOG.log(logging.INFO if isinstance(entry, _RARE) else logging.DEBUG, "%s", entry)

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections import deque
 from collections.abc import Hashable
 from typing import NamedTuple
 
+from es_service.dispatch.cheap_copies import Sorted, Table
 from es_service.dispatch.events import Limits, WorkItem, with_last_words
 
 
@@ -19,6 +19,8 @@ class Waiting(NamedTuple):
 
     item: WorkItem
     faults: int = 0
+    place: int | None = None
+    """Its place in the queue, smaller than the places of later items; None while it is assigned to a worker."""
     holder: int | None = None
     """The worker that the item is assigned to; None while it is in the queue."""
     last_holder: int | None = None
@@ -33,16 +35,18 @@ class Slot(NamedTuple):
 
 
 class Worker(NamedTuple):
-    """A worker that has come up."""
+    """A worker."""
 
+    rank: int
+    """Position in the order in which workers of its group joined the group; it need not be contiguous."""
     slots: tuple[Slot, ...] = ()
     """Work items that it has not answered yet, in the order in which they were sent; it runs the first."""
     started_s: float = 0.0
     """Time at which it began the first slot."""
     deadline_s: float = math.inf
-    """Time by which it must answer the first slot."""
+    """Time by which it must come up, or answer the first slot."""
     limit: str = ""
-    """Field of `Limits` that determines this deadline."""
+    """Field of `Limits` that determines the deadline for the first slot."""
     warm: frozenset[str] = frozenset()
     """Kinds of which it has finished a work item, so that it need not compile for them again."""
     failures_in_a_row: int = 0
@@ -55,20 +59,26 @@ class SchedulerState(NamedTuple):
     limits: Limits
     wanted: int
     """Number of workers that should run."""
-    starting: dict[int, float]
-    """Worker that has not come up yet -> time by which it must."""
-    up: dict[int, Worker]
+    starting: Table[int, Worker]
+    """Workers that have not come up yet."""
+    up: Table[int, Worker]
     """Workers that can be assigned work items."""
-    draining: dict[int, Worker]
+    draining: Table[int, Worker]
     """Workers that finish their work items and get no others."""
-    items: dict[Hashable, Waiting]
+    deadlines: Sorted[tuple[float, int]]
+    """(deadline, worker) of every worker of these three groups that has a deadline."""
+    free: Sorted[tuple[int, int, int]]
+    """(number of its slots, rank, worker) of every worker that can be assigned another work item."""
+    items: Table[Hashable, Waiting]
     """Work items that have not been delivered, by id."""
-    queue: deque[Hashable]
-    """Ids of the work items to assign; the next one is first."""
+    places: Sorted[tuple[int, Hashable]]
+    """(place, id) of every work item in the queue."""
     durations_s: dict[str, tuple[float, ...]]
     """Kind -> recent durations of one chunk, without those that may include compiling."""
     next_worker: int = 0
     """Id of the next worker to start."""
+    next_rank: int = 0
+    """Rank of the next worker that comes up or drains."""
     start_at_s: float = -math.inf
     """Time before which no worker is started."""
     losses_in_a_row: int = 0
@@ -92,10 +102,17 @@ class SchedulerState(NamedTuple):
     duplicates: int = 0
     """Results and failures that were ignored: outdated, repeated, or from an unknown worker."""
 
+    @property
+    def queue(self) -> list[Hashable]:
+        """Ids of the work items to assign; the next one is first."""
+        return [item_id for _, item_id in self.places]
+
 
 def initial_state(limits: Limits) -> SchedulerState:
     """State without work items and workers; the first step starts the workers, whatever its event is."""
-    return SchedulerState(limits, limits.workers, {}, {}, {}, {}, deque(), {})
+    return SchedulerState(
+        limits, limits.workers, Table(), Table(), Table(), Sorted(), Sorted(), Table(), Sorted(), durations_s={}
+    )
 
 
 def pending(state: SchedulerState) -> int:
@@ -113,13 +130,28 @@ def next_deadline(state: SchedulerState) -> float:
     """Time of the next deadline, at which a `Tick` has an effect; infinity if there is none."""
     if state.failed is not None:
         return math.inf
-    times = [worker.deadline_s for group in (state.up, state.draining) for worker in group.values()]
-    times.extend(state.starting.values())
+    first = state.deadlines.first()
+    at_s = first[0] if first is not None else math.inf
     if len(state.starting) + len(state.up) < state.wanted:
-        times.append(state.start_at_s)
+        at_s = min(at_s, state.start_at_s)
     if state.down_since_s is not None:
-        times.append(state.down_since_s + state.limits.no_worker_timeout_s)
-    return min(times, default=math.inf)
+        at_s = min(at_s, state.down_since_s + state.limits.no_worker_timeout_s)
+    return at_s
+
+
+def late_workers(state: SchedulerState, now: float) -> list[int]:
+    """Workers whose deadline has passed: first those that start, then those that are up, then those that drain."""
+    late = []
+    for deadline_s, worker in state.deadlines:
+        if now < deadline_s:
+            break
+        position = next(
+            (number, group[worker].rank)
+            for number, group in enumerate((state.starting, state.up, state.draining))
+            if worker in group
+        )
+        late.append((position, worker))
+    return [worker for _, worker in sorted(late)]
 
 
 def told_last_words(state: SchedulerState, worker: int, last_words: str) -> SchedulerState:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from es_service.dispatch.events import Command, Event, Limits, StartWorker, Submit, Tick, WorkerUp, WorkItem
@@ -29,6 +30,7 @@ def play(state: SchedulerState, *events: tuple[float, Event]) -> tuple[Scheduler
     commands: list[Command] = []
     for now, event in events:
         state, commands = step(state, event, now)
+        check_consistency(state)
     return state, commands
 
 
@@ -42,3 +44,20 @@ def ready(workers: int = 2, **changes: object) -> SchedulerState:
     state, commands = step(initial_state(replace(LIMITS, workers=workers, **changes)), Tick(), 0.0)
     assert commands == [StartWorker(worker) for worker in range(workers)]
     return play(state, *((0.0, WorkerUp(worker)) for worker in range(workers)))[0]
+
+
+def check_consistency(state: SchedulerState) -> None:
+    """Assert that what a state has twice, so that nobody need look for it, is the same in both places."""
+    deadlines = []
+    for group in (state.starting, state.up, state.draining):
+        records = [(worker, group[worker]) for worker in group]
+        assert [record.rank for _, record in records] == sorted({record.rank for _, record in records})
+        deadlines += [(record.deadline_s, worker) for worker, record in records if record.deadline_s < math.inf]
+    assert list(state.deadlines) == sorted(deadlines)
+    loads = [(len(record.slots), record.rank, worker) for worker, record in ((w, state.up[w]) for w in state.up)]
+    assert list(state.free) == sorted(entry for entry in loads if entry[0] < state.limits.in_flight)
+    waiting = [(item_id, state.items[item_id]) for item_id in state.items]
+    assert all((record.place is None) != (record.holder is None) for _, record in waiting)
+    if state.failed is None:
+        assert list(state.places) == sorted((r.place, item_id) for item_id, r in waiting if r.place is not None)
+        assert state.queue == [item_id for _, item_id in state.places]

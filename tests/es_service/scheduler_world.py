@@ -30,6 +30,7 @@ from es_service.dispatch.events import (
 )
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending
+from tests.es_service.scheduler_play import check_consistency
 
 START_FATES = ("start_dies", "start_hangs", "no_place")
 ITEM_FATES = ("item_dies", "item_hangs", "item_slow", "item_raises", "contradicts")
@@ -237,6 +238,7 @@ class World:
             self.note(event)
         copied = copy.deepcopy(before) if self.check_purity else None
         self.state, commands = step(before, event, self.now)
+        check_consistency(self.state)
         if copied is not None:
             assert step(before, event, self.now) == (self.state, commands)
             assert before == copied
