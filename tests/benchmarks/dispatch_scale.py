@@ -1,0 +1,124 @@
+"""What do many work items and many workers cost the driver?
+
+    python -m tests.benchmarks.dispatch_scale
+
+Real scheduler and engine; the transport answers at once, in this process, so that what is measured is the driver alone.
+Each item is one chunk. A generation is one call of `Engine.evaluate`; the first one finds the workers' first items, so
+the seconds are the median of those after it. The scheduler alone is given the answers of a generation one by one, and
+its microseconds are per answer; a submitted item is assigned at once if there is a worker for it. One JSON row each.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+from collections import deque
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+import numpy as np
+
+from es_service.dispatch.engine import Answer, Engine, Message
+from es_service.dispatch.events import Assign, Limits, Result, Submit, Tick, WorkerUp, WorkItem
+from es_service.dispatch.scheduler import step
+from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending
+from es_service.protocol.messages import NO_CENTRE, GradientResult, TrainingChunk, Work, WorkItemId, around
+
+SIZES = ((10, 10), (100, 100), (1000, 1000), (10_000, 10_000), (10_000, 100))
+"""(items, workers)."""
+GENERATIONS = 6
+_RESULT = GradientResult(np.zeros(0, np.float32))
+
+
+class AnswersAtOnce:
+    """A transport whose workers come up and answer as soon as they are asked."""
+
+    def __init__(self) -> None:
+        self._inbox: deque[Message] = deque()
+
+    def start(self, worker: int) -> None:
+        self._inbox.append(WorkerUp(worker))
+
+    def kill(self, worker: int) -> str:
+        return ""
+
+    def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
+        self._inbox.append(Answer(worker, item_id, attempt, [_RESULT] * len(work)))
+
+    def platforms(self) -> frozenset[str]:
+        return frozenset()
+
+    def silent(self) -> tuple[int, ...]:
+        return ()
+
+    def receive(self, timeout_s: float) -> Message | None:
+        return self._inbox.popleft() if self._inbox else None
+
+    def close(self) -> None:
+        self._inbox.clear()
+
+
+def limits_of(workers: int) -> Limits:
+    """Limits under which an item is one chunk, however short."""
+    return Limits(workers=workers, item_s=0.0)
+
+
+def engine_seconds(items: int, workers: int) -> list[float]:
+    """Seconds of each generation but the first."""
+    seconds = []
+    with Engine(AnswersAtOnce(), limits_of(workers)) as engine:
+        for generation in range(GENERATIONS):
+            work = around(NO_CENTRE, [TrainingChunk(generation, chunk_id) for chunk_id in range(items)])
+            started = time.perf_counter()
+            engine.evaluate(work)
+            seconds.append(time.perf_counter() - started)
+    return seconds[1:]
+
+
+def scheduler_seconds(items: int, workers: int) -> tuple[float, float]:
+    """Seconds of the scheduler alone: for an item that is submitted, and for one that is answered."""
+    state, _ = step(initial_state(limits_of(workers)), Tick(), 0.0)
+    for worker in range(workers):
+        state, _ = step(state, WorkerUp(worker), 0.0)
+    submit, answer = [], []
+    for generation in range(GENERATIONS):
+        ids = [WorkItemId(generation, index, "TrainingChunk", generation, 0, index, 1) for index in range(items)]
+        event = Submit(tuple(WorkItem(item_id, item_id.kind) for item_id in ids))
+        started = time.perf_counter()
+        state, commands = step(state, event, started)
+        submit.append((time.perf_counter() - started) / items)
+        waiting = deque(commands)
+        started = time.perf_counter()
+        while waiting:
+            command = waiting.popleft()
+            if isinstance(command, Assign):
+                event = Result(command.worker, command.item_id, command.attempt)
+                next_deadline(state)  # the engine asks before each wait
+                state, more = step(state, event, time.perf_counter())
+                waiting.extend(more)
+        answer.append((time.perf_counter() - started) / items)
+        assert pending(state) == 0
+    return statistics.median(submit[1:]), statistics.median(answer[1:])
+
+
+def measure(items: int, workers: int) -> dict[str, Any]:
+    seconds = engine_seconds(items, workers)
+    submit_s, answer_s = scheduler_seconds(items, workers)
+    return {
+        "items": items,
+        "workers": workers,
+        "seconds_per_generation": round(statistics.median(seconds), 5),
+        "slowest_generation": round(max(seconds), 5),
+        "scheduler_us_per_event": round(answer_s * 1e6, 1),
+        "scheduler_us_per_submitted_item": round(submit_s * 1e6, 1),
+    }
+
+
+def main() -> None:
+    for items, workers in SIZES:
+        print(json.dumps(measure(items, workers)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
