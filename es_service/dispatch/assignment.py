@@ -9,11 +9,10 @@ limit applies if the worker must compile for it, or if its usual duration is not
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable
 
 from es_service.dispatch.events import Assign, Command
 from es_service.dispatch.scheduler_changes import put_worker, take_item
-from es_service.dispatch.scheduler_state import SchedulerState, Slot, Worker, usual_chunk_s
+from es_service.dispatch.scheduler_state import SchedulerState, Slot, Waiting, Worker, usual_chunk_s
 
 
 def assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
@@ -23,16 +22,15 @@ def assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
         for slots, _, worker in s.free:  # as they are before this round
             if slots > load or not s.places:
                 break
-            found = _next_for(s, worker) if slots == load else None
-            if found is None:
+            waiting = _next_for(s, worker) if slots == load else None
+            if waiting is None:
                 continue
-            place, item_id = found
-            waiting, record = take_item(s, place, item_id, worker), s.up[worker]
+            take_item(s, waiting, worker)
             retries += waiting.item.size if waiting.last_holder is not None else 0
-            slot = Slot(waiting.item, waiting.faults + 1)
+            slot, record = Slot(waiting.item, waiting.faults + 1), s.up[worker]
             record = record._replace(slots=(*record.slots, slot))
             put_worker(s, s.up, worker, begin_first_slot(s, record, now) if load == 0 else record)
-            out.append(Assign(worker, item_id, slot.attempt))
+            out.append(Assign(worker, waiting.item.id, slot.attempt))
     return s if retries == s.retries else s._replace(retries=retries)
 
 
@@ -49,9 +47,10 @@ def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worke
     return worker._replace(started_s=now, deadline_s=now + limit_s, limit=limit)
 
 
-def _next_for(s: SchedulerState, worker: int) -> tuple[int, Hashable] | None:
-    """(place, id) of the first item in the queue that may be assigned to a worker, or None."""
-    for place, item_id in s.places:
-        if s.items[item_id].last_holder != worker or len(s.up) == 1:
-            return place, item_id
+def _next_for(s: SchedulerState, worker: int) -> Waiting | None:
+    """The first item in the queue that may be assigned to a worker, or None."""
+    for _, item_id in s.places:
+        waiting = s.items[item_id]
+        if waiting.last_holder != worker or len(s.up) == 1:
+            return waiting
     return None

@@ -19,7 +19,7 @@ Value = TypeVar("Value")
 Entry = TypeVar("Entry", bound=tuple[Any, ...])
 
 _FIRST = itemgetter(0)
-_LONGEST, _SHORTEST = 96, 24
+_LONGEST, _SHORTEST = 128, 32
 """Most entries of a block of `Sorted`, and fewest of a block that has a neighbour."""
 
 
@@ -32,20 +32,21 @@ class Table(Generic[Key, Value]):
 
     __slots__ = ("_differences", "_shared", "_size")
 
-    def __init__(self) -> None:
-        self._shared: dict[Key, Value] = {}
-        self._differences: dict[Key, Value | None] = {}
+    def __init__(
+        self,
+        shared: dict[Key, Value] | None = None,
+        differences: dict[Key, Value | None] | None = None,
+        size: int = 0,
+    ) -> None:
+        self._shared = {} if shared is None else shared
+        self._differences = {} if differences is None else differences
         """New values, and None for each key of `_shared` that was removed."""
-        self._size = 0
+        self._size = size
 
     def copy(self) -> Table[Key, Value]:
-        new: Table[Key, Value] = Table()
         if len(self._differences) ** 2 > 4 * len(self._shared) + 256:
-            new._shared = self._merged()
-        else:
-            new._shared, new._differences = self._shared, self._differences.copy()
-        new._size = self._size
-        return new
+            return Table(self._merged(), {}, self._size)
+        return Table(self._shared, self._differences.copy(), self._size)
 
     def get(self, key: Key) -> Value | None:
         """The value of a key; None if there is none."""
@@ -63,13 +64,13 @@ class Table(Generic[Key, Value]):
         return value
 
     def __getitem__(self, key: Key) -> Value:
-        value = self.get(key)
+        value = self._differences.get(key, self._shared.get(key))
         if value is None:
             raise KeyError(key)
         return value
 
     def __setitem__(self, key: Key, value: Value) -> None:
-        if self.get(key) is None:
+        if self._differences.get(key, self._shared.get(key)) is None:
             self._size += 1
         self._differences[key] = value
 
@@ -101,14 +102,12 @@ class Sorted(Generic[Entry]):
 
     __slots__ = ("_blocks",)
 
-    def __init__(self) -> None:
-        self._blocks: tuple[tuple[Entry, ...], ...] = ()
+    def __init__(self, blocks: tuple[tuple[Entry, ...], ...] = ()) -> None:
+        self._blocks = blocks
         """None is empty; the lengths of all but a single one are between _SHORTEST and _LONGEST."""
 
     def copy(self) -> Sorted[Entry]:
-        new: Sorted[Entry] = Sorted()
-        new._blocks = self._blocks
-        return new
+        return Sorted(self._blocks)
 
     def first(self) -> Entry | None:
         """The smallest entry; None if there is none."""

@@ -227,9 +227,12 @@ class Engine(Generic[AnyTransport]):
         self._state, commands = step(self._state, event, time.monotonic())
         if commands or not isinstance(event, events.Tick):
             self._tell(event)
+        accepted = False
         for command in commands:
             self._tell(command)
             match command:
+                case events.Deliver():
+                    accepted = True
                 case events.StartWorker(worker):
                     self.transport.start(worker)
                 case events.StopWorker(worker, _):
@@ -238,7 +241,7 @@ class Engine(Generic[AnyTransport]):
                     self.transport.send(worker, item_id, attempt, self._work[item_id])
         if self._state.failed is not None:
             raise EvaluationError(self._state.failed)
-        return any(isinstance(command, events.Deliver) for command in commands)
+        return accepted
 
     def _tell(self, entry: events.Event | events.Command) -> None:
         """Write an event or a command to the dispatch log and to `logging`, faults and losses at level INFO."""

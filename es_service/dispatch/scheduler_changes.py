@@ -66,12 +66,10 @@ def append_items(s: SchedulerState, items: Iterable[WorkItem]) -> None:
     s.places.extend(places)
 
 
-def take_item(s: SchedulerState, place: int, item_id: Hashable, worker: int) -> Waiting:
-    """Move a work item from its place in the queue to a worker; returns what it was before."""
-    waiting = s.items[item_id]
-    s.items[item_id] = waiting._replace(place=None, holder=worker)
-    s.places.remove((place, item_id))
-    return waiting
+def take_item(s: SchedulerState, waiting: Waiting, worker: int) -> None:
+    """Move a work item from the queue to a worker."""
+    s.items[waiting.item.id] = Waiting(waiting.item, waiting.faults, holder=worker, last_holder=waiting.last_holder)
+    _leave_queue(s, waiting)
 
 
 def return_item(s: SchedulerState, worker: int, item_id: Hashable) -> None:
@@ -85,6 +83,11 @@ def return_item(s: SchedulerState, worker: int, item_id: Hashable) -> None:
 def drop_item(s: SchedulerState, item_id: Hashable) -> bool:
     """Forget a work item, wherever it is; returns whether there was one."""
     waiting = s.items.pop(item_id)
-    if waiting is not None and waiting.place is not None:
-        s.places.remove((waiting.place, item_id))
+    if waiting is not None:
+        _leave_queue(s, waiting)
     return waiting is not None
+
+
+def _leave_queue(s: SchedulerState, waiting: Waiting) -> None:
+    if waiting.place is not None:
+        s.places.remove((waiting.place, waiting.item.id))

@@ -173,6 +173,11 @@ def find_slot(worker: Worker, item_id: Hashable, attempt: int) -> int | None:
     return None
 
 
+def without(slots: tuple[Slot, ...], index: int) -> tuple[Slot, ...]:
+    """Slots without the one at an index."""
+    return slots[:index] + slots[index + 1 :]
+
+
 def holds(state: SchedulerState, worker: int, item_id: Hashable) -> bool:
     """Whether a work item is assigned to a worker and has not been delivered."""
     waiting = state.items.get(item_id)

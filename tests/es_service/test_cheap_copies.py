@@ -9,7 +9,7 @@ from random import Random
 
 import pytest
 
-from es_service.dispatch.cheap_copies import Sorted, Table
+from es_service.dispatch.cheap_copies import _LONGEST, _SHORTEST, Sorted, Table
 
 
 @pytest.mark.parametrize("seed", range(25))
@@ -125,8 +125,8 @@ def test_blocks_stay_short_and_few():
         present[index] = number + 2000 if number < 10_000 else random.randrange(10**6, 10**9)
         entries.add((present[index],))
         lengths = [len(block) for block in entries._blocks]
-    assert max(lengths) <= 96
-    assert min(lengths) >= 24
+    assert max(lengths) <= _LONGEST
+    assert min(lengths) >= _SHORTEST
 
 
 @pytest.mark.parametrize("kind", ["table", "sorted"])
