@@ -15,13 +15,12 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from es_service.config.compute import ENGINE_IMPLIES
+from es_service.dispatch.ray_nodes import Claim, Membership, look
 from es_service.dispatch.ray_side_effects import environment_kept, signal_handlers_kept
 from es_service.errors import EvaluationError, Interrupted, WayOut
 from es_service.logs import logger
@@ -55,56 +54,6 @@ WITHOUT_RAY = WayOut(
     "resume", "continue on this machine without Ray", settings={"compute.engine": "inline", **ENGINE_IMPLIES["inline"]}
 )
 """Suggestion for errors of Ray."""
-
-
-@dataclass(frozen=True)
-class Claim:
-    """CPUs and GPUs of a node that one worker needs."""
-
-    cpus: int = 1
-    gpus: float = 0.0
-
-    def __str__(self) -> str:
-        return f"{self.cpus} CPU" + (f" and {self.gpus:g} GPU" if self.gpus else "")
-
-
-ONE_CORE = Claim()
-
-
-@dataclass(frozen=True)
-class Membership:
-    """The nodes of a cluster at one moment."""
-
-    room: int
-    """Number of workers for which the nodes that are alive and not leaving have room."""
-    leaving: frozenset[str]
-    """Ids of the nodes that are being drained."""
-    alive: frozenset[str]
-    """Ids of the nodes that are alive, including those that are being drained."""
-
-
-def actor_cores(nodes: Sequence[int], workers: int | None, most: int | None) -> int:
-    """Cores that each actor owns if they are not configured: all of a node, so that a node needs few messages.
-
-    If the nodes differ, or if there is none yet, it is one core, which leaves no core of any node idle.
-
-    Args:
-        nodes: cores of each node.
-        workers: number of cores that the run uses, which the result divides; None: as many as there are.
-        most: number of cores that have work; None: no limit.
-    """
-    if not nodes or len(set(nodes)) > 1:
-        return 1
-    size = max(1, min(nodes[0], most or nodes[0]))
-    if workers is None:
-        return size
-    return max(cores for cores in range(1, min(size, workers) + 1) if workers % cores == 0)
-
-
-def cores_of_nodes(ray: ModuleType) -> list[int]:
-    """Cores of each node that is alive and has any."""
-    cpus = [node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]]
-    return [int(count) for count in cpus if count >= 1.0]
 
 
 def connect(address: str | None, *, gpus: bool, cpus: int) -> ModuleType:
@@ -187,22 +136,6 @@ def disconnect(ray: ModuleType, *, forget: bool = False) -> None:
                 latest.unlink()
 
 
-def look(ray: ModuleType, claim: Claim) -> Membership:
-    """The nodes of the cluster now. This blocks until the head node answers."""
-    leaving = frozenset(_draining(ray))
-    alive = {node["NodeID"]: node["Resources"] for node in ray.nodes() if node["Alive"]}
-    room = sum(_room(resources, claim) for node, resources in alive.items() if node not in leaving)
-    return Membership(room, leaving, frozenset(alive))
-
-
-def demand(ray: ModuleType, claim: Claim) -> str:
-    """Text on what each worker needs and what the cluster has."""
-    return (
-        f"Each worker needs {claim}; the cluster has {_resources(ray.cluster_resources())} in total and "
-        f"{_resources(ray.available_resources())} free"
-    )
-
-
 class Watch:
     """Regular queries for the nodes of a cluster, in a separate thread because a query may block."""
 
@@ -237,32 +170,6 @@ class Watch:
             with contextlib.suppress(Exception):  # any exception means that there is no answer
                 self._latest = look(self._ray, self._claim)
                 self._answered_s = time.monotonic()
-
-
-def _room(resources: dict[str, float], claim: Claim) -> int:
-    """Number of workers for which a node with these resources has room."""
-    by_cpu = int(resources.get("CPU", 0.0) / claim.cpus)
-    # Ray does not divide the share of one worker between two GPUs.
-    by_gpu = int(resources.get("GPU", 0.0)) * int(1 / claim.gpus) if 0 < claim.gpus < 1 else by_cpu
-    if claim.gpus >= 1:
-        by_gpu = int(resources.get("GPU", 0.0) / claim.gpus)
-    return min(by_cpu, by_gpu)
-
-
-def _resources(amounts: dict[str, float]) -> str:
-    """Text with the numbers of CPUs and GPUs."""
-    return ", ".join(f"{amounts.get(name, 0.0):g} {name}" for name in ("CPU", "GPU"))
-
-
-def _draining(ray: ModuleType) -> dict[str, int]:
-    """Ids of the nodes that are being drained, as keys.
-
-    Ray has no public function for this. If a version of Ray lacks this one, the workers of a drained node are lost when
-    the node ends.
-    """
-    with contextlib.suppress(AttributeError):
-        return ray._private.state.state.get_draining_nodes()
-    return {}
 
 
 def _session_folder(ray: ModuleType) -> Path | None:

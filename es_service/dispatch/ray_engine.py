@@ -14,7 +14,7 @@ import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -22,8 +22,9 @@ from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
-from es_service.dispatch.ray_cluster import Claim, Watch, actor_cores, connect, cores_of_nodes, demand, disconnect, look
+from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_faults import error_text, fault_reason
+from es_service.dispatch.ray_nodes import Claim, demand, layout
 from es_service.errors import EvaluationError
 from es_service.protocol.messages import Centre, Work, WorkerPlace, WorkerSpec, forget_oldest
 
@@ -60,22 +61,11 @@ def ray_engine(
         EvaluationError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
         Interrupted: SIGTERM arrived during the call.
     """
-    here = limits.workers if most is None else cores()
-    ray = connect(address, gpus=bool(gpus), cpus=here)
+    ray = connect(address, gpus=bool(gpus), cpus=limits.workers if most is None else cores())
     try:
-        if cpus is None:  # on this machine alone, actors with one core were measured to be as fast or faster
-            nodes = [] if gpus or address is None else cores_of_nodes(ray)
-            cpus = actor_cores(nodes, limits.workers if most is None else None, most)
-        claim = Claim(cpus, gpus)
-        room = look(ray, claim).room
-        if address is None and not room:  # there will never be room
-            text = f"this machine has no room for a worker. {demand(ray, claim)}. Lower compute.worker_resources."
-            raise EvaluationError(text)
-        most_workers = None if most is None else -(-most // cpus)
-        workers = limits.workers // cpus if most_workers is None else max(1, min(room, most_workers))
-        limits = replace(limits, workers=workers, cores=cpus)
+        claim, limits = layout(ray, limits, cpus, gpus, most, ours=address is None)
         watch = None if address is None else Watch(ray, claim)
-        transport = Actors(ray, spec, actor, claim, watch, most_workers, limits)
+        transport = Actors(ray, spec, actor, claim, watch, None if most is None else -(-most // claim.cpus), limits)
         return Engine(transport, limits, should_stop, log)
     except BaseException:
         disconnect(ray)

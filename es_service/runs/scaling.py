@@ -18,8 +18,8 @@ from es_service.config.parallel import populations
 from es_service.config.tasks import task_of
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.dispatch.ray_cluster import actor_cores
 from es_service.dispatch.ray_engine import ray_engine
+from es_service.dispatch.ray_nodes import actor_cores
 from es_service.dispatch.simulation import Costs, Phase, predict
 from es_service.loop import driver
 from es_service.loop.history import evaluated_columns, history_columns

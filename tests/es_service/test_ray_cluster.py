@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from test.support import catch_unraisable_exception
 
-from es_service.dispatch import ray_cluster, ray_side_effects
+from es_service.dispatch import ray_cluster, ray_nodes, ray_side_effects
 from es_service.errors import EvaluationError, Interrupted
 
 
@@ -94,10 +94,10 @@ def test_a_session_is_forgotten_with_the_link_to_it_and_with_no_other(tmp_path, 
     ],
 )
 def test_an_actor_owns_a_whole_node_where_nodes_are_equal(nodes, workers, most, cores):
-    assert ray_cluster.actor_cores(nodes, workers, most) == cores
+    assert ray_nodes.actor_cores(nodes, workers, most) == cores
 
 
 def test_nodes_without_cores_and_dead_ones_do_not_count():
     nodes = [({"CPU": 8.0}, True), ({}, True), ({"CPU": 0.0}, True), ({"CPU": 4.0}, False)]
     ray = SimpleNamespace(nodes=lambda: [{"Resources": has, "Alive": alive} for has, alive in nodes])
-    assert ray_cluster.cores_of_nodes(ray) == [8]
+    assert ray_nodes.cores_of_nodes(ray) == [8]

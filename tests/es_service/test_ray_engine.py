@@ -14,8 +14,8 @@ import pytest
 
 from es_service.dispatch.engine import Answer, Engine
 from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
-from es_service.dispatch.ray_cluster import ONE_CORE, Membership, look
 from es_service.dispatch.ray_engine import IN_CALL_BYTES, Actors
+from es_service.dispatch.ray_nodes import ONE_CORE, Membership, look
 from es_service.errors import EvaluationError
 from es_service.protocol.messages import KEPT_CENTRES, TrainingChunk, around
 from tests.helpers import SPEC, centre, random_parameters

@@ -1,0 +1,128 @@
+"""The nodes of a Ray cluster: what a worker claims of a node, and for how many workers there is room."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from types import ModuleType
+
+from es_service.dispatch.events import Limits
+from es_service.errors import EvaluationError
+
+
+@dataclass(frozen=True)
+class Claim:
+    """CPUs and GPUs of a node that one worker needs."""
+
+    cpus: int = 1
+    gpus: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.cpus} CPU" + (f" and {self.gpus:g} GPU" if self.gpus else "")
+
+
+ONE_CORE = Claim()
+
+
+@dataclass(frozen=True)
+class Membership:
+    """The nodes of a cluster at one moment."""
+
+    room: int
+    """Number of workers for which the nodes that are alive and not leaving have room."""
+    leaving: frozenset[str]
+    """Ids of the nodes that are being drained."""
+    alive: frozenset[str]
+    """Ids of the nodes that are alive, including those that are being drained."""
+
+
+def layout(
+    ray: ModuleType, limits: Limits, cpus: int | None, gpus: float, most: int | None, *, ours: bool
+) -> tuple[Claim, Limits]:
+    """What each worker claims, and the limits with the number of workers and their cores.
+
+    Args:
+        limits: with the number of cores of all workers together as the number of workers.
+        cpus, gpus, most: as in `ray_engine`.
+        ours: whether this Ray was started for the run and has this machine only.
+
+    Raises:
+        EvaluationError: it is ours and has no room for a worker; there will never be any.
+    """
+    if cpus is None:  # on one machine, actors with one core were measured to be as fast or faster
+        nodes = [] if ours or gpus else cores_of_nodes(ray)
+        cpus = actor_cores(nodes, limits.workers if most is None else None, most)
+    claim = Claim(cpus, gpus)
+    room = look(ray, claim).room
+    if ours and not room:
+        text = f"this machine has no room for a worker. {demand(ray, claim)}. Lower compute.worker_resources."
+        raise EvaluationError(text)
+    workers = limits.workers // cpus if most is None else max(1, min(room, -(-most // cpus)))
+    return claim, replace(limits, workers=workers, cores=cpus)
+
+
+def actor_cores(nodes: Sequence[int], workers: int | None, most: int | None) -> int:
+    """Cores that each actor owns if they are not configured: all of a node, so that a node needs few messages.
+
+    If the nodes differ, or if there is none yet, it is one core, which leaves no core of any node idle.
+
+    Args:
+        nodes: cores of each node.
+        workers: number of cores that the run uses, which the result divides; None: as many as there are.
+        most: number of cores that have work; None: no limit.
+    """
+    if not nodes or len(set(nodes)) > 1:
+        return 1
+    size = max(1, min(nodes[0], most or nodes[0]))
+    if workers is None:
+        return size
+    return max(cores for cores in range(1, min(size, workers) + 1) if workers % cores == 0)
+
+
+def cores_of_nodes(ray: ModuleType) -> list[int]:
+    """Cores of each node that is alive and has any."""
+    cpus = [node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]]
+    return [int(count) for count in cpus if count >= 1.0]
+
+
+def look(ray: ModuleType, claim: Claim) -> Membership:
+    """The nodes of the cluster now. This blocks until the head node answers."""
+    leaving = frozenset(_draining(ray))
+    alive = {node["NodeID"]: node["Resources"] for node in ray.nodes() if node["Alive"]}
+    room = sum(_room(resources, claim) for node, resources in alive.items() if node not in leaving)
+    return Membership(room, leaving, frozenset(alive))
+
+
+def demand(ray: ModuleType, claim: Claim) -> str:
+    """Text on what each worker needs and what the cluster has."""
+    return (
+        f"Each worker needs {claim}; the cluster has {_resources(ray.cluster_resources())} in total and "
+        f"{_resources(ray.available_resources())} free"
+    )
+
+
+def _room(resources: dict[str, float], claim: Claim) -> int:
+    """Number of workers for which a node with these resources has room."""
+    by_cpu = int(resources.get("CPU", 0.0) / claim.cpus)
+    # Ray does not divide the share of one worker between two GPUs.
+    by_gpu = int(resources.get("GPU", 0.0)) * int(1 / claim.gpus) if 0 < claim.gpus < 1 else by_cpu
+    if claim.gpus >= 1:
+        by_gpu = int(resources.get("GPU", 0.0) / claim.gpus)
+    return min(by_cpu, by_gpu)
+
+
+def _resources(amounts: dict[str, float]) -> str:
+    """Text with the numbers of CPUs and GPUs."""
+    return ", ".join(f"{amounts.get(name, 0.0):g} {name}" for name in ("CPU", "GPU"))
+
+
+def _draining(ray: ModuleType) -> dict[str, int]:
+    """Ids of the nodes that are being drained, as keys.
+
+    Ray has no public function for this. If a version of Ray lacks this one, the workers of a drained node are lost when
+    the node ends.
+    """
+    with contextlib.suppress(AttributeError):
+        return ray._private.state.state.get_draining_nodes()
+    return {}
