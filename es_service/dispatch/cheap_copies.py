@@ -161,11 +161,14 @@ class Sorted(Generic[Entry]):
     def _replace(self, at: int, block: tuple[Entry, ...]) -> None:
         """Replace a block; the new one is joined with a neighbour if it is too short, and split if it is too long."""
         blocks, end = self._blocks, at + 1
-        if len(block) < _SHORTEST and len(blocks) > 1:
+        if len(blocks) < 2 and len(block) <= _LONGEST:
+            self._blocks = (block,) if block else ()
+            return
+        if len(block) < _SHORTEST:
             if end < len(blocks):
                 block, end = block + blocks[end], end + 1
             else:
                 block, at = blocks[at - 1] + block, at - 1
         half = len(block) // 2
-        parts = (block[:half], block[half:]) if len(block) > _LONGEST else (block,) if block else ()
+        parts = (block[:half], block[half:]) if len(block) > _LONGEST else (block,)
         self._blocks = blocks[:at] + parts + blocks[end:]
