@@ -33,8 +33,9 @@ class Costs:
     """Kind of chunk -> time of one core for one chunk."""
     message_s: Mapping[str, float]
     """Kind of chunk -> time of the driver to send a work item and to receive the answer; half of it for each."""
-    way_s: float
-    """Time from the end of sending until the worker begins, and as much again from its end until the answer arrives."""
+    way_s: Mapping[str, float]
+    """Kind of chunk -> time from the end of sending until the worker begins, and as much again from its end until the
+    answer arrives."""
     driver_s: float
     """Time of the driver in a generation for everything else: the search and the store."""
 
@@ -118,9 +119,9 @@ def _play(
                 now += costs.message_s[phase.kind] / 2
                 chunks = size_of[command.item_id]
                 takes_s = costs.chunk_s[phase.kind] * longest_part(chunks)
-                end_s = free_s[command.worker] = max(free_s[command.worker], now + costs.way_s) + takes_s
+                end_s = free_s[command.worker] = max(free_s[command.worker], now + costs.way_s[phase.kind]) + takes_s
                 result = events.Result(command.worker, command.item_id, command.attempt)
-                heapq.heappush(answers, (end_s + costs.way_s, next(number), result))
+                heapq.heappush(answers, (end_s + costs.way_s[phase.kind], next(number), result))
         if not pending(state):
             return state, now
         arrives_s, _, event = heapq.heappop(answers)

@@ -51,8 +51,9 @@ MEASURE_S = 1.0
 """Time for the measurement of each kind of chunk."""
 GENERATIONS = 12
 """Generations of the loop with replayed results; the first third does not count."""
-ECHOES, ECHO_ITEMS, ALONE = 4, 200, 20
-"""Actors and work items in the measurement of messages, and items that are sent one at a time."""
+ECHO_ITEMS, SPIN_S = 100, 0.003
+"""Work items in each measurement of messages, and the time that the actor computes for one: while it does so, the
+driver falls asleep, and being woken is a part of what a message costs."""
 
 
 def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int) -> Iterator[dict[str, Any]]:
@@ -73,7 +74,7 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
         "evaluation": (centre, EvaluationChunk(1, 0)),
     }
     chunk_s, answers = _chunk_costs(spec, kinds)
-    message_s, way_s = _message_costs(spec, kinds, answers)
+    message_s, way_s = _message_costs(kinds, answers)
     costs = Costs(chunk_s, message_s, way_s, _driver_cost(config, answers))
     phases = _phases(config)
     steps = sum(
@@ -139,7 +140,7 @@ def _chunk_costs(spec: WorkerSpec, kinds: Mapping[str, Work]) -> tuple[dict[str,
 
 
 class EchoActor:
-    """In the place of a worker's actor: it answers at once, with an answer for as many chunks as it is sent."""
+    """In the place of a worker's actor: it computes for SPIN_S and gives each chunk the recorded answer of its kind."""
 
     def __init__(self, spec: bytes, index: int, gpus: float, cores: int) -> None:
         self._answers: dict[str, ChunkResult] = pickle.loads(pickle.loads(spec))
@@ -154,29 +155,33 @@ class EchoActor:
 
     def run(self, chunks: bytes, *centres: bytes) -> bytes:
         """As `WorkerActor.run`."""
+        until = time.perf_counter() + SPIN_S
         asked: list[tuple[int, Chunk]] = pickle.loads(chunks)
+        while time.perf_counter() < until:
+            pass
         return pickle.dumps([self._answers[type(chunk).__name__] for _, chunk in asked], pickle.HIGHEST_PROTOCOL)
 
 
 def _message_costs(
-    spec: WorkerSpec, kinds: Mapping[str, Work], answers: Mapping[str, ChunkResult]
-) -> tuple[dict[str, float], float]:
-    """(seconds of the driver per work item by kind, seconds of an item's way to a worker) through Ray."""
+    kinds: Mapping[str, Work], answers: Mapping[str, ChunkResult]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """(seconds of the driver per work item, seconds of an item's way to a worker) through Ray, by kind of chunk."""
     message_s: dict[str, float] = {}
-    alone_s: list[float] = []
+    way_s: dict[str, float] = {}
     packed: Any = pickle.dumps(dict(answers))
-    with ray_engine(packed, Limits(ECHOES, item_s=0.0), actor=EchoActor) as engine:
+    with ray_engine(packed, Limits(1, item_s=0.0), actor=EchoActor) as engine:
         for work in kinds.values():
-            engine.evaluate([work] * ECHOES)
-            began = time.perf_counter()
             engine.evaluate([work] * ECHO_ITEMS)
-            message_s[_kind(work)] = (time.perf_counter() - began) / ECHO_ITEMS
-        for _ in range(ALONE):
-            began = time.perf_counter()
-            engine.evaluate([kinds["rollout"]])
-            alone_s.append(time.perf_counter() - began)
-    way_s = (statistics.median(alone_s) - message_s["TrainingChunk"]) / 2
-    return message_s, max(0.0, way_s)
+            began = time.process_time()  # also of Ray's threads in this process, but not while it waits
+            engine.evaluate([work] * ECHO_ITEMS)
+            message_s[_kind(work)] = driver_s = (time.process_time() - began) / ECHO_ITEMS
+            alone_s = []
+            for _ in range(ECHO_ITEMS):
+                began = time.perf_counter()
+                engine.evaluate([work])
+                alone_s.append(time.perf_counter() - began)
+            way_s[_kind(work)] = max(0.0, (statistics.median(alone_s) - SPIN_S - driver_s) / 2)
+    return message_s, way_s
 
 
 class _Replay:

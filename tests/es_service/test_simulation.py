@@ -18,7 +18,7 @@ def generation(rollout, gradient, evaluation):
 
 def costs(message_s=0.0, way_s=0.0, driver_s=0.0, **chunk_s):
     seconds = {"TrainingChunk": 1.0, "GradientChunk": 0.1, "EvaluationChunk": 0.5} | chunk_s
-    return Costs(seconds, dict.fromkeys(KINDS, message_s), way_s, driver_s)
+    return Costs(seconds, dict.fromkeys(KINDS, message_s), dict.fromkeys(KINDS, way_s), driver_s)
 
 
 def predicted(phases, paid, actors, cores=1):
