@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # A run on the nodes of a Slurm job. Activate the Python environment that has es-service, then:
 #
-#     sbatch docker/slurm.sh configs/point_maze_nsra_es.yaml /shared/runs/first
+#     sbatch docker/slurm.sh configs/cluster/ant_maze_me_es.yaml /shared/runs/first
 #     squeue --me                                         # should show the job with state R
 #     es-service status /shared/runs/first --follow       # shows that it works: one line per generation
 #

@@ -36,7 +36,7 @@ def make_worker(spec: WorkerSpec) -> Callable[[Sequence[Work]], list[ChunkResult
 
     With simd the episodes of neighbouring chunks around one centre run in one call of the kernel, since an episode's
     bits do not depend on the others. With xla they might, so each chunk runs alone. A note on an exception names the
-    chunks that raised it. Gradient blocks are added as far as the work item has the neighbours.
+    chunk that raised it. Gradient blocks are added as far as the work item has the neighbours.
     """
     environment = make_environment(spec.environment, spec.environment_options)
     if spec.rollout == "simd":
@@ -84,14 +84,18 @@ def make_worker(spec: WorkerSpec) -> Callable[[Sequence[Work]], list[ChunkResult
         GradientChunk: gradient,
     }
 
-    def run(work: Sequence[Work]) -> list[ChunkResult]:
-        results: list[ChunkResult] = []
-        for centre, chunks in _groups(work, together=spec.rollout == "simd"):
-            try:
-                results += functions[type(chunks[0])](centre, chunks)
-            except BaseException as error:
-                error.add_note(f"raised in {', '.join(map(chunk_name, chunks))}")
+    def run_group(centre: Centre, chunks: Sequence[Chunk]) -> list[ChunkResult]:
+        try:
+            return functions[type(chunks[0])](centre, chunks)
+        except BaseException as error:
+            if len(chunks) == 1:
+                error.add_note(f"raised in {chunk_name(chunks[0])}")
                 raise
+        return [result for chunk in chunks for result in run_group(centre, [chunk])]  # to find the one that raises
+
+    def run(work: Sequence[Work]) -> list[ChunkResult]:
+        groups = _groups(work, together=spec.rollout == "simd")
+        results = [result for centre, chunks in groups for result in run_group(centre, chunks)]
         return with_neighbours_added(work, results)
 
     return run

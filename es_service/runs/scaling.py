@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -67,16 +68,12 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
     spec = worker_spec(config, task)
     parameters = initial_parameters(spec.policy, config.policy.init, config.seed, 0)
     zeros_O = np.zeros(task.observation_size, np.float32)
-    centre = Centre(1, parameters, config.search.sigma, zeros_O, zeros_O + 1.0)
-    kinds: dict[str, Work] = {
-        "rollout": (centre, TrainingChunk(1, 0)),
-        "gradient": (NO_CENTRE, GradientChunk(1, 0, np.ones(spec.gradient_block_pairs, np.float32))),
-        "evaluation": (centre, EvaluationChunk(1, 0)),
-    }
-    chunk_s, answers = _chunk_costs(spec, kinds)
-    message_s, way_s = _message_costs(kinds, answers)
-    costs = Costs(chunk_s, message_s, way_s, _driver_cost(config, answers))
+    centres = [Centre(1, parameters, config.search.sigma, zeros_O, zeros_O + 1.0) for _ in range(populations(config))]
     phases = _phases(config)
+    works = [_work(phase, centres, spec) for phase in phases]
+    chunk_s, answers = _chunk_costs(spec, works)
+    message_s, way_s = _message_costs([work[0] for work in works], answers)
+    costs = Costs(chunk_s, message_s, way_s, _driver_cost(config, answers))
     steps = sum(
         phase.chunks * int(answer.steps.sum())
         for phase in phases
@@ -110,6 +107,16 @@ def _phases(config: RunConfig) -> list[Phase]:
     ]
 
 
+def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec) -> list[Work]:
+    """The chunks of a phase, in the order of the populations."""
+    ids = range(phase.chunks // len(centres))
+    weights_P = np.ones(spec.gradient_block_pairs, np.float32)
+    if phase.name == "gradient":
+        return [(NO_CENTRE, GradientChunk(1, i, weights_P, ask)) for ask in range(len(centres)) for i in ids]
+    kind = TrainingChunk if phase.name == "rollout" else EvaluationChunk
+    return [(centre, kind(1, i, ask)) for ask, centre in enumerate(centres) for i in ids]
+
+
 def _longest_part(chunks: int, cores: int) -> float:
     """Number of chunks that the busiest core of an actor runs, when cores take the next part as they become free."""
     free = [0] * cores
@@ -122,20 +129,21 @@ def _kind(work: Work) -> str:
     return type(work[1]).__name__
 
 
-def _chunk_costs(spec: WorkerSpec, kinds: Mapping[str, Work]) -> tuple[dict[str, float], dict[str, ChunkResult]]:
-    """(seconds of one core per chunk, a result) of each kind."""
+def _chunk_costs(spec: WorkerSpec, works: Sequence[Sequence[Work]]) -> tuple[dict[str, float], dict[str, ChunkResult]]:
+    """(seconds of one core per chunk, a result) of each kind, from the chunks of each phase."""
     seconds: dict[str, float] = {}
     answers: dict[str, ChunkResult] = {}
     with inline_engine(spec, Limits(1)) as engine:
-        for work in kinds.values():
-            answers[_kind(work)] = engine.evaluate([work])[0]  # which compiles
+        for work in works:
+            kind, (answer,) = _kind(work[0]), engine.evaluate(work[:1])  # which compiles
+            answers[kind] = answer
             count, took_s = 1, 0.0
             while took_s < MEASURE_S:
                 began = time.perf_counter()
-                engine.evaluate([work] * count)
+                engine.evaluate(list(islice(cycle(work), count)))
                 took_s = time.perf_counter() - began
-                seconds[_kind(work)] = took_s / count
-                count = 1 + int(1.2 * MEASURE_S / seconds[_kind(work)])
+                seconds[kind] = took_s / count
+                count = 1 + int(1.2 * MEASURE_S / seconds[kind])
     return seconds, answers
 
 
@@ -163,14 +171,14 @@ class EchoActor:
 
 
 def _message_costs(
-    kinds: Mapping[str, Work], answers: Mapping[str, ChunkResult]
+    chunks: Sequence[Work], answers: Mapping[str, ChunkResult]
 ) -> tuple[dict[str, float], dict[str, float]]:
     """(seconds of the driver per work item, seconds of an item's way to a worker) through Ray, by kind of chunk."""
     message_s: dict[str, float] = {}
     way_s: dict[str, float] = {}
     packed: Any = pickle.dumps(dict(answers))
     with ray_engine(packed, Limits(1, item_s=0.0), actor=EchoActor) as engine:
-        for work in kinds.values():
+        for work in chunks:
             engine.evaluate([work] * ECHO_ITEMS)
             began = time.process_time()  # also of Ray's threads in this process, but not while it waits
             engine.evaluate([work] * ECHO_ITEMS)

@@ -27,7 +27,7 @@ IN_IMAGE = "/opt/es-service/"
 PARAMETERS = {
     "IMAGE": "registry.example.com/es-service:1",
     "NAME": "first",
-    "CONFIG": f"{IN_IMAGE}configs/point_maze_nsra_es.yaml",
+    "CONFIG": f"{IN_IMAGE}configs/cluster/ant_maze_me_es.yaml",
     "REGION": "us-west-2",
     "AMI": "ami-0123456789abcdef0",
     "WHEELS": "/home/me/es-service/build/ray-up",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import random
 import signal
+import time
 
 import numpy as np
 import pandas as pd
@@ -12,8 +14,8 @@ import pytest
 from es_service import api
 from es_service.store.digest import digest_parts
 from tests.system.command_line import command
-from tests.system.processes import committed
-from tests.system.session import SMALL, finish
+from tests.system.processes import committed, wait_until
+from tests.system.session import SMALL, finish, start
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::ResourceWarning"),  # Ray leaves files and processes to the garbage collector
@@ -64,6 +66,30 @@ def test_killed_at_three_points_in_three_generations(tmp_path, undisturbed):
         assert committed(folder) == newest
     assert finish(folder) == 0
     assert digest_parts(folder) == digest_parts(reference)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["me_es", "ns_es", "nsr_es", "nsra_es"])
+def test_killed_twenty_times_at_random(tmp_path, name):
+    """At random instants of one run, most of them while it computes."""
+    search = SEARCHES["me_es"] if name == "me_es" else SMALL["search"] | {"algorithm": name, "update": "all"}
+    if name != "nsra_es":
+        search = {key: value for key, value in search.items() if key != "fitness_weight_patience"}
+    config = SMALL | {"search": search, "budget": {"generations": 600}}
+    undisturbed, folder, rng = tmp_path / "undisturbed", tmp_path / "run", random.Random(name)
+    assert finish(undisturbed, config=config) == 0
+    reached = []
+    for _ in range(20):
+        before = committed(folder)
+        with start(folder, config=config if before is None and not (folder / "run.db").exists() else None) as process:
+            wait_until(process, lambda before=before: committed(folder) != before)
+            time.sleep(rng.uniform(0.0, 0.05))
+            assert process.poll() is None, "the run ended before its kill; give it more generations"
+        reached.append(committed(folder))
+    assert len(set(reached)) == 20
+    print(f"{name}: killed at generations {reached} of 600")
+    assert finish(folder) == 0
+    assert digest_parts(folder) == digest_parts(undisturbed)
 
 
 def test_resumed_and_forked_in_the_middle(tmp_path, undisturbed):

@@ -68,8 +68,9 @@ def test_centres_that_take_turns_are_packed_once(monkeypatch):
     assert again is not packed[0]
 
 
-def test_an_exception_names_the_chunks_that_raised_it():
-    broken = centre(random_parameters(1), observation_size=3)
-    with pytest.raises(IndexError) as raised:
-        make_worker(spec(rollout="simd"))([(broken, TrainingChunk(3, 0)), (broken, TrainingChunk(3, 4))])
-    assert raised.value.__notes__ == ["raised in TrainingChunk 0 of generation 3, TrainingChunk 4 of generation 3"]
+def test_an_exception_names_the_chunk_that_raised_it():
+    point = centre(random_parameters(1))
+    chunks = [TrainingChunk(3, 0), TrainingChunk(3, 4), TrainingChunk(3, "two"), TrainingChunk(3, 5)]
+    with pytest.raises(TypeError) as raised:
+        make_worker(spec(rollout="simd"))([(point, chunk) for chunk in chunks])
+    assert raised.value.__notes__ == ["raised in TrainingChunk two of generation 3"]
