@@ -31,6 +31,10 @@ def require_asks(asks: object, state: SearchState, chunk_pairs: int, generation:
                 return f"the sigma of centre {ask.centre} is {ask.sigma}; it must be positive"
             if not isinstance(ask.pairs, int | np.integer) or ask.pairs < 1 or ask.pairs % chunk_pairs:
                 return f"centre {ask.centre} has {ask.pairs} pairs; must be a multiple of chunk_pairs ({chunk_pairs})"
+            given, size = ask.centre_D, state.centres[ask.centre].centre_D.size
+            if not isinstance(given, np.ndarray) or given.dtype != np.float32 or given.shape != (size,):
+                kind = f"{given.dtype} {given.shape}" if isinstance(given, np.ndarray) else type(given).__name__
+                return f"the parameters of centre {ask.centre} are {kind}; must be a float32 array of shape ({size},)"
         return ""
 
     if problem := wrong():

@@ -101,6 +101,9 @@ BAD_SIGMA, BAD_PAIRS = "it must be positive", r"must be a multiple of chunk_pair
         ((replace(GOOD, pairs=0),), f"centre 0 has 0 pairs; {BAD_PAIRS}"),
         ((replace(GOOD, pairs=-16),), f"centre 0 has -16 pairs; {BAD_PAIRS}"),
         ((replace(GOOD, pairs=16.0),), f"centre 0 has 16.0 pairs; {BAD_PAIRS}"),
+        ((replace(GOOD, centre_D=GOOD.centre_D[1:]),), rf"centre 0 are float32 .*; must be .* \({SHAPE.parameters},\)"),
+        ((replace(GOOD, centre_D=GOOD.centre_D.astype(float)),), "centre 0 are float64 .*; must be a float32 array"),
+        ((replace(GOOD, centre_D=None),), "the parameters of centre 0 are NoneType; must be a float32 array"),
     ],
 )
 def test_what_cannot_be_evaluated_is_an_error_with_a_sentence(asks, sentence):
