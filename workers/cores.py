@@ -7,9 +7,7 @@ the number of cores.
 
 from __future__ import annotations
 
-import ctypes
 import os
-import signal
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, wait
@@ -19,13 +17,11 @@ from typing import TypeVar
 
 from es_service.protocol.gradient_tree import with_neighbours_added
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec
+from workers.process import end_with
 from workers.worker import make_worker
 
 PARTS_PER_CORE = 2
 """Parts of a work item for each core, so that a core that finishes early takes over a part of another one."""
-PR_SET_PDEATHSIG = 1
-"""Linux's `prctl` option that sets the signal sent to a process when its parent dies."""
-
 AnyWork = TypeVar("AnyWork")
 RunChunks = Callable[[Sequence[Work]], list[ChunkResult]]
 _run_in_child: RunChunks | None = None
@@ -75,9 +71,7 @@ def parts(work: Sequence[AnyWork], cores: int) -> list[Sequence[AnyWork]]:
 def _begin_child(spec: WorkerSpec, parent: int) -> None:
     """Prepare a child process, which ends with its parent."""
     global _run_in_child
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
+    end_with(parent)
     _run_in_child = make_worker(spec)
 
 

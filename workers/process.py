@@ -32,9 +32,7 @@ def main(descriptor: int, parent: int) -> None:
     `item` names their work item, and `number` the centre of each. It sends ("broken", text), or
     ("up",) and then for each work item ("results", item, attempt, [ChunkResult]) or ("failure", item, attempt, text).
     """
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # do not outlive a driver that was killed
-    if os.getppid() != parent:
-        return
+    end_with(parent)
     with socket.socket(fileno=descriptor) as control:
         try:
             run_chunks = _make_run_chunks(receive(control))
@@ -43,6 +41,13 @@ def main(descriptor: int, parent: int) -> None:
         except Exception:
             traceback.print_exc()
     os._exit(0)  # do not wait for threads, which may be in the middle of a chunk
+
+
+def end_with(parent: int) -> None:
+    """Have this process killed when its parent ends, for whatever reason; end it if the parent has ended already."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 def _descriptor(control: socket.socket) -> int | None:
