@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
@@ -74,18 +75,10 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
     chunk_s, answers = _chunk_costs(spec, works)
     message_s, way_s = _message_costs([work[0] for work in works], answers)
     costs = Costs(chunk_s, message_s, way_s, _driver_cost(config, answers))
-    steps = sum(
-        phase.chunks * int(answer.steps.sum())
-        for phase in phases
-        if isinstance(answer := answers[phase.kind], EpisodesResult)
-    )
+    steps = _steps(config, answers)
     for count in workers:
         cores = actor_cores([cores_per_node], count, None)
-
-        def longest_part(chunks: int, cores: int = cores) -> float:
-            return _longest_part(chunks, cores)
-
-        found = predict(phases, costs, count // cores, cores, longest_part)
+        found = predict(phases, costs, count // cores, cores, partial(_longest_part, cores=cores))
         yield {
             "workers": count,
             "seconds_per_generation": round(found.seconds, 6),
@@ -115,6 +108,18 @@ def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec) -> list[Wor
         return [(NO_CENTRE, GradientChunk(1, i, weights_P, ask)) for ask in range(len(centres)) for i in ids]
     kind = TrainingChunk if phase.name == "rollout" else EvaluationChunk
     return [(centre, kind(1, i, ask)) for ask, centre in enumerate(centres) for i in ids]
+
+
+def _steps(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float:
+    """Environment steps of a generation; surplus episodes of evaluations do not count."""
+    episodes = {
+        "TrainingChunk": 2 * config.search.pairs,  # the steps of a member are those of all of its episodes
+        "EvaluationChunk": config.search.evaluation_episodes,
+    }
+    each = [(answers[kind], count) for kind, count in episodes.items()]
+    return populations(config) * sum(
+        count * float(answer.steps.mean()) for answer, count in each if isinstance(answer, EpisodesResult)
+    )
 
 
 def _longest_part(chunks: int, cores: int) -> float:

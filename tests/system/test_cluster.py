@@ -70,6 +70,18 @@ def memory_in_use() -> tuple[int, int]:
     return total - int(fields["MemAvailable"]) * 1024, total
 
 
+def stop_a_little_later(hosts, driver, run):
+    """Stop a run's driver on the head by SIGTERM, after some more generations; returns what it printed."""
+    reached = read_generation(run)
+    wait_for(lambda: read_generation(run) > reached + 3)
+    for pid, line in hosts.processes("head").items():
+        if "es-service run" in line:
+            os.kill(pid, signal.SIGTERM)
+    printed, _ = driver.communicate(timeout=30)
+    assert driver.returncode == 143, printed
+    return printed
+
+
 @pytest.mark.long
 def test_hosts_come_go_hang_and_die_and_the_digest_is_that_of_one_process(tmp_path):
     config, run = tmp_path / "config.yaml", tmp_path / "run"
@@ -136,13 +148,7 @@ def test_hosts_come_go_hang_and_die_and_the_digest_is_that_of_one_process(tmp_pa
         wait_for(lambda: entries(run, "SetWorkers", 0.0)[-1]["workers"] == 2)
         strike("node dies whole", lambda: hosts.end("two"), working_again)
 
-        reached = read_generation(run)
-        wait_for(lambda: read_generation(run) > reached + 3)
-        for pid, line in hosts.processes("head").items():
-            if "es-service run" in line:
-                os.kill(pid, signal.SIGTERM)
-        printed, _ = driver.communicate(timeout=30)
-        assert driver.returncode == 143, printed
+        printed = stop_a_little_later(hosts, driver, run)
 
     counts = check_dispatch(run)
     reached = read_generation(run)

@@ -7,11 +7,10 @@ import time
 import pytest
 import yaml
 
-from es_service.store.reader import read_generation
 from tests.system import cluster
 from tests.system.cluster import Cluster
 from tests.system.processes import wait_for
-from tests.system.test_cluster import CONFIG, entries, repeated_episodes
+from tests.system.test_cluster import CONFIG, entries, repeated_episodes, stop_a_little_later
 
 pytestmark = [pytest.mark.long, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
 
@@ -31,13 +30,7 @@ def test_a_node_that_is_told_to_stop_hands_its_work_over(tmp_path):
         wait_for(lambda: not hosts.processes("two"))
         seconds = time.time() - since
         print(f"a node that was told to stop ended after {seconds:.1f} s")
-        reached = read_generation(run)
-        wait_for(lambda: read_generation(run) > reached + 3)
-        for pid, line in hosts.processes("head").items():
-            if "es-service run" in line:
-                os.kill(pid, signal.SIGTERM)
-        printed, _ = driver.communicate(timeout=30)
-    assert driver.returncode == 143, printed
+        stop_a_little_later(hosts, driver, run)
     assert {entry["reason"] for entry in entries(run, "StopWorker", since)} == {"drained"}
     assert not entries(run, "WorkerLost", since)
     assert repeated_episodes(run, since) == 0
