@@ -7,7 +7,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
@@ -42,6 +42,8 @@ from es_service.protocol.messages import (
     WorkerSpec,
 )
 from es_service.search.algorithms import ALGORITHMS
+from es_service.search.algorithms.base import Algorithm, CentreEvaluation, SearchState
+from es_service.search.novelty import extended
 from es_service.search.observation_statistics import no_observations
 from es_service.store.beginning import Beginning
 from es_service.store.schema import RunMeta
@@ -53,6 +55,12 @@ MEASURE_S = 1.0
 """Time for the measurement of each kind of chunk."""
 GENERATIONS = 12
 """Generations of the loop with replayed results; the first third does not count."""
+PAST_ENTRIES = 5000
+"""Entries of the novelty archive before the first of these generations."""
+REPLAYED, SCATTER = 64, 0.05
+"""Different answers of each kind, and the standard deviation of an answer's descriptors as a share of their range."""
+UNBOUNDED = 1e3
+"""In the place of a bound of the descriptor that is larger."""
 ECHO_ITEMS, SPIN_S = 100, 0.003
 """Work items in each measurement of messages, and the time that the actor computes for one: while it does so, the
 driver falls asleep, and being woken is a part of what a message costs."""
@@ -198,15 +206,46 @@ def _message_costs(
 
 
 class _Replay:
-    """Evaluator that answers each chunk at once with the recorded result of its kind."""
+    """Evaluator that answers each chunk at once with the recorded result of its kind, but with other descriptors.
+
+    The novelty of equal descriptors takes many times longer. The descriptors are therefore those of a search that has
+    been everywhere: a place for each answer, and a scatter around it.
+    """
 
     counts = DispatchCounts(workers=1)
 
-    def __init__(self, answers: Mapping[str, ChunkResult]) -> None:
-        self._answers = answers
+    def __init__(self, answers: Mapping[str, ChunkResult], random: np.random.Generator, bounds_B_2: np.ndarray) -> None:
+        self._answers = {
+            kind: cycle([_moved(answer, random, bounds_B_2) for _ in range(REPLAYED)])
+            for kind, answer in answers.items()
+        }
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
-        return [self._answers[_kind(one)] for one in work]
+        return [next(self._answers[_kind(one)]) for one in work]
+
+
+def _moved(answer: ChunkResult, random: np.random.Generator, bounds_B_2: np.ndarray) -> ChunkResult:
+    """The result with its descriptors somewhere within the bounds."""
+    if not isinstance(answer, EpisodesResult):
+        return answer
+    low_B, high_B = bounds_B_2.T
+    scatter = random.normal(scale=SCATTER * (high_B - low_B), size=answer.descriptor.shape)
+    return replace(answer, descriptor=np.float32(np.clip(random.uniform(low_B, high_B) + scatter, low_B, high_B)))
+
+
+def _with_past(algorithm: Algorithm, descriptor_N_B: np.ndarray) -> Algorithm:
+    """The algorithm, with these entries in the novelty archive after generation 0."""
+
+    def tell(state: SearchState, told: tuple[CentreEvaluation, ...]) -> SearchState:
+        state = algorithm.tell(state, told)
+        if told[0].generation == 0:
+            archive = state.archive
+            for centre, descriptor_B in enumerate(descriptor_N_B, len(state.centres)):
+                archive = extended(archive, descriptor_B, 0, centre)
+            state = replace(state, archive=archive)
+        return state
+
+    return replace(algorithm, tell=tell)
 
 
 def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float:
@@ -215,9 +254,11 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float
     config = config.model_copy(update={"budget": config.budget.model_copy(update=_budget())})
     shape = worker_spec(config, task).policy
     centres = [initial_parameters(shape, config.policy.init, config.seed, i) for i in range(config.search.centres)]
+    random, bounds_B_2 = np.random.default_rng(0), np.clip(task.descriptor_bounds, -UNBOUNDED, UNBOUNDED)
+    past_N_B = random.uniform(*bounds_B_2.T, size=(PAST_ENTRIES, len(bounds_B_2)))
     search = driver.Search(
         config=config,
-        algorithm=ALGORITHMS[config.search.algorithm](config),
+        algorithm=_with_past(ALGORITHMS[config.search.algorithm](config), past_N_B),
         initial=lambda: (centres, no_observations(task.observation_size)),
         task=task,
     )
@@ -231,7 +272,7 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float
         columns=history_columns(task, config.map.enabled),
         evaluation_columns=evaluated_columns(task, config.map.enabled),
     )
-    replay: Evaluator = _Replay(answers)
+    replay: Evaluator = _Replay(answers, random, bounds_B_2)
     with (
         tempfile.TemporaryDirectory() as folder,
         RunStore.create(Path(folder) / "run", config.resolved_yaml(), meta, Beginning()) as store,

@@ -9,6 +9,8 @@ Axes: N entries of the novelty archive, Q queries, K nearest candidates, B descr
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -29,6 +31,9 @@ LEAST_ROOM = 256
 """Least capacity of an archive's arrays, in entries."""
 SPARE_CANDIDATES = 6
 """Additional neighbours that are requested from the tree, so that an effect of its rounding can be noticed."""
+BLOCK = 1024
+"""Queries that are compared at a time, since more distances would leave the core's cache. While a run computes
+novelties, its workers wait, so each core takes a block. No query depends on another."""
 TREE_ROUNDING = 1e-9
 """Generous bound on the relative difference between the tree's distances and ours."""
 
@@ -159,7 +164,19 @@ def novelty(
     excluded_Q = np.full(len(query_Q_B), -1) if exclude_Q is None else np.asarray(exclude_Q)
     finite_Q = np.isfinite(query_Q_B).all(axis=1)
     novelty_Q = np.full(len(query_Q_B), np.nan)
-    novelty_Q[finite_Q] = _mean_nearest(archive, query_Q_B[finite_Q], excluded_Q[finite_Q], neighbours, distance)
+
+    def fill(first: int) -> None:
+        rows = first + np.flatnonzero(finite_Q[first : first + BLOCK])
+        novelty_Q[rows] = _mean_nearest(archive, query_Q_B[rows], excluded_Q[rows], neighbours, distance)
+
+    blocks = range(0, len(query_Q_B), BLOCK)
+    threads = min(len(blocks), len(os.sched_getaffinity(0)))
+    if threads > 1:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(fill, blocks))
+    else:
+        for first in blocks:
+            fill(first)
     return novelty_Q.reshape(shape)
 
 
@@ -227,7 +244,9 @@ def _mean_nearest(
     near_Q_K = _squared_to(query_Q_B, archive.descriptor_N_B[candidate_Q_K])
     near_Q_K[candidate_Q_K == excluded_Q[:, None]] = np.inf
     tail_Q_N = _squared(archive, query_Q_B, excluded_Q, tree.entries)
-    squared_Q_K = _smallest(np.concatenate([near_Q_K, tail_Q_N], axis=1), neighbours)
+    squared_Q_K = _smallest(near_Q_K, neighbours)
+    newer = np.flatnonzero((tail_Q_N < squared_Q_K[:, -1:]).any(axis=1))  # an entry after the tree is among the nearest
+    squared_Q_K[newer] = _smallest(np.concatenate([squared_Q_K[newer], tail_Q_N[newer]], axis=1), neighbours)
     # A result is sure unless an entry that the tree did not return could, with rounding, be among the nearest.
     sure_Q = np.sqrt(squared_Q_K[:, -1]) <= reach_Q_K[:, -1] * (1.0 - TREE_ROUNDING)
     mean_Q = _mean_smallest(squared_Q_K, neighbours, distance)
@@ -254,9 +273,10 @@ def _squared(
 def _squared_to(query_Q_B: NDArray[np.float64], entry_Q_N_B: NDArray[np.float64]) -> NDArray[np.float64]:
     """Squared distances [Q, N], (x0 - y0)^2 + (x1 - y1)^2 + ... in this order; the only place that computes them."""
     total_Q_N = np.zeros(np.broadcast_shapes((len(query_Q_B), 1), entry_Q_N_B.shape[:2]))
+    squared_Q_N = np.empty_like(total_Q_N)
     for b in range(query_Q_B.shape[1]):
-        difference_Q_N = query_Q_B[:, None, b] - entry_Q_N_B[..., b]
-        total_Q_N += difference_Q_N * difference_Q_N
+        np.subtract(query_Q_B[:, None, b], entry_Q_N_B[..., b], out=squared_Q_N)
+        total_Q_N += np.multiply(squared_Q_N, squared_Q_N, out=squared_Q_N)
     return total_Q_N
 
 

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from es_service.loop.parts import BLOCK_ENTRIES, archive_from_parts, archive_to_parts, block_part
+from es_service.search import novelty as search_novelty
 from es_service.search.novelty import COPIES, TREE_STEP, NoveltyArchive, empty_archive, extended, novelty
 from tests.twins import novelty_search as twin
 
@@ -127,6 +128,19 @@ def test_the_tree_changes_no_bit(dimensions, scatter, neighbours):
     assert with_tree == of(brute, queries, neighbours, exclude=exclude)
     some = [twin.novelty(archive.descriptor_N_B, queries[i], neighbours, without=int(exclude[i])) for i in (0, 41, 59)]
     assert [with_tree[i] for i in (0, 41, 59)] == some
+
+
+@pytest.mark.parametrize("cores", [1, 3])
+def test_many_queries_are_divided_and_change_no_bit(monkeypatch, cores):
+    rng = np.random.default_rng(1)
+    archive = many(rng.uniform(-1, 1, (TREE_STEP + 30, 2)))
+    queries, exclude = rng.uniform(-1, 1, (50, 2)), rng.integers(-1, archive.size, 50)
+    queries[[0, 13, 14, 49], 1] = math.nan
+    whole = of(archive, queries, exclude=exclude)
+    assert [i for i, one in enumerate(whole) if math.isnan(one)] == [0, 13, 14, 49]
+    monkeypatch.setattr(search_novelty, "BLOCK", 7)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: range(cores))
+    np.testing.assert_array_equal(of(archive, queries, exclude=exclude), whole)
 
 
 def test_a_pile_of_equal_ends_costs_no_more_than_its_copies(monkeypatch):
