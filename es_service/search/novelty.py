@@ -162,7 +162,7 @@ def novelty(
     shape = np.shape(descriptor_Q_B)[:-1]
     query_Q_B = np.asarray(descriptor_Q_B, np.float64).reshape(-1, archive.descriptor_N_B.shape[1])
     excluded_Q = np.full(len(query_Q_B), -1) if exclude_Q is None else np.asarray(exclude_Q)
-    finite_Q = np.isfinite(query_Q_B).all(axis=1)
+    finite_Q = np.atleast_1d(np.isfinite(query_Q_B).all(axis=1))
     novelty_Q = np.full(len(query_Q_B), np.nan)
 
     def fill(first: int) -> None:
