@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 
@@ -52,9 +53,11 @@ class Limits:
     max_start_failures: int = 3
     """Number of consecutive failed attempts to start workers, with no worker up, after which the run fails. All workers
     that were started before the first of them was lost count as one attempt."""
+    place_timeout_s: float = math.inf
+    """Longest wait for a first place: no worker has come up so far, and none has a place."""
     no_worker_timeout_s: float = 300.0
-    """Longest time in which work items wait and no worker is up. It only has an effect if it is longer than
-    `start_deadline_s`."""
+    """Longest time in which work items wait and no worker is up, after the first had come up. It only has an effect if
+    it is longer than `start_deadline_s`."""
     names: Mapping[str, str] = field(default_factory=dict)
     """Field -> its name in messages, by which a user can change it; other fields keep their own names."""
 
@@ -80,7 +83,7 @@ class Submit:
 
 @dataclass(frozen=True)
 class Placed:
-    """A worker that waited for a place has one and begins to come up."""
+    """A worker has a place and begins to come up."""
 
     worker: int
 
@@ -140,7 +143,8 @@ class Drain:
 
 @dataclass(frozen=True)
 class SetWorkers:
-    """The wanted number of workers changes; if it shrinks, the newest are drained. `step` raises ValueError below 1."""
+    """The wanted number of workers changes. If it shrinks, workers without a place are stopped first, then those that
+    have not come up; then the newest are drained. `step` raises ValueError below 1."""
 
     workers: int
 

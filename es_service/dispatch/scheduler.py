@@ -15,9 +15,8 @@ Rules:
 * Only the item that a worker was running is charged with the loss of the worker. An item that waited behind it keeps
   its attempts, and so does an item sent to a worker that was gone already, if the transport reports this. Thus the loss
   of a machine with many workers is one fault, however many of them are tried before all are known to be gone.
-* The loss of a draining worker is no fault.
-* A worker that gets no place in time is replaced, because it may have failed before it could report its place. It does
-  not count as lost.
+* The loss of a draining worker is no fault, nor is a missing place: a worker that gets none in time is replaced,
+  because it may have failed before it could report its place, and does not count as lost.
 * Workers that are lost before they come up count as a failed attempt to start workers. They count as another failed
   attempt only if they were started after the first of them was lost.
 
@@ -26,8 +25,8 @@ containers of the state consistent.
 
 Cost: a step copies the containers of the state, whose copies are cheap (cheap_copies.py), and looks only at the workers
 and items that its event concerns and at those that it stops or assigns. An event takes about 12 microseconds with
-10 workers and items, and 19 with 10,000 items (tests/benchmarks/dispatch_scale.py). Only `SetWorkers`, and an event
-that makes the run fail, look at all workers. A free worker passes over those items in the queue that failed on it.
+10 workers and items, and 19 with 10,000 items (tests/benchmarks/dispatch_scale.py). Only `SetWorkers`, a failure of the
+run, and events before a first worker is up look at all workers. A free worker passes over items that failed on it.
 """
 
 from __future__ import annotations
@@ -57,8 +56,11 @@ from es_service.dispatch.scheduler_changes import append_items, drop_item, pop_w
 from es_service.dispatch.scheduler_state import (
     SchedulerState,
     Worker,
+    by_progress,
+    down_limit,
     find_slot,
     holds,
+    is_down,
     late_workers,
     next_deadline,
     without,
@@ -98,7 +100,8 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
             append_items(s, items)
         case Placed(worker):
             if (record := s.starting.get(worker)) is not None:
-                put_worker(s, s.starting, worker, record._replace(deadline_s=now + s.limits.start_deadline_s))
+                deadline_s = now + s.limits.start_deadline_s
+                put_worker(s, s.starting, worker, record._replace(deadline_s=deadline_s, placed=True))
         case WorkerUp(worker):
             if pop_worker(s, s.starting, worker) is not None:
                 put_worker(s, s.up, worker, Worker(s.next_rank))
@@ -115,14 +118,13 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
             if wanted < 1:
                 raise ValueError(f"SetWorkers({wanted}): the number of workers must be at least 1")
             s = s._replace(wanted=wanted)
-            for worker in sorted([*s.starting, *s.up])[wanted:]:
+            for worker in by_progress(s)[wanted:]:
                 s = _drain(s, out, worker)
     if s.failed is None:
         s = _start_workers(s, out, now)
         s = assign(s, out, now)
-        down = bool(s.items) and not s.up and not s.draining
-        if down != (s.down_since_s is not None):
-            s = s._replace(down_since_s=now if down else None)
+        if is_down(s) != (s.down_since_s is not None):
+            s = s._replace(down_since_s=now if s.down_since_s is None else None)
     return s, out
 
 
@@ -248,7 +250,6 @@ def _fail(s: SchedulerState, out: list[Command], message: str) -> SchedulerState
 
 def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int, ...]) -> SchedulerState:
     """Stop every worker whose deadline has passed; the run fails if no worker was up for too long."""
-    limits = s.limits
     for worker in late_workers(s, now):
         if s.failed is None:
             reason = _missed_deadline(s, worker)
@@ -256,11 +257,11 @@ def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int
             is_silent = worker in silent
             has_no_place = is_silent and worker in s.starting
             s = _lose(s, out, worker, reason, now, fault=not has_no_place, charge=not is_silent)
-    if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + limits.no_worker_timeout_s:
-        for_s = f"{_plain(limits.no_worker_timeout_s)} s ({limits.name_of('no_worker_timeout_s')})"
-        return _fail(
-            s, out, f"no worker was up for {for_s} while {len(s.items)} work items waited; last loss: {s.last_loss}"
-        )
+    name, limit_s = down_limit(s)
+    if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + limit_s:
+        for_s = f"for {_plain(limit_s)} s ({s.limits.name_of(name)})"
+        text = f"was up {for_s} while {len(s.items)} work items waited" if s.next_rank else f"got a place {for_s}"
+        return _fail(s, out, f"no worker {text}; last loss: {s.last_loss}")
     return s
 
 

@@ -51,6 +51,8 @@ class Worker(NamedTuple):
     """Kinds of which it has finished a work item, so that it need not compile for them again."""
     failures_in_a_row: int = 0
     """Consecutive work items that raised an exception."""
+    placed: bool = False
+    """Whether it is starting and has reported its place."""
 
 
 class SchedulerState(NamedTuple):
@@ -88,7 +90,7 @@ class SchedulerState(NamedTuple):
     tried: int = 0
     """Workers with a lower id were started before the last of these failures was counted, and belong to it."""
     down_since_s: float | None = None
-    """Time since which work items wait and no worker is up; None if this is not so."""
+    """Time since which `is_down`; None if this is not so."""
     last_lost: int | None = None
     """The worker that was lost last."""
     last_loss: str = "no worker was lost"
@@ -126,6 +128,39 @@ def usual_chunk_s(state: SchedulerState, kind: str) -> float | None:
     return statistics.median(durations_s) if durations_s else None
 
 
+def is_down(state: SchedulerState) -> bool:
+    """Whether work items wait and no worker is up; before the first has come up, whether none has a place.
+
+    The time in which one that has a place comes up is limited by `start_deadline_s`.
+    """
+    if state.up or state.draining:
+        return False
+    if state.next_rank:
+        return bool(state.items)
+    return not any(state.starting[worker].placed for worker in state.starting)
+
+
+def is_waiting(state: SchedulerState) -> bool:
+    """Whether the run waits for its first place: `is_down`, and no worker has come up so far."""
+    return state.down_since_s is not None and not state.next_rank
+
+
+def down_limit(state: SchedulerState) -> tuple[str, float]:
+    """Field of `Limits` that limits the time for which the state `is_down`, and its value in seconds."""
+    name = "no_worker_timeout_s" if state.next_rank else "place_timeout_s"
+    return name, getattr(state.limits, name)
+
+
+def workers_with_place(state: SchedulerState) -> int:
+    """Number of workers that can be assigned work items, now or when they have come up."""
+    return len(state.up) + sum(state.starting[worker].placed for worker in state.starting)
+
+
+def by_progress(state: SchedulerState) -> list[int]:
+    """Workers that are up, then those that start and have a place, then those that wait for one; each oldest first."""
+    return [*sorted(state.up), *sorted(state.starting, key=lambda worker: (not state.starting[worker].placed, worker))]
+
+
 def next_deadline(state: SchedulerState) -> float:
     """Time of the next deadline, at which a `Tick` has an effect; infinity if there is none."""
     if state.failed is not None:
@@ -135,7 +170,7 @@ def next_deadline(state: SchedulerState) -> float:
     if len(state.starting) + len(state.up) < state.wanted:
         at_s = min(at_s, state.start_at_s)
     if state.down_since_s is not None:
-        at_s = min(at_s, state.down_since_s + state.limits.no_worker_timeout_s)
+        at_s = min(at_s, state.down_since_s + down_limit(state)[1])
     return at_s
 
 

@@ -63,6 +63,7 @@ class World:
             restart_backoff_s=0.5,
             max_backoff_s=r.choice((4.0, 20.0)),
             max_start_failures=r.randint(2, 5),
+            place_timeout_s=r.choice((math.inf, 1.0, 4.0)),
             no_worker_timeout_s=r.choice((4.0, 12.0)),
         )
         harshness = r.choice((0.0, 0.05, 0.2, 0.5))
@@ -81,6 +82,7 @@ class World:
         self.inbox: dict[int, deque[tuple[tuple, int]]] = {}
         self.busy: set[int] = set()
         self.unplaced: set[int] = set()
+        self.waits: set[int] = set()
         self.last_word: dict[int, float] = {}
         self.poison: dict[tuple, str] = {}
         # What a correct scheduler must know.
@@ -97,6 +99,7 @@ class World:
         self.last_holder: dict[tuple, int] = {}
         self.again = self.lost = self.dropped = self.start_failures = self.tried = self.newest = 0
         self.start_due: dict[int, float] = {}
+        self.was_up = False
         self.down_since: float | None = None
         self.failed: str | None = None
 
@@ -118,12 +121,12 @@ class World:
         self.alive.add(worker)
         self.inbox[worker], self.open[worker] = deque(), []
         self.start_due[worker] = self.now + self.limits.start_deadline_s
-        if self.happens("no_place"):
-            self.unplaced.add(worker)
-            if self.random.random() < 0.5:
-                self.at(1.2 * self.limits.start_deadline_s * self.random.random(), self.give_place, worker)
-        else:
-            self.build(worker)
+        self.unplaced.add(worker)
+        if not self.happens("no_place"):
+            self.give_place(worker)
+        elif self.random.random() < 0.5:
+            self.waits.add(worker)
+            self.at(1.2 * self.limits.start_deadline_s * self.random.random(), self.give_place, worker)
 
     def give_place(self, worker: int) -> None:
         if worker in self.alive or self.happens("speaks_after_stop"):
@@ -203,10 +206,11 @@ class World:
             case Placed(worker):
                 self.unplaced.discard(worker)
                 if worker in self.known:
-                    self.seen["placed late"] += 1
+                    self.seen["placed late"] += worker in self.waits
                     self.start_due[worker] = self.now + self.limits.start_deadline_s
             case WorkerUp(worker) if worker in self.known and worker not in self.up:
                 self.up.add(worker)
+                self.was_up = True
                 self.start_failures = 0
             case WorkerLost(worker) if worker in self.known:
                 expected = worker in self.draining
@@ -229,7 +233,10 @@ class World:
                 self.draining.add(worker)
             case SetWorkers(wanted):
                 self.wanted = wanted
-                self.draining.update(sorted(self.known - self.draining)[wanted:])
+                by_progress = sorted(
+                    self.known - self.draining, key=lambda w: (w not in self.up, w in self.unplaced, w)
+                )
+                self.draining.update(by_progress[wanted:])
 
     def feed(self, event: Event) -> None:
         before = self.state
@@ -321,11 +328,18 @@ class World:
             assert self.start_failures == self.limits.max_start_failures
             assert not self.up
         else:
-            self.seen["no worker"] += 1
-            assert self.waiting
-            assert not self.up
             assert self.down_since is not None
-            assert self.now - self.down_since >= self.limits.no_worker_timeout_s - 1e-9
+            down_s = self.now - self.down_since + 1e-9
+            assert not self.up
+            if "got a place" in message:
+                self.seen["no first place"] += 1
+                assert not self.was_up
+                assert down_s >= self.limits.place_timeout_s
+            else:
+                self.seen["no worker"] += 1
+                assert self.was_up
+                assert self.waiting
+                assert down_s >= self.limits.no_worker_timeout_s
 
     def check_books(self) -> None:
         state = self.state
@@ -338,7 +352,7 @@ class World:
             return
         assert all(self.faults[item_id] < self.limits.max_attempts for item_id in self.waiting), "poison went unnoticed"
         assert self.start_failures < self.limits.max_start_failures, "a broken environment went unnoticed"
-        if not self.waiting or self.up:
+        if self.up or (not self.waiting if self.was_up else self.known - self.unplaced):
             self.down_since = None
         elif self.down_since is None:
             self.down_since = self.now

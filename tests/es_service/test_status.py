@@ -133,7 +133,7 @@ def test_time_to_go_is_that_of_the_budget_that_is_spent_first(run):
     row = {"generation": 100, "env_steps": 10**6, "wall_clock_s": 3600.0, "best_fitness": 0.0}
 
     def running(limits):
-        return state(Standing(run, {"host": "a", "pid": 1}, row, limits))
+        return state(Standing(run, {"host": "a", "pid": 1, "waiting_since": None}, row, limits))
 
     assert running({}) == running({"target_fitness": 1.0}) == "running on a, pid 1"
     assert running({"generations": 500}) == "running on a, pid 1; about 4 h left"
