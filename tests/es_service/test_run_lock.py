@@ -49,9 +49,13 @@ def test_the_holder_is_known_while_and_only_while_it_holds(tmp_path):
 
 
 def test_what_a_dead_writer_left_in_the_file_means_nothing(tmp_path):
-    (tmp_path / "run.lock").write_text('{"host": "elsewhere", "pid": 1, "since": "long ago"}')
+    (tmp_path / "run.lock").write_text('{"host": "elsewhere", "pid": 1, "since": "long ago", "waiting_since": "then"}')
     assert lock_holder(tmp_path) is None
-    acquire_lock(tmp_path).release()
+    lock = acquire_lock(tmp_path)
+    holder = lock_holder(tmp_path)
+    assert holder is not None
+    assert (holder["pid"], holder["waiting_since"]) == (os.getpid(), None)
+    lock.release()
 
 
 def test_a_holder_that_has_not_yet_written_its_name(tmp_path):

@@ -38,18 +38,23 @@ def test_a_node_that_is_told_to_stop_hands_its_work_over(tmp_path):
 
 
 def test_a_run_asks_an_autoscaler_for_all_of_its_workers_and_begins_with_the_first_node(tmp_path):
-    """Without a number of workers it asks for one, since it follows the room in the cluster."""
+    """Without a number of workers it asks for all that have work, if it knows how large they are; else for one."""
     config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump(CONFIG | {"compute": CONFIG["compute"] | {"dispatch_log": True}}))
-    every = ("--workers", "4", "--set", "compute.worker_resources.cpu=2")
+    size = ("--set", "compute.worker_resources.cpu=2")
+    every = (*size, "--workers", "4")
     with Cluster(tmp_path) as hosts:
-        for options, demand in (((), "{'CPU': 1.0}: 1+ pending"), (every, "{'CPU': 2.0}: 2+ pending")):
+        for options, demand in (
+            ((), "{'CPU': 1.0}: 1+ pending"),
+            (size, "{'CPU': 2.0}: 4+ pending"),
+            (every, "{'CPU': 2.0}: 2+ pending"),
+        ):
             run = tmp_path / f"run{len(options)}"
             driver = hosts.popen(
                 "head", "es-service", "run", config, "--out", run, "--address", hosts.address, *options
             )
             wait_for(lambda demand=demand: demand in hosts.run("head", "ray", "status")[1])
-            if options:
+            if options == every:
                 hosts.start("one", 2)
                 wait_for(lambda run=run: len(entries(run, "Committed", 0.0)) > 3)
                 assert len(entries(run, "WorkerUp", 0.0)) == 1
