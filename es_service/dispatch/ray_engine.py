@@ -116,8 +116,8 @@ class Actors:
         self._handles: dict[int, Any] = {}
         self._calls: dict[Any, _Call] = {}
         self._places: dict[int, WorkerPlace] = {}
-        self._node_of: dict[int, str] = {}
-        """Worker id -> node on which it is, or where it is to be placed."""
+        self._planned: dict[int, str] = {}
+        """Worker id -> node, for workers that have no place yet and are to be placed on a certain node."""
         self._platforms: set[str] = set()
         self._drained: set[int] = set()
         self._has_lost = False
@@ -150,7 +150,7 @@ class Actors:
         for ref in [ref for ref, call in self._calls.items() if call.worker == worker]:
             del self._calls[ref]
         self._places.pop(worker, None)
-        self._node_of.pop(worker, None)
+        self._planned.pop(worker, None)
         handle = self._handles.pop(worker, None)
         self._to_ask = set(self._handles)
         if handle is not None:
@@ -254,7 +254,7 @@ class Actors:
             return WorkerUp(call.worker)
         is_known = call.worker in self._places  # then it was asked again, to find out whether it is alive
         self._places[call.worker] = WorkerPlace(*value)
-        self._node_of[call.worker] = self._places[call.worker].node
+        self._planned.pop(call.worker, None)
         return None if is_known else Placed(call.worker)
 
     def _follow(self, watch: Watch) -> None:
@@ -275,12 +275,12 @@ class Actors:
             self._inbox.append(SetWorkers(wanted))
 
     def _strategy(self, worker: int) -> Any:
-        """Where Ray should place a worker: with several cores, on the node with the most room if that is free. Without
-        such a node, it waits in the cluster, where an autoscaler sees it."""
-        rooms = {} if self._watch is None or self._claim.cpus == 1 else self._watch.latest().rooms
-        if (node := emptiest(rooms, self._node_of.values())) is None:
+        """Where Ray should place a worker: with several cores, on the node that is most free. If none is, the worker
+        waits for any node, and an autoscaler sees it; it does not see workers that wait for a certain node."""
+        free = {} if self._watch is None or self._claim.cpus == 1 else self._watch.latest().free
+        if (node := emptiest(free, self._planned.values())) is None:
             return "SPREAD"
-        self._node_of[worker] = node
+        self._planned[worker] = node
         affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
         return affinity(node, soft=True, _spill_on_unavailable=True)
 

@@ -35,6 +35,8 @@ class Membership:
 
     rooms: Mapping[str, int]
     """Node id -> number of workers for which it has room, used or not, for the nodes that are alive and not leaving."""
+    free: Mapping[str, int]
+    """Node id -> number of further workers for which it has room now, for the same nodes."""
     leaving: frozenset[str]
     """Ids of the nodes that are being drained."""
     alive: frozenset[str]
@@ -123,18 +125,20 @@ def look(ray: ModuleType, claim: Claim) -> Membership:
     leaving = frozenset(_draining(ray))
     alive = {node["NodeID"]: node["Resources"] for node in ray.nodes() if node["Alive"]}
     rooms = {node: _room(resources, claim) for node, resources in alive.items() if node not in leaving}
-    return Membership(rooms, leaving, frozenset(alive))
+    unused = _unused(ray)
+    free = {node: _room(unused.get(node, {}), claim) for node in rooms}
+    return Membership(rooms, free, leaving, frozenset(alive))
 
 
-def emptiest(rooms: Mapping[str, int], taken: Iterable[str]) -> str | None:
-    """The node that has room for the most further workers, the first of equal ones; None if no node has room.
+def emptiest(free: Mapping[str, int], planned: Iterable[str]) -> str | None:
+    """The node that has room for the most further workers, the first of equal ones; None if no node has any.
 
     Args:
-        rooms: as in `Membership`.
-        taken: the node of each worker so far, however many workers it has.
+        free: as in `Membership`.
+        planned: the node of each worker that is to be placed there.
     """
-    workers = Counter(taken)
-    left = {node: room - workers[node] for node, room in rooms.items()}
+    workers = Counter(planned)
+    left = {node: room - workers[node] for node, room in free.items()}
     node = max(left, key=left.__getitem__, default=None)
     return node if node is not None and left[node] > 0 else None
 
@@ -175,6 +179,16 @@ def _room(resources: dict[str, float], claim: Claim) -> int:
 def _resources(amounts: dict[str, float]) -> str:
     """Text with the numbers of CPUs and GPUs."""
     return ", ".join(f"{amounts.get(name, 0.0):g} {name}" for name in ("CPU", "GPU"))
+
+
+def _unused(ray: ModuleType) -> dict[str, dict[str, float]]:
+    """Node id -> resources that nobody uses now.
+
+    Ray has no public function for this. If a version of Ray lacks this one, no node counts as free, and Ray chooses.
+    """
+    with contextlib.suppress(AttributeError):
+        return ray._private.state.available_resources_per_node()
+    return {}
 
 
 def _draining(ray: ModuleType) -> dict[str, int]:

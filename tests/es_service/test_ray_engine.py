@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -149,7 +149,7 @@ class PretendedWatch:
     """Of a cluster that never changes, unless `now` does."""
 
     def __init__(self) -> None:
-        self.now = Membership({}, frozenset(), frozenset())
+        self.now = Membership({}, {}, frozenset(), frozenset())
 
     def latest(self) -> Membership:
         return self.now
@@ -240,7 +240,7 @@ def test_an_actor_that_is_given_no_place_is_not_lost():
 def test_a_run_that_got_no_place_says_what_it_needs_and_what_there_is(watch, rooms, advice):
     """In a Ray of our own, there is room for each worker, so more nodes would not help."""
     if watch is not None:
-        watch.now = Membership(rooms, frozenset(), frozenset({"head", *rooms}))
+        watch.now = Membership(rooms, {}, frozenset(), frozenset({"head", *rooms}))
     ray, limits = PretendedRay(0), Limits(2, start_deadline_s=0.1, place_timeout_s=0.25)
     text = r"no worker got a place for 0\.25 s \(place_timeout_s\).* Each worker needs 1 CPU; .*has 2 CPU.*" + advice
     with ray_engine(ray, limits, watch) as engine, pytest.raises(EvaluationError, match=text):
@@ -261,7 +261,7 @@ def test_the_wait_for_a_first_place_is_told_of_twice_and_can_be_stopped(monkeypa
         return None
 
     watch = PretendedWatch()
-    watch.now = Membership({"node": 2}, frozenset(), frozenset({"node"}))
+    watch.now = Membership({"node": 2}, {}, frozenset(), frozenset({"node"}))
     limits = Limits(2, start_deadline_s=0.2)
     with Engine(transport(ray, limits, watch), limits, should_stop, on_wait=told.append) as engine:
         assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
@@ -276,24 +276,22 @@ def test_the_wait_for_a_first_place_is_told_of_twice_and_can_be_stopped(monkeypa
 
 def test_workers_of_several_cores_are_placed_one_by_one_where_there_is_most_room():
     """Those for which no node has room, and those of one core, are left to Ray."""
-    rooms = {"small": 1, "large": 3}
-    assert emptiest(rooms, ["large", "large"]) == "small"
-    assert emptiest(rooms, ["large", "large", "large", "small"]) is None
+    assert emptiest({"small": 1, "large": 3}, ["large", "large", "large"]) == "small"
+    assert emptiest({"small": 1, "large": 3}, ["large", "large", "large", "small"]) is None
     assert emptiest({}, ["gone"]) is None
-    ray, watch = PretendedRay(), PretendedWatch()
-    ray.node_of = lambda number: "small" if number == 0 else "large"  # Ray may place one elsewhere
-    watch.now = Membership(rooms, frozenset(), frozenset(rooms))
+    ray, watch = PretendedRay(room=2), PretendedWatch()
+    watch.now = Membership({"small": 2, "large": 9}, {"small": 1, "large": 3}, frozenset(), frozenset())
     actors = transport(ray, Limits(4), watch, claim=Claim(8))
-    for worker in range(2):
+    for worker in range(5):
         actors.start(worker)
     while actors.receive(0.0):
         pass
-    for worker in range(2, 5):
-        actors.start(worker)
-    actors.kill(1)
+    watch.now = replace(watch.now, free={"small": 1, "large": 1})  # since two have their places
     actors.start(5)
+    actors.kill(2)
+    actors.start(6)
     assert [strategy if strategy == "SPREAD" else strategy[0] for strategy in ray.strategies] == [
-        "large", "large", "large", "large", "SPREAD", "large"
+        *["large", "large", "small", "large", "SPREAD"], "SPREAD", "small"
     ]  # fmt: skip
     assert ray.strategies[0][1] == {"soft": True, "_spill_on_unavailable": True}
     one_core = PretendedRay()
@@ -305,12 +303,12 @@ def test_a_run_asks_for_more_workers_than_there_is_room_for_up_to_its_work():
     """Whatever becomes of the nodes; an answer without any node is no information."""
 
     def nodes(room: int) -> Membership:
-        return Membership({"node": room} if room else {}, frozenset(), frozenset({"head"}))
+        return Membership({"node": room} if room else {}, {}, frozenset(), frozenset({"head"}))
 
     asks, follows = Growth(10, ahead=4), Growth(10)
     assert [asks.wanted(nodes(room), 7) for room in (0, 3, 8, 99)] == [4, 7, 10, 10]
     assert [follows.wanted(nodes(room), 7) for room in (0, 3, 8, 99)] == [7, 3, 8, 10]
-    assert asks.wanted(Membership({}, frozenset(), frozenset()), 7) == 7
+    assert asks.wanted(Membership({}, {}, frozenset(), frozenset()), 7) == 7
 
 
 def test_a_node_that_dies_under_idle_workers_takes_none_of_the_others_along():
@@ -321,12 +319,12 @@ def test_a_node_that_dies_under_idle_workers_takes_none_of_the_others_along():
     actors = transport(ray, Limits(4), watch, Growth(4))
     with Engine(actors, Limits(4)) as engine:
         for alive in ({"old"}, {"old", "new"}, set(), {"old", "new"}):
-            watch.now = Membership({"old": 2, "new": 2}, frozenset(), frozenset(alive))
+            watch.now = Membership({"old": 2, "new": 2}, {}, frozenset(), frozenset(alive))
             engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
             assert engine.counts.lost_workers == 0
         for number in range(2):
             ray.end(ray.actors[number])
-        watch.now = Membership({"new": 2}, frozenset(), frozenset({"new"}))
+        watch.now = Membership({"new": 2}, {}, frozenset(), frozenset({"new"}))
         assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert (engine.counts.lost_workers, engine.counts.workers, engine.counts.retries) == (2, 2, 0)
         assert "its node died" in engine.last_loss
@@ -339,9 +337,11 @@ def test_nodes_that_are_about_to_go_are_alive_and_give_no_room():
         for name, cpus in (("stays", 4), ("leaves", 2), ("dead", 1))
     ]
     state = SimpleNamespace(get_draining_nodes=lambda: {"leaves": 0})
-    ray = SimpleNamespace(nodes=lambda: nodes, _private=SimpleNamespace(state=SimpleNamespace(state=state)))
+    unused = {"stays": {"CPU": 3.0}, "leaves": {"CPU": 2.0}}
+    private = SimpleNamespace(state=SimpleNamespace(state=state, available_resources_per_node=lambda: unused))
+    ray = SimpleNamespace(nodes=lambda: nodes, _private=private)
     seen = look(ray, ONE_CORE)
-    assert seen == Membership({"stays": 4}, frozenset({"leaves"}), frozenset({"stays", "leaves"}))
+    assert seen == Membership({"stays": 4}, {"stays": 3}, frozenset({"leaves"}), frozenset({"stays", "leaves"}))
 
 
 def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
@@ -349,19 +349,19 @@ def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
     ray, watch = PretendedRay(), PretendedWatch()
     ray.node_of = str
     actors = transport(ray, Limits(3), watch, Growth(3))
-    watch.now = Membership({"0": 1, "1": 1, "2": 1}, frozenset(), frozenset("012"))
+    watch.now = Membership({"0": 1, "1": 1, "2": 1}, {}, frozenset(), frozenset("012"))
     for worker in range(3):
         actors.start(worker)
     while actors.receive(0.0):
         pass
     actors.send(0, "key", 1, around(FIRST, [CHUNK]))
-    watch.now = Membership({"2": 1}, frozenset("1"), frozenset("12"))
+    watch.now = Membership({"2": 1}, {}, frozenset("1"), frozenset("12"))
     told = [actors.receive(0.0) for _ in range(4)]
     assert told[0] == Drain(1)
     assert isinstance(told[1], WorkerLost)
     assert (told[1].worker, told[1].bystander) == (0, False)
     assert told[2:] == [SetWorkers(1), None]
-    watch.now = Membership({"2": 7}, frozenset("1"), frozenset("12"))
+    watch.now = Membership({"2": 7}, {}, frozenset("1"), frozenset("12"))
     assert [actors.receive(0.0) for _ in range(2)] == [SetWorkers(3), None], "no more than there is work for"
 
 

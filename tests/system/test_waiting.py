@@ -46,7 +46,7 @@ def test_a_run_that_finds_the_cluster_full_waits_and_then_ends_with_the_digest_t
     config.write_text(yaml.safe_dump(CONFIG))
     few = ("--or-resume", "--set", f"budget.generations={GENERATIONS}")
     with Cluster(tmp_path) as hosts:
-        hosts.start("one", 1)
+        hosts.start("one", 2)
 
         def start(folder: Path, *options: object) -> subprocess.Popen[str]:
             words = ("es-service", "run", config, "--out", folder, "--address", hosts.address, *options)
@@ -60,13 +60,14 @@ def test_a_run_that_finds_the_cluster_full_waits_and_then_ends_with_the_digest_t
 
         printed, _ = start(run, *few, "--set", "compute.place_timeout_s=3").communicate(timeout=90)
         assert "no worker got a place for 3 s (compute.place_timeout_s)" in printed
-        assert "Each worker needs 1 CPU; the cluster has 1 CPU, 0 GPU in total and 0 CPU" in printed
+        assert "Each worker needs 2 CPU; the cluster has 2 CPU, 0 GPU in total and 0 CPU" in printed
         assert f"es-service resume {run}" in printed
         wait_for(nobody_waits)
 
         driver = start(run, *few, "--set", "compute.place_timeout_s=null")
         wait_for(lambda: waits(run))
         assert "waiting for a first place in the cluster since 2" in es("status", run)[1]
+        wait_for(lambda: "{'CPU': 2.0}: 1+ pending" in hosts.run("head", "ray", "status")[1])
         printed = end(hosts, driver, run, signal.SIGINT)
         assert driver.returncode == 130, printed
         assert "no worker has a place in the cluster; the run waits until there is one. Each worker needs" in printed
