@@ -286,17 +286,28 @@ def test_workers_of_several_cores_are_placed_one_by_one_where_there_is_most_room
         actors.start(worker)
     while actors.receive(0.0):
         pass
-    watch.now = replace(watch.now, free={"small": 1, "large": 1})  # since two have their places
+    watch.now = replace(watch.now, free={"small": 1, "large": 2})  # since two have their places
     actors.start(5)
     actors.kill(2)
     actors.start(6)
     assert [strategy if strategy == "SPREAD" else strategy[0] for strategy in ray.strategies] == [
-        *["large", "large", "small", "large", "SPREAD"], "SPREAD", "small"
+        *["large", "large", "small", "large", "SPREAD"], "large", "small"
     ]  # fmt: skip
     assert ray.strategies[0][1] == {"soft": True, "_spill_on_unavailable": True}
     one_core = PretendedRay()
     transport(one_core, Limits(1), watch).start(0)
     assert one_core.strategies == ["SPREAD"]
+
+
+def test_work_is_divided_among_the_workers_that_have_a_place():
+    """Not among those that wait for one, perhaps for ever: then there would be more and smaller messages."""
+    ray, limits = PretendedRay(room=2), Limits(9, item_s=60.0)
+    with ray_engine(ray, limits) as engine:
+        chunks = [TrainingChunk(2, chunk) for chunk in range(18)]
+        for _ in range(3):  # so that it is known how long a chunk takes
+            ray.calls.clear()
+            engine.evaluate(around(FIRST, chunks))
+        assert len(ray.calls) == 2
 
 
 def test_a_run_asks_for_more_workers_than_there_is_room_for_up_to_its_work():
