@@ -83,8 +83,10 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
     send = Actors.send
 
     def send_and_strike(self, worker, key, attempt, work):
-        send(self, worker, key, attempt, work)
         number = faults.pop(key.generation, None) if key.kind == "TrainingChunk" else None
+        if number is not None:
+            os.kill(self.places()[worker].pid, signal.SIGSTOP)  # or it might have answered before it is struck
+        send(self, worker, key, attempt, work)
         if number is not None:
             os.kill(self.places()[worker].pid, number)
 
