@@ -39,6 +39,11 @@ class Limits:
     first_deadline_s: float = 600.0
     """Longest time for a worker's first item of a kind, which includes compiling, and for any item while its usual
     duration is not known. If the limit for later items is longer, that limit applies."""
+    late_factor: float = 2.0
+    """A worker is late when its item has taken late_factor x size x median of recent durations of its kind. At the end
+    of a phase, its items are then sent to an idle worker too; with infinity, no item ever is."""
+    late_s: float = 0.03
+    """Least time by which a late item exceeds its usual duration, since a copy of a very short item saves nothing."""
     min_deadline_s: float = 30.0
     """Lower bound of the limit for later items."""
     deadline_factor: float = 5.0
@@ -177,6 +182,8 @@ class Assign:
     worker: int
     item_id: Hashable
     attempt: int
+    copy: bool = False
+    """Whether it is a second copy of an item that another worker is late with. It is no new attempt."""
 
 
 @dataclass(frozen=True)

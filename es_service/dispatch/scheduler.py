@@ -20,8 +20,8 @@ Rules:
 * Workers that are lost before they come up count as a failed attempt to start workers. They count as another failed
   attempt only if they were started after the first of them was lost.
 
-assignment.py decides which worker gets which item, and sets the deadlines of items. scheduler_changes.py keeps the
-containers of the state consistent.
+assignment.py decides which worker gets which item, and sets the deadlines of items. stragglers.py decides which items
+are sent a second time. scheduler_changes.py keeps the containers of the state consistent.
 
 Cost: a step copies the containers of the state, whose copies are cheap (cheap_copies.py), and looks only at the workers
 and items that its event concerns and at those that it stops or assigns. An event takes about 12 microseconds with
@@ -31,6 +31,7 @@ run, and events before a first worker is up look at all workers. A free worker p
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable
 
 from es_service.dispatch.assignment import assign, begin_first_slot
@@ -63,8 +64,10 @@ from es_service.dispatch.scheduler_state import (
     is_down,
     late_workers,
     next_deadline,
+    with_own_containers,
     without,
 )
+from es_service.dispatch.stragglers import note_late_workers, send_copies
 
 RECENT_DURATIONS = 31
 """Number of durations per kind of work item from which the running median is computed."""
@@ -82,16 +85,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
     if state.failed is not None or (isinstance(event, Tick) and now < next_deadline(state)):
         return state, []
     # Only the containers of `s` are changed in place, since no other state has them before this step returns.
-    s = state._replace(
-        starting=state.starting.copy(),
-        up=state.up.copy(),
-        draining=state.draining.copy(),
-        deadlines=state.deadlines.copy(),
-        free=state.free.copy(),
-        items=state.items.copy(),
-        places=state.places.copy(),
-        durations_s=state.durations_s.copy(),
-    )
+    s = with_own_containers(state)
     out: list[Command] = []
     match event:
         case Result(worker, item_id, attempt):
@@ -111,6 +105,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
         case Failure():
             s = _failure(s, out, event, now)
         case Tick(silent):
+            note_late_workers(s, now)
             s = _expire(s, out, now, silent)
         case Drain(worker):
             s = _drain(s, out, worker)
@@ -123,6 +118,8 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
     if s.failed is None:
         s = _start_workers(s, out, now)
         s = assign(s, out, now)
+        if isinstance(event, Tick):
+            s = send_copies(s, out, now)
         if is_down(s) != (s.down_since_s is not None):
             s = s._replace(down_since_s=now if s.down_since_s is None else None)
     return s, out
@@ -134,7 +131,7 @@ def _result(
     record = s.up.get(worker) or s.draining.get(worker)
     if record is None:
         return s._replace(duplicates=s.duplicates + 1)
-    if drop_item(s, item_id):
+    if delivered := drop_item(s, item_id):
         out.append(Deliver(item_id))
         if s.losses_in_a_row:
             s = s._replace(losses_in_a_row=0)
@@ -142,13 +139,14 @@ def _result(
         s = s._replace(duplicates=s.duplicates + 1)
     index = find_slot(record, item_id, attempt)
     if index is not None:
-        item, warm = record.slots[index].item, record.warm
-        # For an answer out of order, neither its duration nor whether it included compiling is known.
-        if index == 0 and item.kind in warm:
-            duration_s = (now - record.started_s) / item.size
-            s.durations_s[item.kind] = (*s.durations_s.get(item.kind, ()), duration_s)[-RECENT_DURATIONS:]
-        elif index == 0:
-            warm = warm | {item.kind}
+        item = record.slots[index].item
+        # The duration is not known of an answer out of order, nor of a superseded one, which may have been read late.
+        if index == 0 and delivered:
+            if item.kind in record.warm:  # else it may include compiling
+                duration_s = (now - record.started_s) / item.size
+                s.durations_s[item.kind] = (*s.durations_s.get(item.kind, ()), duration_s)[-RECENT_DURATIONS:]
+            record = record._replace(in_time=record.late_s > -math.inf)
+        warm = record.warm | {item.kind} if index == 0 else record.warm
         record = record._replace(slots=without(record.slots, index), warm=warm, failures_in_a_row=0)
         _close_slot(s, out, worker, record, index, now)
     return s
@@ -168,8 +166,7 @@ def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) 
         out.append(StopWorker(worker, reason))
         # The item that it has just begun is not charged.
         s = _lose(s, out, worker, reason, now, charge=False)
-    waiting = s.items.get(item_id)
-    if waiting is None or waiting.holder != worker:
+    if not holds(s, worker, item_id):
         return s._replace(duplicates=s.duplicates + 1)
     return_item(s, worker, item_id)
     return _charge(s, out, item_id, f"it raised an exception on worker {worker}: {event.message}")

@@ -23,6 +23,10 @@ class Waiting(NamedTuple):
     """Its place in the queue, smaller than the places of later items; None while it is assigned to a worker."""
     holder: int | None = None
     """The worker that the item is assigned to; None while it is in the queue."""
+    second: int | None = None
+    """The worker that has a second copy of the item; None if there is no copy."""
+    late: int | None = None
+    """Its place in `SchedulerState.late`; None if it is not there."""
     last_holder: int | None = None
     """The worker that last had the item without delivering it; None if there was none."""
 
@@ -45,6 +49,11 @@ class Worker(NamedTuple):
     """Time at which it began the first slot."""
     deadline_s: float = math.inf
     """Time by which it must come up, or answer the first slot."""
+    late_s: float = math.inf
+    """Time from which it is late with the first slot; infinity if the usual duration is not known, and -infinity once
+    it is known to be late."""
+    in_time: bool = False
+    """Whether it answered its last item in time, and is not known to be late with the first slot."""
     limit: str = ""
     """Field of `Limits` that determines the deadline for the first slot."""
     warm: frozenset[str] = frozenset()
@@ -68,13 +77,15 @@ class SchedulerState(NamedTuple):
     draining: Table[int, Worker]
     """Workers that finish their work items and get no others."""
     deadlines: Sorted[tuple[float, int]]
-    """(deadline, worker) of every worker of these three groups that has a deadline."""
-    free: Sorted[tuple[int, int, int]]
-    """(number of its slots, rank, worker) of every worker that can be assigned another work item."""
+    """(next time at which it is late or must be stopped, worker) of every worker of these three groups that has one."""
+    free: Sorted[tuple[int, bool, int, int]]
+    """(number of its slots, not `in_time`, rank, worker) of every worker that can be assigned another work item."""
     items: Table[Hashable, Waiting]
     """Work items that have not been delivered, by id."""
     places: Sorted[tuple[int, Hashable]]
     """(place, id) of every work item in the queue."""
+    late: Sorted[tuple[int, Hashable]]
+    """(place, id) of every work item that may be sent a second time, see stragglers.py."""
     durations_s: dict[str, tuple[float, ...]]
     """Kind -> recent durations of one chunk, without those that may include compiling."""
     next_worker: int = 0
@@ -101,6 +112,8 @@ class SchedulerState(NamedTuple):
     """Chunks that were assigned again, counted at each assignment of a work item after the first."""
     lost_workers: int = 0
     """Workers that were lost, or stopped because of a fault."""
+    copies: int = 0
+    """Chunks that were sent a second time because a worker was late with them; these are no retries."""
     duplicates: int = 0
     """Results and failures that were ignored: outdated, repeated, or from an unknown worker."""
 
@@ -113,7 +126,32 @@ class SchedulerState(NamedTuple):
 def initial_state(limits: Limits) -> SchedulerState:
     """State without work items and workers; the first step starts the workers, whatever its event is."""
     return SchedulerState(
-        limits, limits.workers, Table(), Table(), Table(), Sorted(), Sorted(), Table(), Sorted(), durations_s={}
+        limits,
+        limits.workers,
+        Table(),
+        Table(),
+        Table(),
+        Sorted(),
+        Sorted(),
+        Table(),
+        Sorted(),
+        Sorted(),
+        durations_s={},
+    )
+
+
+def with_own_containers(state: SchedulerState) -> SchedulerState:
+    """An equal state whose containers may be changed, since no other state has them."""
+    return state._replace(
+        starting=state.starting.copy(),
+        up=state.up.copy(),
+        draining=state.draining.copy(),
+        deadlines=state.deadlines.copy(),
+        free=state.free.copy(),
+        items=state.items.copy(),
+        places=state.places.copy(),
+        late=state.late.copy(),
+        durations_s=state.durations_s.copy(),
     )
 
 
@@ -165,6 +203,8 @@ def next_deadline(state: SchedulerState) -> float:
     """Time of the next deadline, at which a `Tick` has an effect; infinity if there is none."""
     if state.failed is not None:
         return math.inf
+    if has_idle_worker_for_copies(state):
+        return -math.inf
     first = state.deadlines.first()
     at_s = first[0] if first is not None else math.inf
     if len(state.starting) + len(state.up) < state.wanted:
@@ -172,6 +212,19 @@ def next_deadline(state: SchedulerState) -> float:
     if state.down_since_s is not None:
         at_s = min(at_s, state.down_since_s + down_limit(state)[1])
     return at_s
+
+
+def next_time(worker: Worker) -> float:
+    """Next time at which a worker is late or must be stopped; infinity if there is none."""
+    return worker.deadline_s if worker.late_s == -math.inf else min(worker.late_s, worker.deadline_s)
+
+
+def has_idle_worker_for_copies(state: SchedulerState) -> bool:
+    """Whether the queue is empty, and a worker that is idle and was in time can take the item of one that is late."""
+    if not state.late or state.places or state.limits.late_factor == math.inf:
+        return False
+    first = state.free.first()
+    return first is not None and first[:2] == (0, False)
 
 
 def late_workers(state: SchedulerState, now: float) -> list[int]:
@@ -216,4 +269,4 @@ def without(slots: tuple[Slot, ...], index: int) -> tuple[Slot, ...]:
 def holds(state: SchedulerState, worker: int, item_id: Hashable) -> bool:
     """Whether a work item is assigned to a worker and has not been delivered."""
     waiting = state.items.get(item_id)
-    return waiting is not None and waiting.holder == worker
+    return waiting is not None and worker in (waiting.holder, waiting.second)

@@ -59,6 +59,8 @@ class World:
             first_deadline_s=8.0,
             min_deadline_s=2.0,
             deadline_factor=4.0,
+            late_factor=r.choice((1.2, 2.0, math.inf)),
+            late_s=r.choice((0.0, 0.3)),
             max_failures_in_a_row=r.randint(1, 3),
             restart_backoff_s=0.5,
             max_backoff_s=r.choice((4.0, 20.0)),
@@ -96,6 +98,8 @@ class World:
         self.waiting: set[tuple] = set()
         self.delivered: set[tuple] = set()
         self.faults: Counter[tuple] = Counter()
+        self.assigned: set[tuple] = set()
+        self.copied: dict[tuple, int] = {}
         self.last_holder: dict[tuple, int] = {}
         self.again = self.lost = self.dropped = self.start_failures = self.tried = self.newest = 0
         self.start_due: dict[int, float] = {}
@@ -192,6 +196,9 @@ class World:
             running = self.open[worker][0][0] if self.open[worker] else None
             if charge and running in self.waiting:
                 self.faults[running] += 1
+                self.seen["copy charged"] += running in self.copied
+        for item_id, _ in self.open[worker]:
+            self.last_holder[item_id] = worker
         self.up.discard(worker)
         self.draining.discard(worker)
         self.open[worker] = []
@@ -227,6 +234,7 @@ class World:
                     self.open[worker].remove((item_id, attempt))
                 if valid and item_id in self.waiting:
                     self.faults[item_id] += 1
+                    self.last_holder[item_id] = worker
                 else:
                     self.dropped += 1
             case Drain(worker) if worker in self.known:
@@ -264,8 +272,8 @@ class World:
                     self.start_process(worker)
                 case StopWorker(worker, reason):
                     self.stop(worker, reason, event)
-                case Assign(worker, item_id, attempt):
-                    self.check_assign(worker, item_id, attempt)
+                case Assign(worker, item_id, attempt, is_copy):
+                    self.check_assign(worker, item_id, attempt, event if is_copy else None)
                 case Deliver(item_id):
                     assert isinstance(event, Result)
                     assert event.item_id == item_id
@@ -273,6 +281,7 @@ class World:
                     assert item_id in self.waiting
                     self.waiting.remove(item_id)
                     self.delivered.add(item_id)
+                    self.seen["copy was first"] += self.copied.get(item_id) == event.worker
                     accepted += 1
                 case Fail(message):
                     self.failed = message
@@ -302,21 +311,40 @@ class World:
         if self.happens("reports_stopped"):
             self.say(worker, WorkerLost(worker, "stopped"))
 
-    def check_assign(self, worker: int, item_id: tuple, attempt: int) -> None:
+    def check_assign(self, worker: int, item_id: tuple, attempt: int, copied_by: Event | None) -> None:
         assert worker in self.up - self.draining
         assert item_id in self.waiting
-        assert all(item_id != held for slots in self.open.values() for held, _ in slots)
         assert attempt == self.faults[item_id] + 1 <= self.limits.max_attempts
-        if item_id in self.last_holder:
-            self.again += self.size[item_id]
+        holders = [other for other, slots in self.open.items() for held, _ in slots if held == item_id]
+        if copied_by is not None:
+            self.check_copy(worker, item_id, holders, copied_by)
         else:
-            assert item_id == self.fresh.popleft(), "out of submission order"
-        assert self.last_holder.get(item_id) != worker or len(self.up - self.draining) == 1
-        self.last_holder[item_id] = worker
+            assert not holders
+            if item_id in self.assigned:
+                self.again += self.size[item_id]
+            else:
+                assert item_id == self.fresh.popleft(), "out of submission order"
+            assert self.last_holder.get(item_id) != worker or len(self.up - self.draining) == 1
+        self.assigned.add(item_id)
         self.open[worker].append((item_id, attempt))
         assert len(self.open[worker]) <= self.limits.in_flight
         self.inbox[worker].append((item_id, attempt))
         self.at(0.0, self.begin, worker)
+
+    def check_copy(self, worker: int, item_id: tuple, holders: list[int], event: Event) -> None:
+        """Of an item that one other worker has, and has had alone since it was submitted; nothing else waits."""
+        assert isinstance(event, Tick)
+        assert self.limits.late_factor < math.inf
+        assert not self.open[worker]
+        assert len(holders) == 1
+        assert item_id not in self.copied
+        assert item_id not in self.last_holder, "it may be poison"
+        assert not self.queued()
+        self.copied[item_id] = worker
+        self.seen["copy"] += 1
+
+    def queued(self) -> set[tuple]:
+        return self.waiting - {item_id for slots in self.open.values() for item_id, _ in slots}
 
     def check_fail(self, message: str) -> None:
         worn_out = [item_id for item_id in self.waiting if self.faults[item_id] >= self.limits.max_attempts]
@@ -357,7 +385,7 @@ class World:
         elif self.down_since is None:
             self.down_since = self.now
         usable = self.up - self.draining
-        queued = self.waiting - {item_id for slots in self.open.values() for item_id, _ in slots}
+        queued = self.queued()
         for worker in usable if queued else ():
             if len(self.open[worker]) < self.limits.in_flight:
                 assert len(usable) > 1
@@ -425,15 +453,17 @@ def simulate(seed: int) -> World:
     world.run_until_quiet()
     if world.failed is not None:
         return world
-    scratches = world.lost, world.dropped, world.state.retries
+    scratches, dropped, copied = (world.lost, world.state.retries), world.dropped, len(world.copied)
     world.submit(3)
     world.run_until_quiet()
     assert world.failed is None
     assert not world.waiting
-    assert (world.lost, world.dropped, world.state.retries) == scratches
+    assert (world.lost, world.state.retries) == scratches
+    assert world.dropped - dropped == len(world.copied) - copied, "of two copies, one answer is dropped"
+    assert world.state.copies == sum(world.size[item_id] for item_id in world.copied)
     assert world.alive == world.known == world.up == set(world.state.up)
     assert len(world.alive) == world.wanted
     assert not world.draining
     if world.faultless:
-        assert scratches == (0, 0, 0)
+        assert (scratches, dropped) == ((0, 0), copied)
     return world
