@@ -53,8 +53,17 @@ from es_service.dispatch.events import (
     WorkerLost,
     WorkerUp,
 )
-from es_service.dispatch.scheduler_changes import append_items, drop_item, pop_worker, put_worker, return_item
+from es_service.dispatch.scheduler_changes import (
+    add_duration,
+    append_items,
+    drop_item,
+    pop_worker,
+    put_worker,
+    return_item,
+)
 from es_service.dispatch.scheduler_state import (
+    IN_TIME,
+    LATE,
     SchedulerState,
     Worker,
     by_progress,
@@ -68,9 +77,6 @@ from es_service.dispatch.scheduler_state import (
     without,
 )
 from es_service.dispatch.stragglers import note_late_workers, send_copies
-
-RECENT_DURATIONS = 31
-"""Number of durations per kind of work item from which the running median is computed."""
 
 
 def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerState, list[Command]]:
@@ -140,14 +146,15 @@ def _result(
     index = find_slot(record, item_id, attempt)
     if index is not None:
         item = record.slots[index].item
+        warm, pace = record.warm, record.pace
         # The duration is not known of an answer out of order, nor of a superseded one, which may have been read late.
         if index == 0 and delivered:
-            if item.kind in record.warm:  # else it may include compiling
-                duration_s = (now - record.started_s) / item.size
-                s.durations_s[item.kind] = (*s.durations_s.get(item.kind, ()), duration_s)[-RECENT_DURATIONS:]
-            record = record._replace(in_time=record.late_s > -math.inf)
-        warm = record.warm | {item.kind} if index == 0 else record.warm
-        record = record._replace(slots=without(record.slots, index), warm=warm, failures_in_a_row=0)
+            pace = IN_TIME if record.late_s > -math.inf else LATE
+            if item.kind in warm:  # else it may include compiling
+                add_duration(s, item.kind, (now - record.started_s) / item.size)
+        if index == 0 and item.kind not in warm:
+            warm = warm | {item.kind}
+        record = record._replace(slots=without(record.slots, index), warm=warm, pace=pace, failures_in_a_row=0)
         _close_slot(s, out, worker, record, index, now)
     return s
 

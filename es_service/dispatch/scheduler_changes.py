@@ -11,25 +11,31 @@ from collections.abc import Hashable, Iterable
 
 from es_service.dispatch.cheap_copies import Table
 from es_service.dispatch.events import WorkItem
-from es_service.dispatch.scheduler_state import SchedulerState, Waiting, Worker, next_time
+from es_service.dispatch.scheduler_state import IN_TIME, SchedulerState, Waiting, Worker, next_time
+
+RECENT_DURATIONS = 31
+"""Number of durations per kind of work item from which the running median is computed."""
 
 
 def put_worker(s: SchedulerState, group: Table[int, Worker], worker: int, record: Worker) -> None:
-    """Store a worker in one of the three groups of `s`; `deadlines`, `free` and `late` change with it."""
+    """Store a worker in one of the three groups of `s`; `deadlines`, `free`, `in_time` and `late` change with it."""
     old = group.get(worker)
     group[worker] = record
-    at_s = next_time(record)
-    if old is None or next_time(old) != at_s:
-        if old is not None:
-            _forget_deadline(s, worker, old)
-        if at_s < math.inf:
-            s.deadlines.add((at_s, worker))
-    if group is s.up and (old is None or len(old.slots) != len(record.slots) or old.in_time != record.in_time):
+    old_s, new_s = math.inf if old is None else next_time(old), next_time(record)
+    if old_s != new_s:
+        if old_s < math.inf:
+            s.deadlines.remove((old_s, worker))
+        if new_s < math.inf:
+            s.deadlines.add((new_s, worker))
+    if group is s.up and (old is None or len(old.slots) != len(record.slots) or old.pace != record.pace):
         if old is not None:
             _forget_free(s, worker, old)
         if len(record.slots) < s.limits.in_flight:
-            s.free.add((len(record.slots), not record.in_time, record.rank, worker))
-    if not record.in_time or (old is not None and not old.in_time):
+            s.free.add((len(record.slots), record.pace, record.rank, worker))
+    was_in_time = old is not None and old.pace == IN_TIME
+    if group is s.up and was_in_time != (record.pace == IN_TIME):
+        (s.in_time.remove if was_in_time else s.in_time.add)((worker,))
+    if record.pace != IN_TIME or (old is not None and not was_in_time):
         for slot in record.slots:
             _update_late(s, slot.item.id)
 
@@ -38,20 +44,18 @@ def pop_worker(s: SchedulerState, group: Table[int, Worker], worker: int) -> Wor
     """Remove a worker from one of the three groups of `s` and return it; None if the group does not have it."""
     old = group.pop(worker)
     if old is not None:
-        _forget_deadline(s, worker, old)
+        if (at_s := next_time(old)) < math.inf:
+            s.deadlines.remove((at_s, worker))
         if group is s.up:
             _forget_free(s, worker, old)
+            if old.pace == IN_TIME:
+                s.in_time.remove((worker,))
     return old
-
-
-def _forget_deadline(s: SchedulerState, worker: int, old: Worker) -> None:
-    if (at_s := next_time(old)) < math.inf:
-        s.deadlines.remove((at_s, worker))
 
 
 def _forget_free(s: SchedulerState, worker: int, old: Worker) -> None:
     if len(old.slots) < s.limits.in_flight:
-        s.free.remove((len(old.slots), not old.in_time, old.rank, worker))
+        s.free.remove((len(old.slots), old.pace, old.rank, worker))
 
 
 def append_items(s: SchedulerState, items: Iterable[WorkItem]) -> None:
@@ -111,10 +115,15 @@ def _leave_queue(s: SchedulerState, waiting: Waiting) -> None:
         s.places.remove((waiting.place, waiting.item.id))
 
 
+def add_duration(s: SchedulerState, kind: str, chunk_s: float) -> None:
+    """Remember how long a chunk of a kind took, in seconds, and forget the oldest duration if there are many."""
+    s.durations_s[kind] = (*s.durations_s.get(kind, ()), chunk_s)[-RECENT_DURATIONS:]
+
+
 def _update_late(s: SchedulerState, item_id: Hashable) -> None:
     """Put a work item into `late` if it belongs there, or remove it.
 
-    It belongs there if its first holder, which must be the only one so far, is not `in_time`. An item that was taken
+    It belongs there if its first holder, which must be the only one so far, is not IN_TIME. An item that was taken
     from a worker does not, since it may be the reason for the worker's loss.
     """
     waiting = s.items.get(item_id)
@@ -123,7 +132,7 @@ def _update_late(s: SchedulerState, item_id: Hashable) -> None:
     belongs = False
     if waiting.holder is not None and waiting.second is None and waiting.last_holder is None:
         record = s.up.get(waiting.holder) or s.draining.get(waiting.holder)
-        belongs = record is not None and not record.in_time
+        belongs = record is not None and record.pace != IN_TIME
     if belongs and waiting.late is None:
         last = s.late.last()
         place = 0 if last is None else last[0] + 1

@@ -13,6 +13,9 @@ from typing import NamedTuple
 from es_service.dispatch.cheap_copies import Sorted, Table
 from es_service.dispatch.events import Limits, WorkItem, with_last_words
 
+IN_TIME, LATE, NEW = range(3)
+"""Values of `Worker.pace`, best first."""
+
 
 class Waiting(NamedTuple):
     """A work item that has not been delivered."""
@@ -52,8 +55,9 @@ class Worker(NamedTuple):
     late_s: float = math.inf
     """Time from which it is late with the first slot; infinity if the usual duration is not known, and -infinity once
     it is known to be late."""
-    in_time: bool = False
-    """Whether it answered its last item in time, and is not known to be late with the first slot."""
+    pace: int = NEW
+    """IN_TIME or LATE, as it was with its last item or is known to be with the first slot; NEW before its first answer.
+    """
     limit: str = ""
     """Field of `Limits` that determines the deadline for the first slot."""
     warm: frozenset[str] = frozenset()
@@ -78,8 +82,10 @@ class SchedulerState(NamedTuple):
     """Workers that finish their work items and get no others."""
     deadlines: Sorted[tuple[float, int]]
     """(next time at which it is late or must be stopped, worker) of every worker of these three groups that has one."""
-    free: Sorted[tuple[int, bool, int, int]]
-    """(number of its slots, not `in_time`, rank, worker) of every worker that can be assigned another work item."""
+    free: Sorted[tuple[int, int, int, int]]
+    """(number of its slots, pace, rank, worker) of every worker that can be assigned another work item."""
+    in_time: Sorted[tuple[int]]
+    """Every worker that is up and IN_TIME."""
     items: Table[Hashable, Waiting]
     """Work items that have not been delivered, by id."""
     places: Sorted[tuple[int, Hashable]]
@@ -128,14 +134,15 @@ def initial_state(limits: Limits) -> SchedulerState:
     return SchedulerState(
         limits,
         limits.workers,
-        Table(),
-        Table(),
-        Table(),
-        Sorted(),
-        Sorted(),
-        Table(),
-        Sorted(),
-        Sorted(),
+        starting=Table(),
+        up=Table(),
+        draining=Table(),
+        deadlines=Sorted(),
+        free=Sorted(),
+        in_time=Sorted(),
+        items=Table(),
+        places=Sorted(),
+        late=Sorted(),
         durations_s={},
     )
 
@@ -148,6 +155,7 @@ def with_own_containers(state: SchedulerState) -> SchedulerState:
         draining=state.draining.copy(),
         deadlines=state.deadlines.copy(),
         free=state.free.copy(),
+        in_time=state.in_time.copy(),
         items=state.items.copy(),
         places=state.places.copy(),
         late=state.late.copy(),
@@ -203,7 +211,7 @@ def next_deadline(state: SchedulerState) -> float:
     """Time of the next deadline, at which a `Tick` has an effect; infinity if there is none."""
     if state.failed is not None:
         return math.inf
-    if has_idle_worker_for_copies(state):
+    if state.late and has_idle_worker_for_copies(state):
         return -math.inf
     first = state.deadlines.first()
     at_s = first[0] if first is not None else math.inf
@@ -216,15 +224,16 @@ def next_deadline(state: SchedulerState) -> float:
 
 def next_time(worker: Worker) -> float:
     """Next time at which a worker is late or must be stopped; infinity if there is none."""
-    return worker.deadline_s if worker.late_s == -math.inf else min(worker.late_s, worker.deadline_s)
+    late_s, deadline_s = worker.late_s, worker.deadline_s
+    return late_s if -math.inf < late_s < deadline_s else deadline_s
 
 
 def has_idle_worker_for_copies(state: SchedulerState) -> bool:
-    """Whether the queue is empty, and a worker that is idle and was in time can take the item of one that is late."""
+    """Whether the queue is empty, and an idle worker can take an item of another one, as stragglers.py explains."""
     if not state.late or state.places or state.limits.late_factor == math.inf:
         return False
     first = state.free.first()
-    return first is not None and first[:2] == (0, False)
+    return first is not None and (first[:2] == (0, IN_TIME) or (first[:2] == (0, LATE) and not state.in_time))
 
 
 def late_workers(state: SchedulerState, now: float) -> list[int]:

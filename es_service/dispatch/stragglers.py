@@ -5,9 +5,9 @@ item. The first answer counts, and the other is dropped like any duplicate: an i
 of a gradient is added twice. It never has more than one copy, and none after a loss or a failure, since it may be the
 cause. A copy is no retry; if it makes its worker fail, the item is charged as ever.
 
-A worker is late if its item takes much longer than usual. It then counts as slow until it answers an item in time, as
-does a worker that has answered none yet and must compile: the items of such a worker are copied as soon as another one
-is idle, and it gets no copies itself. Since a node with several workers is slow or not, copies go to other nodes.
+A worker is late if its item takes much longer than usual, and slow until it answers an item in time. The items of a
+slow worker, or of a new one, which must compile, are copied as soon as another worker is idle. A new worker gets no
+copies, and a slow one only if no other worker is left, so the workers of a slow node do not copy each other's items.
 
 Only a `Tick` does all this. The engine sends one when no answers wait to be read, so a driver that was busy neither
 takes its workers for slow nor sends copies of items that are answered already.
@@ -20,7 +20,7 @@ import math
 from es_service.dispatch.assignment import begin_first_slot
 from es_service.dispatch.events import Assign, Command
 from es_service.dispatch.scheduler_changes import copy_item, put_worker
-from es_service.dispatch.scheduler_state import SchedulerState, Slot, has_idle_worker_for_copies
+from es_service.dispatch.scheduler_state import LATE, SchedulerState, Slot, has_idle_worker_for_copies
 
 
 def note_late_workers(s: SchedulerState, now: float) -> None:
@@ -31,7 +31,7 @@ def note_late_workers(s: SchedulerState, now: float) -> None:
         group = s.up if worker in s.up else s.draining
         record = group.get(worker)
         if record is not None and record.late_s <= now:
-            put_worker(s, group, worker, record._replace(late_s=-math.inf, in_time=False))
+            put_worker(s, group, worker, record._replace(late_s=-math.inf, pace=LATE))
 
 
 def send_copies(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:

@@ -29,19 +29,19 @@ from es_service.dispatch.events import (
     WorkItem,
 )
 from es_service.dispatch.scheduler import step
-from es_service.dispatch.scheduler_state import SchedulerState, next_deadline, pending
+from es_service.dispatch.scheduler_state import IN_TIME, LATE, SchedulerState, next_deadline, pending
 from es_service.protocol.gradient_tree import tree_sum, with_neighbours_added
 from es_service.protocol.messages import GradientChunk, GradientResult, around
 from tests.es_service.scheduler_play import check_consistency, items, play, ready
 from tests.es_service.test_engine import Scripted
 from tests.helpers import centre, random_parameters
 
-LATE = {"late_factor": 2.0, "late_s": 0.0}
+LIMITS = {"late_factor": 2.0, "late_s": 0.0}
 
 
 def experienced(workers: int = 2, **changes: object) -> SchedulerState:
     """At time 10, idle workers that have compiled; an item takes one second."""
-    state = ready(workers, **LATE | changes)
+    state = ready(workers, **LIMITS | changes)
     for now in (0.0, 9.0):
         state, _ = step(state, Submit(tuple(WorkItem(number, "train") for number in range(workers))), now)
         for worker in range(workers):
@@ -113,12 +113,17 @@ def test_a_worker_is_slow_until_it_answers_in_time():
     assert step(state, Tick(), 18.5) == (state, [])
 
 
-def test_a_slow_worker_gets_no_copy():
+def test_a_slow_worker_gets_a_copy_only_if_no_other_would():
+    state, _ = play(experienced(3), (10.0, items("abc")), (11.0, Result(1, "b", 1)), (11.0, Result(2, "c", 1)))
+    state, _ = play(state, (12.0, Tick()), (13.0, Result(1, "a", 1)), (15.0, Result(0, "a", 1)))
+    sized = Submit((WorkItem("d", "train", 1), WorkItem("e", "train", 9)))
+    state, commands = play(state, (16.0, sized), (18.0, Tick()))
+    assert (commands, sorted(state.up[worker].pace for worker in state.up)) == ([], [IN_TIME, LATE, LATE])
+    assert play(state, (19.0, Result(2, "e", 1)), (19.0, Tick()))[1] == [Assign(2, "d", 1, copy=True)]
     state, _ = play(experienced(), (10.0, items("ab")), (11.0, Result(1, "b", 1)), (12.0, Tick()))
     state, _ = play(state, (13.0, Result(1, "a", 1)), (15.0, Result(0, "a", 1)))
-    assert play(state, (16.0, items("c")))[1] == [Assign(1, "c", 1)]
     state, commands = play(state, (16.0, items("c")), (18.0, Tick()))
-    assert (commands, [state.up[worker].in_time for worker in (0, 1)]) == ([], [False, False])
+    assert commands == [Assign(0, "c", 1, copy=True)], "now both are slow"
 
 
 def test_a_worker_that_must_compile_does_not_hold_up_the_others():
@@ -133,7 +138,7 @@ def test_only_a_tick_notes_that_a_worker_is_late():
     state, _ = play(experienced(), (10.0, items("ab")))
     state, commands = play(state, (50.0, Result(0, "a", 1)), (50.0, Result(1, "b", 1)))
     assert commands == [Deliver("b")]
-    assert all(state.up[worker].in_time for worker in state.up)
+    assert [worker for (worker,) in state.in_time] == [0, 1]
 
 
 @pytest.mark.parametrize("loss", [WorkerLost(1, "killed"), Failure(1, "a", 1, "no")])
