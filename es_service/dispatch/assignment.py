@@ -15,6 +15,9 @@ from es_service.dispatch.events import Assign, Command
 from es_service.dispatch.scheduler_changes import put_worker, take_item
 from es_service.dispatch.scheduler_state import SchedulerState, Slot, Waiting, Worker, usual_chunk_s
 
+RECENT_DURATIONS = 31
+"""Number of durations per kind of work item from which the running median is computed."""
+
 
 def assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
     """Assign queued items to workers that can take more, idle workers first; this changes the containers of `s`."""
@@ -48,6 +51,11 @@ def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worke
     usual_item_s = math.inf if usual_s is None else item.size * usual_s
     late_s = now + max(limits.late_factor * usual_item_s, usual_item_s + limits.late_s)
     return worker._replace(started_s=now, deadline_s=now + limit_s, limit=limit, late_s=late_s)
+
+
+def add_duration(s: SchedulerState, kind: str, chunk_s: float) -> None:
+    """Remember how long a chunk of a kind took, in seconds, and forget the oldest duration if there are many."""
+    s.durations_s[kind] = (*s.durations_s.get(kind, ()), chunk_s)[-RECENT_DURATIONS:]
 
 
 def _next_for(s: SchedulerState, worker: int) -> Waiting | None:

@@ -34,7 +34,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable
 
-from es_service.dispatch.assignment import assign, begin_first_slot
+from es_service.dispatch.assignment import add_duration, assign, begin_first_slot
 from es_service.dispatch.cheap_copies import Sorted, Table
 from es_service.dispatch.events import (
     Command,
@@ -53,14 +53,7 @@ from es_service.dispatch.events import (
     WorkerLost,
     WorkerUp,
 )
-from es_service.dispatch.scheduler_changes import (
-    add_duration,
-    append_items,
-    drop_item,
-    pop_worker,
-    put_worker,
-    return_item,
-)
+from es_service.dispatch.scheduler_changes import append_items, drop_item, pop_worker, put_worker, return_item
 from es_service.dispatch.scheduler_state import (
     IN_TIME,
     LATE,

@@ -13,9 +13,6 @@ from es_service.dispatch.cheap_copies import Table
 from es_service.dispatch.events import WorkItem
 from es_service.dispatch.scheduler_state import IN_TIME, SchedulerState, Waiting, Worker, next_time
 
-RECENT_DURATIONS = 31
-"""Number of durations per kind of work item from which the running median is computed."""
-
 
 def put_worker(s: SchedulerState, group: Table[int, Worker], worker: int, record: Worker) -> None:
     """Store a worker in one of the three groups of `s`; `deadlines`, `free`, `in_time` and `late` change with it."""
@@ -113,11 +110,6 @@ def drop_item(s: SchedulerState, item_id: Hashable) -> bool:
 def _leave_queue(s: SchedulerState, waiting: Waiting) -> None:
     if waiting.place is not None:
         s.places.remove((waiting.place, waiting.item.id))
-
-
-def add_duration(s: SchedulerState, kind: str, chunk_s: float) -> None:
-    """Remember how long a chunk of a kind took, in seconds, and forget the oldest duration if there are many."""
-    s.durations_s[kind] = (*s.durations_s.get(kind, ()), chunk_s)[-RECENT_DURATIONS:]
 
 
 def _update_late(s: SchedulerState, item_id: Hashable) -> None:
