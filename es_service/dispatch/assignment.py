@@ -49,7 +49,7 @@ def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worke
     if compiles and limit_s < limits.first_deadline_s:
         limit, limit_s = "first_deadline_s", limits.first_deadline_s
     usual_item_s = math.inf if usual_s is None else item.size * usual_s
-    late_s = now + max(limits.late_factor * usual_item_s, usual_item_s + limits.late_s)
+    late_s = now + max(limits.late_factor * usual_item_s, usual_item_s + limits.late_by_s)
     return worker._replace(started_s=now, deadline_s=now + limit_s, limit=limit, late_s=late_s)
 
 

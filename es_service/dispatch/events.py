@@ -42,7 +42,7 @@ class Limits:
     late_factor: float = 2.0
     """A worker is late when its item has taken late_factor x size x median of recent durations of its kind. At the end
     of a phase, its items are then sent to an idle worker too; with infinity, no item ever is."""
-    late_s: float = 0.03
+    late_by_s: float = 0.03
     """Least time by which a late item exceeds its usual duration, since a copy of a very short item saves nothing."""
     min_deadline_s: float = 30.0
     """Lower bound of the limit for later items."""
@@ -132,7 +132,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Tick:
-    """Time has passed, so deadlines are checked."""
+    """Time has passed and no message waits, so deadlines are checked, and late items are sent a second time."""
 
     silent: tuple[int, ...] = ()
     """Workers that have no place yet, and workers that may have been gone before they received their work item. If one

@@ -60,7 +60,7 @@ class World:
             min_deadline_s=2.0,
             deadline_factor=4.0,
             late_factor=r.choice((1.2, 2.0, math.inf)),
-            late_s=r.choice((0.0, 0.3)),
+            late_by_s=r.choice((0.0, 0.3)),
             max_failures_in_a_row=r.randint(1, 3),
             restart_backoff_s=0.5,
             max_backoff_s=r.choice((4.0, 20.0)),

@@ -36,7 +36,7 @@ from tests.es_service.scheduler_play import check_consistency, items, play, read
 from tests.es_service.test_engine import Scripted
 from tests.helpers import centre, random_parameters
 
-LIMITS = {"late_factor": 2.0, "late_s": 0.0}
+LIMITS = {"late_factor": 2.0, "late_by_s": 0.0}
 
 
 def experienced(workers: int = 2, **changes: object) -> SchedulerState:
@@ -78,7 +78,7 @@ def test_no_item_has_a_third_copy():
 def test_items_in_the_queue_come_before_copies_and_late_is_late_by_much():
     state, _ = play(experienced(in_flight=1), (10.0, items("abc")), (12.0, Tick()))
     assert play(state, (12.5, Result(1, "b", 1)))[1] == [Deliver("b"), Assign(1, "c", 1)]
-    state, _ = play(experienced(late_s=1.5), (10.0, items("ab")), (11.0, Result(1, "b", 1)))
+    state, _ = play(experienced(late_by_s=1.5), (10.0, items("ab")), (11.0, Result(1, "b", 1)))
     assert next_deadline(state) == 10.0 + 1.0 + 1.5
     sized = Submit((WorkItem("a", "train", 4), WorkItem("b", "train", 1)))
     state, _ = play(experienced(), (10.0, sized), (11.0, Result(1, "b", 1)))
@@ -252,7 +252,7 @@ def test_sums_over_neighbouring_blocks_are_counted_once_whichever_copy_answers_f
     monkeypatch.setattr(engine_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
     weights = np.zeros(1, np.float32)
     limits = Limits(
-        rng.randint(2, 6), cores=rng.choice((1, 4)), item_s=0.004, late_s=0.002, max_attempts=20, min_deadline_s=2.0
+        rng.randint(2, 6), cores=rng.choice((1, 4)), item_s=0.004, late_by_s=0.002, max_attempts=20, min_deadline_s=2.0
     )
     with Engine(transport, limits) as engine:
         for generation in range(6):
