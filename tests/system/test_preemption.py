@@ -10,7 +10,7 @@ import yaml
 from tests.system import cluster
 from tests.system.cluster import Cluster
 from tests.system.processes import wait_for
-from tests.system.test_cluster import CONFIG, entries, repeated_episodes, stop_a_little_later
+from tests.system.test_cluster import CONFIG, entries, episodes_begun_again, stop_a_little_later
 
 pytestmark = [pytest.mark.long, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
 
@@ -33,7 +33,7 @@ def test_a_node_that_is_told_to_stop_hands_its_work_over(tmp_path):
         stop_a_little_later(hosts, driver, run)
     assert {entry["reason"] for entry in entries(run, "StopWorker", since)} == {"drained"}
     assert not entries(run, "WorkerLost", since)
-    assert repeated_episodes(run, since) == 0
+    assert episodes_begun_again(run, since)[0] == 0
     assert seconds < 25.0, "it was idle and ended by itself; Ray's limit is 30 s"
 
 
