@@ -14,7 +14,6 @@ import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -22,9 +21,10 @@ from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
+from es_service.dispatch.ray_calls import Call, Calls
 from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_faults import error_text, fault_reason
-from es_service.dispatch.ray_nodes import Claim, Growth, emptiest, layout, shortage
+from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage
 from es_service.protocol.messages import Centre, Work, WorkerPlace, WorkerSpec, forget_oldest
 
 IN_CALL_BYTES = 64 * 2**10
@@ -73,17 +73,6 @@ def ray_engine(
         raise
 
 
-@dataclass(frozen=True)
-class _Call:
-    """A call of an actor that has not been answered yet."""
-
-    worker: int
-    what: str
-    """Method that was called: place, build or run."""
-    item_id: Hashable = None
-    attempt: int = 0
-
-
 class Actors:
     """Transport whose workers are Ray actors."""
 
@@ -106,21 +95,19 @@ class Actors:
         """
         self._ray = ray
         self._spec, self._claim = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim
-        self._class = ray.remote(
-            num_cpus=claim.cpus,
-            num_gpus=claim.gpus,
-            max_restarts=0,
-            max_task_retries=0,
-        )(actor)
+        options = {"num_cpus": claim.cpus, "num_gpus": claim.gpus, "max_restarts": 0, "max_task_retries": 0}
+        self._class = ray.remote(**options)(actor)
         self._watch, self._growth, self._wanted = watch, growth, workers
         self._handles: dict[int, Any] = {}
-        self._calls: dict[Any, _Call] = {}
+        self._calls = Calls(ray)
         self._places: dict[int, WorkerPlace] = {}
         self._planned: dict[int, str] = {}
         """Worker id -> node, for workers that have no place yet and are to be placed on a certain node."""
         self._platforms: set[str] = set()
         self._drained: set[int] = set()
         self._has_lost = False
+        self._followed: Membership | None = None
+        """The state of the cluster that all workers are known to be in accord with."""
         self._nodes: frozenset[str] = frozenset()
         """Nodes that have been alive at some time."""
         self._to_ask: set[int] = set()
@@ -139,16 +126,15 @@ class Actors:
             at = self._class.options(scheduling_strategy=self._strategy(worker))
             handle = at.remote(self._spec, worker, self._claim.gpus, 1 if self._claim.gpus else self._claim.cpus)
             self._handles[worker] = handle
-            self._calls[handle.place.remote()] = _Call(worker, "place")
-            self._calls[handle.build.remote()] = _Call(worker, "build")
+            self._calls[handle.place.remote()] = Call(worker, "place")
+            self._calls[handle.build.remote()] = Call(worker, "build")
         except self._ray.exceptions.RayError as error:
             self._lose(worker, f"cannot be started: {error}")
 
     def kill(self, worker: int) -> str:
         """Kill an actor and ignore its unanswered calls. Returns "", since its output is in Ray's logs on its node."""
         self._has_lost = True
-        for ref in [ref for ref, call in self._calls.items() if call.worker == worker]:
-            del self._calls[ref]
+        self._calls.forget(worker)
         self._places.pop(worker, None)
         self._planned.pop(worker, None)
         handle = self._handles.pop(worker, None)
@@ -175,12 +161,12 @@ class Actors:
             chunks = pickle.dumps([(index[id(centre)], chunk) for centre, chunk in work], pickle.HIGHEST_PROTOCOL)
             if worker in self._to_ask:
                 self._to_ask.discard(worker)
-                self._calls[self._handles[worker].place.remote()] = _Call(worker, "place")
+                self._calls[self._handles[worker].place.remote()] = Call(worker, "place")
             ref = self._handles[worker].run.remote(chunks, *centres.values())
         except self._ray.exceptions.RayError as error:
             self._lose(worker, fault_reason(error))
             return
-        self._calls[ref] = _Call(worker, "run", item_id, attempt)
+        self._calls[ref] = Call(worker, "run", item_id, attempt)
 
     def platforms(self) -> frozenset[str]:
         """`machine.platform_text` of each kind of actor that has come up."""
@@ -188,7 +174,7 @@ class Actors:
 
     def silent(self) -> tuple[int, ...]:
         """Workers that have not answered the call for their place."""
-        return tuple(worker for worker, what in self._owed_first().items() if what == "place")
+        return tuple(worker for worker, what in self._calls.owed_first().items() if what == "place")
 
     def shortage(self) -> str:
         """What a worker needs and the cluster has; this waits for the head node."""
@@ -204,11 +190,9 @@ class Actors:
             time.sleep(timeout_s)
             return None
         while self._calls:
-            # Oldest first, so that the answers of one worker stay in order.
-            ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=timeout_s)
-            if not ready:
+            if (ref := self._calls.answered(timeout_s)) is None:
                 break
-            if (message := self._message(ready[0])) is not None:
+            if (message := self._message(ref)) is not None:
                 return message
             timeout_s = 0.0  # a worker confirmed its place; another answer may be waiting, so do not return None
         return None
@@ -221,7 +205,6 @@ class Actors:
         forget = self._watch is None and bool(self._places) and not self._has_lost
         for worker in list(self._handles):
             self.kill(worker)
-        self._calls.clear()
         self._centres.clear()
         disconnect(self._ray, forget=forget)
 
@@ -255,12 +238,16 @@ class Actors:
         is_known = call.worker in self._places  # then it was asked again, to find out whether it is alive
         self._places[call.worker] = WorkerPlace(*value)
         self._planned.pop(call.worker, None)
+        self._followed = None
         return None if is_known else Placed(call.worker)
 
     def _follow(self, watch: Watch) -> None:
         """Report changes of the cluster. Drained and lost workers come before a smaller number of workers, which would
         otherwise drain others. Ray itself reports the end of an idle actor only when it is called."""
         now = watch.latest()
+        if now is self._followed:
+            return
+        self._followed = now
         for worker, place in self._places.items():
             if place.node in now.leaving and worker not in self._drained:
                 self._drained.add(worker)
@@ -284,17 +271,10 @@ class Actors:
         affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
         return affinity(node, soft=True, _spill_on_unavailable=True)
 
-    def _owed_first(self) -> dict[int, str]:
-        """Worker id -> method of its first unanswered call: place, build or run."""
-        first: dict[int, str] = {}
-        for call in self._calls.values():
-            first.setdefault(call.worker, call.what)
-        return first
-
     def _lose(self, worker: int, reason: str) -> None:
         self._inbox.append(self._lost(worker, reason))
 
     def _lost(self, worker: int, reason: str) -> WorkerLost:
-        has_begun = self._owed_first().get(worker) == "run"
+        has_begun = self._calls.owed_first().get(worker) == "run"
         self.kill(worker)
         return WorkerLost(worker, reason, bystander=not has_begun)
