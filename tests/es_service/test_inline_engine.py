@@ -68,12 +68,12 @@ class Receiver:
 
     def item(self) -> list[tuple[float, int]]:
         """(first parameter of the centre, id) of each chunk of the next work item."""
-        while (said := receive(self.end))[0] == "centre":
+        while (said := receive(self.end))[0] == "subject":
             _, number, point = said
             self.centres[number] = point
             self.received += 1
         found = [(float(self.centres[number].parameters_D[0]), chunk.chunk_id) for number, chunk in said[3]]
-        forget_oldest(self.centres)
+        forget_oldest(self.centres, lambda point: point.nbytes)
         return found
 
 
