@@ -51,12 +51,16 @@ def _wrong_policies(ask: PolicyAsk, size: int, observation_size: int) -> str:
         return f"the parameters of the policies {problem}"
     if not np.isfinite(ask.parameters_N_D).all():
         return "the parameters of the policies are not all finite"
-    mean, std = ask.observation_mean_N_O, ask.observation_std_N_O
-    if mean is None and std is None:
+    statistics = {"mean": ask.observation_mean_N_O, "standard deviation": ask.observation_std_N_O}
+    if all(given is None for given in statistics.values()):
         return ""
-    for name, given in (("mean", mean), ("standard deviation", std)):
+    for name, given in statistics.items():
         if problem := _not_floats(given, (count, observation_size)):
             return f"the observation {name} of the policies {problem}; or both statistics are None"
+        assert given is not None
+        if not np.isfinite(given).all() or (name != "mean" and not (given > 0.0).all()):
+            must = "finite" if name == "mean" else "finite and positive"
+            return f"the observation {name} of the policies must be {must}"
     return ""
 
 
