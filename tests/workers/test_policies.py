@@ -133,18 +133,18 @@ def test_policies_of_one_kind_in_any_order_of_chunks_give_the_same_bits(evaluato
 
 
 def test_each_part_of_an_address_gives_other_resets_and_none_is_that_of_a_centre(evaluator):
-    """Policies are all the same, without statistics, so that only resets differ."""
-    first = np.repeat(POLICIES[:1], 4, axis=0)
+    """Policies are all the same, without statistics, so that only resets differ; they are more than travel together."""
+    first = np.repeat(POLICIES[:1], POLICY_SLOTS + 4, axis=0)
 
     def returns(**address: int) -> list[float]:
-        asked = policy_work(first, no_statistics(4, 2), 4, **{"seed": 3, "generation": 1, **address})
+        asked = policy_work(first, no_statistics(len(first), 2), 4, **{"seed": 3, "generation": 1, **address})
         return policy_episodes(asked, evaluator.evaluate(asked.work)).returns.ravel().tolist()
 
     found = [*returns(), *returns(seed=4), *returns(generation=2), *returns(ask=1)]
     centres = [(centre(first[0]), EvaluationChunk(1, 0, ask)) for ask in range(5)]
     found += [value for result in evaluator.evaluate(centres) for value in result.returns.tolist()]
     assert len(set(found)) == len(found)
-    assert returns() == found[:16]
+    assert returns() == found[: 4 * len(first)]
 
 
 def test_several_generations_seeds_and_asks_in_one_work_item_are_kept_apart(evaluator):
