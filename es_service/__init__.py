@@ -8,11 +8,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from es_service.api import fork, load_config, open_run, resume, run
+    from es_service.api import evaluator, fork, load_config, open_run, resume, run
 
     __version__: str
 
-__all__ = ["__version__", "fork", "load_config", "open_run", "resume", "run"]
+__all__ = ["__version__", "evaluator", "fork", "load_config", "open_run", "resume", "run"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""The Python interface: start, resume and fork runs."""
+"""The Python interface: start, resume and fork runs, and evaluate policies of your own."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from es_service.loop.budget import REACHED, limits_of, raised
 from es_service.loop.history import evaluated_columns, history_columns
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.checked_config import changed_config, load_config
+from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.lineage import fork_config, forked, started
 from es_service.runs.session import OnGeneration, OnNotice, Outcome, work
 from es_service.runs.standing import Standing, look

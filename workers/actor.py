@@ -55,14 +55,14 @@ class WorkerActor:
 
         return platform_text(platform_info() | {"device": jax.devices()[0].device_kind})
 
-    def run(self, chunks: bytes, *centres: bytes) -> bytes:
+    def run(self, chunks: bytes, *subjects: bytes) -> bytes:
         """Run chunks; returns the pickled results.
 
         Args:
-            chunks: pickled [(index of its centre in `centres`, Chunk)].
-            centres: each one pickled.
+            chunks: pickled [(index of its subject in `subjects`, Chunk)].
+            subjects: each one pickled.
         """
         assert self._run_chunks is not None, "run was called before build"
-        known = [pickle.loads(centre) for centre in centres]
+        known = [pickle.loads(subject) for subject in subjects]
         work = [(known[index], chunk) for index, chunk in pickle.loads(chunks)]
         return pickle.dumps(self._run_chunks(work), pickle.HIGHEST_PROTOCOL)

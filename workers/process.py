@@ -14,9 +14,10 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
+from operator import attrgetter
 from typing import Any
 
-from es_service.protocol.messages import Centre, forget_oldest
+from es_service.protocol.messages import Subject, forget_oldest
 from es_service.protocol.wire import framed, receive
 from workers.xla_cache import xla_cache_settings
 
@@ -28,8 +29,8 @@ def main(descriptor: int, parent: int) -> None:
     """Serve workers until the parent closes its end of the socket `descriptor`.
 
     The parent sends over this socket the WorkerSpec, and then for each worker one byte with the descriptor of the
-    worker's socket. A worker receives ("centre", number, Centre) and ("chunks", item, attempt, [(number, Chunk)]);
-    `item` names their work item, and `number` the centre of each. It sends ("broken", text), or
+    worker's socket. A worker receives ("subject", number, Subject) and ("chunks", item, attempt, [(number, Chunk)]);
+    `item` names their work item, and `number` the subject of each. It sends ("broken", text), or
     ("up",) and then for each work item ("results", item, attempt, [ChunkResult]) or ("failure", item, attempt, text).
     """
     end_with(parent)
@@ -92,19 +93,19 @@ def _serve(parent: socket.socket, run_chunks: Callable[..., Any] | str) -> None:
         parent.sendall(framed(("broken", run_chunks)))
         return
     parent.sendall(framed(("up",)))
-    centres: dict[int, Centre] = {}
+    subjects: dict[int, Subject] = {}
     while True:
         match receive(parent):
-            case ("centre", number, centre):
-                centres[number] = centre
+            case ("subject", number, subject):
+                subjects[number] = subject
             case ("chunks", item, attempt, chunks):
                 try:
-                    work = [(centres[number], chunk) for number, chunk in chunks]
+                    work = [(subjects[number], chunk) for number, chunk in chunks]
                     answer = ("results", item, attempt, run_chunks(work))
                 except BaseException:  # also sys.exit in an environment
                     answer = ("failure", item, attempt, traceback.format_exc())
                 parent.sendall(framed(answer))
-                forget_oldest(centres)
+                forget_oldest(subjects, attrgetter("nbytes"))
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from jax import lax
 
 from es_service.protocol.messages import SIGNS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
+from es_service.protocol.policies import POLICY_SLOTS
 from workers.environments import Environment
 from workers.episode import Carry, Episodes, episode_steps
 from workers.policy import act, split_layers
@@ -66,6 +67,26 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Calla
     return jax.jit(_make_episodes(environment, spec, training=False))
 
 
+def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
+    """Rollout of one policy chunk, with episodes of explicit policies without action noise; compiled at its first call.
+
+    Returns:
+        f(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L_4) -> Episodes with leading axis [L], for at most
+        POLICY_SLOTS lanes. The parameters are a list of arrays [N, D]; policy_L is the row of each lane among the rows
+        of all. Lanes repeat to fill the chunk, whose shape never changes.
+    """
+    episodes = jax.jit(_make_episodes(environment, spec, training=False, own_weights=True))
+
+    def rollout(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
+        lanes = len(policy_L)
+        lane_L = np.minimum(np.arange(POLICY_SLOTS), lanes - 1)
+        parameters_L_D = np.concatenate(parameters_G_N_D)[policy_L[lane_L]]
+        found = episodes(parameters_L_D, mean_L_O[lane_L], std_L_O[lane_L], reset_keys_L[lane_L])
+        return jax.tree.map(lambda x: np.asarray(x)[:lanes], found)
+
+    return rollout
+
+
 def make_gradient_sum(parameters: int) -> Callable:
     """Sum of weighted noise of one block of pairs; it is compiled at its first call.
 
@@ -103,24 +124,26 @@ def _make_member_episodes(environment: Environment, spec: WorkerSpec):
     return episodes
 
 
-def _make_episodes(environment: Environment, spec: WorkerSpec, *, training: bool):
+def _make_episodes(environment: Environment, spec: WorkerSpec, *, training: bool, own_weights: bool = False):
     """Function that runs one episode per lane.
 
     Returns:
         f(parameters, mean_O, std_O, reset_keys_L_4[, action_keys_L_4]) -> Episodes with leading axis [L]. In training,
-        every lane has its own parameters [L, D] and action noise; otherwise all lanes share parameters [D].
+        every lane has its own parameters [L, D] and action noise; otherwise all lanes share parameters [D], or with
+        `own_weights` every lane has its own parameters [L, D] and statistics [L, O].
     """
     steps = episode_steps(environment, spec, training=training)
-    policies = jax.vmap(lambda layers, x_O: act(jnp, layers, x_O), in_axes=(0 if training else None, 0))
-    looks = jax.vmap(steps.look, in_axes=(0, None, None))
-    moves = jax.vmap(steps.move, in_axes=(0, None, 0, 0))
+    by_lane, of_statistics = 0 if training or own_weights else None, 0 if own_weights else None
+    policies = jax.vmap(lambda layers, x_O: act(jnp, layers, x_O), in_axes=(by_lane, 0))
+    looks = jax.vmap(steps.look, in_axes=(0, of_statistics, of_statistics))
+    moves = jax.vmap(steps.move, in_axes=(0, of_statistics, 0, 0))
 
     def split(parameters_D):
         return split_layers(spec.policy, parameters_D)
 
     def episodes(parameters, mean_O, std_O, reset_keys_L, action_keys_L=None):
         layers = (
-            jax.vmap(split)(parameters) if training else split(parameters)
+            split(parameters) if by_lane is None else jax.vmap(split)(parameters)
         )  # inside the loop this would copy them in every step
         keys_L = reset_keys_L if action_keys_L is None else action_keys_L
 

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from es_service.cli.commands import assignments, error_message
-from es_service.config.compute import ENGINE_IMPLIES
+from es_service.config.compute import implied_by
 from es_service.errors import ConfigError, ServiceError
 from es_service.logs import FORMAT
 
@@ -73,13 +73,9 @@ def overrides(
     The implied keys replace the cluster settings of the config file or of the resumed run. A `--set` that contradicts
     them stays in force, so that the checks of the config refuse the combination.
     """
-    if address is not None:  # only a Ray cluster can be joined
-        implied = ENGINE_IMPLIES["ray"] | ({} if engine else {"compute.engine": "ray"})
-    else:
-        implied = ENGINE_IMPLIES.get(engine or "", {})
     named = {"seed": seed, "compute.workers": workers, "compute.engine": engine, "compute.address": address}
     options = {key: value for key, value in named.items() if value is not None}
-    return [*assignments(implied), *(set_ or []), *assignments(options)]
+    return [*assignments(implied_by(engine, address)), *(set_ or []), *assignments(options)]
 
 
 def print_note(message: str, style: str | None = None) -> None:

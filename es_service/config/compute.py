@@ -101,3 +101,10 @@ ENGINE_IMPLIES: dict[str, dict[str, Any]] = {
     "ray": {"compute.inline_workers": "processes"},
 }
 """Engine -> settings that only the other engine uses, with the values that they must have with this one."""
+
+
+def implied_by(engine: str | None, address: str | None) -> dict[str, Any]:
+    """Settings that a choice of the engine or of a cluster's address implies; None: no choice."""
+    if address is None:
+        return ENGINE_IMPLIES.get(engine or "", {})
+    return ENGINE_IMPLIES["ray"] | ({} if engine else {"compute.engine": "ray"})  # only a Ray cluster can be joined

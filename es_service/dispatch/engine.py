@@ -190,7 +190,7 @@ class Engine(Generic[AnyTransport]):
             self._serve()
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
-        """Results of chunks, all of one kind, in the order of `work`.
+        """Results of chunks in the order of `work`; a work item has neighbouring chunks of one kind.
 
         They do not depend on the number of workers or on faults. After an exception, only `close` may be called.
 
@@ -225,16 +225,16 @@ class Engine(Generic[AnyTransport]):
 
         Their sizes depend on measured durations, but results do not.
         """
-        if not work:
-            return []
-        kind, limits = type(work[0][1]).__name__, self._state.limits
+        state, limits, parts, first = self._state, self._state.limits, [], 0
         # Workers that wait for a place may wait for long, and items for them would be needlessly small.
-        workers = workers_with_place(self._state) or self._state.wanted
-        sizes = item_sizes(len(work), workers, usual_chunk_s(self._state, kind), limits.item_s, limits.cores)
-        ends = list(itertools.accumulate(sizes))
-        firsts = [end - size for end, size in zip(ends, sizes, strict=True)]
-        parts = [work[first:end] for first, end in zip(firsts, ends, strict=True)]
-        return [(self._item_id(first, kind, part), part) for first, part in zip(firsts, parts, strict=True)]
+        workers = workers_with_place(state) or state.wanted
+        for kind, chunks in itertools.groupby(type(chunk).__name__ for _, chunk in work):
+            count, chunk_s = len(list(chunks)), usual_chunk_s(state, kind)
+            for size in item_sizes(count, workers, chunk_s, limits.item_s, limits.cores):
+                part = work[first : first + size]
+                parts.append((self._item_id(first, kind, part), part))
+                first += size
+        return parts
 
     def _item_id(self, first: int, kind: str, part: Sequence[Work]) -> WorkItemId:
         chunk = part[0][1]

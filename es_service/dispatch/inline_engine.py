@@ -25,7 +25,7 @@ from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
-from es_service.protocol.messages import Centre, Work, WorkerSpec, forget_oldest
+from es_service.protocol.messages import Subject, Work, WorkerSpec, forget_oldest
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.wire import BUFFER_BYTES, Channel, framed
 
@@ -73,8 +73,8 @@ class _Worker:
 
     child: _Child
     channel: Channel
-    centres: dict[int, None] = field(default_factory=dict)
-    """Numbers of the centres that it has, in the order in which they were sent."""
+    subjects: dict[int, int] = field(default_factory=dict)
+    """Numbers of the subjects that it has, in the order in which they were sent, and their bytes."""
     unanswered: int = 0
     """Number of work items that it was sent and has not answered."""
 
@@ -88,9 +88,9 @@ class ChildProcesses:
         self._by_descriptor: dict[int, int] = {}
         self._poll = select.poll()
         self._ready: deque[Message] = deque()
-        self._centres: dict[int, tuple[Centre, int, bytes]] = {}
-        """By `id`, which the centre in the entry keeps from being reused."""
-        self._next_centre = 0
+        self._subjects: dict[int, tuple[Subject, int, bytes]] = {}
+        """By `id`, which the subject in the entry keeps from being reused."""
+        self._next_subject = 0
 
     def process_ids(self) -> dict[int, int]:
         """Worker id -> process id, for the workers that are not known to be lost; for diagnosis and tests."""
@@ -123,18 +123,18 @@ class ChildProcesses:
         return self._lose(child, f"worker {worker}, a thread of the same process, was killed", bystanders=True)
 
     def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
-        """Send the chunks, after those of their centres that the worker does not have."""
+        """Send the chunks, after those of their subjects that the worker does not have."""
         to = self._workers.get(worker)
         if to is None:
             return  # lost with another thread of its child, which `receive` is going to report
         frames, numbered = [], []
-        for centre, chunk in work:
-            number, frame = self._framed_centre(centre)
-            if number not in to.centres:
-                to.centres[number] = None
+        for subject, chunk in work:
+            number, frame = self._framed_subject(subject)
+            if number not in to.subjects:
+                to.subjects[number] = subject.nbytes
                 frames.append(frame)
             numbered.append((number, chunk))
-        forget_oldest(to.centres)
+        forget_oldest(to.subjects, int)
         to.unanswered += 1
         to.channel.send(*frames, framed(("chunks", item_id, attempt, numbered)))
         self._watch(to.channel)
@@ -173,13 +173,13 @@ class ChildProcesses:
         for worker in list(self._workers):
             self.kill(worker)
 
-    def _framed_centre(self, centre: Centre) -> tuple[int, bytes]:
-        """Number and message of a centre. A centre that was forgotten meanwhile gets another number."""
-        if (known := self._centres.get(id(centre))) is None:
-            frame = framed(("centre", self._next_centre, centre))
-            known = self._centres[id(centre)] = centre, self._next_centre, frame
-            self._next_centre += 1
-            forget_oldest(self._centres)
+    def _framed_subject(self, subject: Subject) -> tuple[int, bytes]:
+        """Number and message of a subject. One that was forgotten meanwhile gets another number."""
+        if (known := self._subjects.get(id(subject))) is None:
+            frame = framed(("subject", self._next_subject, subject))
+            known = self._subjects[id(subject)] = subject, self._next_subject, frame
+            self._next_subject += 1
+            forget_oldest(self._subjects, lambda entry: entry[0].nbytes)
         return known[1:]
 
     def _add(self, number: int, child: _Child, ours: socket.socket) -> None:

@@ -3,7 +3,7 @@
 Ray starts processes and moves messages. The scheduler decides on retries, deadlines and replacements: Ray never
 restarts actors and never repeats calls, so each fault is reported here exactly once.
 
-Each message is pickled here into one `bytes`, so that Ray moves a single small object, and a centre that fits into a
+Each message is pickled here into one `bytes`, so that Ray moves a single small object, and a subject that fits into a
 call needs no shared memory. Together this halves the time that Ray adds to a generation of short chunks.
 """
 
@@ -25,10 +25,10 @@ from es_service.dispatch.ray_calls import Call, Calls
 from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_faults import error_text, fault_reason
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage
-from es_service.protocol.messages import Centre, Work, WorkerPlace, WorkerSpec, forget_oldest
+from es_service.protocol.messages import Subject, Work, WorkerPlace, WorkerSpec, forget_oldest
 
 IN_CALL_BYTES = 64 * 2**10
-"""Largest size in bytes of a centre that is sent with every call; a larger one is stored, and fetched once per node."""
+"""Largest size in bytes of a subject sent with every call; a larger one is stored, and fetched once per node."""
 
 
 def ray_engine(
@@ -113,8 +113,8 @@ class Actors:
         self._to_ask: set[int] = set()
         """Workers that must be asked for their place again before the next chunks, because another worker was lost."""
         self._inbox: deque[Message] = deque()
-        self._centres: dict[int, tuple[Centre, Any]] = {}
-        """By `id`, which the centre in the entry keeps from being reused."""
+        self._subjects: dict[int, tuple[Subject, Any]] = {}
+        """By `id`, which the subject in the entry keeps from being reused."""
 
     def places(self) -> dict[int, WorkerPlace]:
         """Worker id -> place, for the workers that have one."""
@@ -145,7 +145,7 @@ class Actors:
         return ""
 
     def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
-        """Call the actor. A large centre is stored once for all calls that share it.
+        """Call the actor. A large subject is stored once for all calls that share it.
 
         The loss of an idle actor shows only when it is called. So after a loss, perhaps of a node, each other actor is
         asked for its place before its next chunks, which are charged with its loss only if it has answered that call.
@@ -153,16 +153,16 @@ class Actors:
         if worker not in self._handles:
             return  # it has just been lost when it was sent other chunks, which `receive` is going to report
         try:
-            centres: dict[int, Any] = {}
-            for centre, _ in work:
-                if id(centre) not in centres:
-                    centres[id(centre)] = self._packed(centre)
-            index = {key: number for number, key in enumerate(centres)}
-            chunks = pickle.dumps([(index[id(centre)], chunk) for centre, chunk in work], pickle.HIGHEST_PROTOCOL)
+            subjects: dict[int, Any] = {}
+            for subject, _ in work:
+                if id(subject) not in subjects:
+                    subjects[id(subject)] = self._packed(subject)
+            index = {key: number for number, key in enumerate(subjects)}
+            chunks = pickle.dumps([(index[id(subject)], chunk) for subject, chunk in work], pickle.HIGHEST_PROTOCOL)
             if worker in self._to_ask:
                 self._to_ask.discard(worker)
                 self._calls[self._handles[worker].place.remote()] = Call(worker, "place")
-            ref = self._handles[worker].run.remote(chunks, *centres.values())
+            ref = self._handles[worker].run.remote(chunks, *subjects.values())
         except self._ray.exceptions.RayError as error:
             self._lose(worker, fault_reason(error))
             return
@@ -205,16 +205,16 @@ class Actors:
         forget = self._watch is None and bool(self._places) and not self._has_lost
         for worker in list(self._handles):
             self.kill(worker)
-        self._centres.clear()
+        self._subjects.clear()
         disconnect(self._ray, forget=forget)
 
-    def _packed(self, centre: Centre) -> Any:
-        """The centre as an argument of a call: pickled, or the reference under which Ray has stored that."""
-        if (known := self._centres.get(id(centre))) is None:
-            pickled = pickle.dumps(centre, pickle.HIGHEST_PROTOCOL)
-            known = centre, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
-            self._centres[id(centre)] = known
-            forget_oldest(self._centres)
+    def _packed(self, subject: Subject) -> Any:
+        """The subject as an argument of a call: pickled, or the reference under which Ray has stored that."""
+        if (known := self._subjects.get(id(subject))) is None:
+            pickled = pickle.dumps(subject, pickle.HIGHEST_PROTOCOL)
+            known = subject, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
+            self._subjects[id(subject)] = known
+            forget_oldest(self._subjects, lambda entry: entry[0].nbytes)
         return known[1]
 
     def _message(self, ref: Any) -> Message | None:

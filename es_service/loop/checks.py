@@ -11,34 +11,65 @@ from numpy.typing import NDArray
 
 from es_service.errors import EvaluationError, WayOut
 from es_service.protocol.messages import Centre, EpisodesResult
-from es_service.search.algorithms.base import Ask, SearchState
+from es_service.search.algorithms.base import Ask, PolicyAsk, SearchState
 
 
-def require_asks(asks: object, state: SearchState, chunk_pairs: int, generation: int) -> None:
+def require_asks(asks: object, state: SearchState, chunk_pairs: int, observation_size: int, generation: int) -> None:
     """Raise an EvaluationError if what a search asks for, a user's perhaps, cannot be evaluated."""
 
     def wrong() -> str:
-        if not isinstance(asks, tuple) or not asks or not all(isinstance(ask, Ask) for ask in asks):
+        if not isinstance(asks, tuple) or not asks or not all(isinstance(ask, Ask | PolicyAsk) for ask in asks):
             kinds = f" of {', '.join(type(ask).__name__ for ask in asks)}" if isinstance(asks, tuple) and asks else ""
             returned = "an empty tuple" if asks == () else type(asks).__name__ + kinds
-            return f"`ask` returned {returned}; it must return a tuple of one or more Ask"
-        indices = [ask.centre for ask in asks]
+            return f"`ask` returned {returned}; it must return a tuple of one or more Ask or PolicyAsk"
+        indices = [ask.centre for ask in asks if isinstance(ask, Ask)]
         known = all(isinstance(index, int | np.integer) and 0 <= index < len(state.centres) for index in indices)
         if not known or len(set(indices)) < len(indices):
             return f"the asks are for the centres {indices}; each of the {len(state.centres)} may occur once"
+        size = state.centres[0].centre_D.size
         for ask in asks:
+            if isinstance(ask, PolicyAsk):
+                if problem := _wrong_policies(ask, size, observation_size):
+                    return problem
+                continue
             if not (isinstance(ask.sigma, int | float | np.floating) and 0.0 < ask.sigma < math.inf):
                 return f"the sigma of centre {ask.centre} is {ask.sigma}; it must be positive"
             if not isinstance(ask.pairs, int | np.integer) or ask.pairs < 1 or ask.pairs % chunk_pairs:
                 return f"centre {ask.centre} has {ask.pairs} pairs; must be a multiple of chunk_pairs ({chunk_pairs})"
-            given, size = ask.centre_D, state.centres[ask.centre].centre_D.size
-            if not isinstance(given, np.ndarray) or given.dtype != np.float32 or given.shape != (size,):
-                kind = f"{given.dtype} {given.shape}" if isinstance(given, np.ndarray) else type(given).__name__
-                return f"the parameters of centre {ask.centre} are {kind}; must be a float32 array of shape ({size},)"
+            if problem := _not_floats(ask.centre_D, (size,)):
+                return f"the parameters of centre {ask.centre} {problem}"
         return ""
 
     if problem := wrong():
         raise EvaluationError(f"generation {generation}: {problem}", field="search.algorithm")
+
+
+def _wrong_policies(ask: PolicyAsk, size: int, observation_size: int) -> str:
+    """Why policies cannot be evaluated; empty if they can."""
+    count = len(ask.parameters_N_D) if isinstance(ask.parameters_N_D, np.ndarray) and ask.parameters_N_D.ndim else 1
+    if problem := _not_floats(ask.parameters_N_D, (max(1, count), size)):
+        return f"the parameters of the policies {problem}"
+    if not np.isfinite(ask.parameters_N_D).all():
+        return "the parameters of the policies are not all finite"
+    statistics = {"mean": ask.observation_mean_N_O, "standard deviation": ask.observation_std_N_O}
+    if all(given is None for given in statistics.values()):
+        return ""
+    for name, given in statistics.items():
+        if problem := _not_floats(given, (count, observation_size)):
+            return f"the observation {name} of the policies {problem}; or both statistics are None"
+        assert given is not None
+        if not np.isfinite(given).all() or (name != "mean" and not (given > 0.0).all()):
+            must = "finite" if name == "mean" else "finite and positive"
+            return f"the observation {name} of the policies must be {must}"
+    return ""
+
+
+def _not_floats(given: object, shape: tuple[int, ...]) -> str:
+    """In which way a value is no float32 array of a shape; empty if it is one."""
+    if isinstance(given, np.ndarray) and given.dtype == np.float32 and given.shape == shape:
+        return ""
+    kind = f"{given.dtype} {given.shape}" if isinstance(given, np.ndarray) else type(given).__name__
+    return f"are {kind}; must be a float32 array of shape {shape}"
 
 
 def valid_members(result: EpisodesResult) -> NDArray[np.bool_]:

@@ -17,6 +17,7 @@ from es_service.config.model import BudgetConfig
 from es_service.loop import budget as budgets
 from es_service.loop.checks import invalidate, require_asks, require_finite, require_some_finite
 from es_service.loop.clock import Clock
+from es_service.loop.evaluated import evaluated_rows, in_ask_order, policies_asked
 from es_service.loop.generation import (
     better,
     centre_evaluation,
@@ -35,16 +36,17 @@ from es_service.loop.history import (
     evaluation_columns,
     fault_columns,
     map_columns,
-    norm,
     population_columns,
     search_columns,
     step_columns,
 )
 from es_service.loop.interfaces import Search, Store, Stored
 from es_service.loop.parts import ELITE_PREFIX, elite_from_arrays, elite_part, state_from_parts, state_parts
+from es_service.loop.policies import as_population
 from es_service.loop.state import Best, RunState
 from es_service.protocol.evaluator import DispatchCounts, Evaluator
 from es_service.protocol.messages import TaskSpec
+from es_service.search.algorithms.base import Ask
 from es_service.search.algorithms.steps import first_state
 from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
 from es_service.search.maps.geometry import make_geometry, reachable_cells
@@ -165,7 +167,8 @@ def _next_generation(
 ) -> tuple[RunState, HistoryRow, list[HistoryRow]]:
     """One generation: a pure function of (search, state, elites in the store) but for its timings.
 
-    It may ask for several populations. Each phase runs all of them side by side; results are taken in ask order.
+    It may ask for several populations, and for policies. Each phase runs all of them side by side; results are taken in
+    ask order.
     """
     config, algorithm = search.config, search.algorithm
     settings, sizes = config.search, config.compute
@@ -176,16 +179,21 @@ def _next_generation(
     start_cells = algorithm.start_cells(begun, generation)
     for index, cell in start_cells.items():
         begun = algorithm.restart(begun, index, cell, elite_from_arrays(store.part(elite_part(cell))))
-    asks = algorithm.ask(begun, generation)
-    require_asks(asks, begun, sizes.chunk_pairs, generation)
+    asked = algorithm.ask(begun, generation)
+    require_asks(asked, begun, sizes.chunk_pairs, search.task.observation_size, generation)
+    asks = [ask for ask in asked if isinstance(ask, Ask)]
+    policies = policies_asked(config, search.task, generation, asked)
     centres = [
         make_centre(config, generation, ask.centre_D, state.observations, begun.centres[ask.centre], ask.sigma)
         for ask in asks
     ]
     clock.lap("seconds_driver")
-    populations, observed = evaluate_populations(evaluator, centres, [ask.pairs for ask in asks], sizes.chunk_pairs)
+    pairs = [ask.pairs for ask in asks]
+    populations, observed, found = evaluate_populations(evaluator, centres, pairs, sizes.chunk_pairs, policies)
     clock.lap("seconds_rollout")
-    populations = invalidate(populations, settings.max_invalid_fraction, generation)
+    members = [*populations, *map(as_population, found)]
+    members = invalidate(members, settings.max_invalid_fraction, generation)
+    populations = members[: len(asks)]
     weights = [algorithm.weights(begun, *told) for told in zip(asks, populations, strict=True)]
     clock.lap("seconds_driver")
     gradients = estimate_gradients(evaluator, generation, weights, sizes.gradient_block_pairs)
@@ -202,61 +210,50 @@ def _next_generation(
     clock.lap("seconds_driver")
     evaluations = evaluate_centres(evaluator, new_centres, settings.evaluation_episodes)
     clock.lap("seconds_evaluation")
-    told = tuple(
-        centre_evaluation(generation, ask.centre, evaluation, population)
-        for ask, evaluation, population in zip(asks, evaluations, populations, strict=True)
+    evaluated = in_ask_order(
+        asked,
+        zip(new_centres, evaluations, populations, strict=True),
+        zip(policies, found, strict=True),
+        generation=generation,
+        centres=len(begun.centres),
+        fitness_weight=begun.weight.value,
     )
+    told = tuple(centre_evaluation(generation, one.index, one.evaluation, one.population) for one in evaluated)
     learned = tell(algorithm, moved, told)
 
     nearest = config.novelty
     descriptors = [one.descriptor_B for one in told]
     novelties = novelty(moved.archive, descriptors, neighbours=nearest.neighbours, distance=nearest.distance).tolist()
-    rows = [
-        evaluated_row(
-            evaluation,
-            search.task,
-            learned.map,
-            generation=generation,
-            centre=ask.centre,
-            fitness_weight=ask.fitness_weight,
-            start_cell=start_cells.get(ask.centre),
-            novelty=centre_novelty,
-            update_norm=norm(new_centre.parameters_D - ask.centre_D),
-            env_steps=steps_of(population) + steps_of(evaluation),
-        )
-        for ask, population, evaluation, new_centre, centre_novelty in zip(
-            asks, populations, evaluations, new_centres, novelties, strict=True
-        )
-    ]
-    shown = fittest(told)  # the history's row is about this one
-    asked, evaluation = asks[shown], evaluations[shown]
+    rows = evaluated_rows(evaluated, search.task, learned.map, generation, start_cells, novelties)
+    at = fittest(told)
+    shown = evaluated[at]  # the history's row is about this one
     row: HistoryRow = {
-        **search_columns(asked.centre, asked.fitness_weight, novelties[shown], learned.archive.size),
+        **search_columns(shown.index, shown.fitness_weight, novelties[at], learned.archive.size),
         **map_columns(
             learned.map,
             config.map.qd_offset,
             reachable,
             generation=generation,
-            centre=asked.centre,
-            start_cell=start_cells.get(asked.centre),
+            centre=shown.index,
+            start_cell=start_cells.get(shown.index),
         ),
-        **step_columns(asked.centre_D, new_centres[shown].parameters_D),
-        **population_columns(populations),
-        **evaluation_columns(evaluation, search.task),
+        **step_columns(shown.before_D, shown.point.parameters_D),
+        **population_columns(members),
+        **evaluation_columns(shown.evaluation, search.task),
         **fault_columns(evaluator.counts, since=counts),
     }
-    members = sum(population.fitness.size for population in populations)
+    points, evaluations = [one.point for one in evaluated], [one.evaluation for one in evaluated]
     state = RunState(
         generation=generation,
         search=learned,
         observations=merge_moments(state.observations, observed),
-        best=better(state.best, new_centres, told),
-        env_steps=state.env_steps + sum(map(steps_of, populations)) + sum(map(steps_of, evaluations)),
+        best=better(state.best, points, told),
+        env_steps=state.env_steps + sum(one.env_steps for one in evaluated),
         episodes=state.episodes
-        + members * config.task.episodes_per_member
+        + sum(population.fitness.size for population in populations) * config.task.episodes_per_member
         + sum(evaluation.fitness.size for evaluation in evaluations),
         wall_clock_s=clock.total(),
-        elites=entered(learned, told, new_centres, evaluations),
+        elites=entered(learned, told, points, evaluations),
     )
     return state, row, rows
 

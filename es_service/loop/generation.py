@@ -16,6 +16,7 @@ import numpy as np
 
 from es_service.config.model import RunConfig
 from es_service.loop.checks import valid_members
+from es_service.loop.policies import PolicyWork, policy_episodes
 from es_service.loop.state import Best, statistics_in_force
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.gradient_tree import tree_sum
@@ -23,7 +24,6 @@ from es_service.protocol.messages import (
     EVALUATION_EPISODES_PER_CHUNK,
     NO_CENTRE,
     Centre,
-    Chunk,
     EpisodesResult,
     EvaluationChunk,
     FloatArray,
@@ -31,6 +31,7 @@ from es_service.protocol.messages import (
     GradientResult,
     Moments,
     TrainingChunk,
+    Work,
     around,
 )
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, CentreState, SearchState, read_only
@@ -58,21 +59,30 @@ def make_centre(
 
 
 def evaluate_populations(
-    evaluator: Evaluator, centres: Sequence[Centre], pairs: Sequence[int], chunk_pairs: int
-) -> tuple[list[EpisodesResult], list[Moments]]:
-    """Roll out each centre's number of pairs around it.
+    evaluator: Evaluator,
+    centres: Sequence[Centre],
+    pairs: Sequence[int],
+    chunk_pairs: int,
+    policies: Sequence[PolicyWork] = (),
+) -> tuple[list[EpisodesResult], list[Moments], list[EpisodesResult]]:
+    """Roll out each centre's number of pairs around it, and side by side with them policies.
 
     Returns:
-        The results of each population, with axes [P, S], and the observation moments in the order of the populations
-        and, within each, of its chunks.
+        The results of each population, with axes [P, S]; the observation moments in the order of the populations and,
+        within each, of its chunks; and the results of each ask for policies, with axes [N, E].
     """
     asked = [
-        (centre, [TrainingChunk(centre.generation, chunk_id, ask) for chunk_id in range(count // chunk_pairs)])
+        around(centre, [TrainingChunk(centre.generation, chunk_id, ask) for chunk_id in range(count // chunk_pairs)])
         for ask, (centre, count) in enumerate(zip(centres, pairs, strict=True))
     ]
-    found = _evaluate(EpisodesResult, evaluator, asked)
-    moments = [result.moments for results in found for result in results if result.moments is not None]
-    return [_concatenate(results, count) for results, count in zip(found, pairs, strict=True)], moments
+    found = _evaluate(EpisodesResult, evaluator, [*asked, *(one.work for one in policies)])
+    trained, of_policies = found[: len(asked)], found[len(asked) :]
+    moments = [result.moments for results in trained for result in results if result.moments is not None]
+    return (
+        [_concatenate(results, count) for results, count in zip(trained, pairs, strict=True)],
+        moments,
+        [policy_episodes(one, results) for one, results in zip(policies, of_policies, strict=True)],
+    )
 
 
 def evaluate_centres(
@@ -92,7 +102,7 @@ def evaluate_centres(
     asked = []
     for index, centre in enumerate(centres):
         first, ask = index * count if resets == "by_chunk" else 0, index if resets == "by_ask" else 0
-        asked.append((centre, [EvaluationChunk(centre.generation, first + i, ask) for i in range(count)]))
+        asked.append(around(centre, [EvaluationChunk(centre.generation, first + i, ask) for i in range(count)]))
     return [_concatenate(results, episodes) for results in _evaluate(EpisodesResult, evaluator, asked)]
 
 
@@ -114,22 +124,20 @@ def estimate_gradients(
             block_P = weights_P[first : first + block_pairs]
             padded_P = np.pad(block_P, (0, block_pairs - block_P.size))
             chunks.append(GradientChunk(generation, chunk_id, padded_P, ask))
-        asked.append((NO_CENTRE, chunks))
+        asked.append(around(NO_CENTRE, chunks))
     found = _evaluate(GradientResult, evaluator, asked)
     return [
         tree_sum(results) * np.float32(1.0 / weights_P.size) for results, weights_P in zip(found, weights, strict=True)
     ]
 
 
-def _evaluate(
-    kind: type[Result], evaluator: Evaluator, asked: Sequence[tuple[Centre, Sequence[Chunk]]]
-) -> list[list[Result]]:
-    """The results of each centre's chunks; all are computed side by side."""
-    results = evaluator.evaluate([work for centre, chunks in asked for work in around(centre, chunks)])
+def _evaluate(kind: type[Result], evaluator: Evaluator, asked: Sequence[Sequence[Work]]) -> list[list[Result]]:
+    """The results of each ask's chunks; all are computed side by side."""
+    results = evaluator.evaluate([one for work in asked for one in work])
     checked = [result for result in results if isinstance(result, kind)]
     assert len(checked) == len(results), f"an evaluator returned a result that is not a {kind.__name__}"
     found = iter(checked)
-    return [list(islice(found, len(chunks))) for _, chunks in asked]
+    return [list(islice(found, len(work))) for work in asked]
 
 
 @np.errstate(invalid="ignore", over="ignore")  # an infinite fitness makes the centre invalid

@@ -31,7 +31,7 @@ class Evaluator(Protocol):
         ...
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
-        """Results of chunks, all of one kind, in the order of `work`.
+        """Results of chunks in the order of `work`.
 
         Raises:
             EvaluationError: the chunks cannot be computed.

@@ -1,17 +1,20 @@
 """Messages between the driver and the workers: picklable, with NumPy arrays whose names end in their axes.
 
-Axes: D policy parameters, P antithetic pairs of one chunk, S sign [+, -], E episodes of one evaluation chunk,
-O observation, B descriptor dimensions, T points of a trace. Both sides import this module and it imports neither.
+Axes: D policy parameters, P antithetic pairs of one chunk, S sign [+, -], E episodes of one evaluation chunk, L slots
+of one policy chunk, O observation, B descriptor dimensions, T points of a trace. Both sides import this module and it
+imports neither.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from es_service.protocol.policies import Policies, PolicyChunk
 
 FloatArray = NDArray[np.float32]
 Bounds = tuple[tuple[float, float], ...]
@@ -136,6 +139,11 @@ class Centre:
     """Statistics at the start of the generation, or those of the elite with which the block started; 0 and 1 if
     normalisation is off."""
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the parameters."""
+        return self.parameters_D.nbytes
+
 
 _NOTHING = np.zeros(0, np.float32)
 NO_CENTRE = Centre(0, _NOTHING, 0.0, _NOTHING, _NOTHING)
@@ -176,16 +184,20 @@ class GradientChunk:
     """As for training."""
 
 
-Chunk = TrainingChunk | EvaluationChunk | GradientChunk
-Work = tuple[Centre, Chunk]
-"""A chunk with the centre that it belongs to."""
+Chunk = TrainingChunk | EvaluationChunk | GradientChunk | PolicyChunk
+Subject = Centre | Policies
+"""What the episodes of a chunk run: the centre of training, evaluation and gradient chunks, or policies."""
+Work = tuple[Subject, Chunk]
+"""A chunk with the subject that it belongs to."""
 KEPT_CENTRES = 64
-"""Number of centres that a worker keeps after each work item, so that they need not be sent to it again."""
+"""Most subjects that a worker keeps after each work item, so that they need not be sent to it again."""
+KEPT_BYTES = 32 * 2**20
+"""Most bytes of parameters that it keeps."""
 
 
-def around(centre: Centre, chunks: Iterable[Chunk]) -> list[Work]:
-    """The chunks, each with the same centre."""
-    return [(centre, chunk) for chunk in chunks]
+def around(subject: Subject, chunks: Iterable[Chunk]) -> list[Work]:
+    """The chunks, each with the same subject."""
+    return [(subject, chunk) for chunk in chunks]
 
 
 def chunk_name(chunk: Chunk) -> str:
@@ -194,13 +206,19 @@ def chunk_name(chunk: Chunk) -> str:
     return f"{type(chunk).__name__} {chunk.chunk_id}{population} of generation {chunk.generation}"
 
 
-def forget_oldest(centres: dict[int, Any]) -> None:
-    """Remove all but the newest KEPT_CENTRES centres, in order of insertion.
+def forget_oldest(kept: dict[int, Any], size_of: Callable[[Any], int]) -> None:
+    """Remove the oldest entries, in order of insertion, so that at most KEPT_CENTRES and KEPT_BYTES remain, or one.
 
-    A worker and its sender both do so after each work item, so that the sender knows which centres the worker has.
+    A worker and its sender both do so after each work item, so that the sender knows which subjects the worker has.
+
+    Args:
+        size_of: bytes of an entry.
     """
-    for number in list(centres)[:-KEPT_CENTRES]:
-        del centres[number]
+    total = sum(map(size_of, kept.values()))
+    for number in list(kept)[:-1]:
+        if len(kept) <= KEPT_CENTRES and total <= KEPT_BYTES:
+            return
+        total -= size_of(kept.pop(number))
 
 
 class WorkItemId(NamedTuple):
@@ -238,10 +256,10 @@ class Moments:
 
 @dataclass(frozen=True)
 class EpisodesResult:
-    """Result of a training chunk, or of an evaluation chunk.
+    """Result of a training chunk, an evaluation chunk or a policy chunk.
 
-    A training chunk's arrays have leading axes [P, S] and are over the member's episodes. An evaluation chunk's arrays
-    have the leading axis [E] and are of single episodes of the centre.
+    A training chunk's arrays have leading axes [P, S] and are over the member's episodes. The arrays of other chunks
+    are of single episodes: [E] of the centre, or [L] of the policies in a chunk's slots.
     """
 
     fitness: FloatArray
@@ -260,7 +278,7 @@ class EpisodesResult:
     the observation statistics."""
     trace_T_B: FloatArray | None = None
     """Descriptor along the first episode of an evaluation chunk, at equal time intervals from the reset to the last
-    possible step; None for training."""
+    possible step; None for training. For policies [..., T, B]: of each slot with a first episode, or None."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from es_service.config.model import RunConfig, policy_shape, worker_spec
 from es_service.config.parallel import chunks_at_once, parallel_sentence
 from es_service.config.tasks import task_of
 from es_service.dispatch.cores import cores
-from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log
+from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log, no_log
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
@@ -98,7 +98,7 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
         _naming_the_run(store.folder),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
         stop_on_signals() as should_stop,
-        _engine(config, should_stop, log, tell_wait) as engine,
+        make_engine(config, should_stop, log, tell_wait) as engine,
     ):
 
         def after_generation(row: Mapping[str, Any]) -> None:
@@ -181,11 +181,23 @@ def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
     )
 
 
-def _engine(
-    config: RunConfig, should_stop: Callable[[], int | None], log: Log, on_wait: Callable[[str], None]
+def make_engine(
+    config: RunConfig,
+    should_stop: Callable[[], int | None] = lambda: None,
+    log: Log = no_log,
+    on_wait: Callable[[str], None] = lambda shortage: None,
+    *,
+    at_once: int | None = None,
 ) -> Engine[Any]:
-    """The configured engine, whose workers are starting."""
-    spec, compute, limits = worker_spec(config, task_of(config)), config.compute, dispatch_limits(config)
+    """The configured engine, whose workers are starting.
+
+    Args:
+        should_stop, log, on_wait: as in `Engine`.
+        at_once: number of chunks that can be computed at the same time; None: as in a generation of a run.
+    """
+    spec, compute = worker_spec(config, task_of(config)), config.compute
+    at_once = chunks_at_once(config) if at_once is None else at_once
+    limits = dispatch_limits(config, at_once)
     if compute.engine == "inline":
         return inline_engine(spec, limits, should_stop, threads=compute.inline_workers == "threads", log=log)
     from es_service.dispatch.ray_engine import ray_engine
@@ -198,7 +210,7 @@ def _engine(
         address=compute.address,
         cpus=None if compute.worker_resources.cpu == "auto" else compute.worker_resources.cpu,
         gpus=compute.worker_resources.gpu,
-        most=chunks_at_once(config) if compute.workers == "auto" else None,
+        most=at_once if compute.workers == "auto" else None,
         log=log,
         on_wait=on_wait,
     )
@@ -210,9 +222,12 @@ def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Mome
     task, centres = task_of(config), range(config.search.centres)
     if store.start is not None:
         return [store.start["centre_D"] for _ in centres], moments_from_arrays(store.start)
-    shape = policy_shape(config, task)
-    centres = [initial_parameters(shape, config.policy.init, config.seed, centre) for centre in centres]
-    return centres, no_observations(task.observation_size)
+    return [initial_policy(config, centre) for centre in centres], no_observations(task.observation_size)
+
+
+def initial_policy(config: RunConfig, centre: int) -> FloatArray:
+    """Random parameters [D] with which a centre of a run begins, by `policy.init` and the seed."""
+    return initial_parameters(policy_shape(config, task_of(config)), config.policy.init, config.seed, centre)
 
 
 def worker_count(config: RunConfig, most: int | None = None) -> int:

@@ -126,9 +126,9 @@ def measure(task: str) -> dict[str, float]:
     pair_keys = stream_keys(0, Domain.PARAMETER_NOISE, 0, np.arange(pairs))
     filled = run_of([fill], call, ["keys", "places", "noise"])(pair_keys, network.places, noise, times=20)
     call = "call void @policy(ptr %seen, ptr %alive, ptr %centre, ptr %hidden, ptr %action)"
-    without_noise = run_of([policy_function(network, noisy=False)], call, names)(*arrays)
+    without_noise = run_of([policy_function(network, "shared")], call, names)(*arrays)
     call = "call void @policy(ptr %seen, ptr %alive, ptr %centre, ptr %noise, float %unit, ptr %hidden, ptr %action)"
-    parts["policy"] = run_of([policy_function(network, noisy=True)], call, names)(*arrays, unit=unit)
+    parts["policy"] = run_of([policy_function(network, "perturbed")], call, names)(*arrays, unit=unit)
     call = "call void @move(ptr %carry, ptr %constants, ptr %action, ptr %keys)"
     parts["move"] = run_of([move], call, ["carry", "constants", "action", "keys"])(
         carries, constants, acted, keys, times=200

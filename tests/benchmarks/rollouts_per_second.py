@@ -1,11 +1,14 @@
 """How many environment steps a second do the workers make, policy and noise in the loop; simd beside xla, two workers
 beside one?
 
-    python -m tests.benchmarks.rollouts_per_second [--tasks ant_maze ...] [--seconds 5] [--threads]
+    python -m tests.benchmarks.rollouts_per_second [--tasks ant_maze ...] [--seconds 5] [--threads | --policies]
 
 Rounds alternate, so that all see the same machine; the ratios count. Policies are the paper's (64x64, ants 256x256)
 with weights of their own per member, action noise and statistics; the inline engine, 4,096 pairs of whole PointMaze
 episodes, 64 pairs of ants for 500 steps. xla's batch is its best: a block of pairs whose weights stay in cache.
+
+`--policies` compares, with simd, as many explicit policies, whose parameters are sent to the workers in every call,
+with the perturbed ones, whose parameters the workers make.
 """
 
 from __future__ import annotations
@@ -20,11 +23,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from es_service import api
-from es_service.config.model import worker_spec
+from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
+from es_service.loop.policies import no_statistics, policy_episodes, policy_work
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.messages import EpisodesResult, TrainingChunk, around
 from tests.helpers import centre
@@ -44,15 +50,24 @@ def measure(engine: Evaluator, point: Any, chunks: int, seconds: float) -> float
     return steps / (time.perf_counter() - start)
 
 
+def measure_policies(engine: Evaluator, parameters_N_D: Any, observation_size: int, seconds: float) -> float:
+    """Steps per second over one episode of each policy, again and again; the messages are made anew each time."""
+    steps, generation, start = 0, 0, time.perf_counter()
+    statistics = no_statistics(len(parameters_N_D), observation_size)
+    while time.perf_counter() - start < seconds or not generation:
+        asked = policy_work(parameters_N_D, statistics, 1, seed=0, generation=(generation := generation + 1))
+        steps += int(policy_episodes(asked, engine.evaluate(asked.work)).steps.sum())
+    return steps / (time.perf_counter() - start)
+
+
 def resident_mib(pid: int) -> float:
     status = Path(f"/proc/{pid}/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
-def compare(task: str, seconds: float, *, threads: bool) -> dict[str, Any]:
-    """A row: medians of the rounds, ratios of medians."""
+def config_of(task: str) -> RunConfig:
     maze = task == "point_maze"
-    config = api.load_config(
+    return api.load_config(
         {
             "task": {"environment": task, "episode_steps": None if maze else ANT_STEPS},
             "policy": {"hidden": [64, 64] if maze else [256, 256]},
@@ -60,6 +75,33 @@ def compare(task: str, seconds: float, *, threads: bool) -> dict[str, Any]:
             "budget": {"generations": 1},
         }
     )
+
+
+def compare_policies(task: str, seconds: float) -> dict[str, Any]:
+    """A row: medians of the rounds of perturbed and of explicit policies, and the ratio of the medians."""
+    config = config_of(task)
+    spec = replace(worker_spec(config, task_of(config)), rollout="simd")
+    chunks, size = config.search.pairs // spec.chunk_pairs, spec.policy.widths[0]
+    first_D = initial_parameters(spec.policy, "unit_columns", 0)
+    rng = np.random.default_rng(0)
+    policies_N_D = first_D + 0.02 * rng.normal(size=(2 * config.search.pairs, first_D.size)).astype(np.float32)
+    point = centre(first_D, sigma=0.02, observation_size=size)
+    row: dict[str, Any] = {"task": task, "policies": len(policies_N_D), "bytes_of_each": policies_N_D[0].nbytes}
+    for workers in (1, 2):
+        rates: dict[str, list[float]] = {"perturbed": [], "explicit": []}
+        with inline_engine(spec, Limits(workers)) as engine:
+            for length in (0.0, *[seconds] * ROUNDS):  # the first compiles
+                rates["perturbed"].append(measure(engine, point, chunks, length or 1e-9))
+                rates["explicit"].append(measure_policies(engine, policies_N_D, size, length))
+        rate = {kind: statistics.median(found[1:]) for kind, found in rates.items()}
+        row |= {f"{kind}_{workers}": round(found) for kind, found in rate.items()}
+        row[f"explicit_over_perturbed_{workers}"] = round(rate["explicit"] / rate["perturbed"], 2)
+    return row
+
+
+def compare(task: str, seconds: float, *, threads: bool) -> dict[str, Any]:
+    """A row: medians of the rounds, ratios of medians."""
+    config = config_of(task)
     spec = worker_spec(config, task_of(config))
     chunks = config.search.pairs // spec.chunk_pairs
     size = spec.policy.widths[0]
@@ -94,9 +136,14 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=["point_maze", "ant_maze", "ant_trap"])
     parser.add_argument("--seconds", type=float, default=5.0, help="length of each round")
     parser.add_argument("--threads", action="store_true", help="workers of simd are threads of one process")
+    parser.add_argument("--policies", action="store_true", help="explicit policies beside perturbed ones, with simd")
     arguments = parser.parse_args()
     for task in arguments.tasks:
-        print(json.dumps(compare(task, arguments.seconds, threads=arguments.threads)), flush=True)
+        if arguments.policies:
+            row = compare_policies(task, arguments.seconds)
+        else:
+            row = compare(task, arguments.seconds, threads=arguments.threads)
+        print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from es_service.dispatch import engine as engine_module
 from es_service.dispatch.engine import POLL_S, Answer, Engine, item_sizes
 from es_service.dispatch.events import Failure, Limits, WorkerLost, WorkerUp
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol.messages import TrainingChunk, around
+from es_service.protocol.messages import EvaluationChunk, TrainingChunk, around
 from tests.helpers import centre, random_parameters
 
 FIRST, SECOND = centre(random_parameters(0)), centre(random_parameters(1))
@@ -135,6 +135,19 @@ def test_results_of_several_centres_come_in_the_order_of_the_work(seed, item_s):
     assert len({sent.item_id for sent in transport.sent}) == len(transport.sent)
     mixed = [sent for sent in transport.sent if len({id(point) for point, _ in sent.work}) > 1]
     assert bool(mixed) == (item_s > 0.0)
+
+
+def test_chunks_of_several_kinds_run_side_by_side_and_no_work_item_has_two():
+    """As populations and policies of a generation do; each kind is divided by its own durations."""
+    transport, held = Scripted(), []
+    transport.on_send, transport.on_wait = held.append, lambda: transport.inbox.append(held.pop().answer())
+    with Engine(transport, Limits(workers=2, item_s=60.0)) as engine:
+        for _ in range(3):
+            work = around(FIRST, [*CHUNKS, *(EvaluationChunk(1, chunk) for chunk in range(5)), *CHUNKS])
+            assert engine.evaluate(work) == [expected(*one) for one in work]
+    assert all(len({type(chunk) for _, chunk in sent.work}) == 1 for sent in transport.sent)
+    assert {sent.item_id.kind for sent in transport.sent} == {"TrainingChunk", "EvaluationChunk"}
+    assert max(len(sent.work) for sent in transport.sent) > 1
 
 
 @given(st.integers(1, 500), st.integers(1, 70), st.integers(1, 64), st.none() | st.floats(1e-7, 10.0))

@@ -22,6 +22,7 @@ from es_service.dispatch.engine import Answer
 from es_service.dispatch.events import Limits, Placed, WorkerLost, WorkerUp
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError, Interrupted
+from es_service.protocol import messages
 from es_service.protocol.messages import KEPT_CENTRES, TrainingChunk, Work, around, forget_oldest
 from es_service.protocol.wire import framed, receive
 from tests.helpers import SPEC, centre, random_parameters, spec
@@ -68,12 +69,12 @@ class Receiver:
 
     def item(self) -> list[tuple[float, int]]:
         """(first parameter of the centre, id) of each chunk of the next work item."""
-        while (said := receive(self.end))[0] == "centre":
+        while (said := receive(self.end))[0] == "subject":
             _, number, point = said
             self.centres[number] = point
             self.received += 1
         found = [(float(self.centres[number].parameters_D[0]), chunk.chunk_id) for number, chunk in said[3]]
-        forget_oldest(self.centres)
+        forget_oldest(self.centres, lambda point: point.nbytes)
         return found
 
 
@@ -106,6 +107,25 @@ def test_a_centre_is_sent_once_while_it_is_among_the_newest_and_again_when_it_wa
     transport.send(1, "key", 1, work_of(99, 98))  # what one worker has, another may not have
     assert second.item() == [(99, 0), (98, 1)]
     assert second.received == 2
+
+
+def test_of_large_centres_a_worker_keeps_as_many_as_fit_and_always_one(transport, monkeypatch):
+    monkeypatch.setattr(messages, "KEPT_BYTES", 400)
+    transport, (end, _) = transport
+    worker, sizes = Receiver(end), {0: 50, 1: 50, 2: 25, 3: 101}
+    points = {number: centre(np.full(size, number, np.float32)) for number, size in sizes.items()}
+    for numbers, received, kept in (
+        ([0, 1], 2, 2),
+        ([2, 1], 3, 2),  # 0 made room
+        ([0], 4, 2),  # and 1 for it
+        ([3, 3, 2], 6, 1),  # too large to be kept with another
+        ([3], 7, 1),
+        ([3, 3], 7, 1),  # the newest stays, however large
+    ):
+        work = [(points[number], TrainingChunk(3, position)) for position, number in enumerate(numbers)]
+        transport.send(0, "key", 1, work)
+        assert worker.item() == [(number, position) for position, number in enumerate(numbers)]
+        assert (worker.received, len(worker.centres)) == (received, kept)
 
 
 @pytest.mark.parametrize("seed", range(5))

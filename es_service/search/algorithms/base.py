@@ -128,13 +128,29 @@ class Ask:
 
 
 @dataclass(frozen=True)
+class PolicyAsk:
+    """Policies to evaluate as they are in a generation, with `search.evaluation_episodes` episodes each.
+
+    They run without noise and do not update the observation statistics. The reset of an episode depends on the
+    generation, the number of the policy in this ask, the number of the episode, and the number of this ask among those
+    of the generation that are for policies.
+    """
+
+    parameters_N_D: FloatArray
+    """Parameters of each policy."""
+    observation_mean_N_O: FloatArray | None = None
+    observation_std_N_O: FloatArray | None = None
+    """Mean and standard deviation with which each policy's episodes normalise observations; None: 0 and 1."""
+
+
+@dataclass(frozen=True)
 class CentreEvaluation:
-    """Result of the evaluation episodes of a centre."""
+    """Result of the evaluation episodes of a centre, or of a policy that was asked for."""
 
     generation: int
     """Generation that produced the centre; 0 for an initial centre."""
     centre: int
-    """Index of the centre."""
+    """Index of the centre. Policies count on: number of centres + number of the policy in its generation."""
     valid: bool
     """Whether fitness and descriptor of every episode are finite."""
     fitness: float
@@ -149,16 +165,16 @@ class CentreEvaluation:
 class Algorithm:
     """The functions of one method. All are pure."""
 
-    ask: Callable[[SearchState, int], tuple[Ask, ...]]
-    """(state, generation) -> populations to evaluate in that generation, side by side."""
+    ask: Callable[[SearchState, int], tuple[Ask | PolicyAsk, ...]]
+    """(state, generation) -> populations and policies to evaluate in that generation, side by side."""
     weights: Callable[[SearchState, Ask, EpisodesResult], NDArray[np.float32]]
     """(state, asked, the whole population's results with axes P, S) -> weight of each pair's noise [P]."""
     step: Callable[[SearchState, Ask, FloatArray], SearchState]
-    """(state, asked, gradient estimate [D]) -> state with the asked centre moved up the gradient. Called for each ask,
-    in order."""
+    """(state, asked, gradient estimate [D]) -> state with the asked centre moved up the gradient. Called for each
+    population asked for, in order."""
     tell: Callable[[SearchState, tuple[CentreEvaluation, ...]], SearchState]
-    """(state, evaluations of a generation's centres in the order of the asks) -> state updated with them. The first
-    call has all initial centres."""
+    """(state, evaluations of a generation's centres and policies in the order of the asks) -> state updated with them.
+    The first call has all initial centres."""
     fitness_weight: float
     """Initial value of the state's `weight`."""
     start_cells: Callable[[SearchState, int], Mapping[int, int]] = lambda state, generation: {}

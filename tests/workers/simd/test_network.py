@@ -37,7 +37,7 @@ def run(
         builder.do("call void @fill(ptr %keys, ptr %places, ptr %noise)")
     given = "ptr %noise, float %unit, " if noisy else ""
     builder.do(f"call void @policy(ptr %x, ptr %alive, ptr %centre, {given}ptr %hidden, ptr %action)")
-    functions = [fill, policy_function(network, noisy=noisy), builder]
+    functions = [fill, policy_function(network, "perturbed" if noisy else "shared"), builder]
     native = load_compiled(f"policy {network.places.tolist()} {noisy}", lambda: module(functions), target, folder)
     lanes = aligned((network.inputs if not network.hidden else network.hidden[0].inputs, network.width))
     lanes.view(np.float32)[:] = x.T

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from es_service.protocol.noise import KEY_WORDS
 from workers.simd.backend.emit import emit
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import Target, host_target
@@ -20,6 +22,7 @@ from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.graph import live
 from workers.simd.graph.operations import OPERATIONS
+from workers.simd.graph.unsupported import UnsupportedError
 
 
 class Facts(NamedTuple):
@@ -127,3 +130,27 @@ def compile_kernel(
         _function=ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(native.address),
         _alive=native.alive,
     )
+
+
+def compile_resets(
+    begin: Callable[[Any], Any], target: Target, folder: Path | None
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Function from reset keys [lane, 4] to words of carries, compiled by simd if possible and otherwise by JAX.
+
+    Resets of Brax's own environments, for example, cannot be compiled by simd. Resets are few compared with steps, but
+    the bits of those that JAX compiles may differ between processors.
+    """
+    key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
+    try:
+        kernel = compile_kernel(begin, key, target=target, folder=folder)
+    except UnsupportedError:
+        resets = jax.jit(jax.vmap(begin))
+        return lambda keys_L: pack([np.asarray(leaf) for leaf in jax.tree.leaves(resets(keys_L))], target.width)
+
+    def words(keys_L: np.ndarray) -> np.ndarray:
+        keys = pack([keys_L], target.width)
+        out = aligned((len(keys), kernel.words_out, target.width))
+        kernel.run(keys, out)
+        return out
+
+    return words

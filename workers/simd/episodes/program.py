@@ -1,7 +1,8 @@
 """Kernels of whole episodes: observation, policy, physics and sums from reset to end, one block of lanes at a time.
 
-The members of a pair are neighbouring lanes. The data of a block fits in the cache of a core: the noise of its pairs
-(one byte per parameter), the centre, and the state of its episodes.
+In training, the members of a pair are neighbouring lanes. The data of a block fits in the cache of a core: the noise of
+its pairs (one byte per parameter), the centre, and the state of its episodes. In evaluations, all lanes have the
+weights and the observation statistics of the centre, or with `own_weights` each lane has its own.
 """
 
 from __future__ import annotations
@@ -26,20 +27,21 @@ from workers.simd.backend.function_builder import FunctionBuilder, Values, modul
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import Target, host_target
 from workers.simd.backend.words import ALIGNMENT, aligned, filled, pack, unpack, words_of
-from workers.simd.episodes.kernel import Kernel, compile_kernel
+from workers.simd.episodes.kernel import compile_resets
 from workers.simd.episodes.layout import Network, plan
-from workers.simd.episodes.network import policy_function
+from workers.simd.episodes.network import Weights, policy_function, singles_function
 from workers.simd.episodes.noise import definition, fill_function
 from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
-from workers.simd.graph.unsupported import UnsupportedError
 
 
 @dataclass(frozen=True)
 class EpisodeKernel:
-    """Compiled episodes, either training episodes of both members of pairs or evaluation episodes of the centre."""
+    """Compiled episodes: training episodes of both members of pairs, or evaluation episodes of the centre or, with
+    `own_weights`, of a policy in each lane."""
 
     training: bool
+    own_weights: bool
     spec: WorkerSpec
     inputs_O: np.ndarray
     """Indices of the observations that are computed, as inputs of the policy."""
@@ -68,8 +70,10 @@ class EpisodeKernel:
         """Run the episodes of all lanes, [L]; returns NumPy arrays.
 
         Args:
-            weights: the centre, packed by `network.pack`.
+            weights: the centre, packed by `network.pack`; with own weights the uint64 address of each lane's float32
+                parameters, in memory that goes on for at least a vector behind them.
             unit: sigma / NORMAL_STD.
+            mean_O, std_O: observation statistics; with own weights those of each lane, [L, O].
             noise_keys_P: keys of the pairs' noise; None for evaluations.
             reset_keys_L, action_keys_L: stream keys of each lane's reset and action noise.
         """
@@ -82,21 +86,25 @@ class EpisodeKernel:
         blocks = len(carries)
         carries[-1, self.alive_word, lanes - width * (blocks - 1) :] = 0  # lanes without an episode
         actions = pack([action_keys_L], width)
-        constants = np.concatenate([mean_O[self.inputs_O], std_O[self.inputs_O]]).astype(np.float32)
-        seen_and_done = len(self.inputs_O) + self.network.outputs
-        memory = aligned((len(constants) + seen_and_done + self.network.hidden_vectors, width))
-        splats, room = memory[: len(constants)], memory[len(constants) :]
-        splats[:] = constants.view(np.uint32)[:, None]
+        statistics = [x[..., self.inputs_O].reshape(-1, len(self.inputs_O)).astype(np.float32) for x in (mean_O, std_O)]
+        constants = pack(statistics, width)
+        room = aligned((len(self.inputs_O) + self.network.outputs + self.network.hidden_vectors, width))
         keys, noise = np.zeros((0, KEY_WORDS), np.uint32), np.zeros(0, np.int8)
+        if self.own_weights:
+            assert len(statistics[0]) == len(weights) == lanes
+            weights = filled(weights, blocks * width)
+            noise = aligned((len(self.network.places) - self.network.vectors, width)).view(np.int8)  # single weights
+        else:
+            assert weights.ctypes.data % ALIGNMENT == 0
+            assert weights.shape == (self.network.rows, width)
+            assert len(constants) == 1
         if noise_keys_P is not None:
             pairs = width // 2
             keys = filled(noise_keys_P, blocks * pairs)
             noise = np.empty(self.network.noise_bytes, np.int8)
-        arrays = (carries, actions, splats, weights, keys, self.network.places, noise, room)
-        assert [array.dtype.char for array in arrays] == list("IIIfIIbI")
+        arrays = (carries, actions, constants, weights, keys, self.network.places, noise, room)
+        assert [array.dtype.char for array in arrays] == list("IIILIIbI" if self.own_weights else "IIIfIIbI")
         assert all(array.flags.c_contiguous for array in arrays)
-        assert weights.ctypes.data % ALIGNMENT == 0
-        assert weights.shape == (self.network.rows, width)
         pointers = [array.ctypes.data for array in arrays]
         self._call(*pointers, np.float32(unit), blocks, self.spec.episode_steps)
         # The result of an episode is the last part of a carry.
@@ -114,6 +122,7 @@ def compile_episodes(
     inputs_O: np.ndarray,
     *,
     training: bool,
+    own_weights: bool = False,
     target: Target | None = None,
     folder: Path | None = None,
 ) -> EpisodeKernel:
@@ -122,6 +131,7 @@ def compile_episodes(
     Args:
         inputs_O: indices of the observations that are computed; others are always zero.
         training: training episodes, or else evaluation episodes.
+        own_weights: evaluation episodes of a policy in each lane, instead of those of the centre.
         target: processor and instruction set; the widest vectors of this machine if None.
         folder: folder of the cache; the user's cache if None.
 
@@ -130,16 +140,17 @@ def compile_episodes(
         NoVectorsError: this processor lacks the vector instructions.
     """
     target = target or host_target()
-    program = write_episodes(environment, spec, inputs_O, target.width, training=training)
+    program = write_episodes(environment, spec, inputs_O, target.width, training=training, own_weights=own_weights)
     native = load_compiled(program.name, program.text, target, folder)
     signature = [*[ctypes.c_void_p] * 8, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
     carry = program.carry
     return EpisodeKernel(
         training=training,
+        own_weights=own_weights,
         spec=spec,
         inputs_O=inputs_O,
         network=program.network,
-        begin=_begin(program.steps, target, folder),
+        begin=compile_resets(program.steps.begin, target, folder),
         alive_word=program.alive_word,
         episode_avals=carry.episode,
         episode_words=sum(map(words_of, carry.episode)),
@@ -164,13 +175,20 @@ class EpisodeProgram(NamedTuple):
 
 
 def write_episodes(
-    environment: Environment, spec: WorkerSpec, inputs_O: np.ndarray, width: int, *, training: bool
+    environment: Environment,
+    spec: WorkerSpec,
+    inputs_O: np.ndarray,
+    width: int,
+    *,
+    training: bool,
+    own_weights: bool = False,
 ) -> EpisodeProgram:
     """Program of a run's episodes for vectors of `width` lanes, for any processor; `compile_episodes` compiles it.
 
     Raises:
         UnsupportedError: a step of the environment cannot be compiled. `text` of the result may raise it as well.
     """
+    weights: Weights = "perturbed" if training else "own" if own_weights else "shared"
     steps = episode_steps(environment, spec, training=training, inputs_O=inputs_O)
     network = plan(spec.policy, inputs_O, width)
     key, inputs = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32), jax.ShapeDtypeStruct((len(inputs_O),), jnp.float32)
@@ -189,42 +207,29 @@ def write_episodes(
     words = sum(map(words_of, leaves))
 
     def text() -> str:
-        return _module(look, move, network, len(inputs_O), words, alive_word, training=training)
+        return _module(look, move, network, len(inputs_O), words, alive_word, weights)
 
     digests = f"{definition()} {jaxpr_digest(look)} {jaxpr_digest(move)}"
-    name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {training}"
+    name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {training}{' own' * own_weights}"
     return EpisodeProgram(steps, carry, alive_word, network, name, text)
 
 
-def _begin(steps: EpisodeSteps, target: Target, folder: Path | None) -> Callable[[np.ndarray], np.ndarray]:
-    """Function that resets environments, compiled by simd if possible and otherwise by JAX.
-
-    Resets of Brax's own environments, for example, cannot be compiled by simd. Resets are few compared with steps, but
-    the bits of those that JAX compiles may differ between processors.
-    """
-    key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
-    try:
-        kernel: Kernel = compile_kernel(steps.begin, key, target=target, folder=folder)
-    except UnsupportedError:
-        resets = jax.jit(jax.vmap(steps.begin))
-        return lambda keys_L: pack([np.asarray(leaf) for leaf in jax.tree.leaves(resets(keys_L))], target.width)
-
-    def begin(keys_L: np.ndarray) -> np.ndarray:
-        keys = pack([keys_L], target.width)
-        out = aligned((len(keys), kernel.words_out, target.width))
-        kernel.run(keys, out)
-        return out
-
-    return begin
-
-
 def _module(
-    look: ClosedJaxpr, move: ClosedJaxpr, network: Network, inputs: int, words: int, alive_word: int, *, training: bool
+    look: ClosedJaxpr,
+    move: ClosedJaxpr,
+    network: Network,
+    inputs: int,
+    words: int,
+    alive_word: int,
+    weights: Weights,
 ) -> str:
     """LLVM IR of whole episodes, the function
 
     void kernel(ptr carries, ptr action_keys, ptr constants, ptr centre, ptr keys, ptr places, ptr noise, ptr room,
                 float unit, i64 blocks, i64 steps)
+
+    With own weights, constants are those of each block, centre has the lanes' addresses, and noise is memory for the
+    single weights of a block.
     """
     width = network.width
     actions = network.outputs
@@ -234,8 +239,10 @@ def _module(
     graph, _, outputs = trace_jaxpr(move)
     sources = [("carry", words), ("constants", inputs), ("action", actions), ("action_key", KEY_WORDS)]
     move_code = graph_function("move", graph, outputs, sources, "carry", width)
-    policy_code = policy_function(network, noisy=training)
+    policy_code = policy_function(network, weights)
     fill_code = fill_function(network.vectors, len(network.places) - network.vectors, width)
+    before = {"perturbed": [fill_code], "own": [singles_function(network)], "shared": []}[weights]
+    own, noisy = weights == "own", weights == "perturbed"
 
     pointers = ["carries", "action_keys", "constants", "centre", "keys", "places", "noise", "room"]
     builder = FunctionBuilder(
@@ -249,15 +256,19 @@ def _module(
         carry = builder.at("%carries", builder.index((number, words)), vector)
         action_key = builder.at("%action_keys", builder.index((number, KEY_WORDS)), vector)
         alive = builder.at(carry, alive_word, vector)
-        if training:
+        constants = builder.at("%constants", builder.index((number, 2 * inputs)), vector) if own else "%constants"
+        policies = builder.at("%centre", builder.index((number, width)), "i64") if own else "%centre"
+        given = "ptr %places, ptr %noise, " if own else "ptr %noise, float %unit, " if noisy else ""
+        if own:
+            builder.do(f"call void @singles(ptr {policies}, ptr %places, ptr %noise)")
+        if noisy:
             keys = builder.at("%keys", builder.index((number, KEY_WORDS * width // 2)), "i32")
             builder.do(f"call void @fill(ptr {keys}, ptr %places, ptr %noise)")
 
         def step(_: str, __: Values) -> Values:
-            builder.do(f"call void @look(ptr {carry}, ptr %constants, ptr {seen})")
-            noise = "ptr %noise, float %unit, " if training else ""
-            builder.do(f"call void @policy(ptr {seen}, ptr {alive}, ptr %centre, {noise}ptr {hidden}, ptr {action})")
-            builder.do(f"call void @move(ptr {carry}, ptr %constants, ptr {action}, ptr {action_key})")
+            builder.do(f"call void @look(ptr {carry}, ptr {constants}, ptr {seen})")
+            builder.do(f"call void @policy(ptr {seen}, ptr {alive}, ptr {policies}, {given}ptr {hidden}, ptr {action})")
+            builder.do(f"call void @move(ptr {carry}, ptr {constants}, ptr {action}, ptr {action_key})")
             return []
 
         def all_done() -> str:
@@ -267,4 +278,4 @@ def _module(
         return []
 
     builder.loop("%blocks", block)
-    return module([look_code, move_code, policy_code, *([fill_code] if training else []), builder])
+    return module([look_code, move_code, policy_code, *before, builder])

@@ -91,14 +91,36 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Calla
     return rollout
 
 
+def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
+    """Rollout of explicit policies, with the interface of `workers.rollout.make_policy_rollout`, for any number of
+    lanes."""
+    kernels = _Kernels(environment, spec, training=False, own_weights=True)
+    parameters = spec.policy.parameters
+
+    def rollout(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
+        kernel = kernels.fitting(mean_L_O)
+        # Rows begin at whole vectors, and a vector that begins in the last row ends in this memory.
+        stride = (parameters // kernel.network.width + 2) * kernel.network.width
+        rows = aligned((sum(map(len, parameters_G_N_D)), stride)).view(np.float32)
+        np.concatenate(parameters_G_N_D, out=rows[:, :parameters])
+        addresses_L = (rows.ctypes.data + policy_L * rows.strides[0]).astype(np.uint64)
+        assert 0 <= policy_L.min() <= policy_L.max() < len(rows)
+        return kernel.run(addresses_L, 0.0, mean_L_O, std_L_O, None, reset_keys_L, reset_keys_L)
+
+    return rollout
+
+
 class _Kernels:
     """Kernels of a run: one that omits inputs that are always zero, and one with all inputs.
 
     The second is used when the statistics have a mean other than 0 for such an input.
     """
 
-    def __init__(self, environment: Environment, spec: WorkerSpec, *, training: bool) -> None:
-        self._environment, self._spec, self._training = environment, spec, training
+    def __init__(
+        self, environment: Environment, spec: WorkerSpec, *, training: bool, own_weights: bool = False
+    ) -> None:
+        self._environment, self._spec = environment, spec
+        self._training, self._own_weights = training, own_weights
         self._zero_O = always_zero(environment)
         if self._zero_O.all():
             self._zero_O[0] = False
@@ -106,12 +128,25 @@ class _Kernels:
         self._lock = threading.Lock()
         self._packed: tuple[tuple[bool, np.ndarray, np.ndarray], ...] = ()
 
+    def fitting(self, mean: np.ndarray) -> EpisodeKernel:
+        """The kernel for statistics with this mean, [O] or [L, O]."""
+        return self._kernel(self._omits_zero_inputs(mean))
+
+    def _omits_zero_inputs(self, mean: np.ndarray) -> bool:
+        return not mean[..., self._zero_O].any()  # then (0 - mean) / std is 0 and contributes nothing
+
     def _kernel(self, omit_zero_inputs: bool) -> EpisodeKernel:
         with self._lock:  # threads share the kernels
             if omit_zero_inputs not in self._compiled:
                 inputs_O = np.flatnonzero(~self._zero_O) if omit_zero_inputs else np.arange(self._zero_O.size)
                 try:
-                    kernel = compile_episodes(self._environment, self._spec, inputs_O, training=self._training)
+                    kernel = compile_episodes(
+                        self._environment,
+                        self._spec,
+                        inputs_O,
+                        training=self._training,
+                        own_weights=self._own_weights,
+                    )
                 except UnsupportedError as error:  # `why_not` checks the default options only
                     raise UnsupportedError(
                         f"simd cannot compile {self._spec.environment}: {error}; set compute.rollout to xla"
@@ -121,7 +156,7 @@ class _Kernels:
 
     def for_centre(self, centre_D: np.ndarray, mean_O: np.ndarray) -> tuple[EpisodeKernel, np.ndarray]:
         """(kernel, packed weights) of a centre; the packed weights of the last KEPT_PACKED centres are kept."""
-        omit_zero_inputs = not mean_O[self._zero_O].any()  # then (0 - mean) / std is 0 and contributes nothing
+        omit_zero_inputs = self._omits_zero_inputs(mean_O)
         kernel, kept = self._kernel(omit_zero_inputs), self._packed
         for omitted, packed_D, weights in kept:
             if omitted == omit_zero_inputs and np.array_equal(packed_D, centre_D):

@@ -1,0 +1,111 @@
+"""Explicit policies: the chunks in which they travel to the workers, and their results.
+
+Axes: N policies, E episodes, D policy parameters, O observation, T points of a trace, B descriptor dimensions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from es_service.protocol.messages import EpisodesResult, FloatArray, Policies, PolicyChunk, Work, around
+from es_service.protocol.policies import POLICY_SLOTS, chunks_of
+
+
+@dataclass(frozen=True)
+class PolicyWork:
+    """An ask for policies: the policies with their observation statistics, and the chunks in which they travel."""
+
+    parameters_N_D: FloatArray
+    observation_mean_N_O: FloatArray
+    observation_std_N_O: FloatArray
+    episodes: int
+    """Episodes of each policy."""
+    work: list[Work]
+
+
+def policy_work(
+    parameters_N_D: FloatArray,
+    statistics: tuple[FloatArray, FloatArray],
+    episodes: int,
+    *,
+    seed: int,
+    generation: int,
+    ask: int = 0,
+    traces: bool = False,
+) -> PolicyWork:
+    """The chunks of policies with some number of episodes each.
+
+    The reset of each episode depends on (seed, generation, ask, number of the policy, number of the episode) alone.
+
+    Args:
+        statistics: mean and standard deviation of observations, [N, O] each.
+    """
+    work: list[Work] = []
+    for first in range(0, len(parameters_N_D), POLICY_SLOTS):
+        of = slice(first, first + POLICY_SLOTS)
+        arrays = [np.ascontiguousarray(array[of]) for array in (parameters_N_D, *statistics)]
+        policies = Policies(first, episodes, seed, traces, *arrays)
+        parts = range(chunks_of(len(policies.parameters_N_D), episodes))
+        work += around(policies, [PolicyChunk(generation, len(work) + part, ask, part) for part in parts])
+    return PolicyWork(parameters_N_D, *statistics, episodes, work)
+
+
+def no_statistics(policies: int, observation_size: int) -> tuple[FloatArray, FloatArray]:
+    """The observation statistics of policies that have none: mean 0 and standard deviation 1, [N, O] each."""
+    shape = policies, observation_size
+    return np.zeros(shape, np.float32), np.ones(shape, np.float32)
+
+
+def policy_episodes(asked: PolicyWork, results: Sequence[EpisodesResult]) -> EpisodesResult:
+    """The results of all chunks in one, with axes [N, E]; traces, if there are any, are [N, T, B]."""
+    policies, episodes = len(asked.parameters_N_D), asked.episodes
+    whole = policies // POLICY_SLOTS * POLICY_SLOTS
+
+    def by_policy(name: str) -> np.ndarray:
+        flat = np.concatenate([getattr(result, name) for result in results])
+        full, last = flat[: whole * episodes], flat[whole * episodes :]
+        full = full.reshape(-1, episodes, POLICY_SLOTS, *flat.shape[1:]).swapaxes(1, 2)
+        last = last.reshape(episodes, policies - whole, *flat.shape[1:]).swapaxes(0, 1)
+        return np.concatenate([full.reshape(whole, *full.shape[2:]), last])
+
+    traces = [result.trace_T_B for result in results if result.trace_T_B is not None]
+    return EpisodesResult(
+        fitness=by_policy("fitness"),
+        returns=by_policy("returns"),
+        descriptor=by_policy("descriptor"),
+        steps=by_policy("steps"),
+        goal_distance=by_policy("goal_distance"),
+        moments=None,
+        trace_T_B=np.concatenate(traces) if traces else None,
+    )
+
+
+def each_policy(result: EpisodesResult) -> list[EpisodesResult]:
+    """The result of each policy, with the axis [E] and its trace, like that of an evaluated centre."""
+    assert result.trace_T_B is not None, "the policies of a search are traced"
+    return [
+        EpisodesResult(
+            fitness=result.fitness[policy],
+            returns=result.returns[policy],
+            descriptor=result.descriptor[policy],
+            steps=result.steps[policy],
+            goal_distance=result.goal_distance[policy],
+            moments=None,
+            trace_T_B=result.trace_T_B[policy],
+        )
+        for policy in range(len(result.fitness))
+    ]
+
+
+@np.errstate(invalid="ignore", over="ignore")  # an infinite value makes the policy invalid
+def as_population(result: EpisodesResult) -> EpisodesResult:
+    """The policies as members of a population: means over the episodes, with axis [N]."""
+    return replace(
+        result,
+        fitness=result.fitness.mean(axis=1),
+        returns=result.returns.mean(axis=1),
+        descriptor=result.descriptor.mean(axis=1),
+    )

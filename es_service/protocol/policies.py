@@ -1,0 +1,69 @@
+"""Messages about explicit policies: parameter vectors that are evaluated as they are, without noise in parameters or
+actions.
+
+Axes: N policies that travel together, L slots of a chunk, D policy parameters, O observation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+POLICY_SLOTS = 16
+"""Slots of a policy chunk, each of which is one episode of one policy. This is a constant so that the shape that is
+compiled never changes."""
+
+
+@dataclass(frozen=True)
+class Policies:
+    """Up to POLICY_SLOTS policies that travel together, once to each worker that runs chunks of them."""
+
+    first: int
+    """Number of the first of them among the policies of their ask."""
+    episodes: int
+    """Episodes of each policy."""
+    seed: int
+    """Seed of the resets. In a run it is the seed of the run."""
+    traces: bool
+    """Whether the results have the trace of the first episode of each policy."""
+    parameters_N_D: NDArray[np.float32]
+    observation_mean_N_O: NDArray[np.float32]
+    observation_std_N_O: NDArray[np.float32]
+    """Observation statistics of each policy; 0 and 1 if there are none."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the parameters."""
+        return self.parameters_N_D.nbytes
+
+
+@dataclass(frozen=True)
+class PolicyChunk:
+    """Request to roll out the policies that it is sent with, from slot `POLICY_SLOTS * part` on.
+
+    Slots count the policies first: slot s is episode s // N of policy s % N, so that one episode of each wastes
+    nothing. The last chunk may have fewer slots. The reset of an episode is addressed by seed, generation, episode,
+    number of the policy and ask, so neither the chunk nor the number of policies has an influence on it.
+    """
+
+    generation: int
+    chunk_id: int
+    """Number of the chunk among those of its ask."""
+    ask: int = 0
+    """Index of the policies' ask among those of its generation that are for policies."""
+    part: int = 0
+    """Number of the chunk among those of the policies that it is sent with."""
+
+
+def chunks_of(policies: int, episodes: int) -> int:
+    """Number of chunks of policies that travel together."""
+    return -(-policies * episodes // POLICY_SLOTS)
+
+
+def slots(policies: Policies, chunk: PolicyChunk) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """(index of the policy [L], number of the episode [L]) of each slot of a chunk."""
+    count, first = len(policies.parameters_N_D), chunk.part * POLICY_SLOTS
+    slot_L = np.arange(first, min(first + POLICY_SLOTS, count * policies.episodes))
+    return slot_L % count, slot_L // count

@@ -1,0 +1,213 @@
+"""Evaluation as a service: episodes of policies from an optimiser of the caller's own.
+
+The policies run on the workers of a run, with the same engines and the same handling of faults. Axes: N policies,
+E episodes, D policy parameters, O observation, B descriptor dimensions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from es_service.config.compute import implied_by
+from es_service.config.loading import Source
+from es_service.config.model import RunConfig, policy_shape
+from es_service.config.tasks import task_of
+from es_service.dispatch.engine import Engine
+from es_service.errors import ConfigError, EvaluationError
+from es_service.loop.checks import valid_members
+from es_service.loop.policies import no_statistics, policy_episodes, policy_work
+from es_service.protocol.messages import EpisodesResult, FloatArray
+from es_service.runs.checked_config import changed_config, load_config
+from es_service.runs.session import initial_policy, make_engine
+
+ANY_NUMBER = 2**20
+"""Chunks of work at a time, for `workers: auto`: the evaluator cannot know how many policies it will be given."""
+LARGEST = 2**63 - 1
+"""Largest seed and generation."""
+
+
+@dataclass(frozen=True)
+class PolicyEvaluations:
+    """Results of E episodes of each of N policies."""
+
+    fitness: FloatArray
+    """[N, E]: return of an episode, or with `task.fitness: final` the reward of its last step. It is maximised."""
+    returns: FloatArray
+    """[N, E]: sum of the rewards of an episode."""
+    descriptor: FloatArray
+    """[N, E, B]: descriptor at the end of an episode, in the units of the task."""
+    steps: NDArray[np.int32]
+    """[N, E]: number of environment steps, up to and including `done`."""
+    valid: NDArray[np.bool_]
+    """[N, E]: whether fitness and descriptor are finite."""
+
+
+class PolicyEvaluator:
+    """Callable that evaluates policies; `evaluator` makes one. It may be called from one thread at a time."""
+
+    def __init__(self, config: RunConfig, engine: Engine[Any]) -> None:
+        self.config = config
+        self.task = task_of(config)
+        """The task, with `descriptor_names` and `descriptor_bounds`."""
+        self.parameters = policy_shape(config, self.task).parameters
+        """Number of parameters of a policy, D."""
+        self._engine = engine
+        self._closed = ""
+
+    def initial(self, number: int = 0) -> FloatArray:
+        """Parameters [D] with which a run of this config would begin, those of centre `number`: see `policy.init`."""
+        return initial_policy(self.config, _whole("number", number, 0))
+
+    def __call__(
+        self,
+        parameters: ArrayLike,
+        *,
+        episodes: int = 1,
+        seed: int | None = None,
+        generation: int = 0,
+        observation_mean: ArrayLike | None = None,
+        observation_std: ArrayLike | None = None,
+    ) -> PolicyEvaluations:
+        """Run episodes of policies without noise in parameters or actions.
+
+        Equal arguments give equal bits, whatever the workers and whatever happened to them. Episode e of policy n
+        begins with a reset that depends on seed, generation, n and e alone; give another generation in each iteration
+        to have new ones.
+
+        Args:
+            parameters: policies [N, D]; they are converted to float32.
+            episodes: number of episodes of each policy.
+            seed: from 0 to 2**63 - 1; None: the seed of the config.
+            generation: from 0 to 2**63 - 1.
+            observation_mean, observation_std: statistics with which observations are normalised, [O] or [N, O]; None:
+                0 and 1.
+
+        Raises:
+            ConfigError: an argument is wrong; `field` names it.
+            EvaluationError: the rollouts cannot continue, after which the evaluator is closed; or it is closed.
+        """
+        if self._closed:
+            raise EvaluationError(f"{self._closed}; make another one with es_service.evaluator")
+        policies_N_D = self._policies(parameters)
+        statistics = self._statistics(len(policies_N_D), observation_mean, observation_std)
+        asked = policy_work(
+            policies_N_D,
+            statistics,
+            _whole("episodes", episodes, 1),
+            seed=self.config.seed if seed is None else _whole("seed", seed, 0),
+            generation=_whole("generation", generation, 0),
+        )
+        try:
+            answers = self._engine.evaluate(asked.work)
+        except BaseException as error:  # also an interrupt: the engine may have stopped at any point
+            self.close(f"this evaluator was closed by an error during a call ({type(error).__name__}: {error})")
+            raise
+        result = policy_episodes(asked, [answer for answer in answers if isinstance(answer, EpisodesResult)])
+        valid = valid_members(result)
+        return PolicyEvaluations(result.fitness, result.returns, result.descriptor, result.steps, valid)
+
+    def close(self, why: str = "this evaluator is closed") -> None:
+        """End the workers. Later calls raise an EvaluationError that begins with `why`."""
+        if not self._closed:
+            self._closed = why
+            self._engine.close()
+
+    def _policies(self, parameters: ArrayLike) -> FloatArray:
+        """The policies as float32 [N, D]."""
+        allowed = f"an array of numbers of shape (policies, {self.parameters}), with at least one policy"
+        policies_N_D = _floats("parameters", parameters, allowed)
+        if policies_N_D.ndim != 2 or not len(policies_N_D) or policies_N_D.shape[1] != self.parameters:
+            raise _wrong("parameters", f"has the shape {policies_N_D.shape}", policies_N_D.shape, allowed)
+        wrong = np.flatnonzero(~np.isfinite(policies_N_D).all(axis=1))
+        if wrong.size:
+            which = f"{wrong.size} of {len(policies_N_D)} policies, the first of which is policy {wrong[0]}"
+            raise _wrong("parameters", f"has NaN or infinite float32 numbers in {which}", None, "finite numbers")
+        return policies_N_D
+
+    def _statistics(
+        self, policies: int, mean: ArrayLike | None, std: ArrayLike | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Mean and standard deviation of each policy, [N, O]."""
+        size = self.task.observation_size
+        if mean is None and std is None:
+            return no_statistics(policies, size)
+        found = []
+        for name, given in (("observation_mean", mean), ("observation_std", std)):
+            allowed = f"an array of shape ({size},) or ({policies}, {size}), or None for both statistics"
+            if given is None:
+                raise _wrong(name, "is None, but the other statistic is given", None, allowed)
+            array = _floats(name, given, allowed)
+            if array.shape not in ((size,), (policies, size)):
+                raise _wrong(name, f"has the shape {array.shape}", array.shape, allowed)
+            if not np.isfinite(array).all():
+                raise _wrong(name, "has NaN or infinite float32 numbers", None, "finite numbers")
+            found.append(np.ascontiguousarray(np.broadcast_to(array, (policies, size))))
+        if not (found[1] > 0.0).all():
+            raise _wrong("observation_std", "has numbers that are not positive", None, "positive numbers")
+        return found[0], found[1]
+
+
+@contextmanager
+def evaluator(
+    config: RunConfig | Source,
+    *,
+    workers: int | Literal["auto"] | None = None,
+    engine: Literal["inline", "ray"] | None = None,
+    address: str | None = None,
+) -> Iterator[PolicyEvaluator]:
+    """Start the workers of a config and evaluate policies with them; at the end of the block, the workers end.
+
+        with evaluator("point_maze_es.yaml") as evaluate:
+            result = evaluate(parameters_N_D, episodes=4, seed=0, generation=7)
+
+    Task, policy, seed and `compute` of the config are used; the search and the budget are not.
+
+    Args:
+        config: a RunConfig, or what `load_config` accepts.
+        workers, engine, address: as `--workers`, `--engine` and `--address` of the command line: number of workers
+            ("auto": one for each core of the machine or the cluster), "inline" or "ray", and the Ray cluster to join;
+            None: as configured.
+
+    Raises:
+        ConfigError: the config is wrong. EvaluationError: the workers cannot be started.
+    """
+    given = {"compute.workers": workers, "compute.engine": engine, "compute.address": address}
+    overrides = implied_by(engine, address) | {key: value for key, value in given.items() if value is not None}
+    if not isinstance(config, RunConfig):
+        config = load_config(config, overrides, new=False)
+    elif overrides:
+        config = changed_config(config.model_dump(mode="json"), overrides)
+    made = PolicyEvaluator(config, make_engine(config, at_once=ANY_NUMBER))
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def _floats(name: str, given: ArrayLike, allowed: str) -> FloatArray:
+    """An argument as a contiguous float32 array."""
+    try:
+        array = np.asarray(given)
+        if array.dtype.kind not in "fiu":
+            raise ValueError(f"its type is {array.dtype}")
+    except (TypeError, ValueError) as error:
+        raise _wrong(name, f"is no array of numbers ({error})", None, allowed) from error
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def _whole(name: str, given: int, least: int) -> int:
+    """An argument that must be an integer in a range."""
+    if isinstance(given, bool) or not isinstance(given, int | np.integer) or not least <= given <= LARGEST:
+        raise _wrong(name, f"is {given!r}", given, f"an integer from {least} to 2**63 - 1")
+    return int(given)
+
+
+def _wrong(name: str, what: str, value: object, allowed: str) -> ConfigError:
+    return ConfigError(f"{name} {what}; must be {allowed}", field=name, value=value, allowed=allowed)

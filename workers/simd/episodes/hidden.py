@@ -1,0 +1,209 @@
+"""Code of the hidden layers of a policy, for a block of members: tanh(weights x), one member per lane.
+
+A vector holds several outputs of one member. Every output is one sum in the order of the inputs, starting with the
+bias, whatever the width and wherever the weights are from:
+
+shared: from the centre, for all members.
+perturbed: the weights of + are (centre + unit) + 2 unit j, and those of - are 2 centre minus that weight, its mirror
+    image up to a rounding. The members of a pair share the bytes j of their noise k = 2 j + 1.
+own: from the parameters of each member.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from workers.simd.backend.emit import inline
+from workers.simd.backend.function_builder import FunctionBuilder, Values
+from workers.simd.episodes.layout import Layer, Network, sums_at_once
+from workers.simd.graph import elementary
+from workers.simd.graph.folding import FoldingGraph
+
+
+class View(NamedTuple):
+    """Array of members' floats in memory; element (member, input) is at member * by_member + input * by_input."""
+
+    pointer: str
+    by_member: int
+    by_input: int
+
+
+def shared(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
+    """Write out = tanh(centre x), for several members at a time."""
+    floats = builder.llvm_types["f"]
+    members = min(builder.width, sums_at_once(builder.width) // layer.tile)
+    assert builder.width % members == 0
+
+    def tile(first: str, number: str) -> Values:
+        weights = builder.index((number, (layer.inputs + 1) * layer.tile), (layer.first, 1))
+
+        def centre(row: str | int) -> Values:
+            at = builder.index((weights, 1), (row, layer.tile))
+            return [builder.load(floats, "%centre", builder.index((at, 1), (v, 1))) for v in range(layer.tile)]
+
+        def add(row: str, sums: Values) -> Values:
+            vectors, found = centre(row), []
+            for member in range(members):
+                seen = _seen(builder, x, first, member, row)
+                mine = sums[member * layer.tile : (member + 1) * layer.tile]
+                found += [builder.fma(seen, vector, one) for vector, one in zip(vectors, mine, strict=True)]
+            return found
+
+        sums = builder.loop(layer.inputs, add, [(floats, one) for one in centre(layer.inputs) * members])
+        for member in range(members):
+            _put(builder, layer, out, first, member, number, sums[member * layer.tile : (member + 1) * layer.tile])
+        return []
+
+    _by_members(builder, layer, members, tile)
+
+
+def perturbed(builder: FunctionBuilder, network: Network, layer: Layer, x: View, out: View) -> None:
+    """Write out = tanh((centre +- unit k) x), for several pairs at a time.
+
+    The weights of - come from an addition, because the multipliers are the bottleneck.
+    """
+    floats = builder.llvm_types["f"]
+    pairs = min(builder.width // 2, max(1, sums_at_once(builder.width) // (2 * layer.tile)))
+    assert builder.width % (2 * pairs) == 0
+    unit, twice = units(builder)
+
+    def tile(first: str, number: str) -> Values:
+        weights = builder.index((number, (layer.inputs + 1) * layer.tile), (layer.first, 1))
+        first_pair = builder.value(f"lshr i64 {first}, 1")
+
+        def member_weights(row: str | int, v: int) -> list[tuple[str, str]]:
+            """Weights (of +, of -) of each pair for input `row` and vector `v` of the tile."""
+            at = builder.index((weights, 1), (row, layer.tile), (v, 1))
+            centre = builder.load(floats, "%centre", at)
+            moved, doubled = (builder.value(f"fadd {floats} {centre}, {one}") for one in (unit, centre))
+            found = []
+            for pair in range(pairs):
+                place = builder.index((first_pair, network.vectors), (pair * network.vectors, 1), (at, 1))
+                plus = builder.fma(noise_of_weights(builder, "%noise", place), twice, moved)
+                found.append((plus, builder.value(f"fsub {floats} {doubled}, {plus}")))
+            return found
+
+        def add(row: str, sums: Values) -> Values:
+            seen = [_seen(builder, x, first, member, row) for member in range(2 * pairs)]
+            found = list(sums)
+            for v in range(layer.tile):
+                for pair, of_signs in enumerate(member_weights(row, v)):
+                    for sign, weight in enumerate(of_signs):
+                        place = (2 * pair + sign) * layer.tile + v
+                        found[place] = builder.fma(seen[2 * pair + sign], weight, sums[place])
+            return found
+
+        biases = [""] * (2 * pairs * layer.tile)
+        for v in range(layer.tile):
+            for pair, of_signs in enumerate(member_weights(layer.inputs, v)):
+                for sign, weight in enumerate(of_signs):
+                    biases[(2 * pair + sign) * layer.tile + v] = weight
+        sums = builder.loop(layer.inputs, add, [(floats, one) for one in biases])
+        for member in range(2 * pairs):
+            _put(builder, layer, out, first, member, number, sums[member * layer.tile : (member + 1) * layer.tile])
+        return []
+
+    _by_members(builder, layer, 2 * pairs, tile)
+
+
+def own(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
+    """Write out = tanh(weights x) with the parameters of each member, whose addresses are in `%weights`.
+
+    A weight is used once per call, so memory is the bottleneck. A tile is therefore as wide as the registers allow,
+    which reads the weights in the order in which they are stored.
+    """
+    floats, most = builder.llvm_types["f"], sums_at_once(builder.width)
+    tiles = max(count for count in (1, 2, 4, 8) if layer.tiles % count == 0 and count * layer.tile <= most)
+    wide = layer._replace(tile=tiles * layer.tile, tiles=layer.tiles // tiles)
+    members = min(builder.width, most // wide.tile)
+    assert builder.width % members == 0
+
+    def tile(first: str, number: str) -> Values:
+        places = builder.index((number, (layer.inputs + 1) * wide.tile), (layer.first, 1))
+        addresses = [
+            builder.load("i64", "%weights", builder.index((first, 1), (member, 1))) for member in range(members)
+        ]
+        pointers = [builder.value(f"inttoptr i64 {address} to ptr") for address in addresses]
+
+        def weights(row: str | int) -> list[Values]:
+            """Vectors of the tile for input `row`, of each member; they follow each other in memory."""
+            place = builder.load("i32", "%places", builder.index((places, 1), (row, layer.tile)))
+            start = builder.value(f"zext i32 {place} to i64")
+            ends = [builder.index((start, 1), (v * builder.width, 1)) for v in range(wide.tile)]
+            return [
+                [builder.value(f"load {floats}, ptr {builder.at(pointer, end, 'float')}, align 4") for end in ends]
+                for pointer in pointers
+            ]
+
+        def add(row: str, sums: Values) -> Values:
+            found = []
+            for member, vectors in enumerate(weights(row)):
+                seen = _seen(builder, x, first, member, row)
+                mine = sums[member * wide.tile : (member + 1) * wide.tile]
+                found += [builder.fma(seen, vector, one) for vector, one in zip(vectors, mine, strict=True)]
+            return found
+
+        biases = [(floats, vector) for vectors in weights(layer.inputs) for vector in vectors]
+        sums = builder.loop(layer.inputs, add, biases)
+        for member in range(members):
+            _put(builder, wide, out, first, member, number, sums[member * wide.tile : (member + 1) * wide.tile])
+        return []
+
+    _by_members(builder, wide, members, tile)
+
+
+def _by_members(builder: FunctionBuilder, layer: Layer, members: int, tile: Callable[[str, str], Values]) -> None:
+    """Write `tile(first member, number of the tile)` for each group of members of which at least one is alive."""
+
+    def block(number: str, _: Values) -> Values:
+        first = builder.index((number, members))
+        builder.when(
+            _any_alive(builder, first, members), lambda: builder.loop(layer.tiles, lambda t, _: tile(first, t))
+        )
+        return []
+
+    builder.loop(builder.width // members, block)
+
+
+def units(builder: FunctionBuilder) -> tuple[str, str]:
+    """Vectors of unit and of 2 unit; unit k is the first plus j times the second."""
+    return builder.splat("%unit"), builder.splat(builder.value("fadd float %unit, %unit"))
+
+
+def noise_of_weights(builder: FunctionBuilder, noise: str, vector: str) -> str:
+    """Vector of noise j, as floats, of a vector of weights."""
+    llvm_type = f"<{builder.width} x i8>"
+    words = builder.value(f"sext {llvm_type} {builder.load(llvm_type, noise, vector)} to {builder.llvm_types['i']}")
+    return builder.value(f"sitofp {builder.llvm_types['i']} {words} to {builder.llvm_types['f']}")
+
+
+def _seen(builder: FunctionBuilder, x: View, first: str, member: int, row: str) -> str:
+    """Vector with a member's value of input `row` in all lanes."""
+    index = builder.index((first, x.by_member), (member * x.by_member, 1), (row, x.by_input))
+    return builder.splat(builder.load("float", x.pointer, index))
+
+
+def _put(
+    builder: FunctionBuilder, layer: Layer, out: View, first: str, member: int, tile: str, sums: Sequence[str]
+) -> None:
+    """Store tanh of a member's sums in `out`."""
+    vectors = layer.tiles * layer.tile
+    for v, value in enumerate(tanh(builder, sums)):
+        place = builder.index((first, vectors), (tile, layer.tile), (member * vectors + v, 1))
+        builder.store(builder.llvm_types["f"], value, out.pointer, place)
+
+
+def _any_alive(builder: FunctionBuilder, first: str, members: int) -> str:
+    """An i1 that is true if any of some members, from `first` on, is alive."""
+    return builder.any(
+        builder.value(f"load <{members} x i32>, ptr {builder.at('%alive', first, 'i32')}, align 4"), members
+    )
+
+
+def tanh(builder: FunctionBuilder, values: Sequence[str]) -> Values:
+    """Vectors of tanh of each vector."""
+    graph = FoldingGraph()
+    nodes = [graph.input("f", k) for k in range(len(values))]
+    outputs = [elementary.tanh(graph, node) for node in nodes]
+    return inline(builder, graph, outputs, dict(zip(nodes, values, strict=True)))
