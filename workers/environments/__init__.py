@@ -32,6 +32,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
         has_goal=True,
         options={"start": ("default", "corner")},
         walls=(((-0.5, -0.495), (1.0, -0.495)), ((-1.0, 0.205), (0.5, 0.205))),
+        goal=(-0.5, 0.8),
         least_reward=-2.3431,  # from the corner (1, -1)
         summary="a point must reach a goal in a square; two walls block the direct path",
     ),
@@ -54,6 +55,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
             ((10.0, -35.0), (10.0, 0.0)),
         ),
         wall_clearance=ANT_CLEARANCE,
+        goal=(35.0, -25.0),
         least_reward=-95.6,  # from the corner (-35, 40)
         summary="an ant must go round three walls to a goal 60 m away; the direct path ends in a pocket",
     ),
