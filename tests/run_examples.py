@@ -167,7 +167,9 @@ def _row(task: TaskSpec, g: int, fitness_G: np.ndarray, descriptor_B: np.ndarray
 def _filled(geometry: Geometry, share: float, rng: np.random.Generator) -> BehaviourMap:
     cells = np.sort(rng.permutation(geometry.size)[: round(share * geometry.size)])
     if isinstance(geometry, Grid):
-        index_N_B = np.array([geometry.index_of(int(cell)) for cell in cells]).reshape(cells.size, -1)
+        index_N_B = np.array([geometry.index_of(int(cell)) for cell in cells], int).reshape(
+            cells.size, len(geometry.bounds)
+        )
         middle_N_B = [
             (edges[:-1] + edges[1:])[index] / 2 for edges, index in zip(geometry.edges, index_N_B.T, strict=True)
         ]

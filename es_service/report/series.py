@@ -138,9 +138,9 @@ def phase_curves(history: Columns) -> tuple[NDArray[np.float64], Mapping[str, ND
 
 
 def groups(generations: int, most: int = MOST_POINTS) -> NDArray[np.int64]:
-    """End (exclusive) of each group of neighbouring generations, [K]: at most `most` groups of nearly equal size."""
-    count = min(generations, most)
-    return (np.arange(1, count + 1) * generations) // max(count, 1)
+    """End (exclusive) of each group of neighbouring generations, [K]: at most `most` groups, all but the last equal."""
+    size = max(1, -(-generations // most))
+    return np.minimum(np.arange(1, -(-generations // size) + 1) * size, generations)
 
 
 def thinned(values_G: NDArray[np.float64], ends_K: NDArray[np.int64], group: Group) -> NDArray[np.float64]:

@@ -98,9 +98,11 @@ def test_generation_0_alone_is_shown(tmp_path):
 def test_curves_of_long_runs_are_groups_of_generations():
     values_G = np.arange(8001.0)
     ends_K = series.groups(8001)
-    assert ends_K.size == series.MOST_POINTS
+    assert ends_K.size == 297  # groups of 27, the last smaller
     assert ends_K[-1] == 8001
-    assert set(np.diff(ends_K, prepend=0)) <= {26, 27}
+    assert set(np.diff(ends_K, prepend=0)) == {27, 9}
+    np.testing.assert_array_equal(series.groups(3), [1, 2, 3])
+    assert series.groups(0).size == 0
     np.testing.assert_array_equal(series.thinned(values_G, ends_K, "last"), ends_K - 1)
     np.testing.assert_allclose(
         series.thinned(values_G, ends_K, "mean"), (ends_K - 1 + np.concatenate([[0], ends_K[:-1]])) / 2
