@@ -155,7 +155,7 @@ def _bars(data: RunData, level_N: NDArray[np.int64], colours: Range) -> Markup:
     assert isinstance(map_.geometry, Grid)
     low, high = spread([map_.fitness_N, np.array(colours)])
     frame = Frame(map_.geometry.bounds[0], (low, high), 64, 8, floor.WIDTH - 74, 220)
-    across, bottom = frame.across(map_.geometry.edges[0]), frame.top + frame.height
+    across, bottom = frame.across(map_.geometry.edges[0]).tolist(), frame.top + frame.height
     bars = [
         _rectangle(cell, colour, across[cell], top, across[cell + 1], bottom)
         for cell, colour, top in zip(map_.cell_N, level_N, frame.down(np.maximum(map_.fitness_N, low)), strict=True)

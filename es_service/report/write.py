@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
-from es_service.errors import StoreError
+from es_service.errors import ConfigError, StoreError
 from es_service.report.data import read_run
 from es_service.report.page import Evaluate, run_page
+from es_service.report.replays import MOST_CELLS, replay_section
 
 REPORT = "report.html"
 """Name of a run's report in its folder."""
@@ -23,18 +25,37 @@ def python_call(folder: Path) -> Evaluate:
     return call
 
 
-def write_report(folder: Path, out: Path | None = None, evaluate: Evaluate | None = None) -> Path:
+def write_report(
+    folder: Path,
+    out: Path | None = None,
+    *,
+    best: bool = True,
+    cells: Sequence[Sequence[int]] = (),
+    evaluate: Evaluate | None = None,
+) -> Path:
     """Write the report of one run and return its file.
 
     Args:
         out: file to write; None: `report.html` in the run's folder.
+        best: whether to record an episode of the best centre for a replay, which takes seconds.
+        cells: places of at most eight cells whose elites are to be replayed, too.
         evaluate: what evaluates a policy, as text; None: the Python call.
 
     Raises:
-        StoreError: the run cannot be read, or the file cannot be written.
+        ConfigError: too many cells. NotInRunError: a cell does not exist or is empty. StoreError: the run cannot be
+            read, or the file cannot be written.
     """
+    if len(cells) > MOST_CELLS:
+        raise ConfigError(
+            f"{len(cells)} cells are too many for replays in one page; choose at most {MOST_CELLS}",
+            field="replay",
+            value=len(cells),
+            allowed=f"at most {MOST_CELLS} cells",
+        )
     data = read_run(folder)
-    return write_page(run_page(data, evaluate or python_call(folder)), out or folder / REPORT)
+    found = bool(data.history["generation"].size) and (best or bool(cells))
+    replays = replay_section(data, best=best, cells=cells) if found else None
+    return write_page(run_page(data, evaluate or python_call(folder), replays), out or folder / REPORT)
 
 
 def write_page(page: str, file: Path) -> Path:

@@ -76,6 +76,8 @@ class Page:
                 self.complaints.append(json.dumps(message["params"]["exceptionDetails"]))
             case "Runtime.consoleAPICalled" if message["params"]["type"] in ("error", "warning", "assert"):
                 self.complaints.append(json.dumps(message["params"]["args"]))
+            case "Log.entryAdded" if "GPU stall due to ReadPixels" in message["params"]["entry"]["text"]:
+                pass  # a screenshot reads pixels
             case "Log.entryAdded" if message["params"]["entry"]["level"] in ("error", "warning"):
                 self.complaints.append(message["params"]["entry"]["text"])
             case "Network.requestWillBeSent":
@@ -92,6 +94,14 @@ class Page:
         self.send("Page.navigate", url=address)
         self.until(f"document.readyState === 'complete' && location.href === {json.dumps(address)}")
         self.requests = [one for one in self.requests if one != address and not one.startswith("data:")]
+
+    def without_webgl(self) -> None:
+        """Have pages that are opened from now on find no WebGL."""
+        script = (
+            "const own = HTMLCanvasElement.prototype.getContext; HTMLCanvasElement.prototype.getContext = "
+            "function (kind, ...more) { return kind.startsWith('webgl') ? null : own.call(this, kind, ...more); };"
+        )
+        self.send("Page.addScriptToEvaluateOnNewDocument", source=script)
 
     def value(self, script: str) -> Any:
         """Value of a JavaScript expression in the page."""

@@ -1,14 +1,18 @@
 """Reports in a headless browser: what a pointer does, no complaint of the page, and no request to any network."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from es_service.config.tasks import TASKS
 from tests.run_examples import write_run
 from tests.system.browser import browser
 from tests.system.command_line import es
+from tests.system.processes import ROOT
+from workers.environments import SHIPPED
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +30,7 @@ def pixels(png: bytes) -> np.ndarray:
 @pytest.fixture(scope="module")
 def point_maze(tmp_path_factory):
     folder = write_run(tmp_path_factory.mktemp("runs") / "a run", generations=400)
-    code, printed = es("report", folder)
+    code, printed = es("report", folder, "--replay", "none")
     assert (code, printed.strip()) == (0, str(folder / "report.html"))
     return folder / "report.html"
 
@@ -91,3 +95,78 @@ def test_a_page_fits_its_window_in_light_and_dark(page, point_maze, width, dark)
     corner = seen[-1, 0].mean()
     assert corner < 60 if dark else corner > 200
     assert seen.std() > 5
+
+
+def replayed(folder, settings, task, *options, **environment):
+    """Report of a made-up run of a task, with a recorded episode of its policy."""
+    write_run(folder, {"policy.hidden": [8], "task.episode_steps": 40, **settings}, task=task, filled=0.01)
+    code, printed = es("report", folder, *options, **environment)
+    assert code == 0, printed
+    return folder / "report.html"
+
+
+def test_a_point_is_replayed_in_the_plane(page, tmp_path):
+    page.open(replayed(tmp_path / "run", {"map.enabled": False, "search.algorithm": "es"}, SHIPPED["point_maze"]))
+    assert page.text("#step").startswith("step 0 of 40; return so far 0")
+    start = page.value("document.querySelector('#plan circle.body').outerHTML")
+    page.slide("#scrub", 40)
+    assert page.text("#step").startswith("step 40 of 40; return so far -")
+    assert page.value("document.querySelector('#plan circle.body').outerHTML") != start
+    page.click("#play")  # from the beginning again
+    page.until("/^step [1-9]/.test(document.getElementById('step').textContent)")
+    page.until("document.getElementById('play').textContent === 'Play'")
+    assert page.text("#step").startswith("step 40 of 40")
+
+
+SLALOM = "tests.examples.ant_slalom:AntSlalom"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ant_maze", "ant_trap", "brax:hopper", SLALOM])
+def test_bodies_are_replayed_in_three_dimensions(page, tmp_path, name):
+    environment = {"PYTHONPATH": str(ROOT)}
+    page.open(replayed(tmp_path / "run", {"map.enabled": False, "search.algorithm": "es"}, TASKS[name], **environment))
+    page.until("Number(document.getElementById('stage').dataset.triangles) > 500")
+    seen = []
+    for step in (0, 39):
+        page.slide("#scrub", min(step, int(page.value("document.getElementById('scrub').max"))))
+        page.value("document.getElementById('stage-box').scrollIntoView()")
+        page.click("#follow") if not step else None
+        seen.append(pixels(page.screenshot(whole=False)))
+    assert seen[0].std() > 5
+    assert (seen[0] != seen[1]).mean() > 1e-4, "the body does not move"
+
+
+@pytest.mark.slow
+def test_without_webgl_the_path_is_shown_from_above(tmp_path):
+    report = replayed(tmp_path / "run", {"map.enabled": False, "search.algorithm": "es"}, SHIPPED["ant_trap"])
+    with browser() as page:
+        page.without_webgl()
+        page.open(report)
+        assert page.value("document.getElementById('stage-box').hidden")
+        assert not page.value("document.getElementById('plan').hidden")
+        before = page.value("document.querySelector('#plan circle.body').outerHTML")
+        page.slide("#scrub", 40)
+        assert page.value("document.querySelector('#plan circle.body').outerHTML") != before
+        assert page.complaints == []
+
+
+def test_a_task_that_is_gone_is_reported_without_a_replay(page, tmp_path):
+    gone = replace(SHIPPED["point_maze"], name="no_such_package:Task")
+    report = replayed(tmp_path / "run", {}, gone)
+    page.open(report)
+    assert "No episode could be recorded on this machine" in page.text("#replay")
+    assert "no_such_package" in page.text("#replay")
+
+
+def test_wrong_replays_are_refused(tmp_path):
+    folder = write_run(tmp_path / "run", filled=0.5)
+    for options, message in (
+        (["--replay", "x"], "--replay x: must be whole numbers"),
+        (["--replay", "99,99"], "cell 99,99 is not in the map"),
+        (["--replay", "none", "--replay", "best"], "cannot be combined"),
+        ([word for cell in range(9) for word in ("--replay", f"{cell},0")], "9 cells are too many"),
+    ):
+        code, printed = es("report", folder, *options)
+        assert code == 2
+        assert message in printed

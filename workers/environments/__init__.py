@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from es_service.protocol.messages import TaskSpec
+from workers.viewer import Viewer
 
 
 class TaskError(Exception):
@@ -94,6 +95,8 @@ class Environment:
     """Function from a state to the descriptor [B] of an episode that ends in it."""
     goal_distance: Callable[[Any], Any]
     """Function from a state to the distance to the goal, NaN if the task has no goal."""
+    viewer: Viewer | None = None
+    """What a replay in three dimensions needs; None if the task has no bodies."""
 
 
 def make_environment(name: str, options: Mapping[str, str]) -> Environment:

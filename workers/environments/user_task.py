@@ -20,6 +20,8 @@ It may also have:
 - if the descriptor is a place in the plane, `walls`, a tuple of segments ((x, y), (x, y)), and `wall_clearance`, the
   least distance of a descriptor from a wall. The behaviour map's coverage is then relative to the reachable cells;
   and `goal`, a place (x, y). Reports draw both;
+- `viewer(self)`, if the task has bodies: a `workers.viewer.Viewer`, with which reports replay episodes in three
+  dimensions. `workers.environments.ant.ant_viewer` makes that of an ant;
 - `least_reward`: the reward per step from which QD-scores are counted;
 - a docstring, whose first line `es-service` shows.
 
@@ -203,7 +205,8 @@ def make(path: str, options: Mapping[str, str]) -> Environment:
         state, reward, done = task.step(state, action)
         return state, jnp.asarray(reward, jnp.float32), jnp.asarray(done, bool)
 
-    return Environment(task.reset, task.observe, step, task.descriptor, goal_distance)
+    viewer = task.viewer() if hasattr(task, "viewer") else None
+    return Environment(task.reset, task.observe, step, task.descriptor, goal_distance, viewer)
 
 
 def _import(path: str) -> Any:

@@ -5,7 +5,7 @@
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer;
   const byId = (name) => document.getElementById(name);
   const SVG = "http://www.w3.org/2000/svg";
-  window.report = { read, bytes, byId };
+  window.report = { read, bytes, byId }; // for replay.js
 
   for (const input of document.querySelectorAll('input[name="x"]')) {
     const choose = () => { if (input.checked) document.body.dataset.x = input.value; };

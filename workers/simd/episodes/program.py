@@ -48,8 +48,8 @@ class EpisodeKernel:
     """Function from reset keys [lane, 4] to words of carries [block, word, lane]."""
     alive_word: int
     """Index of the word of a carry that says whether the episode is alive."""
-    episode_avals: Episodes
-    """Shapes and dtypes of an episode's result."""
+    carry: Carry
+    """Shapes and dtypes of a carry."""
     episode_words: int
     """Number of words of an episode's result."""
     _call: Callable[..., None]
@@ -73,6 +73,38 @@ class EpisodeKernel:
             noise_keys_P: keys of the pairs' noise; None for evaluations.
             reset_keys_L, action_keys_L: stream keys of each lane's reset and action noise.
         """
+        lanes = len(reset_keys_L)
+        carries, go = self._begun(weights, unit, mean_O, std_O, noise_keys_P, reset_keys_L, action_keys_L)
+        go(self.spec.episode_steps)
+        # The result of an episode is the last part of a carry.
+        found = Episodes(*unpack(carries[:, -self.episode_words :], self.carry.episode, lanes))
+        if not self.training or len(self.inputs_O) == self.spec.policy.widths[0]:
+            return found
+        sums = [np.zeros((lanes, self.spec.policy.widths[0]), np.float32) for _ in range(2)]
+        sums[0][:, self.inputs_O], sums[1][:, self.inputs_O] = found.shifted_sum_O, found.shifted_square_sum_O
+        return found._replace(shifted_sum_O=sums[0], shifted_square_sum_O=sums[1])
+
+    def watch(self, weights: np.ndarray, mean_O: np.ndarray, std_O: np.ndarray, reset_key: np.ndarray) -> Carry:
+        """Run one evaluation episode step by step; returns its carries until it is done, with leading axis [T]."""
+        carries, go = self._begun(weights, 0.0, mean_O, std_O, None, reset_key[None], reset_key[None])
+        words = [carries[0, :, 0].copy()]
+        while carries[0, self.alive_word, 0] and len(words) <= self.spec.episode_steps:
+            go(1)
+            words.append(carries[0, :, 0].copy())
+        leaves, structure = jax.tree.flatten(self.carry)
+        return structure.unflatten(unpack(np.stack(words, axis=1)[None], leaves, len(words)))
+
+    def _begun(
+        self,
+        weights: np.ndarray,
+        unit: float,
+        mean_O: np.ndarray,
+        std_O: np.ndarray,
+        noise_keys_P: np.ndarray | None,
+        reset_keys_L: np.ndarray,
+        action_keys_L: np.ndarray,
+    ) -> tuple[np.ndarray, Callable[[int], None]]:
+        """Words of the carries after the reset [block, word, lane], and a function that runs so many more steps."""
         width, lanes = self.network.width, len(reset_keys_L)
         # Native code would read beyond the end of a shorter array without an error.
         assert (noise_keys_P is not None) == self.training
@@ -98,14 +130,12 @@ class EpisodeKernel:
         assert weights.ctypes.data % ALIGNMENT == 0
         assert weights.shape == (self.network.rows, width)
         pointers = [array.ctypes.data for array in arrays]
-        self._call(*pointers, np.float32(unit), blocks, self.spec.episode_steps)
-        # The result of an episode is the last part of a carry.
-        found = Episodes(*unpack(carries[:, -self.episode_words :], self.episode_avals, lanes))
-        if not self.training or len(self.inputs_O) == self.spec.policy.widths[0]:
-            return found
-        sums = [np.zeros((lanes, self.spec.policy.widths[0]), np.float32) for _ in range(2)]
-        sums[0][:, self.inputs_O], sums[1][:, self.inputs_O] = found.shifted_sum_O, found.shifted_square_sum_O
-        return found._replace(shifted_sum_O=sums[0], shifted_square_sum_O=sums[1])
+
+        def go(steps: int) -> None:
+            assert all(array is not None for array in arrays)  # their memory must live as long as this function
+            self._call(*pointers, np.float32(unit), blocks, steps)
+
+        return carries, go
 
 
 def compile_episodes(
@@ -141,7 +171,7 @@ def compile_episodes(
         network=program.network,
         begin=_begin(program.steps, target, folder),
         alive_word=program.alive_word,
-        episode_avals=carry.episode,
+        carry=carry,
         episode_words=sum(map(words_of, carry.episode)),
         _call=ctypes.CFUNCTYPE(None, *signature)(native.address),
         _alive=native.alive,

@@ -13,7 +13,7 @@ import numpy as np
 from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from workers.environments import Environment, make_environment
-from workers.episode import Episodes
+from workers.episode import Carry, Episodes
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import WIDTHS, Target, host_target
 from workers.simd.backend.words import aligned
@@ -87,6 +87,17 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Calla
     def rollout(centre_D, mean_O, std_O, reset_keys_E):
         kernel, weights = kernels.for_centre(centre_D, mean_O)
         return kernel.run(weights, 0.0, mean_O, std_O, None, reset_keys_E, reset_keys_E)
+
+    return rollout
+
+
+def make_watched_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Carry]:
+    """Rollout of one episode, with the interface of `workers.rollout.make_watched_rollout` and the run's own bits."""
+    kernels = _Kernels(environment, spec, training=False)
+
+    def rollout(centre_D, mean_O, std_O, reset_key):
+        kernel, weights = kernels.for_centre(centre_D, mean_O)
+        return kernel.watch(weights, mean_O, std_O, reset_key)
 
     return rollout
 
