@@ -13,6 +13,8 @@ from es_service.report.markup import Frame, Markup, joined, spread, table, tag, 
 from es_service.report.series import X_AXES, Chart
 
 WIDTH, HEIGHT = 560, 250
+STYLES = 7
+"""Number of styles of curves in the stylesheet; more curves use them again."""
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 12, 10, 40
 
 
@@ -21,47 +23,50 @@ class Drawn(NamedTuple):
 
     figure: Markup
     points: dict[str, Any]
-    """`axes`: column of X_AXES -> pixels across of each point; `texts`: what is shown at each point."""
+    """`axes`: column of X_AXES -> pixels across of each point; `texts`: the same -> what is shown at each point, or
+    under "" what is shown on all axes."""
 
 
 def draw_charts(charts: Sequence[Chart], x_axes: Mapping[str, NDArray[np.float64]]) -> list[Drawn]:
-    """Charts whose points have the places of `x_axes` (column of X_AXES -> [K])."""
-    return [_draw(chart, x_axes) for chart in charts]
+    """Charts whose points have the places of `x_axes` (column of X_AXES -> [K]), the same ones on every axis."""
+    found = []
+    for chart in charts:
+        figure, axes = draw({column: (chart, x_K) for column, x_K in x_axes.items()})
+        texts = [
+            f"generation {x_axes['generation'][k]:,.0f}: {values_text(chart, k)}"
+            for k in range(len(x_axes["generation"]))
+        ]
+        found.append(Drawn(figure, {"axes": axes, "texts": {"": texts}}))
+    return found
 
 
-def _draw(chart: Chart, x_axes: Mapping[str, NDArray[np.float64]]) -> Drawn:
-    scale = 100.0 if chart.percent else 1.0
-    band = () if chart.band is None else chart.band[1:]
-    low, high = spread([scale * values for values in (*(line.y_K for line in chart.lines), *band)])
-    if chart.percent:
-        low, high = 0.0, min(100.0, high) if high > 0 else 1.0
+def draw(chart_on: Mapping[str, tuple[Chart, NDArray[np.float64]]]) -> tuple[Markup, dict[str, list[float]]]:
+    """A figure with a chart for each axis, of which the page shows one, and the pixels across of its points.
+
+    Args:
+        chart_on: column of X_AXES -> the chart on this axis and the places of its points, [K].
+    """
     figures, axes = [], {}
-    for column, label in X_AXES.items():
-        x_K = x_axes[column]
-        first, last = float(np.nanmin(x_K)), float(np.nanmax(x_K))
-        # The space between the first and the last point must not be empty, as it is for generation 0 alone.
-        x = (min(0.0, first), last if last > first else first + 1.0)
-        frame = Frame(x, (low, high), _LEFT, _TOP, WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM)
+    for column, (chart, x_K) in chart_on.items():
+        label, scale = X_AXES[column], _scale(chart)
+        frame = Frame(_x_range(x_K), _y_range(chart), _LEFT, _TOP, WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM)
         content = [axis_lines(frame, label, "%" if chart.percent else "")]
         if chart.band is not None:
             content.append(tag("path", d=area(frame, x_K, scale * chart.band[1], scale * chart.band[2]), class_="band"))
+        for index, line in enumerate(chart.lines):
+            if line.range_K is not None:
+                low_K, high_K = (scale * values for values in line.range_K)
+                content.append(tag("path", d=area(frame, x_K, low_K, high_K), class_=f"fill range s{index % STYLES}"))
         content += [
-            tag("path", d=line_path(frame, x_K, scale * line.y_K), class_=f"line s{index}")
+            tag("path", d=line_path(frame, x_K, scale * line.y_K), class_=f"line s{index % STYLES}")
             for index, line in enumerate(chart.lines)
         ]
         content.append(tag("line", class_="pointer", y1=_TOP, y2=HEIGHT - _BOTTOM))
-        figures.append(
-            tag(
-                "svg",
-                *content,
-                viewBox=f"0 0 {WIDTH} {HEIGHT}",
-                role="img",
-                aria_label=f"{chart.title} against {label}",
-                class_=f"x x-{column}",
-            )
-        )
+        box, name = f"0 0 {WIDTH} {HEIGHT}", f"{chart.title} against {label}"
+        figures.append(tag("svg", *content, viewBox=box, role="img", aria_label=name, class_=f"x x-{column}"))
         axes[column] = np.round(frame.across(x_K), 1).tolist()
-    legend = [_key(f"s{index}", line.label) for index, line in enumerate(chart.lines)]
+    chart = next(iter(chart_on.values()))[0]
+    legend = [_key(f"s{index % STYLES}", line.label) for index, line in enumerate(chart.lines)]
     if chart.band is not None:
         legend.append(tag("span", tag("i", class_="swatch"), chart.band[0], class_="key"))
     figure = tag(
@@ -71,16 +76,34 @@ def _draw(chart: Chart, x_axes: Mapping[str, NDArray[np.float64]]) -> Drawn:
         tag("div", *legend, class_="legend"),
         class_="chart",
     )
-    return Drawn(figure, {"axes": axes, "texts": _texts(chart, x_axes, scale)})
+    return figure, axes
 
 
-def _texts(chart: Chart, x_axes: Mapping[str, NDArray[np.float64]], scale: float) -> list[str]:
-    unit = " %" if chart.percent else ""
-    rows = []
-    for k in range(len(x_axes["generation"])):
-        values = "; ".join(f"{line.label} {number(scale * float(line.y_K[k]))}{unit}" for line in chart.lines)
-        rows.append(f"generation {x_axes['generation'][k]:,.0f}: {values}")
-    return rows
+def values_text(chart: Chart, k: int) -> str:
+    """Values of all curves at a point, with their ranges."""
+    scale, unit = _scale(chart), " %" if chart.percent else ""
+    shown = []
+    for line in chart.lines:
+        text = f"{line.label} {number(scale * float(line.y_K[k]))}{unit}"
+        if line.range_K is not None:
+            text += " ({} to {})".format(*(number(scale * float(values[k])) for values in line.range_K))
+        shown.append(text)
+    return "; ".join(shown)
+
+
+def _scale(chart: Chart) -> float:
+    return 100.0 if chart.percent else 1.0
+
+
+def _x_range(x_K: NDArray[np.float64]) -> tuple[float, float]:
+    first, last = float(np.nanmin(x_K)), float(np.nanmax(x_K))
+    return min(0.0, first), last if last > first else first + 1.0  # generation 0 alone must have some width, too
+
+
+def _y_range(chart: Chart) -> tuple[float, float]:
+    shown = [line.y_K for line in chart.lines] + [values for line in chart.lines for values in line.range_K or ()]
+    low, high = spread([_scale(chart) * values for values in (*shown, *(chart.band[1:] if chart.band else ()))])
+    return (0.0, min(100.0, high) if high > 0 else 1.0) if chart.percent else (low, high)
 
 
 def axis_lines(frame: Frame, label: str, unit: str = "", most: int = 6) -> Markup:

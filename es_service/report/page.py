@@ -66,6 +66,15 @@ def section(title: str, *content: object, id_: str) -> Markup:
     return tag("section", tag("h2", title), *content, id=id_)
 
 
+def axis_choice(axes: Mapping[str, str]) -> Markup:
+    """Buttons that choose what curves are drawn against, the first one chosen; axes are columns with labels."""
+    buttons = [
+        tag("label", Markup(f'<input type="radio" name="x" value="{column}"{" checked" * (index == 0)}>'), label)
+        for index, (column, label) in enumerate(axes.items())
+    ]
+    return tag("div", tag("span", "against"), *buttons, class_="choice", role="radiogroup")
+
+
 def colour_legend(data: RunData) -> Markup | None:
     """Colours of the map's fitness."""
     return maps.colour_bar(value_range(data.map.fitness_N)) if data.map is not None else None
@@ -94,10 +103,6 @@ def _head(data: RunData) -> Markup:
 def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
     drawn = curves.draw_charts(series.charts(data.history), series.x_axes(data.history))
     scripts["charts"] = [one.points for one in drawn]
-    buttons = [
-        tag("label", Markup(f'<input type="radio" name="x" value="{column}"{" checked" * (index == 0)}>'), label)
-        for index, (column, label) in enumerate(series.X_AXES.items())
-    ]
     generations = data.history["generation"].size
     together = series.groups(generations)[0]
     grouped = None
@@ -106,7 +111,7 @@ def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
                       "where values count so far, else the mean.", class_="note")  # fmt: skip
     return section(
         "Curves",
-        tag("div", tag("span", "against"), *buttons, class_="choice", role="radiogroup"),
+        axis_choice(series.X_AXES),
         tag("div", *(one.figure for one in drawn), class_="charts"),
         grouped,
         id_="curves",

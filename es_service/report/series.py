@@ -36,6 +36,8 @@ class Line(NamedTuple):
     label: str
     column: str
     y_K: NDArray[np.float64]
+    range_K: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+    """(low [K], high [K]) of the region around the curve, such as quartiles over seeds."""
 
 
 class Chart(NamedTuple):

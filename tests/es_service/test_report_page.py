@@ -192,9 +192,9 @@ def test_a_damaged_run_says_so(tmp_path):
 
 def test_a_report_is_written_into_the_folder_or_elsewhere(tmp_path):
     folder = write_run(tmp_path / "run")
-    assert write_report(folder) == folder / "report.html"
+    assert write_report(folder, best=False) == [folder / "report.html"]
     elsewhere = tmp_path / "new" / "page.html"
-    assert write_report(folder, elsewhere) == elsewhere
+    assert write_report(folder, elsewhere, best=False) == [elsewhere]
     assert elsewhere.read_text() == (folder / "report.html").read_text()
     assert [path.name for path in elsewhere.parent.iterdir()] == ["page.html"]
 

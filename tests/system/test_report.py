@@ -170,3 +170,21 @@ def test_wrong_replays_are_refused(tmp_path):
         code, printed = es("report", folder, *options)
         assert code == 2
         assert message in printed
+
+
+def test_a_comparison_is_shown_and_different_tasks_are_refused(page, tmp_path):
+    runs = [write_run(tmp_path / f"run{seed}", {"seed": seed}) for seed in range(3)]
+    code, printed = es("report", *runs, "--out", tmp_path / "all.html", "--group-by", "seed", "--threshold", "-70")
+    assert (code, printed.strip()) == (0, str(tmp_path / "all.html"))
+    page.open(tmp_path / "all.html")
+    page.move(".chart .x-env_steps", 0.5)
+    assert "environment steps: seed 0 -" in page.text(".chart .at")
+    page.click('input[value="wall_clock_s"]')
+    page.move(".chart .x-wall_clock_s", 0.5)
+    assert "seconds: seed 0 -" in page.text(".chart .at")
+    other = write_run(tmp_path / "other", task=SHIPPED["ant_trap"])
+    code, printed = es("report", runs[0], other, "--out", tmp_path / "wrong.html")
+    assert code == 2
+    assert "task.environment differs" in printed
+    code, printed = es("report", *runs)
+    assert (code, "add --out FILE" in printed) == (2, True)

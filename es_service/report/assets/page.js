@@ -33,7 +33,7 @@
         text.className = "at readout note";
         figure.append(text);
       }
-      text.textContent = texts[nearest];
+      text.textContent = (texts[axis] || texts[""])[nearest];
     });
   });
 
