@@ -10,6 +10,8 @@ from es_service.errors import StoreError
 from es_service.report import facts, series, settings
 from es_service.report.data import read_run
 from es_service.runs.view import open_run
+from es_service.store.sound import read_sound
+from es_service.store.writer import RunStore
 from tests.run_examples import write_run
 from workers.environments import SHIPPED
 
@@ -179,3 +181,39 @@ def test_a_folder_without_a_run_is_refused(tmp_path):
 def test_the_goal_of_a_task_is_stored(tmp_path):
     elsewhere = replace(POINT, goal=(0.25, 0.5))
     assert read_run(write_run(tmp_path / "run", task=elsewhere)).task.goal == (0.25, 0.5)
+
+
+def test_a_run_that_is_being_written_is_read_as_of_one_generation(tmp_path):
+    """A driver commits another generation while the parts are read; nothing of it is in what is returned."""
+    folder = write_run(tmp_path / "run")
+    with RunStore.open(folder) as store:
+        parts, row = store.load(), store.last_history()
+        committed = []
+
+        def kept(part, arrays):
+            if not committed:
+                following = {**row, "generation": 21, "best_fitness": 0.0}
+                store.commit(21, {"best": {**parts["best"], "fitness": np.asarray(0.0)}}, following, [])
+                committed.append(part)
+            return arrays
+
+        found = read_sound(folder, kept)
+        assert committed
+        assert (found.generation, found.history[-1]["generation"], len(found.history)) == (20, 20, 21)
+        assert found.parts["best"]["fitness"] < 0.0
+        assert found.problems == ()
+        data = read_run(folder)
+    assert data.last("generation") == 21
+    assert data.best == (data.best[0], 0.0)
+    assert data.digest == ""
+    assert dict(facts.what_was_run(data))["state"].startswith("running on")
+    assert dict(facts.provenance(data))["digest"] == "not computed while a driver is writing"
+    assert read_run(folder).digest == open_run(folder).digest()
+
+
+def test_an_interrupted_run_is_shown_as_one(tmp_path):
+    data = read_run(write_run(tmp_path / "run", {"budget.generations": 1000}))
+    fields = dict(facts.what_was_run(data))
+    assert fields["state"] == "stopped before its budget was spent"
+    assert fields["generations"] == "20 of 1,000"
+    assert data.digest

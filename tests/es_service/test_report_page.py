@@ -216,3 +216,7 @@ def test_axes_have_round_numbers():
     assert tick_text(-20.0, 10.0) == "-20"
     frame = Frame((0.0, 2.0), (-1.0, 1.0), 10.0, 5.0, 100.0, 50.0)
     assert (float(frame.across(1.0)), float(frame.down(1.0)), float(frame.down(0.0))) == (60.0, 5.0, 30.0)
+
+
+def test_a_full_map_fits_into_five_megabytes(tmp_path):
+    assert len(page_of(write_run(tmp_path / "run", generations=2000, filled=1.0))) < 5e6
