@@ -1,18 +1,20 @@
-"""Evolution strategies for neuro-evolution: `from es_service import load_config, run, open_run`.
+"""Evolution strategies for neuro-evolution: `from es_service import load_config, run, open_run`, and `plots`.
 
 Names are imported from `es_service.api` at their first use, so that importing one module does not import everything.
 """
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from es_service.api import evaluator, fork, load_config, open_run, resume, run
+    from es_service.report import plots
 
     __version__: str
 
-__all__ = ["__version__", "evaluator", "fork", "load_config", "open_run", "resume", "run"]
+__all__ = ["__version__", "evaluator", "fork", "load_config", "open_run", "plots", "resume", "run"]
 
 
 def __getattr__(name: str) -> Any:
@@ -22,6 +24,8 @@ def __getattr__(name: str) -> Any:
         from es_service.protocol.machine import VERSION
 
         return VERSION
+    if name == "plots":
+        return importlib.import_module("es_service.report.plots")
     from es_service import api
 
     return getattr(api, name)

@@ -87,6 +87,28 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Callable[
     return rollout
 
 
+def make_watched_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Carry]:
+    """Rollout of one evaluation episode that keeps what it went through, for replays; compiled at its first call.
+
+    Returns:
+        f(centre_D, mean_O, std_O, reset_key_4) -> Carry with leading axis [T + 1], of the reset and after every step.
+    """
+    steps = episode_steps(environment, spec, training=False)
+
+    def rollout(centre_D, mean_O, std_O, reset_key):
+        layers = split_layers(spec.policy, centre_D)
+
+        def body(carry: Carry, _: None) -> tuple[Carry, Carry]:
+            after = steps.move(carry, mean_O, act(jnp, layers, steps.look(carry, mean_O, std_O)), reset_key)
+            return after, after
+
+        start = steps.begin(reset_key)
+        later = lax.scan(body, start, None, spec.episode_steps)[1]
+        return jax.tree.map(lambda first, others: jnp.concatenate([first[None], others]), start, later)
+
+    return jax.jit(rollout)
+
+
 def make_gradient_sum(parameters: int) -> Callable:
     """Sum of weighted noise of one block of pairs; it is compiled at its first call.
 

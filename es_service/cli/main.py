@@ -1,5 +1,5 @@
-"""The command line: `es-service run | resume | fork | status | digest | config | list | evaluate | export | submit |
-jobs | logs | stop | bench | doctor`.
+"""The command line: `es-service run | resume | fork | status | digest | config | list | evaluate | export | report |
+submit | jobs | logs | stop | bench | doctor`.
 
 Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by SIGINT or SIGTERM.
 """
@@ -37,6 +37,7 @@ from es_service.cli.options import (
     print_error,
     print_note,
 )
+from es_service.cli.report import report
 from es_service.cli.tables.catalogue import print_catalogue
 from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.progress import show_progress
@@ -239,6 +240,7 @@ def export(
         print(file)
 
 
+app.command()(report)
 app.add_typer(job_commands)
 app.add_typer(bench, name="bench")
 

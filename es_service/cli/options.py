@@ -90,9 +90,9 @@ def print_error(error: ServiceError | str) -> None:
     print_note(f"error: {message}", style="red")
 
 
-def place_of(text: str) -> tuple[int, ...]:
+def place_of(text: str, option: str = "--cell") -> tuple[int, ...]:
     """Place of a cell, parsed from text such as 3,17."""
     try:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
-        raise ConfigError(f"--cell {text}: must be whole numbers separated by commas, such as 3,17") from None
+        raise ConfigError(f"{option} {text}: must be whole numbers separated by commas, such as 3,17") from None

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
+from typing import Any
 
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
@@ -78,21 +79,22 @@ def _described(name: str) -> TaskSpec:
     answer = json.loads(lines[-1])
     if "problem" in answer:
         raise ConfigError(answer["problem"])
-    return _task_spec(answer["task"])
+    return task_from_fields(answer["task"])
 
 
-def _task_spec(fields: dict) -> TaskSpec:
-    """A TaskSpec from JSON, with tuples in place of lists."""
+def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
+    """A TaskSpec from its fields as JSON has them, also those that a run stores, with tuples in place of lists."""
 
     def bounds(pairs: list) -> tuple[tuple[float, float], ...]:
         return tuple((float(low), float(high)) for low, high in pairs)
 
     return TaskSpec(
-        **fields
+        **dict(fields)
         | {
             "descriptor_names": tuple(fields["descriptor_names"]),
             "descriptor_bounds": bounds(fields["descriptor_bounds"]),
             "walls": None if fields["walls"] is None else tuple(bounds(wall) for wall in fields["walls"]),
+            "goal": None if fields.get("goal") is None else tuple(fields["goal"]),
             "options": {name: tuple(values) for name, values in fields["options"].items()},
             "descriptors": {
                 name: (tuple(names), bounds(pairs)) for name, (names, pairs) in fields["descriptors"].items()

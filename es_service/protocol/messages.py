@@ -55,6 +55,8 @@ class TaskSpec:
     reached. None if they are not specified."""
     wall_clearance: float = 0.0
     """Least distance between a descriptor and the middle line of a wall."""
+    goal: tuple[float, float] | None = None
+    """Place of the goal, if the descriptor is a position in the plane; shown in reports. None if there is none."""
     least_reward: float | None = None
     """Reward per step from which a QD-score counts: about the least mean reward of an episode. It is not always a
     lower bound: short episodes of AntTrap can be below it. None if it is not specified."""

@@ -48,7 +48,11 @@ def newest_runs(folder: Path, most: int = 10) -> list[Path]:
 def look(run: Run) -> Standing:
     """The present standing of a run. Raises StoreError if the run cannot be read."""
     driver = lock_holder(run.folder)  # read before the history, so that the last row is not missed
-    row = read_newest(run.folder)
+    return standing_at(run, driver, read_newest(run.folder))
+
+
+def standing_at(run: Run, driver: Mapping[str, Any] | None, row: Row | None) -> Standing:
+    """The standing of a run whose driver and newest history row were read before; see `Standing`."""
     try:
         return Standing(run, driver, row, limits_of(BudgetConfig.model_validate(run.present_config["budget"])))
     except ConfigError as error:

@@ -61,16 +61,20 @@ def _connected(folder: Path) -> tuple[sqlite3.Connection, RunMeta]:
         way_out = WayOut("resume", f"restore it from {COPY}", str(folder))
         raise StoreError(f"{folder / DATABASE} is missing", run=folder, ways_out=[way_out])
     if not is_network_filesystem(folder) or not (folder / COPY).exists():
-        return _connected_to(folder / DATABASE)
+        return connected_to(folder / DATABASE)
     # On a network file system, read the copy while a writer is running.
     if lock_holder(folder) is None:
         # This fails if a killed writer left a transaction that must be rolled back, which readers cannot do.
         with contextlib.suppress(sqlite3.Error):
-            return _connected_to(folder / DATABASE)
-    return _connected_to(folder / COPY)
+            return connected_to(folder / DATABASE)
+    return connected_to(folder / COPY)
 
 
-def _connected_to(file: Path) -> tuple[sqlite3.Connection, RunMeta]:
+def connected_to(file: Path) -> tuple[sqlite3.Connection, RunMeta]:
+    """A read-only connection to a database, inside a transaction, and the description of its run.
+
+    Raises Damaged, StoreError or sqlite3.Error if it cannot be read.
+    """
     uri = f"{file.absolute().as_uri()}?mode=ro"
     connection = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None)
     try:

@@ -114,6 +114,7 @@ def test_an_ant_comes_as_near_to_a_wall_as_both_are_thick_less_what_the_wall_giv
     ("name", "goal", "within"), [("point_maze", point_maze.GOAL, 1e-4), ("ant_maze", ant_maze.GOAL, 0.1)]
 )
 def test_the_least_reward_of_a_maze_is_that_of_its_farthest_corner(name, goal, within):
+    assert SHIPPED[name].goal == goal
     (x_low, x_high), (y_low, y_high) = SHIPPED[name].descriptor_bounds
     farthest = max(math.dist(goal, (x, y)) for x in (x_low, x_high) for y in (y_low, y_high))
     least = SHIPPED[name].least_reward

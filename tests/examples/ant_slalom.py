@@ -7,7 +7,7 @@ All methods are pure functions of one ant's state that JAX can trace; they are b
 
 import jax.numpy as jnp
 
-from workers.environments.ant import make_ant, observe
+from workers.environments.ant import ant_viewer, make_ant, observe
 
 # Axes of the walls, in metres; each is thickened by half a metre and cannot be climbed.
 GATES = (
@@ -49,3 +49,7 @@ class AntSlalom:
 
     def descriptor(self, state):
         return state.q[:2]
+
+    def viewer(self):
+        """What `es-service report` replays episodes with."""
+        return ant_viewer(self.ant.system)

@@ -15,7 +15,7 @@ from es_service.search.algorithms import OURS
 
 ROOT = Path(__file__).parents[2]
 LAYERS = ("cli", "api", "report", "runs", "dispatch", "store", "loop", "search", "config", "protocol", "errors", "logs")
-"""From the user's side down. `report` does not exist yet."""
+"""From the user's side down."""
 LOWEST = ("protocol", "errors", "logs")
 """Layers that import nothing of the project."""
 ENTRIES = {"es_service.__init__": "api", "es_service.__main__": "cli"}

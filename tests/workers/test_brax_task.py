@@ -129,6 +129,7 @@ def test_a_class_with_contradictions_is_refused(monkeypatch):
         ("least_reward", "", r"least_reward = '' is not a finite number"),
         ("wall_clearance", float("nan"), r"wall_clearance = nan is not a finite number"),
         ("wall_clearance", None, r"wall_clearance = None is not a finite number"),
+        ("goal", (1.0, None), r"goal = \(1.0, None\) is not a place"),
         ("goal_distance", lambda self, state: jnp.zeros(2), r"goal_distance has the shape \(2,\), not \(\)"),
         ("goal_distance", None, r"cannot be traced by JAX: "),
         ("options", {"walls": "both"}, r"option walls = 'both' is not a tuple of strings"),

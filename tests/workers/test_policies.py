@@ -20,7 +20,7 @@ from workers.environments import make_environment
 from workers.policy import initial_parameters
 from workers.simd.backend.words import aligned
 from workers.simd.episodes import rollout
-from workers.simd.episodes.program import compile_episodes
+from workers.simd.episodes.compiled import compile_episodes
 from workers.worker import POLICY_CHUNKS_TOGETHER, make_worker
 
 N, E = 37, 3

@@ -8,7 +8,7 @@ import pytest
 from es_service.protocol.messages import EvaluationChunk, GradientChunk, TrainingChunk
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.simd.episodes import rollout
-from workers.simd.episodes.program import EpisodeKernel
+from workers.simd.episodes.compiled import EpisodeKernel
 from workers.worker import make_worker
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from es_service.protocol.messages import TaskSpec
+from workers.viewer import Viewer
 
 
 class TaskError(Exception):
@@ -32,6 +33,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
         has_goal=True,
         options={"start": ("default", "corner")},
         walls=(((-0.5, -0.495), (1.0, -0.495)), ((-1.0, 0.205), (0.5, 0.205))),
+        goal=(-0.5, 0.8),
         least_reward=-2.3431,  # from the corner (1, -1)
         summary="a point must reach a goal in a square; two walls block the direct path",
     ),
@@ -54,6 +56,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
             ((10.0, -35.0), (10.0, 0.0)),
         ),
         wall_clearance=ANT_CLEARANCE,
+        goal=(35.0, -25.0),
         least_reward=-95.6,  # from the corner (-35, 40)
         summary="an ant must go round three walls to a goal 60 m away; the direct path ends in a pocket",
     ),
@@ -92,6 +95,8 @@ class Environment:
     """Function from a state to the descriptor [B] of an episode that ends in it."""
     goal_distance: Callable[[Any], Any]
     """Function from a state to the distance to the goal, NaN if the task has no goal."""
+    viewer: Viewer | None = None
+    """What a replay in three dimensions needs; None if the task has no bodies."""
 
 
 def make_environment(name: str, options: Mapping[str, str]) -> Environment:

@@ -34,6 +34,7 @@ from workers.environments.brax_parts import (
     quietly,
 )
 from workers.environments.walls import WALL_RADIUS, Segment, nearest_wall
+from workers.viewer import Viewer
 
 SUBSTEPS = 10
 SUBSTEP_S = 0.005
@@ -141,6 +142,11 @@ def expand(system: System, state: AntState) -> State:
 def observe(state: AntState) -> Any:
     """Gym's observation [27]: torso height and quaternion, joint angles, all velocities."""
     return jnp.concatenate([state.q[2:], state.qd])
+
+
+def ant_viewer(system: System) -> Viewer:
+    """What a replay of an ant needs."""
+    return Viewer(system.mj_model, lambda state: com.to_world(system, state.centre, state.motion)[0], STEP_S)
 
 
 def contact_forces(state: AntState) -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from workers.environments import SHIPPED, Environment
-from workers.environments.ant import AntState, make_ant, observe
+from workers.environments.ant import AntState, ant_viewer, make_ant, observe
 
 WALLS = SHIPPED["ant_maze"].walls or ()
 LOW, HIGH = SHIPPED["ant_maze"].descriptor_bounds[0]
@@ -30,7 +30,8 @@ def make() -> Environment:
         state = ant.step(state, action)
         return state, -_goal_distance(state), jnp.array(False)
 
-    return Environment(lambda key: ant.reset(key, START), _observe, step, _position, _goal_distance)
+    viewer = ant_viewer(ant.system)
+    return Environment(lambda key: ant.reset(key, START), _observe, step, _position, _goal_distance, viewer)
 
 
 def _position(state: AntState) -> Any:

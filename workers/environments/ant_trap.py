@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from workers.environments import SHIPPED, Environment
-from workers.environments.ant import STEP_S, AntState, contact_forces, make_ant, observe
+from workers.environments.ant import STEP_S, AntState, ant_viewer, contact_forces, make_ant, observe
 
 WALLS = SHIPPED["ant_trap"].walls or ()
 DESCRIPTOR_BOUNDS = SHIPPED["ant_trap"].descriptor_bounds
@@ -35,7 +35,7 @@ def make() -> Environment:
         done = (new.q[2] < HEALTHY_Z[0]) | (new.q[2] > HEALTHY_Z[1])
         return new, forward + SURVIVAL_REWARD - control - contact, done
 
-    return Environment(lambda key: ant.reset(key, START), _observe, step, _descriptor, _no_goal)
+    return Environment(lambda key: ant.reset(key, START), _observe, step, _descriptor, _no_goal, ant_viewer(ant.system))
 
 
 def _observe(state: AntState) -> Any:

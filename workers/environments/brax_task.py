@@ -16,6 +16,7 @@ import numpy as np
 from es_service.protocol.messages import Bounds, TaskSpec
 from workers.environments import Environment, TaskError
 from workers.environments.brax_parts import Transform, brax_contact, quietly
+from workers.viewer import Viewer
 
 with quietly():
     from brax import envs
@@ -105,7 +106,10 @@ def make(name: str, descriptor: str | None = None, backend: str | None = None) -
             case _:
                 return state.touched_F / jnp.maximum(state.steps, 1.0)
 
-    return Environment(reset, lambda state: state.brax.obs, step, describe_state, lambda state: jnp.float32(jnp.nan))
+    viewer = Viewer(system.mj_model, lambda state: state.brax.pipeline_state.x, float(environment.dt))
+    return Environment(
+        reset, lambda state: state.brax.obs, step, describe_state, lambda state: jnp.float32(jnp.nan), viewer
+    )
 
 
 def _make_brax(name: str, backend: str) -> Any:

@@ -19,6 +19,9 @@ It may also have:
 - `options = {"name": ("default", "other")}`: keyword arguments of the constructor, which must not change any size;
 - if the descriptor is a place in the plane, `walls`, a tuple of segments ((x, y), (x, y)), and `wall_clearance`, the
   least distance of a descriptor from a wall. The behaviour map's coverage is then relative to the reachable cells;
+  and `goal`, a place (x, y). Reports draw both;
+- `viewer(self)`, if the task has bodies: a `workers.viewer.Viewer`, with which reports replay episodes in three
+  dimensions. `workers.environments.ant.ant_viewer` makes that of an ant;
 - `least_reward`: the reward per step from which QD-scores are counted;
 - a docstring, whose first line `es-service` shows.
 
@@ -97,6 +100,9 @@ def describe(path: str) -> TaskSpec:
         if not _are_walls(getattr(task, "walls", None)):
             wrong.append(f"walls = {task.walls!r} is not a tuple of segments ((x, y), (x, y))")
         least = getattr(task, "least_reward", None)
+        goal = getattr(task, "goal", None)
+        if goal is not None and not (_are_finite(goal) and len(goal) == 2):
+            wrong.append(f"goal = {goal!r} is not a place (x, y) of finite numbers")
         numbers = {
             "wall_clearance": getattr(task, "wall_clearance", 0.0),
             "least_reward": 0.0 if least is None else least,
@@ -120,6 +126,7 @@ def describe(path: str) -> TaskSpec:
         summary=(task.__doc__ or "").strip().partition("\n")[0],
         walls=getattr(task, "walls", None),
         wall_clearance=float(getattr(task, "wall_clearance", 0.0)),
+        goal=getattr(task, "goal", None),
         least_reward=getattr(task, "least_reward", None),
     )
 
@@ -198,7 +205,8 @@ def make(path: str, options: Mapping[str, str]) -> Environment:
         state, reward, done = task.step(state, action)
         return state, jnp.asarray(reward, jnp.float32), jnp.asarray(done, bool)
 
-    return Environment(task.reset, task.observe, step, task.descriptor, goal_distance)
+    viewer = task.viewer() if hasattr(task, "viewer") else None
+    return Environment(task.reset, task.observe, step, task.descriptor, goal_distance, viewer)
 
 
 def _import(path: str) -> Any:

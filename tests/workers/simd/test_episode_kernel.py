@@ -8,7 +8,7 @@ import pytest
 from es_service.protocol.noise import KEY_WORDS
 from tests.helpers import SPEC, random_parameters
 from workers.environments import make_environment
-from workers.simd.episodes.program import compile_episodes
+from workers.simd.episodes.compiled import compile_episodes
 
 LANES = 6
 

@@ -23,9 +23,9 @@ from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import WIDTHS, host_target
 from workers.simd.episodes import rollout
+from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.layout import plan
 from workers.simd.episodes.noise import UNROLLED, fill_function
-from workers.simd.episodes.program import compile_episodes
 
 
 def test_episodes_of_point_maze_are_xlas():

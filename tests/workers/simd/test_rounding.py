@@ -27,8 +27,8 @@ from workers.simd.backend.emit import emit
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import host_target
 from workers.simd.backend.words import aligned, pack
+from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.kernel import compile_kernel
-from workers.simd.episodes.program import compile_episodes
 from workers.simd.episodes.rollout import always_zero
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph import loops

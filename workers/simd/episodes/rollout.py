@@ -13,12 +13,13 @@ import numpy as np
 from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from workers.environments import Environment, make_environment
-from workers.episode import Episodes
+from workers.episode import Carry, Episodes
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import WIDTHS, Target, host_target
 from workers.simd.backend.words import aligned
+from workers.simd.episodes.compiled import EpisodeKernel, compile_episodes
 from workers.simd.episodes.noise import UNROLLED, definition, gradient_module
-from workers.simd.episodes.program import EpisodeKernel, compile_episodes, write_episodes
+from workers.simd.episodes.program import write_episodes
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.unsupported import UnsupportedError
 
@@ -106,6 +107,17 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Callable[
         addresses_L = (rows.ctypes.data + policy_L * rows.strides[0]).astype(np.uint64)
         assert 0 <= policy_L.min() <= policy_L.max() < len(rows)
         return kernel.run(addresses_L, 0.0, mean_L_O, std_L_O, None, reset_keys_L, reset_keys_L)
+
+    return rollout
+
+
+def make_watched_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Carry]:
+    """Rollout of one episode, with the interface of `workers.rollout.make_watched_rollout` and the run's own bits."""
+    kernels = _Kernels(environment, spec, training=False)
+
+    def rollout(centre_D, mean_O, std_O, reset_key):
+        kernel, weights = kernels.for_centre(centre_D, mean_O)
+        return kernel.watch(weights, mean_O, std_O, reset_key)
 
     return rollout
 

@@ -1,0 +1,64 @@
+"""Messages about recorded episodes, for replays: which episode, what was seen, and what the bodies look like.
+
+Axes: T control steps of the episode, the reset included; L moving links; B descriptor dimensions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from es_service.protocol.messages import Centre, FloatArray
+
+
+@dataclass(frozen=True)
+class RecordRequest:
+    """Request to record one evaluation episode of a policy."""
+
+    centre: Centre
+    """The policy with its statistics; its generation is part of the episode's address."""
+    ask: int = 0
+    """The place of the policy among those that its generation evaluated."""
+    episode: int = 0
+
+
+class Shape(NamedTuple):
+    """A body, as its task's MJCF describes it."""
+
+    kind: str
+    """plane, sphere, capsule, ellipsoid, cylinder or box."""
+    link: int
+    """The link that it moves with; -1 for the world."""
+    size: tuple[float, ...]
+    """As in MJCF: half-lengths of a box, radius and half-length of a capsule, ..."""
+    position: tuple[float, ...]
+    """In the frame of its link."""
+    rotation: tuple[float, ...]
+    """Quaternion (w, x, y, z) in the frame of its link."""
+    colour: tuple[float, ...]
+    """Red, green, blue and opacity, from 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One episode, step by step until it ended."""
+
+    descriptor_T_B: FloatArray
+    returns_T: FloatArray
+    """Return so far."""
+    poses_T_L_7: FloatArray | None
+    """Position (x, y, z) and quaternion (w, x, y, z) of each link in the world; None if the task has no bodies."""
+    fitness: float
+    trace_T_B: FloatArray
+    """The episode's trace, as evaluations have it; equal to an elite's stored trace if the bits are the same."""
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """The answer to several requests, in their order."""
+
+    recordings: tuple[Recording, ...]
+    shapes: tuple[Shape, ...]
+    """The bodies of the task; empty if it has none."""
+    step_s: float
+    """Seconds of a control step in the task's own time; 0 if the task has no bodies."""

@@ -1,0 +1,184 @@
+"""Several runs of one task, grouped by their settings: medians and quartiles over seeds, as papers compare methods.
+
+Axes: R runs of a group, K points of a curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.config.fields import RESOURCES
+from es_service.config.problems import did_you_mean, nearest
+from es_service.config.resolution import LEFT_OPEN
+from es_service.config.yaml_text import in_line
+from es_service.errors import ConfigError
+from es_service.report.data import RunData
+from es_service.report.series import Chart, Line
+
+POINTS = 200
+AXES = ("env_steps", "wall_clock_s")
+"""History columns that groups are compared against."""
+COLUMNS = {
+    "best_fitness": ("Best fitness so far", "Highest mean fitness of an evaluated centre.", False),
+    "goal_distance": ("Distance to the goal", "Mean over the evaluation episodes of the newest centre.", False),
+    "coverage": ("Coverage of the behaviour map", "Filled cells as a share of all cells.", True),
+    "qd_score": ("QD-score", "Sum over all elites of fitness less map.qd_offset.", False),
+}
+"""History column -> title, explanation, whether it is a fraction."""
+OWN_TO_A_RUN = ("seed", "compute.", RESOURCES)
+"""Keys, or beginnings of keys, by which runs are not grouped unless a user says so."""
+
+
+class Group(NamedTuple):
+    """Runs with the same values of the keys by which runs are grouped."""
+
+    name: str
+    runs: tuple[RunData, ...]
+
+
+class Quartiles(NamedTuple):
+    """Median and quartiles of one number over runs."""
+
+    median: float
+    low: float
+    high: float
+
+
+class Summary(NamedTuple):
+    """The final values of a group."""
+
+    group: Group
+    values: Mapping[str, Quartiles]
+    """History column -> its value at the end of each run."""
+    solved: int
+    """Number of runs whose best fitness reached the threshold."""
+    steps: Quartiles
+    """Environment steps until then, of the runs that reached it; NaN if none did."""
+
+
+def grouped(runs: Sequence[RunData], keys: Sequence[str] = ()) -> list[Group]:
+    """Groups in the order of their first runs, each named by the values of the keys.
+
+    Args:
+        keys: dotted config keys; none: the keys in which the runs differ, but for the seed and what follows from
+            others, or the algorithm alone if it explains all differences.
+
+    Raises:
+        ConfigError: a key is unknown, or the runs are of different tasks.
+    """
+    constants = [run.constants for run in runs]
+    known = sorted({key for one in constants for key in one})
+    for key in keys:
+        if key not in known:
+            raise ConfigError(
+                f"the runs cannot be grouped by {key}: no run has this setting{did_you_mean(key, known)}",
+                field="group_by",
+                value=key,
+                suggestion=nearest(key, known),
+            )
+    differing = [key for key in known if len({in_line(one.get(key)) for one in constants}) > 1]
+    _refuse_other_tasks(runs, [key for key in differing if key not in keys or key == "task.environment"])
+    chosen = list(keys) or _explaining(constants, differing)
+    found: dict[str, list[RunData]] = {}
+    for run in runs:
+        values = [in_line(run.constants.get(key)) for key in chosen]
+        name = values[0] if chosen == ["search.algorithm"] else ", ".join(map("{} {}".format, chosen, values))
+        found.setdefault(name or str(run.constants["search.algorithm"]), []).append(run)
+    return [Group(name, tuple(members)) for name, members in found.items()]
+
+
+def _refuse_other_tasks(runs: Sequence[RunData], differing: Sequence[str]) -> None:
+    for key in differing:
+        if key.startswith("task."):
+            values = {in_line(run.constants.get(key)): run for run in reversed(runs)}
+            shown = "; ".join(f"{run.folder} has {value}" for value, run in reversed(values.items()))
+            ways = "compare runs of one task"
+            if key != "task.environment":
+                ways += f", or group by {key}"
+            raise ConfigError(
+                f"these runs cannot be compared, because {key} differs: {shown}; {ways}", field=key, value=list(values)
+            )
+
+
+def _explaining(constants: Sequence[Mapping[str, Any]], differing: Sequence[str]) -> list[str]:
+    own = [key for key in differing if not key.startswith(OWN_TO_A_RUN) and key not in LEFT_OPEN]
+    if "search.algorithm" in own:
+        by_algorithm: dict[str, set[str]] = {}
+        for one in constants:
+            by_algorithm.setdefault(one["search.algorithm"], set()).add(str([in_line(one.get(key)) for key in own]))
+        if all(len(values) == 1 for values in by_algorithm.values()):
+            return ["search.algorithm"]
+    return own
+
+
+def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.float64]]:
+    """A chart for each column that all runs have, and the places of its points on an axis of AXES, [K].
+
+    A curve ends where the first run of its group ends, so that every point is over all of its runs.
+    """
+    last = max(float(np.nanmax(run.history[axis])) for group in groups for run in group.runs)
+    x_K = np.linspace(0.0, last, POINTS)
+    found = []
+    for column, (title, note, percent) in COLUMNS.items():
+        if not all(column in run.history for group in groups for run in group.runs):
+            continue
+        lines = []
+        for group in groups:
+            y_R_K = np.stack([at(run.history[axis], run.history[column], x_K) for run in group.runs])
+            low_K, median_K, high_K = np.quantile(y_R_K, [0.25, 0.5, 0.75], axis=0)  # NaN where a run has no value
+            several = len(group.runs) > 1
+            lines.append(Line(group.name, column, median_K, (low_K, high_K) if several else None))
+        if any(np.isfinite(line.y_K).any() for line in lines):
+            found.append(Chart(title, note, tuple(lines), None, percent))
+    return found, x_K
+
+
+def at(x_G: NDArray[np.float64], y_G: NDArray[np.float64], x_K: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Value of a run at places of an axis: that of its newest generation by then; NaN before the first and after the
+    last generation."""
+    row_K = np.searchsorted(x_G, x_K * (1 + 1e-12), side="right") - 1
+    inside_K = (row_K >= 0) & (x_K <= x_G[-1] * (1 + 1e-12))
+    return np.where(inside_K, y_G[np.maximum(row_K, 0)], np.nan)
+
+
+def common_threshold(runs: Sequence[RunData]) -> float | None:
+    """The target fitness of the runs' budgets, if they all have the same."""
+    targets = {run.meta.config["budget"].get("target_fitness") for run in runs}
+    return targets.pop() if len(targets) == 1 else None
+
+
+def summaries(groups: Sequence[Group], threshold: float | None) -> list[Summary]:
+    """The final values of each group; `threshold`: fitness from which a run counts as solved, None: no run does."""
+    found = []
+    for group in groups:
+        columns = (*COLUMNS, *AXES)
+        values = {
+            column: _quartiles([run.last(column) for run in group.runs])
+            for column in columns
+            if all(column in run.history for run in group.runs)
+        }
+        steps = []
+        for run in group.runs:
+            if threshold is None:
+                break
+            reached = np.flatnonzero(run.history["best_fitness"] >= threshold)
+            steps += [float(run.history["env_steps"][reached[0]])] if reached.size else []
+        found.append(Summary(group, values, len(steps), _quartiles(steps)))
+    return found
+
+
+def _quartiles(values: Sequence[float]) -> Quartiles:
+    if not values:
+        return Quartiles(np.nan, np.nan, np.nan)
+    low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
+    return Quartiles(float(median), float(low), float(high))
+
+
+def median_run(group: Group) -> RunData:
+    """The run of a group whose final best fitness is the median (of an even number, the lower of the two)."""
+    ordered = sorted(group.runs, key=lambda run: run.last("best_fitness"))
+    return ordered[(len(ordered) - 1) // 2]

@@ -1,0 +1,165 @@
+"""The page that compares runs: curves of groups, a final table, and maps side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from es_service.errors import NotInRunError
+from es_service.report import compare, facts, maps
+from es_service.report.colours import value_range
+from es_service.report.compare import Group, Quartiles
+from es_service.report.curves import draw, values_text
+from es_service.report.data import RunData
+from es_service.report.facts import number
+from es_service.report.markup import Markup, table, tag
+from es_service.report.page import axis_choice, document, section
+from es_service.report.series import X_AXES
+from es_service.runs.standing import state
+
+UNITS = {"coverage": (100.0, " %"), "env_steps": (1e-6, "")}
+"""History column -> factor and unit in which it is shown."""
+HEADS = {
+    "best_fitness": "best fitness",
+    "goal_distance": "distance to the goal",
+    "coverage": "coverage",
+    "qd_score": "QD-score",
+    "env_steps": "million steps",
+    "wall_clock_s": "seconds",
+}
+
+
+def comparison_page(runs: Sequence[RunData], keys: Sequence[str] = (), threshold: float | None = None) -> str:
+    """HTML of the comparison of runs; see `compare.grouped` for the keys.
+
+    Args:
+        threshold: fitness from which a run counts as solved; None: the target fitness of all runs, if there is one.
+
+    Raises:
+        ConfigError: the runs cannot be compared. NotInRunError: a run has no finished generation.
+    """
+    for run in runs:
+        if not run.history["generation"].size:
+            raise NotInRunError(f"{run.folder} has no finished generation yet; leave it out", run=run.folder)
+    groups = compare.grouped(runs, keys)
+    threshold = compare.common_threshold(runs) if threshold is None else threshold
+    on_axes = {axis: compare.charts(groups, axis) for axis in compare.AXES}
+    figures, points = [], []
+    for number_, _ in enumerate(on_axes["env_steps"][0]):
+        chart_on = {axis: (charts[number_], x_K) for axis, (charts, x_K) in on_axes.items()}
+        figure, axes = draw(chart_on)
+        texts = {
+            axis: [f"{number(float(x))} {X_AXES[axis]}: {values_text(chart, k)}" for k, x in enumerate(x_K)]
+            for axis, (chart, x_K) in chart_on.items()
+        }
+        figures.append(figure)
+        points.append({"axes": axes, "texts": texts})
+    task = runs[0].constants["task.environment"]
+    sections = [
+        tag("section", tag("p", _sentence(groups, threshold), class_="verdict"), *_problems(runs), id="what"),
+        section(
+            "Curves",
+            tag("p", "Median over the runs of a group; the shaded region reaches from the first to the third quartile. "
+                "A curve ends where the first of its runs ends.", class_="note"),
+            axis_choice({axis: X_AXES[axis] for axis in compare.AXES}),
+            tag("div", *figures, class_="charts"),
+            id_="curves",
+        ),
+        section("Final values", _final(groups, threshold), id_="final"),
+        *_maps(groups),
+        section("Runs", _runs(groups), id_="runs"),
+    ]  # fmt: skip
+    return document(f"{len(runs)} runs on {task}", sections, {"charts": points})
+
+
+def _sentence(groups: Sequence[Group], threshold: float | None) -> str:
+    found = compare.summaries(groups, threshold)
+    best = max(found, key=lambda one: one.values["best_fitness"].median)
+    value = number(best.values["best_fitness"].median)
+    runs = facts.count(len(best.group.runs), "run")
+    if len(groups) == 1:
+        sentence = f"{runs} of {best.group.name} end with a best fitness of {value} (median)"
+    else:
+        sentence = (
+            f"Of {len(groups)} groups, {best.group.name} ends with the highest median of best fitness: {value} ({runs})"
+        )
+    if threshold is not None:
+        solved = sum(one.solved for one in found)
+        total = sum(len(one.group.runs) for one in found)
+        sentence += f"; {solved} of {total} runs reach {number(threshold)}"
+    return f"{sentence}."
+
+
+def _problems(runs: Sequence[RunData]) -> list[Markup]:
+    return [
+        tag("p", tag("b", f"{run.folder} is damaged: "), problem, class_="problem")
+        for run in runs
+        for problem in run.problems
+    ]
+
+
+def _final(groups: Sequence[Group], threshold: float | None) -> Markup:
+    found = compare.summaries(groups, threshold)
+    columns = [column for column in HEADS if all(column in one.values for one in found)]
+    solved = () if threshold is None else (f"reach {number(threshold)}", "million steps until then")
+    rows = []
+    for one in found:
+        runs = len(one.group.runs)
+        cells = [_shown(one.values[column], column) for column in columns]
+        reached = (
+            (f"{one.solved} of {runs}", _shown(one.steps, "env_steps") if one.solved else "none") if solved else ()
+        )
+        rows.append((one.group.name, f"{runs}", *reached, *cells))
+    heads = ("group", "runs", *solved, *(HEADS[column] for column in columns))
+    note = tag("p", "Median (first quartile to third quartile) over the runs of a group.", class_="note")
+    return Markup(table(rows, heads, "numbers") + note)
+
+
+def _shown(values: Quartiles, column: str) -> str:
+    scale, unit = UNITS.get(column, (1.0, ""))
+    median, low, high = (number(scale * value) for value in values)
+    return f"{median}{unit}" if low == high else f"{median}{unit} ({low} to {high})"
+
+
+def _maps(groups: Sequence[Group]) -> list[Markup]:
+    """The map of the median run of each group, all with the same colours."""
+    shown = [(group, compare.median_run(group)) for group in groups]
+    shown = [(group, run) for group, run in shown if run.map is not None and run.map.size]
+    if not shown:
+        return []
+    colours = value_range(np.concatenate([run.map.fitness_N for _, run in shown if run.map is not None]))
+    figures = []
+    for group, run in shown:
+        figure, _, _ = maps.draw_map(run, colours)
+        caption = tag("figcaption", tag("b", group.name), " ", tag("span", run.name, class_="note"))
+        figures.append(tag("figure", caption, figure))
+    return [
+        section(
+            "Behaviour maps",
+            tag(
+                "p",
+                "Of the run of each group whose best fitness is the median; all have the same colours.",
+                class_="note",
+            ),
+            tag("div", *figures, class_="side"),
+            maps.colour_bar(colours),
+            id_="maps",
+        )
+    ]
+
+
+def _runs(groups: Sequence[Group]) -> Markup:
+    rows = [
+        (
+            str(run.folder),
+            group.name,
+            f"{run.constants['seed']}",
+            f"{run.last('generation'):,.0f}",
+            number(run.last("best_fitness")),
+            state(run.standing),
+        )
+        for group in groups
+        for run in group.runs
+    ]
+    return table(rows, ("run", "group", "seed", "generations", "best fitness", "state"), "listed")

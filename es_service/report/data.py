@@ -1,0 +1,179 @@
+"""What a report shows of a run, read once from its store: columns of numbers, the map, and the paths of its elites.
+
+Axes: G generations, N evaluated centres, T points of a path, B descriptor dimensions.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.config.tasks import task_from_fields
+from es_service.errors import StoreError
+from es_service.loop.parts import (
+    BEST,
+    CELL_PREFIX,
+    ELITE_PREFIX,
+    GEOMETRY_PART,
+    map_from_parts,
+)
+from es_service.protocol.machine import is_mixed
+from es_service.protocol.messages import TaskSpec
+from es_service.runs.standing import Standing, standing_at
+from es_service.runs.view import Run
+from es_service.search.maps.behaviour_map import BehaviourMap
+from es_service.store.digest import checked_parts, digest_of
+from es_service.store.lock import lock_holder
+from es_service.store.schema import RunMeta
+from es_service.store.sound import Arrays, SoundRun, read_sound
+
+Columns = Mapping[str, NDArray[np.float64]]
+"""Column name -> its values; NaN stands for no value."""
+TRACE = "trace_T_B"
+
+
+@dataclass(frozen=True)
+class RunData:
+    """A run as of one generation, without its policies."""
+
+    folder: Path
+    meta: RunMeta
+    task: TaskSpec
+    history: Columns
+    """Columns of the history, [G]; a damaged row is left out."""
+    centres: Columns
+    """Columns of the evaluated centres, [N]: `generation`, `ask` (the place among those of its generation), and those
+    of the run."""
+    map: BehaviourMap | None
+    """None if the run has no map, or if it cannot be read."""
+    paths: Mapping[int, NDArray[np.float32]]
+    """Number of a cell -> descriptor along the first evaluation episode of its elite, [T, B]."""
+    best: tuple[int, float] | None
+    """Generation and fitness of the best centre; None before the first generation."""
+    standing: Standing
+    platforms: list[tuple[int, dict[str, Any]]]
+    """(first generation, platform); each applies until the next one."""
+    digest: str
+    """The digest; empty if it cannot be computed, or while a driver is writing."""
+    problems: tuple[str, ...]
+    """What is damaged, one sentence each."""
+
+    @property
+    def constants(self) -> Mapping[str, Any]:
+        """Settings that cannot change in the run: dotted key -> value."""
+        return self.meta.constants
+
+    @property
+    def name(self) -> str:
+        """Name of the run's folder."""
+        return self.folder.absolute().name
+
+    @property
+    def mixed(self) -> bool:
+        """Whether generations were computed on several platforms."""
+        return is_mixed(platform for _, platform in self.platforms)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the descriptor's dimensions."""
+        return tuple(self.meta.task["descriptor_names"])
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], ...]:
+        """(low, high) of each descriptor dimension: those of the map, or those of the task if there is no map."""
+        return self.map.geometry.bounds if self.map is not None else self.task.descriptor_bounds
+
+    def last(self, column: str) -> float:
+        """Newest value of a history column; NaN if there is none."""
+        values = self.history.get(column)
+        return float(values[-1]) if values is not None and values.size else float("nan")
+
+    def cell_name(self, cell: int) -> str:
+        """A cell as users write it: its place along each dimension, such as 3,17, or its number in a cvt map."""
+        assert self.map is not None
+        return ",".join(map(str, self.map.geometry.index_of(cell)))
+
+
+def read_run(folder: Path, *, paths: bool = True, digest: bool = True) -> RunData:
+    """Read a run; one transaction, so that a driver that is writing does not change it meanwhile.
+
+    Args:
+        paths: whether to read the paths of the elites, for which all of the map's policies must be read once.
+        digest: whether to check all data and compute the digest.
+
+    Raises:
+        StoreError: `folder` is not a run folder, or nothing of the run can be read.
+    """
+
+    def kept(part: str, arrays: Arrays) -> Arrays | None:
+        if part.startswith(ELITE_PREFIX):
+            return {TRACE: arrays[TRACE]} if paths else None
+        if part == BEST:
+            return {name: arrays[name] for name in ("generation", "fitness")}
+        return arrays if part == GEOMETRY_PART or part.startswith(CELL_PREFIX) else None
+
+    driver = lock_holder(folder)  # read before the history, so that the last row is not missed
+    found = read_sound(folder, kept)
+    problems = list(found.problems)
+    row = found.history[-1] if found.history else None
+    run = Run(folder)
+    run.__dict__["meta"] = found.meta  # it is cached there, and `run.db` itself may be damaged
+    best = found.parts.get(BEST)
+    return RunData(
+        folder=folder,
+        meta=found.meta,
+        task=task_from_fields(json.loads(json.dumps(found.meta.task))),
+        history=_columns([column.name for column in found.meta.columns], found.history),
+        centres=_centres(found),
+        map=_map(found, problems),
+        paths=_paths(found),
+        best=None if best is None else (int(best["generation"]), float(best["fitness"])),
+        standing=standing_at(run, driver, row),
+        platforms=found.platforms,
+        digest=_digest(folder, problems) if digest and driver is None and row is not None else "",
+        problems=tuple(problems),
+    )
+
+
+def _columns(names: list[str], rows: list[dict[str, Any]]) -> dict[str, NDArray[np.float64]]:
+    return {name: np.array([row[name] for row in rows], np.float64) for name in names}
+
+
+def _centres(found: SoundRun) -> dict[str, NDArray[np.float64]]:
+    rows = [
+        {"generation": row["generation"], "ask": ask, **centre}
+        for row, centres in zip(found.history, found.evaluations, strict=True)
+        for ask, centre in enumerate(centres)
+    ]
+    return _columns(["generation", "ask", *(column.name for column in found.meta.evaluation_columns)], rows)
+
+
+def _map(found: SoundRun, problems: list[str]) -> BehaviourMap | None:
+    map_ = map_from_parts(found.parts)
+    if map_ is None and found.meta.constants.get("map.enabled") and found.generation is not None:
+        problems.append("the behaviour map cannot be shown, because its geometry is damaged")
+    return map_
+
+
+def _paths(found: SoundRun) -> dict[int, NDArray[np.float32]]:
+    return {
+        int(part.removeprefix(ELITE_PREFIX)): arrays[TRACE]
+        for part, arrays in found.parts.items()
+        if part.startswith(ELITE_PREFIX)
+    }
+
+
+def _digest(folder: Path, problems: list[str]) -> str:
+    """The digest, after all stored data were checked; empty if data are damaged, which then becomes a problem."""
+    try:
+        return digest_of(checked_parts(folder)[0])
+    except StoreError as error:
+        if not problems:
+            problems.append(error.sentence)
+        return ""

@@ -1,0 +1,153 @@
+"""A run in words and numbers: what was run, what came of it, on which machine, and which faults it survived."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from es_service.report.data import RunData
+from es_service.report.series import phase_seconds
+from es_service.runs.standing import state
+
+
+class Fault(NamedTuple):
+    """A generation in which workers were lost or chunks sent again."""
+
+    generation: int
+    lost_workers: int
+    retries: int
+
+
+def verdict(data: RunData) -> str:
+    """What came of the run, in one or two sentences."""
+    if data.best is None or not data.history["generation"].size:
+        return "No generation is finished yet, so there is nothing to show."
+    generation, fitness = data.best
+    where = "before any update" if generation == 0 else f"in generation {generation:,}"
+    # A run of generation 0 alone has evaluated random weights and has not searched.
+    alone = "" if data.last("generation") else "Only the initial centres were evaluated so far. "
+    episodes = data.constants["search.evaluation_episodes"]
+    found = f"The best centre, found {where}, has a mean fitness of {number(fitness)}"
+    sentence = f"{alone}{found} over {count(episodes, 'evaluation episode')}"
+    target = data.standing.limits.get("target_fitness")
+    if target is not None:
+        reached = "reaches" if fitness >= target else "does not reach"
+        sentence += f", which {reached} the target of {number(target)}"
+    if "goal_distance_min" in data.history and np.isfinite(data.history["goal_distance_min"]).any():
+        least = float(np.nanmin(data.history["goal_distance_min"]))
+        sentence += f"; the nearest that an evaluated episode came to the goal is {number(least)}"
+    if data.map is not None:
+        cells, size = data.map.size, data.map.geometry.size
+        sentence += f"; {cells:,} of {size:,} cells of the behaviour map are filled ({100 * cells / size:.1f} %)"
+    return f"{sentence}."
+
+
+def what_was_run(data: RunData) -> list[tuple[str, str]]:
+    """Task, search, state and budget, as (label, text)."""
+    constants, limits = data.constants, data.standing.limits
+    fields = [
+        ("task", f"{constants['task.environment']}, {constants['task.episode_steps']:,} steps an episode"),
+        ("search", f"{constants['search.algorithm']}, {constants['search.pairs']:,} pairs, seed {constants['seed']}"),
+        ("state", state(data.standing)),
+    ]
+    if data.history["generation"].size:
+        of = {key: f" of {limit:,g}" for key, limit in limits.items()}
+        fields += [
+            ("generations", f"{data.last('generation'):,.0f}{of.get('generations', '')}"),
+            (
+                "environment steps",
+                f"{data.last('env_steps'):,.0f}{of.get('env_steps', '')} in {data.last('episodes'):,.0f} episodes",
+            ),
+            ("time", f"{duration(data.last('wall_clock_s'))} on {data.last('workers'):,.0f} workers"),
+        ]
+    if data.meta.parent:
+        parent = data.meta.parent
+        fields.append(("started from", f"{parent['folder']}, generation {parent['generation']}"))
+    return fields
+
+
+def provenance(data: RunData) -> list[tuple[str, str]]:
+    """Versions, machine, digest and identity, as (label, text)."""
+    fields = []
+    for at, platform in data.platforms:
+        since = f" since generation {at:,}" if len(data.platforms) > 1 else ""
+        fields += [
+            (f"machine{since}", str(platform.get("cpu", "?"))),
+            (f"versions{since}", ", ".join(f"{name} {text}" for name, text in platform.items() if _is_version(name))),
+        ]
+        for other in platform.get("workers", ()):
+            versions = ", ".join(f"{name} {text}" for name, text in other.items() if _is_version(name))
+            fields.append((f"workers{since}", f"{other.get('cpu', '?')}; {versions}"))
+    digest = data.digest or ("not computed while a driver is writing" if data.standing.driver else "not available")
+    return [
+        *fields,
+        ("digest", f"{digest}{', mixed: computed on several platforms' if data.mixed else ''}"),
+        ("run", data.meta.run_id),
+        ("created", data.meta.created),
+        ("folder", str(data.folder)),
+    ]
+
+
+def faults(data: RunData) -> list[Fault]:
+    """Generations with lost workers or repeated chunks, in order."""
+    lost_G, retries_G = np.nan_to_num(data.history["lost_workers"]), np.nan_to_num(data.history["retries"])
+    return [
+        Fault(int(data.history["generation"][row]), int(lost_G[row]), int(retries_G[row]))
+        for row in np.flatnonzero((lost_G > 0) | (retries_G > 0))
+    ]
+
+
+def fault_sentence(found: list[Fault]) -> str:
+    """The faults of a run in one sentence."""
+    if not found:
+        return "No worker was lost and no chunk had to be sent again."
+    lost, retries = sum(one.lost_workers for one in found), sum(one.retries for one in found)
+    were, sent = ("was" if one == 1 else "were" for one in (lost, retries))
+    return (
+        f"{count(lost, 'worker')} {were} lost and replaced, and {count(retries, 'chunk')} {sent} sent again, in "
+        f"{count(len(found), 'generation')}. No result depends on it."
+    )
+
+
+def time_sentence(data: RunData) -> str:
+    """Where the time of the run went, in one sentence."""
+    seconds = phase_seconds(data.history)
+    total = sum(seconds.values())
+    if not total:
+        return "No time was recorded."
+    shares = ", ".join(f"{label} {100 * value / total:.1f} %" for label, value in seconds.items())
+    rate = data.last("env_steps") / data.last("wall_clock_s") if data.last("wall_clock_s") else math.nan
+    return f"Of {duration(total)}: {shares}. Overall {rate:,.0f} environment steps a second."
+
+
+def number(value: float) -> str:
+    """A number with about four significant digits, such as -24.31, 68,959 or 1.3e-05."""
+    if not math.isfinite(value):
+        return "none" if math.isnan(value) else f"{value:g}"
+    size = abs(value)
+    if size >= 1000:
+        return f"{value:,.0f}"
+    if size and size < 1e-3:
+        return f"{value:.2e}"
+    return f"{value:.{0 if size >= 1000 else 1 if size >= 100 else 2 if size >= 1 else 3}f}"
+
+
+def count(how_many: int, what: str) -> str:
+    """A number and a noun, such as "1 worker" or "3 workers"."""
+    return f"{how_many:,} {what}{'' if how_many == 1 else 's'}"
+
+
+def duration(seconds: float) -> str:
+    """A duration, such as 34.5 s, 12 min 3 s or 5 h 20 min."""
+    if not math.isfinite(seconds):
+        return "an unknown time"
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _is_version(name: str) -> bool:
+    return name not in ("cpu", "workers")

@@ -1,0 +1,69 @@
+"""Files of figures for a paper: each as SVG and as PNG."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from es_service.errors import StoreError
+from es_service.report import compare, plots
+from es_service.report.colours import value_range
+from es_service.report.data import RunData
+
+DPI = 200
+SIZE = (4.6, 3.4)
+"""Width and height of a figure in inches."""
+
+
+def write_figures(runs: Sequence[RunData], folder: Path, keys: Sequence[str] = ()) -> list[Path]:
+    """Write all figures of one run, or of the comparison of several; return the files.
+
+    Args:
+        keys: config keys that group the runs.
+
+    Raises:
+        ConfigError: matplotlib is missing, or the runs cannot be compared. StoreError: the folder cannot be written.
+    """
+    pyplot = plots.pyplot()
+    found: dict[str, Callable[[Any], Any]] = {}
+    for column in compare.COLUMNS:
+        if all(column in run.history for run in runs):
+            found[column] = lambda axes, column=column: plots.curves(list(runs), axes, column, group_by=keys)
+    mapped = [run for run in runs if run.map is not None and run.map.size and len(run.names) <= 2]
+    if len(runs) == 1:
+        if mapped:
+            found["behaviour_map"] = lambda axes: _map(mapped[0], axes)
+            if len(mapped[0].names) == 2:
+                found["trajectory"] = lambda axes: _path(mapped[0], axes)
+        found["centres"] = lambda axes: axes.figure.colorbar(plots.centres(runs[0], axes), label="fitness")
+    elif mapped:
+        colours = value_range(np.concatenate([run.map.fitness_N for run in mapped if run.map is not None]))
+        for index, group in enumerate(compare.grouped(runs, keys)):
+            if (run := compare.median_run(group)) in mapped:
+                found[f"behaviour_map_{index}"] = lambda axes, run=run, name=group.name: _map(run, axes, colours, name)
+    written = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, draw in found.items():
+            figure, axes = pyplot.subplots(figsize=SIZE, layout="constrained")
+            draw(axes)
+            for kind in ("svg", "png"):
+                written.append(folder / f"{name}.{kind}")
+                figure.savefig(written[-1], dpi=DPI)
+            pyplot.close(figure)
+    except OSError as error:
+        raise StoreError(f"cannot write into {folder}: {error.strerror or error}; choose another folder") from error
+    return written
+
+
+def _map(run: RunData, axes: Any, colours: tuple[float, float] | None = None, title: str = "") -> None:
+    axes.figure.colorbar(plots.behaviour_map(run, axes, colours), label="fitness")
+    axes.set_title(title, parse_math=False)
+
+
+def _path(run: RunData, axes: Any) -> None:
+    _map(run, axes)
+    plots.trajectory(run, axes)

@@ -1,0 +1,256 @@
+"""The behaviour map as SVG: a heat map over the floor plan, or what shows the cells of other maps best.
+
+- A grid of one dimension: a bar for each cell.
+- A grid of two: a heat map. A cvt map of two: its Voronoi cells.
+- A grid of more: a heat map of heat maps, in which the dimensions alternate between right and up; the first ones give
+  the large blocks, the last ones the cells inside them.
+- A cvt map of more: the elites as points, one figure for each pair of the first four dimensions.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.report import floor
+from es_service.report.colours import LEVELS, SCALE, level, value_range
+from es_service.report.curves import axis_lines
+from es_service.report.data import RunData
+from es_service.report.facts import number
+from es_service.report.markup import Frame, Markup, joined, packed, spread, tag
+from es_service.search.maps.behaviour_map import BehaviourMap
+from es_service.search.maps.geometry import Cvt, Grid
+
+Range = tuple[float, float]
+SMALL = 250
+"""Width of a figure when several are shown side by side."""
+PAIRED_DIMENSIONS = 4
+PATH_HEIGHT = 160
+TENTHS = 10.0
+"""Paths are stored in tenths of a pixel."""
+
+
+class MapView(NamedTuple):
+    """The map as markup, and what its script needs."""
+
+    figure: Markup
+    explanation: str
+    """How to read the figure; one or two sentences."""
+    cells: dict[str, Any]
+    """`rows`: number of a cell -> [name, text]; `paths`: all paths in base64; `points`: their length; `lines`: number
+    of curves of a path, each with x and y; `overlay`: whether they are drawn above the map."""
+    path_figure: Markup | None
+    """Empty figure for the path of a chosen cell where it cannot be drawn above the map."""
+
+
+def map_view(data: RunData) -> MapView:
+    """The behaviour map of a run, which must have one."""
+    assert data.map is not None
+    figure, explanation, frame = draw_map(data)
+    cells, path_figure = _paths(data, frame)
+    return MapView(figure, explanation, cells, path_figure)
+
+
+def draw_map(
+    data: RunData, colours: Range | None = None, width: float = floor.WIDTH
+) -> tuple[Markup, str, Frame | None]:
+    """Figure, explanation, and for two dimensions the frame of the plane.
+
+    Args:
+        colours: fitness values of the first and last colour; None: those of this map.
+    """
+    map_ = data.map
+    assert map_ is not None
+    colours = colours or value_range(map_.fitness_N)
+    level_N = level(map_.fitness_N, *colours)
+    dimensions = len(map_.geometry.bounds)
+    if dimensions == 2:
+        frame = floor.plan_frame(map_.geometry.bounds, width)
+        shapes = (
+            _rectangles(map_, frame, level_N) if isinstance(map_.geometry, Grid) else _voronoi(map_, frame, level_N)
+        )
+        content = [floor.ground(frame, data.names), *shapes, floor.walls_and_goal(frame, data.task), _overlay()]
+        return _svg(content, *floor.size(frame)), "Each cell shows the fitness of its elite.", frame
+    if isinstance(map_.geometry, Cvt):
+        text = (
+            f"Each point is an elite, at its place in {min(dimensions, PAIRED_DIMENSIONS)} of {dimensions} dimensions."
+        )
+        return _pairs(data, level_N), text, None
+    if dimensions == 1:
+        return _bars(data, level_N, colours), "Each bar is a cell; its height is the fitness of its elite.", None
+    return _stacked(data, level_N)
+
+
+def colour_bar(colours: Range, label: str = "fitness") -> Markup:
+    """Legend of the colours of values."""
+    steps = [tag("rect", x=f"{100 * i / LEVELS:.3f}%", width="3.3%", height=12, fill=SCALE[i]) for i in range(LEVELS)]
+    return tag(
+        "div",
+        tag("span", number(colours[0])),
+        tag("svg", *steps, class_="scale", height=12, role="img", aria_label=f"Colours of {label}"),
+        tag("span", number(colours[1])),
+        tag("span", label, class_="note"),
+        class_="legend",
+    )
+
+
+def _overlay() -> Markup:
+    """Empty group for the path of a chosen cell."""
+    return tag("g", class_="path")
+
+
+def _svg(content: list[Markup], width: float, height: float, class_: str = "map") -> Markup:
+    return tag("svg", *content, viewBox=f"0 0 {width:.0f} {height:.0f}", class_=class_, role="img",
+               aria_label="Behaviour map")  # fmt: skip
+
+
+def _rectangles(map_: BehaviourMap, frame: Frame, level_N: NDArray[np.int64]) -> list[Markup]:
+    assert isinstance(map_.geometry, Grid)
+    across, down = (place(edges) for place, edges in zip((frame.across, frame.down), map_.geometry.edges, strict=True))
+    found = []
+    for cell, colour in zip(map_.cell_N.tolist(), level_N.tolist(), strict=True):
+        i, j = map_.geometry.index_of(cell)
+        found.append(_rectangle(cell, colour, across[i], down[j + 1], across[i + 1], down[j]))
+    return found
+
+
+def _rectangle(cell: int, colour: int, left: float, top: float, right: float, bottom: float) -> Markup:
+    return Markup(  # without `tag`, since there may be ten thousand
+        f'<rect x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" height="{bottom - top:.1f}" '
+        f'fill="{SCALE[colour]}" data-c="{cell}"/>'
+    )
+
+
+def _voronoi(map_: BehaviourMap, frame: Frame, level_N: NDArray[np.int64]) -> list[Markup]:
+    """Voronoi cells of the centroids inside the bounds, in units in which both dimensions are equally long."""
+    from scipy.spatial import Voronoi
+
+    assert isinstance(map_.geometry, Cvt)
+    low_2, high_2 = np.array(map_.geometry.bounds).T
+    place_C_2 = (map_.geometry.centroid_C_B - low_2) / (high_2 - low_2)
+    # With a mirror image of all centroids beyond each side, the sides are edges of the cells inside.
+    mirrored = [place_C_2]
+    for axis in range(2):
+        for side in (0.0, 1.0):
+            image = place_C_2.copy()
+            image[:, axis] = 2 * side - image[:, axis]
+            mirrored.append(image)
+    diagram = Voronoi(np.concatenate(mirrored))
+    found = []
+    for cell, colour in zip(map_.cell_N.tolist(), level_N.tolist(), strict=True):
+        corners = low_2 + diagram.vertices[diagram.regions[diagram.point_region[cell]]] * (high_2 - low_2)
+        points = " ".join(
+            f"{x:.1f},{y:.1f}" for x, y in zip(frame.across(corners[:, 0]), frame.down(corners[:, 1]), strict=True)
+        )
+        found.append(Markup(f'<polygon points="{points}" fill="{SCALE[colour]}" data-c="{cell}"/>'))
+    return found
+
+
+def _bars(data: RunData, level_N: NDArray[np.int64], colours: Range) -> Markup:
+    map_ = data.map
+    assert map_ is not None
+    assert isinstance(map_.geometry, Grid)
+    low, high = spread([map_.fitness_N, np.array(colours)])
+    frame = Frame(map_.geometry.bounds[0], (low, high), 64, 8, floor.WIDTH - 74, 220)
+    across, bottom = frame.across(map_.geometry.edges[0]).tolist(), frame.top + frame.height
+    bars = [
+        _rectangle(cell, colour, across[cell], top, across[cell + 1], bottom)
+        for cell, colour, top in zip(map_.cell_N, level_N, frame.down(np.maximum(map_.fitness_N, low)), strict=True)
+    ]
+    return _svg([axis_lines(frame, data.names[0]), *bars], floor.WIDTH, bottom + 40)
+
+
+def _stacked(data: RunData, level_N: NDArray[np.int64]) -> tuple[Markup, str, None]:
+    map_ = data.map
+    assert map_ is not None
+    shape = map_.geometry.shape
+    right, up = range(0, len(shape), 2), range(1, len(shape), 2)
+    columns, rows = (int(np.prod([shape[b] for b in axes])) for axes in (right, up))
+    width, height = 500.0, min(500.0, max(120.0, 500.0 * rows / columns))
+    frame = Frame((0.0, float(columns)), (0.0, float(rows)), 8, 8, width, height)
+    content = [tag("rect", x=8, y=8, width=width, height=height, class_="ground")]
+    for cell, colour in zip(map_.cell_N.tolist(), level_N.tolist(), strict=True):
+        index = map_.geometry.index_of(cell)
+        x, y = (int(np.ravel_multi_index([index[b] for b in axes], [shape[b] for b in axes])) for axes in (right, up))
+        left, after = frame.across([x, x + 1])
+        bottom, top = frame.down([y, y + 1])
+        content.append(_rectangle(cell, colour, left, top, after, bottom))
+    for i in range(1, shape[0]):
+        x = f"{float(frame.across(i * columns / shape[0])):.1f}"
+        content.append(tag("line", x1=x, x2=x, y1=8, y2=8 + height, class_="block"))
+    for j in range(1, shape[1]):
+        y = f"{float(frame.down(j * rows / shape[1])):.1f}"
+        content.append(tag("line", x1=8, x2=8 + width, y1=y, y2=y, class_="block"))
+    order = [" then ".join(data.names[b] for b in axes) for axes in (right, up)]
+    text = (
+        f"Each cell shows the fitness of its elite. To the right: {order[0]}; upwards: {order[1]}, from large to small."
+    )
+    return _svg(content, width + 16, height + 16), text, None
+
+
+def _pairs(data: RunData, level_N: NDArray[np.int64]) -> Markup:
+    map_ = data.map
+    assert map_ is not None
+    bounds = map_.geometry.bounds
+    figures = []
+    for a, b in combinations(range(min(len(bounds), PAIRED_DIMENSIONS)), 2):
+        frame = Frame(bounds[a], bounds[b], floor.LEFT, 8, SMALL - 62, SMALL - 62)
+        points = [
+            Markup(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{SCALE[colour]}" data-c="{cell}"/>')
+            for cell, colour, x, y in zip(
+                map_.cell_N.tolist(),
+                level_N.tolist(),
+                frame.across(np.clip(map_.descriptor_N_B[:, a], *bounds[a])),
+                frame.down(np.clip(map_.descriptor_N_B[:, b], *bounds[b])),
+                strict=True,
+            )
+        ]
+        content = [floor.ground(frame, (data.names[a], data.names[b])), *points]
+        figures.append(_svg(content, *floor.size(frame), class_="map small"))
+    return tag("div", *figures, class_="pairs")
+
+
+def _paths(data: RunData, frame: Frame | None) -> tuple[dict[str, Any], Markup | None]:
+    """`MapView.cells` and `MapView.path_figure`."""
+    map_ = data.map
+    assert map_ is not None
+    rows = {}
+    for row, cell in enumerate(map_.cell_N.tolist()):
+        place = ", ".join(
+            f"{name} {number(float(x))}" for name, x in zip(data.names, map_.descriptor_N_B[row], strict=True)
+        )
+        text = f"fitness {number(float(map_.fitness_N[row]))}; {place}; found in generation {map_.generation_N[row]:,}"
+        rows[str(cell)] = [data.cell_name(cell), text]
+    known = [cell for cell in map_.cell_N.tolist() if cell in data.paths]
+    found: dict[str, Any] = {"rows": rows, "order": known, "overlay": frame is not None, "points": 0, "lines": 1}
+    if not known:
+        return found | {"paths": ""}, None
+    path_N_T_B = np.stack([data.paths[cell] for cell in known]).astype(np.float64)
+    points = path_N_T_B.shape[1]
+    if frame is not None:
+        lines = np.stack([frame.across(path_N_T_B[..., 0]), frame.down(path_N_T_B[..., 1])], axis=-1)
+        return found | {"points": points, "paths": packed(TENTHS * lines, "int16")}, None
+    shown = min(len(data.names), PAIRED_DIMENSIONS)
+    time = Frame(
+        (0.0, float(data.constants["task.episode_steps"])), (0.0, 1.0), 40, 8, floor.WIDTH - 50, PATH_HEIGHT - 48
+    )
+    low_B, high_B = np.array(data.bounds).T
+    share = np.clip((path_N_T_B - low_B) / (high_B - low_B), -0.02, 1.02)[..., :shown]
+    x = np.broadcast_to(time.across(np.linspace(*time.x, points))[:, None], share.shape)
+    lines = np.stack([x, time.down(share)], axis=-1).transpose(0, 2, 1, 3)
+    legend = [tag("span", tag("i", class_=f"dot s{b}"), data.names[b], class_="key") for b in range(shown)]
+    box = tag("rect", x=40, y=8, width=floor.WIDTH - 50, height=PATH_HEIGHT - 48, class_="ground")
+    labels = joined(
+        [
+            tag("text", "step of the episode", x=floor.WIDTH / 2, y=PATH_HEIGHT - 8, class_="label middle"),
+            tag("text", "low", x=2, y=PATH_HEIGHT - 42, class_="tick"),
+            tag("text", "high", x=0, y=16, class_="tick"),
+        ]
+    )
+    chart = tag("svg", box, labels, _overlay(), viewBox=f"0 0 {floor.WIDTH} {PATH_HEIGHT}", class_="map")
+    caption = tag("figcaption", "Descriptor in the course of the chosen elite's episode, between the map's bounds")
+    figure = tag("figure", caption, chart, tag("div", *legend, class_="legend"))
+    return found | {"points": points, "lines": shown, "paths": packed(TENTHS * lines, "int16")}, figure

@@ -1,0 +1,185 @@
+"""The page of one run: one HTML file with everything in it, which opens without a network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import resources
+from typing import Any
+
+from es_service.report import cloud as clouds
+from es_service.report import curves, facts, maps, series
+from es_service.report.colours import value_range
+from es_service.report.data import RunData
+from es_service.report.markup import Markup, data_script, table, tag
+from es_service.report.settings import changed_settings
+
+Evaluate = Callable[[str], str]
+"""Function from the name of a policy ("best", or a cell such as "3,17") to the text that evaluates it."""
+MOST_FAULTS = 20
+"""Generations with faults that are listed one by one."""
+
+
+def run_page(data: RunData, evaluate: Evaluate, replays: Mapping[str, Any] | None = None) -> str:
+    """HTML of the report of a run.
+
+    Args:
+        evaluate: what evaluates a policy, as text to copy.
+        replays: what `replays.replay_section` returns; None for no replay.
+    """
+    sections = [_head(data)]
+    scripts: dict[str, Any] = {}
+    if data.history["generation"].size:
+        sections += [_curves(data, scripts), _map(data, evaluate, scripts), _cloud(data, scripts)]
+        if replays is not None:
+            sections.append(replays["section"])
+            scripts |= replays["scripts"]
+        sections += [_time(data), _faults(data)]
+    libraries = list(replays["libraries"]) if replays is not None else []
+    return document(f"{data.name}: {data.constants['search.algorithm']} on {data.constants['task.environment']}",
+                    sections, scripts, libraries)  # fmt: skip
+
+
+def document(title: str, sections: list[Markup], scripts: Mapping[str, Any], libraries: list[str] | None = None) -> str:
+    """A whole page: title, sections, data for the script, scripts and stylesheet of `assets`."""
+    policy = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
+    head = tag(
+        "head",
+        Markup('<meta charset="utf-8">'),
+        Markup('<meta name="viewport" content="width=device-width, initial-scale=1">'),
+        Markup(f'<meta http-equiv="Content-Security-Policy" content="{policy}">'),
+        tag("title", title),
+        tag("style", Markup(asset("page.css"))),
+    )
+    data = [data_script(f"data-{name}", value) for name, value in scripts.items()]
+    code = [tag("script", Markup(text)) for text in (*(libraries or []), asset("page.js"))]
+    body = tag("body", tag("header", tag("h1", title)), tag("main", *sections), *data, *code)
+    return f"<!DOCTYPE html>\n{tag('html', head, body, lang='en')}\n"
+
+
+def asset(name: str) -> str:
+    """Text of a file of `assets`."""
+    return (resources.files("es_service.report") / "assets" / name).read_text()
+
+
+def section(title: str, *content: object, id_: str) -> Markup:
+    """A part of the page with a heading."""
+    return tag("section", tag("h2", title), *content, id=id_)
+
+
+def axis_choice(axes: Mapping[str, str]) -> Markup:
+    """Buttons that choose what curves are drawn against, the first one chosen; axes are columns with labels."""
+    buttons = [
+        tag("label", Markup(f'<input type="radio" name="x" value="{column}"{" checked" * (index == 0)}>'), label)
+        for index, (column, label) in enumerate(axes.items())
+    ]
+    return tag("div", tag("span", "against"), *buttons, class_="choice", role="radiogroup")
+
+
+def colour_legend(data: RunData) -> Markup | None:
+    """Colours of the map's fitness."""
+    return maps.colour_bar(value_range(data.map.fitness_N)) if data.map is not None else None
+
+
+def _head(data: RunData) -> Markup:
+    changed = changed_settings(data.meta.config, data.task)
+    rows = [(one.key, one.value, one.default or "unknown") for one in changed]
+    settings = table(rows, ("setting", "value", "default"), "settings") if rows else tag("p", "None.")
+    problems = [tag("p", tag("b", "Damaged: "), problem, class_="problem") for problem in data.problems]
+    return tag(
+        "section",
+        tag("p", facts.verdict(data), class_="verdict"),
+        *problems,
+        tag(
+            "div",
+            tag("div", tag("h2", "What was run"), table(facts.what_was_run(data))),
+            tag("div", tag("h2", "Settings that differ from their defaults"), settings),
+            class_="columns",
+        ),
+        tag("details", tag("summary", "Versions, machine and digest"), table(facts.provenance(data)), open="open"),
+        id="what",
+    )
+
+
+def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
+    drawn = curves.draw_charts(series.charts(data.history), series.x_axes(data.history))
+    scripts["charts"] = [one.points for one in drawn]
+    generations = data.history["generation"].size
+    together = series.groups(generations)[0]
+    grouped = None
+    if together > 1:
+        grouped = tag("p", f"Each point stands for {together} neighbouring generations: the last value "
+                      "where values count so far, else the mean.", class_="note")  # fmt: skip
+    return section(
+        "Curves",
+        axis_choice(series.X_AXES),
+        tag("div", *(one.figure for one in drawn), class_="charts"),
+        grouped,
+        id_="curves",
+    )
+
+
+def _map(data: RunData, evaluate: Evaluate, scripts: dict[str, Any]) -> Markup:
+    if data.map is None:
+        enabled = data.constants.get("map.enabled")
+        text = "The map cannot be read." if enabled else "This run has no behaviour map (map.enabled is false)."
+        return section("Behaviour map", tag("p", text), id_="map")
+    if not data.map.size:
+        return section("Behaviour map", tag("p", "No cell is filled yet."), id_="map")
+    view = maps.map_view(data)
+    names = {cell: row[0] for cell, row in view.cells["rows"].items()}
+    scripts["map"] = view.cells | {"evaluate": {cell: evaluate(name) for cell, name in names.items()}}
+    fittest = str(int(data.map.cell_N[data.map.fitness_N.argmax()]))
+    scripts["map"]["first"] = fittest
+    return section(
+        "Behaviour map",
+        tag("p", f"{view.explanation} Point at a cell for its values; click it for its elite's path.", class_="note"),
+        tag(
+            "div",
+            tag("div", view.figure, colour_legend(data)),
+            tag(
+                "div",
+                tag("h3", "Chosen cell"),
+                tag("p", id="cell", class_="readout", aria_live="polite"),
+                view.path_figure,
+                tag("p", "Evaluate its elite on fresh episodes:", class_="note"),
+                tag("pre", id="command"),
+                tag("p", "Its stored fitness is the highest of many noisy means; fresh episodes show how much of it "
+                    "is luck.", class_="note"),
+            ),
+            class_="columns",
+        ),
+        id_="map",
+    )  # fmt: skip
+
+
+def _cloud(data: RunData, scripts: dict[str, Any]) -> Markup:
+    found = clouds.cloud(data)
+    if found is None:
+        return section("Evaluated centres", tag("p", "No valid centre was evaluated."), id_="centres")
+    scripts["cloud"] = found.points
+    last = len(found.points["stops"]) - 1
+    slider = Markup(f'<input type="range" id="until" min="0" max="{last}" value="{last}" aria-label="generation">')
+    return section(
+        "Evaluated centres",
+        tag("p", found.explanation, class_="note"),
+        found.figure,
+        tag("div", slider, tag("span", id="until-text", class_="readout"), class_="slider"),
+        maps.colour_bar(found.colours),
+        id_="centres",
+    )
+
+
+def _time(data: RunData) -> Markup:
+    x_K, phases = series.phase_curves(data.history)
+    figure = curves.phase_figure(series.phase_seconds(data.history), x_K, phases)
+    return section("Where the time went", tag("p", facts.time_sentence(data)), figure, id_="time")
+
+
+def _faults(data: RunData) -> Markup:
+    found = facts.faults(data)
+    rows = [(f"{one.generation:,}", f"{one.lost_workers:,}", f"{one.retries:,}") for one in found[:MOST_FAULTS]]
+    more = None
+    if len(found) > MOST_FAULTS:
+        more = tag("p", f"{len(found) - MOST_FAULTS:,} more generations are not listed.", class_="note")
+    listed = table(rows, ("generation", "workers lost", "chunks sent again"), "numbers") if rows else None
+    return section("Faults survived", tag("p", facts.fault_sentence(found)), listed, more, id_="faults")

@@ -1,0 +1,193 @@
+"""Figures for papers and notebooks: functions that draw a run into an Axes of matplotlib.
+
+    from es_service import open_run, plots
+    plots.behaviour_map(open_run("runs/a"), axes)
+
+`run` is what `open_run` returns, or the folder of a run. matplotlib is an extra: figures.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from es_service.errors import ConfigError, NotInRunError, WayOut
+from es_service.report import compare
+from es_service.report.colours import value_range
+from es_service.report.data import RunData, read_run
+from es_service.report.floor import is_plan
+from es_service.report.series import X_AXES
+from es_service.runs.view import Run
+from es_service.search.maps.geometry import Grid
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Source = Run | RunData | str | os.PathLike[str]
+Several = list[Source] | list[RunData] | tuple[Source, ...]
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8a6d00", "#56b4e9", "#59626d")
+DASHES = ("-", "--", ":", "-.", (0, (3, 1)), (0, (8, 2)), (0, (6, 2, 1, 2, 1, 2)))
+WALL, PATH = "#1d2126", "#d55e00"
+
+
+def behaviour_map(run: Source, axes: Axes, colours: tuple[float, float] | None = None) -> Any:
+    """Draw the behaviour map of a run with a descriptor of one or two dimensions, with its walls and its goal.
+
+    Args:
+        colours: fitness of the first and last colour; None: those of this map.
+
+    Returns:
+        what `Figure.colorbar` takes. Raises NotInRunError without a map, or for more dimensions.
+    """
+    data = _data(run)
+    if data.map is None or len(data.names) > 2:
+        what = (
+            "no behaviour map"
+            if data.map is None
+            else f"a map of {len(data.names)} dimensions, of which no plot is made"
+        )
+        raise NotInRunError(f"{data.folder} has {what}", run=data.folder)
+    map_, geometry = data.map, data.map.geometry
+    low, high = colours or value_range(map_.fitness_N)
+    collections = importlib.import_module("matplotlib.collections")
+    style: dict[str, Any] = {
+        "cmap": "viridis",
+        "norm": importlib.import_module("matplotlib.colors").Normalize(low, high),
+    }
+    if len(data.names) == 1:
+        bars = collections.PolyCollection(_bars(data), array=map_.fitness_N, **style)
+        axes.add_collection(bars)
+        axes.set(xlim=data.bounds[0], xlabel=data.names[0], ylabel="fitness")
+        axes.set_ylim(min(low, float(map_.fitness_N.min(initial=low))), high)
+        return bars
+    _plane(data, axes)
+    if isinstance(geometry, Grid):
+        filled = np.full(geometry.shape, np.nan)
+        for cell, fitness in zip(map_.cell_N, map_.fitness_N, strict=True):
+            filled[geometry.index_of(int(cell))] = fitness
+        return axes.pcolormesh(*geometry.edges, filled.T, zorder=1, rasterized=True, **style)
+    return axes.scatter(*geometry.centroid_C_B[map_.cell_N].T, c=map_.fitness_N, marker="h", zorder=1, **style)
+
+
+def centres(run: Source, axes: Axes) -> Any:
+    """Draw all evaluated centres of a run at the first two dimensions of their descriptors, coloured by fitness.
+
+    With one dimension, the vertical axis is fitness. Returns what `Figure.colorbar` takes.
+    """
+    data = _data(run)
+    x, fitness = data.centres[data.names[0]], data.centres["fitness_mean"]
+    if len(data.names) == 1:
+        y = fitness
+        axes.set(xlim=data.bounds[0], xlabel=data.names[0], ylabel="fitness")
+    else:
+        y = data.centres[data.names[1]]
+        _plane(data, axes)
+    low, high = value_range(fitness)
+    return axes.scatter(
+        x, y, c=fitness, cmap="viridis", vmin=low, vmax=high, s=4, linewidths=0, zorder=2, rasterized=True
+    )
+
+
+def trajectory(run: Source, axes: Axes, cell: int | Sequence[int] | Literal["best"] = "best", **style: Any) -> None:
+    """Draw the path of an elite's first evaluation episode, as the run stored it.
+
+    Args:
+        cell: place of the elite's cell; "best": the fittest elite.
+        style: passed on to `Axes.plot`.
+
+    Raises NotInRunError for an empty or missing cell, or a descriptor without two dimensions.
+    """
+    data = _data(run)
+    opened = Run(data.folder)
+    if len(data.names) != 2:
+        raise NotInRunError(f"the descriptor of {data.folder} is no place in the plane", run=data.folder)
+    if cell == "best":
+        map_ = opened.behaviour_map
+        if not map_.size:
+            raise NotInRunError(f"the map of {data.folder} is empty", run=data.folder)
+        cell = map_.geometry.index_of(int(map_.cell_N[map_.fitness_N.argmax()]))
+    assert not isinstance(cell, str)
+    _plane(data, axes)
+    axes.plot(*opened.elite(cell).trace_T_B.T, **{"color": PATH, "linewidth": 1.4, "zorder": 4} | style)
+
+
+def curves(
+    runs: Source | Several,
+    axes: Axes,
+    column: str = "best_fitness",
+    against: str = "env_steps",
+    group_by: Sequence[str] = (),
+) -> None:
+    """Draw a history column: of one run as a line, of several as the median and quartiles of each group.
+
+    Args:
+        against: `generation`, `env_steps` or `wall_clock_s`.
+        group_by: config keys that group the runs; see `compare.grouped`.
+
+    Raises ConfigError for another column or axis, and for runs of different tasks.
+    """
+    found = [_data(one) for one in (runs if isinstance(runs, list | tuple) else [runs])]
+    for name, allowed in ((column, found[0].history), (against, X_AXES)):
+        if name not in allowed or any(column not in one.history for one in found):
+            raise ConfigError(f"{name} is no history column of all runs", value=name, allowed=", ".join(allowed))
+    groups = compare.grouped(found, group_by)
+    last = max(float(run.history[against][-1]) for run in found)
+    x_K = np.linspace(0.0, last, compare.POINTS)
+    for index, group in enumerate(groups):
+        style = {"color": COLOURS[index % len(COLOURS)], "linestyle": DASHES[index % len(DASHES)], "linewidth": 1.6}
+        if len(found) == 1:
+            axes.plot(group.runs[0].history[against], group.runs[0].history[column], **style)
+            continue
+        y_R_K = np.stack([compare.at(run.history[against], run.history[column], x_K) for run in group.runs])
+        low_K, median_K, high_K = np.quantile(y_R_K, [0.25, 0.5, 0.75], axis=0)
+        axes.plot(x_K, median_K, label=group.name, **style)
+        axes.fill_between(x_K, low_K, high_K, color=style["color"], alpha=0.18, linewidth=0)
+    axes.set(xlabel=X_AXES[against], ylabel=column.replace("_", " "))
+    axes.spines[["top", "right"]].set_visible(False)
+    if len(groups) > 1:
+        axes.legend(frameon=False)
+
+
+def pyplot() -> Any:
+    """matplotlib's pyplot, which draws into files. Raises ConfigError if matplotlib is not installed."""
+    try:
+        matplotlib = importlib.import_module("matplotlib")
+    except ImportError as error:
+        ways_out = [WayOut("install", "install it", extra="figures")]
+        raise ConfigError("figures need matplotlib", field="figures", ways_out=ways_out) from error
+    matplotlib.use("Agg")
+    return importlib.import_module("matplotlib.pyplot")
+
+
+def _data(run: Source) -> RunData:
+    if isinstance(run, RunData):
+        return run
+    return read_run(run.folder if isinstance(run, Run) else Path(run), paths=False, digest=False)
+
+
+def _bars(data: RunData) -> list[list[tuple[float, float]]]:
+    assert data.map is not None
+    assert isinstance(data.map.geometry, Grid)
+    edges, floor = data.map.geometry.edges[0].tolist(), value_range(data.map.fitness_N)[0]
+    return [
+        [(edges[cell], floor), (edges[cell], fitness), (edges[cell + 1], fitness), (edges[cell + 1], floor)]
+        for cell, fitness in zip(data.map.cell_N.tolist(), data.map.fitness_N.tolist(), strict=True)
+    ]
+
+
+def _plane(data: RunData, axes: Axes) -> None:
+    """The plane of the first two dimensions, its walls and its goal."""
+    axes.set(xlim=data.bounds[0], ylim=data.bounds[1], xlabel=data.names[0], ylabel=data.names[1])
+    if not is_plan(data.task, data.names):
+        return
+    axes.set_aspect("equal")
+    for start, end in data.task.walls or ():
+        axes.plot(*np.transpose([start, end]), color=WALL, linewidth=2.5, solid_capstyle="butt", zorder=3)
+    if data.task.goal is not None:
+        axes.plot(*data.task.goal, "o", markerfacecolor="none", markeredgecolor=PATH, markersize=9, markeredgewidth=2,
+                  zorder=3)  # fmt: skip

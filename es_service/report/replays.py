@@ -1,0 +1,170 @@
+"""Replays in a page: recorded episodes in three dimensions for tasks with bodies, else as a path in the plane.
+
+Poses are stored as 16-bit integers: positions in steps of the recording's own range (a millimetre for a way of 65 m),
+quaternions in steps of 1/32767. The page turns them back into numbers and draws them; nothing is computed there that is
+reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from es_service.errors import ServiceError
+from es_service.protocol.recordings import Recordings
+from es_service.report import floor
+from es_service.report.data import RunData
+from es_service.report.facts import number
+from es_service.report.markup import Markup, packed, spread, tag
+from es_service.report.page import asset, section
+from es_service.runs.replay import Replay, record
+from es_service.runs.view import Run
+
+MOST_CELLS = 8
+"""Elites that are replayed in one page, besides the best centre; each ant takes half a megabyte."""
+SPEEDS = (0.25, 0.5, 1, 2, 4, 8)
+PLAIN_STEP_S = 0.05
+"""Seconds of a step in the replay of a task that has no time of its own."""
+
+
+def replay_section(data: RunData, *, best: bool, cells: Sequence[Sequence[int]]) -> Mapping[str, Any]:
+    """The section of the page, the data of its script, and the libraries that it needs.
+
+    A task that cannot be run on this machine, such as a user's task whose package is missing, has a section that says
+    so. Errors about cells are raised: NotInRunError.
+    """
+    run = Run(Path(data.folder))
+    run.__dict__["meta"] = data.meta
+    for place in cells:
+        run.cell(place)
+    try:
+        replays, found = record(run, best=best, cells=cells)
+    except ServiceError as error:
+        text = f"No episode could be recorded on this machine: {error.sentence}"
+        return {
+            "section": section("Replay", tag("p", text, class_="problem"), id_="replay"),
+            "scripts": {},
+            "libraries": [],
+        }
+    solid = bool(found.shapes) and all(one.recording.poses_T_L_7 is not None for one in replays)
+    scripts = {"replay": _solid(data, replays, found) if solid else _flat(data, replays)}
+    scripts["replay"]["names"] = [_title(one) for one in replays]
+    libraries = [asset("three.bundle.js")] if solid else []
+    return {
+        "section": _section(data, replays, solid=solid),
+        "scripts": scripts,
+        "libraries": [*libraries, asset("replay.js")],
+    }
+
+
+def _title(one: Replay) -> str:
+    name = "best centre" if one.candidate.name == "best" else f"cell {one.candidate.name}"
+    return f"{name}: fitness {number(one.recording.fitness)} in this episode"
+
+
+def _notes(one: Replay) -> str:
+    """Which episode is shown, and how it compares with what the run stored."""
+    text = (
+        f"Evaluation episode 0 of generation {one.candidate.generation:,}, recorded with the stored policy and "
+        f"statistics: {one.recording.returns_T.size - 1:,} steps, fitness {number(one.recording.fitness)} (mean of all "
+        f"its evaluation episodes: {number(one.candidate.stored_fitness)})."
+    )
+    if one.difference is None:
+        return text
+    if one.difference == 0.0:
+        return f"{text} Its path equals the stored one bit for bit."
+    return f"{text} Its path differs from the stored one by up to {number(one.difference)}, as other roundings cause."
+
+
+def _section(data: RunData, replays: Sequence[Replay], *, solid: bool) -> Markup:
+    options = [tag("option", _title(one), value=index) for index, one in enumerate(replays)]
+    speeds = [tag("option", f"{speed:g} x", value=speed, selected="" if speed == 1 else None) for speed in SPEEDS]
+    longest = max(one.recording.returns_T.size for one in replays) - 1
+    scrub = Markup(f'<input type="range" id="scrub" min="0" max="{longest}" value="0" step="1" aria-label="step">')
+    follow = Markup('<input type="checkbox" id="follow">')
+    frame = _frame(data, replays)
+    plan = tag("svg", floor.ground(frame, _labels(data)), floor.walls_and_goal(frame, data.task),
+               tag("g", class_="path"), viewBox="0 0 {:.0f} {:.0f}".format(*floor.size(frame)), class_="map",
+               role="img", aria_label="Path from above")  # fmt: skip
+    stage = tag("div", tag("canvas", id="stage"), class_="stage", id="stage-box") if solid else None
+    return section(
+        "Replay",
+        tag(
+            "div",
+            tag("select", *options, id="episode", aria_label="episode"),
+            tag("button", "Play", id="play", type="button"),
+            scrub,
+            tag("label", "speed ", tag("select", *speeds, id="speed")),
+            tag("label", follow, " follow") if solid else None,
+            class_="controls",
+        ),
+        tag("p", id="step", class_="readout"),
+        stage,
+        tag("div", plan, class_="stage flat", id="plan", hidden="" if solid else None),
+        *(tag("p", _notes(one), class_="note episode", hidden="" if i else None) for i, one in enumerate(replays)),
+        tag("p", "Drag to turn, scroll to come nearer, drag with the right button to move.", class_="note")
+        if solid
+        else None,
+        id_="replay",
+    )
+
+
+def _labels(data: RunData) -> tuple[str, str]:
+    first, *others = data.names
+    return (first, others[0]) if others else ("step of the episode", first)
+
+
+def _plane(data: RunData, one: Replay) -> tuple[np.ndarray, np.ndarray]:
+    """x and y of a path in the plane: the first two dimensions, or one dimension against time."""
+    way_T_B = one.recording.descriptor_T_B
+    if one.recording.poses_T_L_7 is not None and not floor.is_plan(data.task, data.names):
+        return one.recording.poses_T_L_7[:, 0, 0], one.recording.poses_T_L_7[:, 0, 1]
+    if way_T_B.shape[1] == 1:
+        return np.arange(len(way_T_B), dtype=float), way_T_B[:, 0]
+    return way_T_B[:, 0], way_T_B[:, 1]
+
+
+def _frame(data: RunData, replays: Sequence[Replay]) -> Any:
+    if floor.is_plan(data.task, data.names):
+        return floor.plan_frame(data.bounds)
+    ways = [_plane(data, one) for one in replays]
+    return floor.plan_frame((spread([x for x, _ in ways]), spread([y for _, y in ways])))
+
+
+def _flat(data: RunData, replays: Sequence[Replay]) -> dict[str, Any]:
+    """Paths in tenths of a pixel of the floor plan."""
+    frame = _frame(data, replays)
+    episodes = []
+    for one in replays:
+        x, y = _plane(data, one)
+        way = np.stack([frame.across(np.clip(x, *frame.x)), frame.down(np.clip(y, *frame.y))], axis=1)
+        returns = [number(float(value)) for value in one.recording.returns_T]
+        episodes.append({"steps": len(way) - 1, "way": packed(10 * way, "int16"), "returns": returns})
+    return {"solid": False, "step_s": PLAIN_STEP_S, "episodes": episodes}
+
+
+def _solid(data: RunData, replays: Sequence[Replay], found: Recordings) -> dict[str, Any]:
+    """Poses of all links, and the shapes that move with them."""
+    flat = _flat(data, replays)
+    for one, episode in zip(replays, flat["episodes"], strict=True):
+        poses = np.nan_to_num(np.asarray(one.recording.poses_T_L_7, np.float64))
+        low, high = poses[..., :3].min(axis=(0, 1)), poses[..., :3].max(axis=(0, 1))
+        size = np.maximum(high - low, 1e-6) / 65535.0
+        episode |= {
+            "low": low.tolist(),
+            "size": size.tolist(),
+            "positions": packed((poses[..., :3] - low) / size, "uint16"),
+            "rotations": packed(poses[..., 3:] * 32767.0, "int16"),
+        }
+    links = replays[0].recording.poses_T_L_7
+    assert links is not None
+    return flat | {
+        "solid": True,
+        "step_s": found.step_s,
+        "links": links.shape[1],
+        "shapes": [shape._asdict() for shape in found.shapes],
+        "goal": None if data.task.goal is None else list(data.task.goal),
+    }

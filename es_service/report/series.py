@@ -1,0 +1,159 @@
+"""The curves of a run: which columns of the history are drawn together, thinned to as many points as a page can show.
+
+Axes: G generations, K points of a curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.report.data import Columns
+
+MOST_POINTS = 300
+"""A curve of more generations shows groups of neighbouring ones."""
+X_AXES = {"generation": "generation", "env_steps": "environment steps", "wall_clock_s": "seconds"}
+"""History columns that curves can be drawn against -> labels."""
+PHASES = {
+    "seconds_rollout": "training episodes",
+    "seconds_gradient": "gradient",
+    "seconds_evaluation": "evaluation",
+    "seconds_driver": "driver",
+    "seconds_store": "store",
+}
+"""History columns that divide a generation's time -> labels."""
+
+Group = Literal["last", "mean"]
+"""What a point shows of a group of generations: "last" for values so far, "mean" for values of one generation."""
+
+
+class Line(NamedTuple):
+    """A curve: its label and its values, [K]."""
+
+    label: str
+    column: str
+    y_K: NDArray[np.float64]
+    range_K: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+    """(low [K], high [K]) of the region around the curve, such as quartiles over seeds."""
+
+
+class Chart(NamedTuple):
+    """Curves that share both axes."""
+
+    title: str
+    note: str
+    """What the values mean, one sentence."""
+    lines: tuple[Line, ...]
+    band: tuple[str, NDArray[np.float64], NDArray[np.float64]] | None
+    """(label, low [K], high [K]) of a shaded region."""
+    percent: bool
+    """Whether values are fractions that are shown as percentages."""
+
+
+class _Spec(NamedTuple):
+    title: str
+    note: str
+    lines: tuple[tuple[str, str, Group], ...]
+    band: tuple[str, str, str] | None = None
+    percent: bool = False
+
+
+_SPECS = (
+    _Spec(
+        "Fitness",
+        "Mean over the evaluation episodes of a centre; of the population, single training episodes with noise.",
+        (
+            ("best centre so far", "best_fitness", "last"),
+            ("centre", "centre_fitness_mean", "mean"),
+            ("population, median", "population_fitness_median", "mean"),
+        ),
+        ("population, quartiles", "population_fitness_q25", "population_fitness_q75"),
+    ),
+    _Spec(
+        "Distance to the goal",
+        "In the evaluation episodes of the centre.",
+        (("at the end, mean", "goal_distance", "mean"), ("on the way, least", "goal_distance_min", "mean")),
+    ),
+    _Spec(
+        "Coverage of the behaviour map",
+        "Filled cells as a share of all cells, and of those that can be reached where the task knows its walls.",
+        (("of all cells", "coverage", "last"), ("of reachable cells", "coverage_reachable", "last")),
+        percent=True,
+    ),
+    _Spec("QD-score", "Sum over all elites of fitness less map.qd_offset.", (("QD-score", "qd_score", "last"),)),
+    _Spec(
+        "Novelty of the centre",
+        "Mean distance of its descriptor to the nearest centres evaluated before.",
+        (("novelty", "centre_novelty", "mean"),),
+    ),
+    _Spec(
+        "Weight of fitness (w)",
+        "Weight of fitness beside novelty in the utilities: 1 follows fitness alone, 0 novelty alone.",
+        (("w", "fitness_weight", "mean"),),
+    ),
+)
+
+
+def charts(history: Columns) -> list[Chart]:
+    """The charts of a run that have values; w is left out where it never changes."""
+    ends_K = groups(len(history["generation"]))
+    found = []
+    for spec in _SPECS:
+        lines = tuple(
+            Line(label, column, thinned(history[column], ends_K, group))
+            for label, column, group in spec.lines
+            if column in history and np.isfinite(history[column]).any()
+        )
+        if not lines or (spec.lines[0][1] == "fitness_weight" and np.ptp(history["fitness_weight"]) == 0.0):
+            continue
+        band = None
+        if spec.band is not None and np.isfinite(history.get(spec.band[1], np.full(1, np.nan))).any():
+            label, low, high = spec.band
+            band = (label, thinned(history[low], ends_K, "mean"), thinned(history[high], ends_K, "mean"))
+        found.append(Chart(spec.title, spec.note, lines, band, spec.percent))
+    return found
+
+
+def x_axes(history: Columns) -> dict[str, NDArray[np.float64]]:
+    """Values of every axis of X_AXES at the end of each group of generations, [K]."""
+    ends_K = groups(len(history["generation"]))
+    return {column: thinned(history[column], ends_K, "last") for column in X_AXES}
+
+
+def phase_seconds(history: Columns) -> dict[str, float]:
+    """Seconds of each phase over the whole run, by label of PHASES."""
+    return {label: float(np.nansum(history[column])) for column, label in PHASES.items() if column in history}
+
+
+def phase_curves(history: Columns) -> tuple[NDArray[np.float64], Mapping[str, NDArray[np.float64]]]:
+    """Generation at the end of each group [K], and by label of PHASES the mean seconds of a generation [K]."""
+    ends_K = groups(len(history["generation"]))
+    curves = {
+        label: np.nan_to_num(thinned(history[column], ends_K, "mean"))
+        for column, label in PHASES.items()
+        if column in history
+    }
+    return thinned(history["generation"], ends_K, "last"), curves
+
+
+def groups(generations: int, most: int = MOST_POINTS) -> NDArray[np.int64]:
+    """End (exclusive) of each group of neighbouring generations, [K]: at most `most` groups, all but the last equal."""
+    size = max(1, -(-generations // most))
+    return np.minimum(np.arange(1, -(-generations // size) + 1) * size, generations)
+
+
+def thinned(values_G: NDArray[np.float64], ends_K: NDArray[np.int64], group: Group) -> NDArray[np.float64]:
+    """One value for each group, [K]: the last or the mean of its finite values; NaN for a group without any."""
+    starts_K = np.concatenate([[0], ends_K[:-1]])
+    if not ends_K.size:
+        return np.zeros(0)
+    finite_G = np.isfinite(values_G)
+    if group == "last":
+        last_G = np.maximum.accumulate(np.where(finite_G, np.arange(values_G.size), -1))[ends_K - 1]
+        return np.where(last_G >= starts_K, values_G[np.maximum(last_G, 0)], np.nan)
+    with np.errstate(invalid="ignore"):
+        sums_K = np.add.reduceat(np.where(finite_G, values_G, 0.0), starts_K)
+        return sums_K / np.where(counts := np.add.reduceat(finite_G.astype(float), starts_K), counts, np.nan)

@@ -1,0 +1,72 @@
+"""The settings of a run that differ from the defaults of its task, its algorithm and its preset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from es_service.config.fields import OPTIONS
+from es_service.config.loading import load_config
+from es_service.config.model import flat
+from es_service.config.resolution import LEFT_OPEN
+from es_service.config.yaml_text import in_line
+from es_service.errors import ConfigError
+from es_service.protocol.messages import TaskSpec
+
+SHOWN_ELSEWHERE = ("task.environment", "search.algorithm", "seed", "budget.", "compute.workers", "compute.engine")
+"""Keys, or beginnings of keys, that a report shows in any case."""
+PRESET = "search.preset"
+
+
+class Setting(NamedTuple):
+    """A setting as text in YAML."""
+
+    key: str
+    value: str
+    default: str
+    """The default; empty if it is not known."""
+
+
+def changed_settings(config: Mapping[str, Any], task: TaskSpec) -> list[Setting]:
+    """Settings whose values differ from those that a config with only the task, the algorithm and the preset gets.
+
+    A value that follows from others, such as `compute.chunk_pairs` from `search.pairs`, counts as its default. If the
+    defaults cannot be found, because the config is of another version, all settings are returned.
+
+    Args:
+        config: resolved config of a run, as its store has it.
+        task: the task as the run knows it, so that the task's package need not be installed.
+    """
+    values = flat(config)
+    defaults = _defaults(config, values, task)
+    return [
+        Setting(key, in_line(value), in_line(defaults[key]) if key in defaults else "")
+        for key, value in values.items()
+        if not key.startswith(SHOWN_ELSEWHERE) and (key not in defaults or _plain(defaults[key]) != _plain(value))
+    ]
+
+
+def _defaults(config: Mapping[str, Any], values: Mapping[str, Any], task: TaskSpec) -> dict[str, Any]:
+    environment, algorithm = values["task.environment"], values["search.algorithm"]
+    options = {key.removeprefix(OPTIONS): value for key, value in values.items() if key.startswith(OPTIONS)}
+    least = {
+        "task": {"environment": environment, "options": options},
+        "search": {"algorithm": algorithm, "preset": values.get(PRESET, "literature")},
+        "budget": config["budget"],
+    }
+    following = {key: value for key, value in values.items() if key not in LEFT_OPEN}
+    try:
+        known: dict[str, Any] = {"tasks": {environment: task}, "algorithms": {algorithm: None}, "new": False}
+        plain, followed = (
+            flat(load_config(source, overrides, **known).model_dump(mode="json"))
+            for source, overrides in ((least, {}), (least, following))
+        )
+    except ConfigError:
+        return {}
+    first = {OPTIONS + name: allowed[0] for name, allowed in task.options.items() if allowed}
+    return plain | {key: followed[key] for key in LEFT_OPEN} | first | {PRESET: "literature"}
+
+
+def _plain(value: Any) -> Any:
+    """A value with lists in place of tuples, as JSON has it."""
+    return [_plain(one) for one in value] if isinstance(value, list | tuple) else value

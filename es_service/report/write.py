@@ -1,0 +1,99 @@
+"""Writing of reports: which file, from which data."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from es_service.errors import ConfigError, StoreError
+from es_service.report.compare_page import comparison_page
+from es_service.report.data import read_run
+from es_service.report.figures import write_figures
+from es_service.report.page import Evaluate, run_page
+from es_service.report.replays import MOST_CELLS, replay_section
+
+REPORT = "report.html"
+"""Name of a run's report in its folder."""
+
+
+def python_call(folder: Path) -> Evaluate:
+    """The Python call that gives a policy of a run."""
+
+    def call(name: str) -> str:
+        place = repr(name) if name in ("best", "centre") else f"({name})" if "," in name else name
+        return f"open_run({str(folder)!r}).policy({place})"
+
+    return call
+
+
+def write_report(
+    folder: Path,
+    out: Path | None = None,
+    *,
+    best: bool = True,
+    cells: Sequence[Sequence[int]] = (),
+    evaluate: Evaluate | None = None,
+    figures: Path | None = None,
+) -> list[Path]:
+    """Write the report of one run and return the files written, the page first.
+
+    Args:
+        out: file to write; None: `report.html` in the run's folder.
+        best: whether to record an episode of the best centre for a replay, which takes seconds.
+        cells: places of at most eight cells whose elites are to be replayed, too.
+        evaluate: what evaluates a policy, as text; None: the Python call.
+        figures: folder to write figures into; None: none are written.
+
+    Raises:
+        ConfigError: too many cells, or figures without matplotlib. NotInRunError: a cell does not exist or is empty.
+            StoreError: the run cannot be read, or the file cannot be written.
+    """
+    if len(cells) > MOST_CELLS:
+        raise ConfigError(
+            f"{len(cells)} cells are too many for replays in one page; choose at most {MOST_CELLS}",
+            field="replay",
+            value=len(cells),
+            allowed=f"at most {MOST_CELLS} cells",
+        )
+    data = read_run(folder)
+    found = bool(data.history["generation"].size) and (best or bool(cells))
+    replays = replay_section(data, best=best, cells=cells) if found else None
+    page = write_page(run_page(data, evaluate or python_call(folder), replays), out or folder / REPORT)
+    return [page, *(write_figures([data], figures) if figures is not None else [])]
+
+
+def write_comparison(
+    folders: Sequence[Path],
+    out: Path,
+    group_by: Sequence[str] = (),
+    threshold: float | None = None,
+    figures: Path | None = None,
+) -> list[Path]:
+    """Write the page that compares runs of one task and return the files written, the page first.
+
+    Args:
+        group_by: config keys that group the runs; see `compare.grouped`.
+        threshold: fitness from which a run counts as solved; None: the target fitness of all runs, if there is one.
+        figures: folder to write figures into; None: none are written.
+
+    Raises:
+        ConfigError: the runs cannot be compared or grouped, or figures without matplotlib. NotInRunError: a run has no
+            finished generation. StoreError: a run cannot be read, or a file cannot be written.
+    """
+    runs = [read_run(folder, paths=False, digest=False) for folder in folders]
+    page = write_page(comparison_page(runs, group_by, threshold), out)
+    return [page, *(write_figures(runs, figures, group_by) if figures is not None else [])]
+
+
+def write_page(page: str, file: Path) -> Path:
+    """Write a page so that a reader never sees half of it."""
+    half = file.with_name(f".{file.name}.{os.getpid()}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        half.write_text(page)
+        half.replace(file)
+    except OSError as error:
+        half.unlink(missing_ok=True)
+        raise StoreError(f"cannot write {file}: {error.strerror or error}; choose another file") from error
+    return file

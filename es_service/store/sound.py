@@ -1,0 +1,162 @@
+"""Everything of a run that can be read, also of a damaged one: what is sound, and a sentence about what is not.
+
+A report needs many kinds of data of one generation at once and should show what is left of a damaged run. All other
+readers (`reader`) refuse damaged data instead.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from es_service.errors import StoreError
+from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict, table_rows
+from es_service.store.folder import COPY
+from es_service.store.reader import EvaluatedCentres, connected_to, platforms, reading, state_payload
+from es_service.store.schema import Damaged, RunMeta, history_select
+from es_service.store.verify import KeptRows, row_is_sound, rows_in_force, state_in_force
+
+Arrays = dict[str, NDArray[Any]]
+Kept = Callable[[str, Arrays], Arrays | None]
+"""Function (name of a part, its arrays) -> the arrays to keep; None: keep nothing of this part."""
+
+
+@dataclass(frozen=True)
+class SoundRun:
+    """What could be read of a run in one transaction; every value matches its SHA-256."""
+
+    meta: RunMeta
+    history: list[dict[str, int | float]]
+    """Sound history rows in the order of generations, as values by column name; NaN stands for no value."""
+    evaluations: list[EvaluatedCentres]
+    """The centres that each generation of `history` evaluated, in the order of the asks."""
+    platforms: list[tuple[int, dict[str, Any]]]
+    """(first generation, platform); each applies until the next one."""
+    generation: int | None
+    """Generation of `parts`; None if no state is stored."""
+    parts: dict[str, Arrays]
+    problems: tuple[str, ...]
+    """What is missing and why, one sentence each; empty if the run is sound as far as it was read."""
+
+
+def read_sound(folder: Path, kept: Kept = lambda part, arrays: arrays) -> SoundRun:
+    """Read a run as far as it is sound; see `SoundRun`. Parts are decoded one at a time, then passed to `kept`.
+
+    Raises:
+        StoreError: neither the database nor its copy has a sound description of the run.
+    """
+    problems: list[str] = []
+    with _any_sound(folder, problems) as (connection, meta):
+        rows, evaluations = _history(connection, meta, problems)
+        found: list[tuple[int, dict[str, Any]]] = []
+        with _noted(problems, "the platforms cannot be read"):
+            found = platforms(connection)
+        generation, parts = None, {}
+        with _noted(problems, "the state cannot be read"):
+            generation, parts = _state(connection, kept, problems)
+    return SoundRun(meta, rows, evaluations, found, generation, parts, tuple(problems))
+
+
+@contextlib.contextmanager
+def _any_sound(folder: Path, problems: list[str]) -> Iterator[tuple[sqlite3.Connection, RunMeta]]:
+    """Connection to the run, or to its copy if the database cannot be opened."""
+    with contextlib.ExitStack() as stack:
+        try:
+            opened = stack.enter_context(reading(folder))
+        except StoreError as error:
+            if not (folder / COPY).exists():
+                raise
+            try:
+                opened = connected_to(folder / COPY)
+            except (sqlite3.Error, Damaged):
+                raise error from None
+            stack.enter_context(contextlib.closing(opened[0]))
+            problems.append(f"{error.sentence}; shown is its copy {COPY}")
+        yield opened
+
+
+@contextlib.contextmanager
+def _noted(problems: list[str], what: str) -> Iterator[None]:
+    """Context manager that turns damage into a sentence."""
+    try:
+        yield
+    except (sqlite3.Error, Damaged, ValueError, TypeError, KeyError) as error:
+        problems.append(f"{what}: {error}")
+
+
+def _history(
+    connection: sqlite3.Connection, meta: RunMeta, problems: list[str]
+) -> tuple[list[dict[str, int | float]], list[EvaluatedCentres]]:
+    """The sound history rows and the centres that were evaluated; a row that is damaged is left out."""
+    columns = column_bytes(meta.columns)
+    rows: list[dict[str, int | float]] = []
+    evaluations: list[EvaluatedCentres] = []
+    expected = 0
+    lost: list[int] = []
+    with _noted(problems, "the end of the history cannot be read"):
+        query = history_select(meta.columns) + " ORDER BY history.generation"
+        for *values, centres, state, sha256 in connection.execute(query):
+            row = tuple(values)
+            named = row_dict(meta.columns, row)
+            if not row_is_sound(columns, row, centres, state, sha256):
+                continue
+            lost += range(expected, int(named["generation"]))
+            expected = int(named["generation"]) + 1
+            rows.append(named)
+            evaluations.append(table_rows(meta.evaluation_columns, centres))
+    with _noted(problems, "the number of generations cannot be read"):
+        newest = connection.execute("SELECT max(generation) FROM state").fetchone()[0]
+        lost += range(expected, (-1 if newest is None else newest) + 1)
+    if lost:
+        problems.append(f"the history rows of generations {_spans(lost)} are damaged or missing")
+    return rows, evaluations
+
+
+def _state(connection: sqlite3.Connection, kept: Kept, problems: list[str]) -> tuple[int | None, dict[str, Arrays]]:
+    """The newest generation whose whole state is stored, and its parts; the newest parts there are if none is."""
+    stored: KeptRows = {}
+    for part, at, sha256 in connection.execute("SELECT part, generation, sha256 FROM state"):
+        stored.setdefault(part, {})[at] = sha256
+    if not stored:
+        return None, {}
+    states = dict(connection.execute("SELECT generation, state_sha256 FROM history ORDER BY generation DESC LIMIT 2"))
+    whole = [at for at, state in states.items() if rows_in_force(stored, at) and state_in_force(stored, at) == state]
+    newest = max(at for rows in stored.values() for at in rows)
+    generation = max(whole, default=newest)
+    if generation not in whole:
+        problems.append("the state of the newest generation is incomplete")
+    parts: dict[str, Arrays] = {}
+    damaged = []
+    for part, (at, sha256) in sorted(rows_in_force(stored, generation).items()):
+        try:
+            payload = state_payload(connection, part, at)
+            if part_sha256(part, at, payload) != sha256:
+                raise ValueError(part)
+            arrays = kept(part, decode_part(payload))
+        except (sqlite3.Error, ValueError, TypeError):
+            damaged.append(part)
+            continue
+        if arrays is not None:
+            parts[part] = arrays
+    if damaged:
+        more = f" and {len(damaged) - 3} more" if len(damaged) > 3 else ""
+        problems.append(f"the state of {', '.join(damaged[:3])}{more} is damaged")
+    return generation, parts
+
+
+def _spans(numbers: list[int]) -> str:
+    """Increasing numbers as text, such as "3, 7 to 9"; at most five spans."""
+    spans: list[list[int]] = []
+    for number in numbers:
+        if spans and number == spans[-1][1] + 1:
+            spans[-1][1] = number
+        else:
+            spans.append([number, number])
+    shown = [str(first) if first == last else f"{first} to {last}" for first, last in spans[:5]]
+    return ", ".join(shown) + (" and others" if len(spans) > 5 else "")

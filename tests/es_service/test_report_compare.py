@@ -1,0 +1,184 @@
+"""Comparisons of runs, with numbers worked out by hand, and figures."""
+
+import re
+import sqlite3
+
+import numpy as np
+import pytest
+
+from es_service import open_run, plots
+from es_service.errors import ConfigError, NotInRunError
+from es_service.report import compare
+from es_service.report.compare_page import comparison_page
+from es_service.report.data import read_run
+from es_service.report.figures import write_figures
+from es_service.report.write import write_comparison
+from tests.es_service.test_report_page import Elements, task_with
+from tests.run_examples import write_run
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Three seeds each of me_es and es; the third of me_es has more generations."""
+    top = tmp_path_factory.mktemp("runs")
+    return [
+        write_run(
+            top / f"{algorithm}_{seed}",
+            {"search.algorithm": algorithm, "seed": seed},
+            generations=30 if (algorithm, seed) == ("me_es", 2) else 20,
+        )
+        for algorithm in ("me_es", "es")
+        for seed in range(3)
+    ]
+
+
+@pytest.fixture(scope="module")
+def runs(folders):
+    return [read_run(folder) for folder in folders]
+
+
+def test_runs_are_grouped_by_what_differs_but_the_seed(runs, tmp_path):
+    assert [(group.name, len(group.runs)) for group in compare.grouped(runs)] == [("me_es", 3), ("es", 3)]
+    wide = read_run(write_run(tmp_path / "wide", {"search.sigma": 0.5}))
+    names = [group.name for group in compare.grouped([runs[0], runs[1], wide])]
+    assert names == ["search.sigma 0.02", "search.sigma 0.5"]
+    assert [group.name for group in compare.grouped([runs[0], wide], ["seed"])] == ["seed 0"]
+    assert [group.name for group in compare.grouped(runs[:3])] == ["me_es"]
+    # The algorithm alone does not explain these, since two groups have the same.
+    assert len(compare.grouped([*runs, wide])) == 3
+
+
+def test_runs_of_different_tasks_are_refused(runs, tmp_path):
+    other = read_run(write_run(tmp_path / "other", task=task_with(2)))
+    with pytest.raises(ConfigError, match=r"task.environment differs: .*me_es_0 has point_maze; .*other has made:Up"):
+        compare.grouped([runs[0], other])
+    with pytest.raises(ConfigError, match=r"task.environment differs"):
+        compare.grouped([runs[0], other], ["task.environment"])
+    longer = read_run(write_run(tmp_path / "longer", {"task.episode_steps": 300, "map.qd_offset": 0.0}))
+    with pytest.raises(ConfigError, match=r"task.episode_steps differs: .* or group by task.episode_steps"):
+        compare.grouped([runs[0], longer])
+    assert len(compare.grouped([runs[0], longer], ["task.episode_steps"])) == 2
+
+
+def test_an_unknown_key_is_refused_with_the_nearest(runs):
+    with pytest.raises(ConfigError, match=r"no run has this setting; did you mean search.algorithm\?"):
+        compare.grouped(runs, ["search.algoritm"])
+
+
+def test_values_on_a_common_axis_are_those_of_the_newest_generation_by_then():
+    x_G, y_G = np.array([10.0, 20.0, 30.0]), np.array([1.0, 2.0, 3.0])
+    found = compare.at(x_G, y_G, np.array([0.0, 10.0, 19.9, 20.0, 30.0, 30.1]))
+    np.testing.assert_array_equal(found, [np.nan, 1.0, 1.0, 2.0, 3.0, np.nan])
+
+
+def test_curves_are_medians_of_all_runs_of_a_group_and_end_with_the_first(runs):
+    groups = compare.grouped(runs)
+    charts, x_K = compare.charts(groups, "env_steps")
+    assert x_K[-1] == 31_000
+    line = charts[0].lines[0]
+    k = int(np.searchsorted(x_K, 15_500))
+    values = [run.history["best_fitness"][int(x_K[k] // 1000) - 1] for run in groups[0].runs]
+    assert line.y_K[k] == np.median(values)
+    assert line.range_K[0][k] == np.quantile(values, 0.25)
+    assert np.isnan(line.y_K[x_K > 21_000]).all()
+    assert np.isfinite(line.y_K[(x_K >= 1000) & (x_K <= 21_000)]).all()
+
+
+def test_solved_runs_are_counted_with_their_steps(runs):
+    groups = compare.grouped(runs)
+    ends = sorted(run.history["best_fitness"][-1] for run in groups[0].runs)
+    threshold = (ends[1] + ends[2]) / 2  # one of three reaches it
+    one = compare.summaries(groups, threshold)[0]
+    solved = next(run for run in groups[0].runs if run.history["best_fitness"][-1] > threshold)
+    first = int(np.argmax(solved.history["best_fitness"] >= threshold))
+    assert (one.solved, one.steps.median) == (1, solved.history["env_steps"][first])
+    assert one.values["best_fitness"] == (ends[1], (ends[0] + ends[1]) / 2, (ends[1] + ends[2]) / 2)
+    assert compare.median_run(groups[0]).history["best_fitness"][-1] == ends[1]
+    assert compare.summaries(groups, None)[0].solved == 0
+
+
+def test_a_comparison_shows_groups_maps_and_runs(runs):
+    page = comparison_page(runs, threshold=-80.0)
+    found = Elements(page)
+    assert found.open == []
+    assert page.count('aria-label="Behaviour map"') == 2
+    assert "reach -80.00" in page
+    for run in runs:
+        assert str(run.folder) in page
+    texts = found.scripts["data-charts"][0]["texts"]
+    assert re.match(r"\S+ environment steps: me_es -?\S+ \(\S+ to \S+\); es ", texts["env_steps"][100])
+
+
+def test_a_common_target_is_the_threshold(tmp_path):
+    runs = [
+        read_run(write_run(tmp_path / str(seed), {"seed": seed, "budget.target_fitness": -90.0})) for seed in range(2)
+    ]
+    assert "2 of 2 runs reach -90.00" in comparison_page(runs)
+
+
+def test_a_run_without_generations_is_refused(runs, tmp_path):
+    with sqlite3.connect(write_run(tmp_path / "run") / "run.db") as connection:
+        connection.execute("DELETE FROM history")
+    with pytest.raises(NotInRunError, match="has no finished generation yet"):
+        comparison_page([runs[0], read_run(tmp_path / "run")])
+
+
+def test_figures_are_written_as_svg_and_png(folders, runs, tmp_path):
+    one = write_figures(runs[:1], tmp_path / "one")
+    names = {"best_fitness", "goal_distance", "coverage", "qd_score", "behaviour_map", "trajectory", "centres"}
+    assert {file.name for file in one} == {f"{name}.{kind}" for name in names for kind in ("svg", "png")}
+    assert all(file.stat().st_size > 2000 for file in one)
+    page, *several = write_comparison(folders, tmp_path / "all.html", figures=tmp_path / "several")
+    assert page.name == "all.html"
+    assert {"best_fitness.svg", "behaviour_map_0.png", "behaviour_map_1.png"} <= {file.name for file in several}
+
+
+@pytest.fixture
+def axes():
+    pyplot = plots.pyplot()
+    figure, axes = pyplot.subplots()
+    yield axes
+    pyplot.close(figure)
+
+
+def test_a_plot_of_a_map_has_its_values_where_they_are(folders, runs, axes):
+    mesh = plots.behaviour_map(open_run(folders[0]), axes)
+    filled = np.ma.filled(mesh.get_array().reshape(20, 20).astype(float), np.nan)  # rows are y
+    map_ = runs[0].map
+    i, j = map_.geometry.index_of(int(map_.cell_N[5]))
+    assert filled[j, i] == map_.fitness_N[5]
+    assert np.isfinite(filled).sum() == map_.size
+    assert len(axes.lines) == 3  # two walls and the goal
+
+
+def test_a_plot_of_a_path_is_the_stored_path(folders, axes):
+    table = open_run(folders[0]).map
+    fittest = table.loc[table.fitness.idxmax()]
+    plots.trajectory(folders[0], axes)
+    drawn = axes.lines[-1].get_xydata()
+    np.testing.assert_array_equal(
+        drawn, open_run(folders[0]).elite((fittest.cell_x, fittest.cell_y)).trace_T_B.astype(float)
+    )
+
+
+def test_plots_of_centres_and_curves(folders, runs, axes):
+    points = plots.centres(folders[0], axes)
+    np.testing.assert_array_equal(points.get_array(), runs[0].centres["fitness_mean"])
+    axes.clear()
+    plots.curves(folders, axes, "coverage")
+    assert [line.get_label() for line in axes.lines] == ["me_es", "es"]
+    axes.clear()
+    plots.curves(folders[0], axes, against="generation")
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), runs[0].history["best_fitness"])
+    with pytest.raises(ConfigError, match="no_column is no history column"):
+        plots.curves(folders[0], axes, "no_column")
+
+
+def test_maps_of_other_dimensions_are_plotted_or_refused(tmp_path, axes):
+    assert plots.behaviour_map(write_run(tmp_path / "one", task=task_with(1)), axes) is not None
+    cvt = write_run(tmp_path / "cvt", {"map.kind": "cvt", "map.cells": [30]}, task=task_with(2))
+    assert plots.behaviour_map(cvt, axes).get_array().size == 15
+    with pytest.raises(NotInRunError, match="a map of 3 dimensions"):
+        plots.behaviour_map(write_run(tmp_path / "three", task=task_with(3)), axes)
+    with pytest.raises(NotInRunError, match="no behaviour map"):
+        plots.behaviour_map(write_run(tmp_path / "none", {"map.enabled": False, "search.algorithm": "es"}), axes)

@@ -1,0 +1,219 @@
+"""What a report says about a run, compared with a run whose every value is known, with damaged ones, and with none."""
+
+import sqlite3
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from es_service.errors import StoreError
+from es_service.report import facts, series, settings
+from es_service.report.data import read_run
+from es_service.runs.view import open_run
+from es_service.store.sound import read_sound
+from es_service.store.writer import RunStore
+from tests.run_examples import write_run
+from workers.environments import SHIPPED
+
+POINT = SHIPPED["point_maze"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_run(tmp_path_factory.mktemp("runs") / "known", {"search.sigma": 0.3, "search.pairs": 64})
+
+
+def test_a_report_reads_what_other_readers_read(folder):
+    data, run = read_run(folder), open_run(folder)
+    assert data.digest == run.digest()
+    np.testing.assert_array_equal(data.history["best_fitness"], run.history["best_fitness"])
+    np.testing.assert_array_equal(data.centres["novelty"], run.evaluations["novelty"])
+    np.testing.assert_array_equal(data.map.fitness_N, run.map["fitness"])
+    assert data.paths.keys() == set(run.map["cell"])
+    place = run.map.iloc[3][["cell_x", "cell_y"]]
+    np.testing.assert_array_equal(data.paths[int(run.map["cell"][3])], run.elite(place).trace_T_B)
+    assert data.cell_name(int(run.map["cell"][3])) == f"{place.iloc[0]:.0f},{place.iloc[1]:.0f}"
+    assert data.problems == ()
+
+
+def test_settings_are_shown_if_they_differ_and_not_if_they_follow(folder):
+    """search.pairs changes the chunks, too; task, algorithm, seed and budget are shown elsewhere."""
+    found = settings.changed_settings(open_run(folder).config, POINT)
+    assert [tuple(one) for one in found] == [("search.pairs", "64", "512"), ("search.sigma", "0.3", "0.02")]
+
+
+def test_a_chosen_option_and_another_preset_are_settings(tmp_path):
+    wanted = {"task.options.start": "corner", "search.preset": "uber", "map.enabled": False, "search.algorithm": "es"}
+    config = open_run(write_run(tmp_path / "run", wanted)).config
+    found = {one.key: (one.value, one.default) for one in settings.changed_settings(config, POINT)}
+    assert found == {
+        "task.options.start": ("corner", "default"),
+        "search.preset": ("uber", "literature"),
+        "map.enabled": ("false", "true"),
+    }
+
+
+def test_all_settings_are_shown_if_the_defaults_are_unknown(folder):
+    config = open_run(folder).config
+    found = settings.changed_settings(config | {"search": config["search"] | {"forgotten": 3}}, POINT)
+    assert {"search.forgotten", "search.l2"} <= {one.key for one in found}
+    assert {one.default for one in found} == {""}
+
+
+def test_the_verdict_says_what_was_found(folder):
+    data = read_run(folder)
+    sentence = facts.verdict(data)
+    generation, fitness = data.best
+    assert f"found in generation {generation}, has a mean fitness of {fitness:.2f} over 30 evaluation" in sentence
+    assert "came to the goal is 0.024" in sentence  # 0.5 / 21
+    assert "200 of 400 cells of the behaviour map are filled (50.0 %)" in sentence
+
+
+def test_the_verdict_names_the_target(tmp_path):
+    missed = read_run(write_run(tmp_path / "missed", {"budget.target_fitness": 0.0}))
+    reached = read_run(write_run(tmp_path / "reached", {"budget.target_fitness": -90.0}))
+    assert "does not reach the target of 0.000" in facts.verdict(missed)
+    assert "which reaches the target of -90.00" in facts.verdict(reached)
+
+
+def test_faults_are_counted(folder):
+    found = facts.faults(read_run(folder))
+    assert [tuple(one) for one in found] == [(5, 1, 2)]
+    assert facts.fault_sentence(found).startswith("1 worker was lost and replaced, and 2 chunks were sent again")
+    assert facts.fault_sentence([]) == "No worker was lost and no chunk had to be sent again."
+
+
+def test_phases_add_up(folder):
+    seconds = series.phase_seconds(read_run(folder).history)
+    assert seconds == pytest.approx(
+        {"training episodes": 1.26, "gradient": 0.21, "evaluation": 0.42, "driver": 0.105, "store": 0.105}
+    )
+
+
+def test_generation_0_alone_is_shown(tmp_path):
+    data = read_run(write_run(tmp_path / "begun", generations=0, filled=0.01))
+    assert "Only the initial centres were evaluated" in facts.verdict(data)
+    assert "before any update" in facts.verdict(data)
+    assert series.charts(data.history)[0].title == "Fitness"
+
+
+def test_curves_of_long_runs_are_groups_of_generations():
+    values_G = np.arange(8001.0)
+    ends_K = series.groups(8001)
+    assert ends_K.size == 297  # groups of 27, the last smaller
+    assert ends_K[-1] == 8001
+    assert set(np.diff(ends_K, prepend=0)) == {27, 9}
+    np.testing.assert_array_equal(series.groups(3), [1, 2, 3])
+    assert series.groups(0).size == 0
+    np.testing.assert_array_equal(series.thinned(values_G, ends_K, "last"), ends_K - 1)
+    np.testing.assert_allclose(
+        series.thinned(values_G, ends_K, "mean"), (ends_K - 1 + np.concatenate([[0], ends_K[:-1]])) / 2
+    )
+
+
+def test_values_that_are_missing_leave_gaps_and_count_for_nothing():
+    values_G, ends_K = np.array([np.nan, 1.0, np.nan, np.nan, 4.0, np.nan]), np.array([2, 4, 6])
+    np.testing.assert_array_equal(series.thinned(values_G, ends_K, "mean"), [1.0, np.nan, 4.0])
+    np.testing.assert_array_equal(series.thinned(values_G, ends_K, "last"), [1.0, np.nan, 4.0])
+    assert series.thinned(np.zeros(0), np.zeros(0, int), "last").size == 0
+
+
+def test_a_weight_that_never_changes_is_not_drawn(folder):
+    history = dict(read_run(folder).history)
+    assert "Weight of fitness (w)" in [chart.title for chart in series.charts(history)]
+    history["fitness_weight"] = np.ones_like(history["fitness_weight"])
+    assert "Weight of fitness (w)" not in [chart.title for chart in series.charts(history)]
+
+
+def test_a_run_without_a_map_has_none(tmp_path):
+    data = read_run(write_run(tmp_path / "run", {"map.enabled": False, "search.algorithm": "es"}))
+    assert data.map is None
+    assert data.problems == ()
+    assert "map" not in facts.verdict(data)
+
+
+def damaged(folder, statement, *values):
+    with sqlite3.connect(folder / "run.db") as connection:
+        assert connection.execute(statement, values).rowcount == 1
+    return read_run(folder)
+
+
+def test_a_damaged_history_row_is_left_out_and_named(tmp_path):
+    data = damaged(write_run(tmp_path / "run"), "UPDATE history SET best_fitness = 5 WHERE generation = 7")
+    assert 7 not in data.history["generation"]
+    assert data.history["generation"].size == data.centres["generation"].size == 20
+    assert data.problems == ("the history rows of generations 7 are damaged or missing",)
+    assert data.digest == ""
+
+
+def test_a_damaged_elite_loses_its_path_only(tmp_path):
+    folder = write_run(tmp_path / "run")
+    cell = int(read_run(folder).map.cell_N[0])
+    data = damaged(folder, "UPDATE state SET payload = 'x' WHERE part = ?", f"elite_{cell:08d}")
+    assert cell not in data.paths
+    assert len(data.paths) == data.map.size - 1
+    assert data.problems == (f"the state of elite_{cell:08d} is damaged",)
+
+
+def test_without_the_newest_state_rows_the_run_is_shown_and_said_to_be_incomplete(tmp_path):
+    folder = write_run(tmp_path / "run")
+    data = damaged(folder, "DELETE FROM state WHERE part = 'map'")
+    assert data.map is None
+    assert data.history["generation"].size == 21
+    assert data.problems[0] == "the state of the newest generation is incomplete"
+    assert "its geometry is damaged" in data.problems[1]
+
+
+def test_a_database_that_cannot_be_opened_is_replaced_by_its_copy(tmp_path):
+    folder = write_run(tmp_path / "run")
+    (folder / "run.db.copy").write_bytes((folder / "run.db").read_bytes())
+    (folder / "run.db").write_bytes(b"no database" * 100)
+    data = read_run(folder)
+    assert data.history["generation"].size == 21
+    assert "shown is its copy run.db.copy" in data.problems[0]
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(StoreError, match="is not a run folder"):
+        read_run(tmp_path)
+
+
+def test_the_goal_of_a_task_is_stored(tmp_path):
+    elsewhere = replace(POINT, goal=(0.25, 0.5))
+    assert read_run(write_run(tmp_path / "run", task=elsewhere)).task.goal == (0.25, 0.5)
+
+
+def test_a_run_that_is_being_written_is_read_as_of_one_generation(tmp_path):
+    """A driver commits another generation while the parts are read; nothing of it is in what is returned."""
+    folder = write_run(tmp_path / "run")
+    with RunStore.open(folder) as store:
+        parts, row = store.load(), store.last_history()
+        committed = []
+
+        def kept(part, arrays):
+            if not committed:
+                following = {**row, "generation": 21, "best_fitness": 0.0}
+                store.commit(21, {"best": {**parts["best"], "fitness": np.asarray(0.0)}}, following, [])
+                committed.append(part)
+            return arrays
+
+        found = read_sound(folder, kept)
+        assert committed
+        assert (found.generation, found.history[-1]["generation"], len(found.history)) == (20, 20, 21)
+        assert found.parts["best"]["fitness"] < 0.0
+        assert found.problems == ()
+        data = read_run(folder)
+    assert data.last("generation") == 21
+    assert data.best == (data.best[0], 0.0)
+    assert data.digest == ""
+    assert dict(facts.what_was_run(data))["state"].startswith("running on")
+    assert dict(facts.provenance(data))["digest"] == "not computed while a driver is writing"
+    assert read_run(folder).digest == open_run(folder).digest()
+
+
+def test_an_interrupted_run_is_shown_as_one(tmp_path):
+    data = read_run(write_run(tmp_path / "run", {"budget.generations": 1000}))
+    fields = dict(facts.what_was_run(data))
+    assert fields["state"] == "stopped before its budget was spent"
+    assert fields["generations"] == "20 of 1,000"
+    assert data.digest

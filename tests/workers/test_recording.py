@@ -1,0 +1,85 @@
+"""Recorded episodes are the episodes that a worker evaluates: bit for bit with simd, and as near as xla repeats."""
+
+import numpy as np
+import pytest
+
+import workers.recording
+from es_service.protocol.messages import EvaluationChunk, PolicyShape
+from es_service.protocol.recordings import RecordRequest
+from tests import helpers
+from tests.workers.test_episode_ends import counting_environment
+from workers.environments import SHIPPED
+from workers.recording import record
+from workers.viewer import shapes
+
+
+def spec_of(name, rollout, steps):
+    task = SHIPPED[name]
+    shape = PolicyShape((task.observation_size, 8, task.action_size))
+    return helpers.spec(environment=name, policy=shape, episode_steps=steps, rollout=rollout)
+
+
+@pytest.mark.parametrize("rollout", ["xla", "simd"])
+@pytest.mark.parametrize("ask", [0, 2])
+def test_a_recording_is_the_worker_s_own_episode(rollout, ask):
+    spec = spec_of("point_maze", rollout, 200)
+    centre = helpers.centre(helpers.random_parameters(size=spec.policy.parameters), generation=7)
+    evaluated = helpers.chunk_runner(spec)(centre, EvaluationChunk(7, 0, ask))
+    for episode in (0, 3):
+        [found] = record(spec, [RecordRequest(centre, ask, episode)]).recordings
+        assert found.returns_T.size == evaluated.steps[episode] + 1
+        same = np.testing.assert_array_equal if rollout == "simd" else np.testing.assert_allclose
+        same(found.fitness, evaluated.fitness[episode])
+        same(found.descriptor_T_B[-1], evaluated.descriptor[episode])
+        if episode == 0:
+            same(found.trace_T_B, evaluated.trace_T_B)
+    assert found.poses_T_L_7 is None
+
+
+@pytest.mark.parametrize("rollout", ["xla", "simd"])
+def test_a_recording_ends_with_its_episode(monkeypatch, rollout):
+    """Each step's reward is its number; nothing after `done` is recorded."""
+    environment = counting_environment([5], poison_after_done=False)
+    monkeypatch.setattr(workers.recording, "make_environment", lambda name, options: environment)
+    spec = helpers.spec(episode_steps=30, rollout=rollout)
+    [found] = record(spec, [RecordRequest(helpers.centre(helpers.random_parameters()))]).recordings
+    assert found.returns_T.tolist() == [0, 1, 3, 6, 10, 15]
+    assert found.descriptor_T_B[:, 1].tolist() == [0, 1, 2, 3, 4, 5]
+    assert found.fitness == 15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ant_maze", "ant_trap"])
+def test_the_poses_of_an_ant_are_those_of_its_links(name):
+    spec = spec_of(name, "simd", 30)
+    size = SHIPPED[name].observation_size
+    centre = helpers.centre(helpers.random_parameters(size=spec.policy.parameters), observation_size=size)
+    evaluated = helpers.chunk_runner(spec)(centre, EvaluationChunk(1, 0))
+    found = record(spec, [RecordRequest(centre)])
+    [one] = found.recordings
+    np.testing.assert_array_equal(one.fitness, evaluated.fitness[0])
+    np.testing.assert_array_equal(one.trace_T_B, evaluated.trace_T_B)
+    assert one.poses_T_L_7.shape == (31, 9, 7)
+    if name == "ant_maze":  # the descriptor of AntTrap is clipped
+        np.testing.assert_allclose(one.poses_T_L_7[:, 0, :2], one.descriptor_T_B, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(one.poses_T_L_7[..., 3:], axis=-1), 1.0, atol=1e-4)
+    # A lower leg hangs from its upper leg, 0.2 m along x and y, wherever the ant is.
+    along = np.linalg.norm(one.poses_T_L_7[:, 2, :3] - one.poses_T_L_7[:, 1, :3], axis=-1)
+    np.testing.assert_allclose(along, np.hypot(0.2, 0.2), atol=0.05)
+    walls = [shape for shape in found.shapes if shape.kind == "box"]
+    assert len(walls) == len(SHIPPED[name].walls)
+    assert {shape.link for shape in walls} == {-1}
+    assert {shape.link for shape in found.shapes if shape.kind == "capsule"} == set(range(9))
+    assert found.step_s == pytest.approx(0.05)
+
+
+def test_shapes_of_meshes_and_of_hidden_groups_are_left_out():
+    import mujoco
+
+    xml = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body><freejoint/>
+        <geom type="sphere" size="0.3" pos="0 0 1" rgba="1 0 0 1"/><geom type="box" size="1 2 3" group="3"/>
+        <geom type="box" size="1 2 3" rgba="0 0 0 0"/></body></worldbody></mujoco>"""
+    plane, sphere = shapes(mujoco.MjModel.from_xml_string(xml))
+    assert (plane.kind, plane.link) == ("plane", -1)
+    assert (sphere.kind, sphere.link, sphere.size[0], sphere.position) == ("sphere", 0, 0.3, (0.0, 0.0, 1.0))
+    assert sphere.colour == (1.0, 0.0, 0.0, 1.0)

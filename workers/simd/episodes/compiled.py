@@ -1,0 +1,181 @@
+"""Compiled episodes: the program of `program.py` as a function that workers call.
+
+In training, the members of a pair are neighbouring lanes. In evaluations, all lanes have the weights and the
+observation statistics of the centre, or with `own_weights` each lane has its own.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from es_service.protocol.messages import WorkerSpec
+from es_service.protocol.noise import KEY_WORDS
+from workers.environments import Environment
+from workers.episode import Carry, Episodes
+from workers.simd.backend.native import load_compiled
+from workers.simd.backend.target import Target, host_target
+from workers.simd.backend.words import ALIGNMENT, aligned, filled, pack, unpack, words_of
+from workers.simd.episodes.kernel import compile_resets
+from workers.simd.episodes.layout import Network
+from workers.simd.episodes.program import write_episodes
+
+
+@dataclass(frozen=True)
+class EpisodeKernel:
+    """Compiled episodes: training episodes of both members of pairs, or evaluation episodes of the centre or, with
+    `own_weights`, of a policy in each lane."""
+
+    training: bool
+    own_weights: bool
+    spec: WorkerSpec
+    inputs_O: np.ndarray
+    """Indices of the observations that are computed, as inputs of the policy."""
+    network: Network
+    begin: Callable[[np.ndarray], np.ndarray]
+    """Function from reset keys [lane, 4] to words of carries [block, word, lane]."""
+    alive_word: int
+    """Index of the word of a carry that says whether the episode is alive."""
+    carry: Carry
+    """Shapes and dtypes of a carry."""
+    episode_words: int
+    """Number of words of an episode's result."""
+    _call: Callable[..., None]
+    _alive: Any
+
+    def run(
+        self,
+        weights: np.ndarray,
+        unit: float,
+        mean_O: np.ndarray,
+        std_O: np.ndarray,
+        noise_keys_P: np.ndarray | None,
+        reset_keys_L: np.ndarray,
+        action_keys_L: np.ndarray,
+    ) -> Episodes:
+        """Run the episodes of all lanes, [L]; returns NumPy arrays.
+
+        Args:
+            weights: the centre, packed by `network.pack`; with own weights the uint64 address of each lane's float32
+                parameters, in memory that goes on for at least a vector behind them.
+            unit: sigma / NORMAL_STD.
+            mean_O, std_O: observation statistics; with own weights those of each lane, [L, O].
+            noise_keys_P: keys of the pairs' noise; None for evaluations.
+            reset_keys_L, action_keys_L: stream keys of each lane's reset and action noise.
+        """
+        lanes = len(reset_keys_L)
+        carries, go = self._begun(weights, unit, mean_O, std_O, noise_keys_P, reset_keys_L, action_keys_L)
+        go(self.spec.episode_steps)
+        # The result of an episode is the last part of a carry.
+        found = Episodes(*unpack(carries[:, -self.episode_words :], self.carry.episode, lanes))
+        if not self.training or len(self.inputs_O) == self.spec.policy.widths[0]:
+            return found
+        sums = [np.zeros((lanes, self.spec.policy.widths[0]), np.float32) for _ in range(2)]
+        sums[0][:, self.inputs_O], sums[1][:, self.inputs_O] = found.shifted_sum_O, found.shifted_square_sum_O
+        return found._replace(shifted_sum_O=sums[0], shifted_square_sum_O=sums[1])
+
+    def watch(self, weights: np.ndarray, mean_O: np.ndarray, std_O: np.ndarray, reset_key: np.ndarray) -> Carry:
+        """Run one evaluation episode step by step; returns its carries until it is done, with leading axis [T]."""
+        carries, go = self._begun(weights, 0.0, mean_O, std_O, None, reset_key[None], reset_key[None])
+        words = [carries[0, :, 0].copy()]
+        while carries[0, self.alive_word, 0] and len(words) <= self.spec.episode_steps:
+            go(1)
+            words.append(carries[0, :, 0].copy())
+        leaves, structure = jax.tree.flatten(self.carry)
+        return structure.unflatten(unpack(np.stack(words, axis=1)[None], leaves, len(words)))
+
+    def _begun(
+        self,
+        weights: np.ndarray,
+        unit: float,
+        mean_O: np.ndarray,
+        std_O: np.ndarray,
+        noise_keys_P: np.ndarray | None,
+        reset_keys_L: np.ndarray,
+        action_keys_L: np.ndarray,
+    ) -> tuple[np.ndarray, Callable[[int], None]]:
+        """Words of the carries after the reset [block, word, lane], and a function that runs so many more steps."""
+        width, lanes = self.network.width, len(reset_keys_L)
+        # Native code would read beyond the end of a shorter array without an error.
+        assert (noise_keys_P is not None) == self.training
+        assert action_keys_L.shape == reset_keys_L.shape == (lanes, KEY_WORDS)
+        assert noise_keys_P is None or (noise_keys_P.shape[1:] == (KEY_WORDS,) and 2 * len(noise_keys_P) >= lanes)
+        carries = self.begin(reset_keys_L)
+        blocks = len(carries)
+        carries[-1, self.alive_word, lanes - width * (blocks - 1) :] = 0  # lanes without an episode
+        actions = pack([action_keys_L], width)
+        statistics = [x[..., self.inputs_O].reshape(-1, len(self.inputs_O)).astype(np.float32) for x in (mean_O, std_O)]
+        constants = pack(statistics, width)
+        room = aligned((len(self.inputs_O) + self.network.outputs + self.network.hidden_vectors, width))
+        keys, noise = np.zeros((0, KEY_WORDS), np.uint32), np.zeros(0, np.int8)
+        if self.own_weights:
+            assert len(statistics[0]) == len(weights) == lanes
+            weights = filled(weights, blocks * width)
+            noise = aligned((len(self.network.places) - self.network.vectors, width)).view(np.int8)  # single weights
+        else:
+            assert weights.ctypes.data % ALIGNMENT == 0
+            assert weights.shape == (self.network.rows, width)
+            assert len(constants) == 1
+        if noise_keys_P is not None:
+            pairs = width // 2
+            keys = filled(noise_keys_P, blocks * pairs)
+            noise = np.empty(self.network.noise_bytes, np.int8)
+        arrays = (carries, actions, constants, weights, keys, self.network.places, noise, room)
+        assert [array.dtype.char for array in arrays] == list("IIILIIbI" if self.own_weights else "IIIfIIbI")
+        assert all(array.flags.c_contiguous for array in arrays)
+        pointers = [array.ctypes.data for array in arrays]
+
+        def go(steps: int) -> None:
+            assert all(array is not None for array in arrays)  # their memory must live as long as this function
+            self._call(*pointers, np.float32(unit), blocks, steps)
+
+        return carries, go
+
+
+def compile_episodes(
+    environment: Environment,
+    spec: WorkerSpec,
+    inputs_O: np.ndarray,
+    *,
+    training: bool,
+    own_weights: bool = False,
+    target: Target | None = None,
+    folder: Path | None = None,
+) -> EpisodeKernel:
+    """Compile the episodes of a run.
+
+    Args:
+        inputs_O: indices of the observations that are computed; others are always zero.
+        training: training episodes, or else evaluation episodes.
+        own_weights: evaluation episodes of a policy in each lane, instead of those of the centre.
+        target: processor and instruction set; the widest vectors of this machine if None.
+        folder: folder of the cache; the user's cache if None.
+
+    Raises:
+        UnsupportedError: a step of the environment cannot be compiled.
+        NoVectorsError: this processor lacks the vector instructions.
+    """
+    target = target or host_target()
+    program = write_episodes(environment, spec, inputs_O, target.width, training=training, own_weights=own_weights)
+    native = load_compiled(program.name, program.text, target, folder)
+    signature = [*[ctypes.c_void_p] * 8, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
+    carry = program.carry
+    return EpisodeKernel(
+        training=training,
+        own_weights=own_weights,
+        spec=spec,
+        inputs_O=inputs_O,
+        network=program.network,
+        begin=compile_resets(program.steps.begin, target, folder),
+        alive_word=program.alive_word,
+        carry=carry,
+        episode_words=sum(map(words_of, carry.episode)),
+        _call=ctypes.CFUNCTYPE(None, *signature)(native.address),
+        _alive=native.alive,
+    )
