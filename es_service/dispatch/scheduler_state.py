@@ -232,8 +232,19 @@ def has_idle_worker_for_copies(state: SchedulerState) -> bool:
     """Whether the queue is empty, and an idle worker can take an item of another one, as stragglers.py explains."""
     if not state.late or state.places or state.limits.late_factor == math.inf:
         return False
-    first = state.free.first()
-    return first is not None and (first[:2] == (0, IN_TIME) or (first[:2] == (0, LATE) and not state.in_time))
+    slots, pace, *_ = state.free.first() or (1, NEW)
+    if slots or pace == IN_TIME or state.in_time:
+        return not slots and pace == IN_TIME
+    return pace == LATE or _first_late_pace(state) == LATE
+
+
+def _first_late_pace(state: SchedulerState) -> int:
+    """Pace of the worker that has the first item in `late`."""
+    first = state.late.first()
+    assert first is not None
+    holder = state.items[first[1]].holder
+    assert holder is not None
+    return (state.up.get(holder) or state.draining[holder]).pace
 
 
 def late_workers(state: SchedulerState, now: float) -> list[int]:

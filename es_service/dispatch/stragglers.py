@@ -6,8 +6,9 @@ of a gradient is added twice. It never has more than one copy, and none after a 
 cause. A copy is no retry; if it makes its worker fail, the item is charged as ever.
 
 A worker is late if its item takes much longer than usual, and slow until it answers an item in time. The items of a
-slow worker, or of a new one, which must compile, are copied as soon as another worker is idle. A new worker gets no
-copies, and a slow one only if no other worker is left, so the workers of a slow node do not copy each other's items.
+slow worker, or of a new one, which must compile, are copied as soon as another worker is idle. While a worker is known
+to be in time, slow and new workers get no copies, so that the workers of a slow node do not copy each other's items.
+When there is none, slow workers get them, and new ones get copies of what a slow worker has.
 
 Only a `Tick` does all this. The engine sends one when no answers wait to be read, so a driver that was busy neither
 takes its workers for slow nor sends copies of items that are answered already.

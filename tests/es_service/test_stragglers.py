@@ -20,6 +20,7 @@ from es_service.dispatch.events import (
     Failure,
     Limits,
     Result,
+    SetWorkers,
     StartWorker,
     StopWorker,
     Submit,
@@ -111,6 +112,21 @@ def test_a_worker_is_slow_until_it_answers_in_time():
     state, _ = play(state, (16.9, Result(0, "f", 1)), (17.0, Result(1, "f", 1)), (17.0, Result(2, "e", 1)))
     state, commands = play(state, (18.0, items("ghi")), (18.5, Result(1, "g", 1)), (18.5, Result(2, "h", 1)))
     assert step(state, Tick(), 18.5) == (state, [])
+
+
+def test_a_new_worker_gets_a_copy_of_what_a_hanging_one_has_if_no_other_could():
+    state, _ = play(experienced(1), (10.0, items("ab")), (10.5, SetWorkers(2)), (11.0, WorkerUp(1)))
+    assert step(state, Tick(), 11.9)[1] == []
+    state, commands = play(state, (12.0, Tick()))
+    assert commands == [Assign(1, "a", 1, copy=True)]
+    state, commands = play(state, (13.0, Result(1, "a", 1)), (13.0, Tick()))
+    assert commands == [Assign(1, "b", 1, copy=True)]
+
+
+def test_new_workers_do_not_copy_each_other_s_items():
+    state, _ = play(ready(2, **LIMITS), (10.0, items("a")))
+    for now in (10.0, 20.0, 29.0):
+        assert step(state, Tick(), now)[1] == []
 
 
 def test_a_slow_worker_gets_a_copy_only_if_no_other_would():
