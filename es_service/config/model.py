@@ -90,6 +90,11 @@ class SearchConfig(Section):
     l2: NotNegative = Field(
         0.005, description="Weight decay, added to the gradient before Adam: lambda in -g + lambda x."
     )
+    shaping: Literal["ranks", "signs", "returns"] = Field(
+        "ranks",
+        description="How fitness, and novelty, become utilities of members. ranks: evenly spaced by rank. signs: of "
+        "each pair, only which member is better. returns: the values, less their mean, over their standard deviation.",
+    )
     centres: Count = Field(
         description="Number of centres searched side by side, each with its own optimiser. auto: 1 for es, "
         "search.emitters for me_es (these allow no other number), 1 for a search of your own; else 5."
