@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from es_service.config.fields import OPTIONS
+from es_service.config.keys import FIELDS
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, Problem, WayOut
 
@@ -81,12 +82,19 @@ def foreign_options(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> lis
 
 
 def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Differences between two results of `constants()`: (dotted key, old value, new value), ABSENT if missing."""
+    """Differences between two results of `constants()`: (dotted key, old value, new value), ABSENT if missing.
+
+    A key that only `new` has may be younger than the run. It counts as its default, which is what the run has done.
+    """
+    before = {name: _default(name) for name in new} | dict(old)
     return [
-        (name, old.get(name, ABSENT), new.get(name, ABSENT))
-        for name in {**old, **new}
-        if old.get(name, ABSENT) != new.get(name, ABSENT)
+        (name, before[name], new.get(name, ABSENT)) for name in {**old, **new} if before[name] != new.get(name, ABSENT)
     ]
+
+
+def _default(name: str) -> Any:
+    """The default of a key; ABSENT for one without a default, such as a task option."""
+    return FIELDS[name].default if name in FIELDS and not FIELDS[name].is_required() else ABSENT
 
 
 def refused_changes(

@@ -86,13 +86,20 @@ class SearchConfig(Section):
         "population, or one for each centre with search.emitters and search.update: all. Set by the preset."
     )
     sigma: Positive = Field(0.02, description="Standard deviation of the parameter noise, in parameter units.")
-    learning_rate: Positive = Field(0.01, description="Step size of Adam, in parameter units.")
+    learning_rate: Positive = Field(
+        0.01, description="Step size of Adam, in parameter units. ars: factor of the plain step."
+    )
     l2: NotNegative = Field(
         0.005, description="Weight decay, added to the gradient before Adam: lambda in -g + lambda x."
     )
+    shaping: Literal["ranks", "signs", "returns"] = Field(
+        "ranks",
+        description="How fitness, and novelty, become utilities of members. ranks: evenly spaced by rank. signs: of "
+        "each pair, only which member is better. returns: the values, less their mean, over their standard deviation.",
+    )
     centres: Count = Field(
-        description="Number of centres searched side by side, each with its own optimiser. auto: 1 for es, "
-        "search.emitters for me_es (these allow no other number), 1 for a search of your own; else 5."
+        description="Number of centres searched side by side, each with its own optimiser. auto: 1 for es and "
+        "ars, search.emitters for me_es (these allow no other number), 1 for a search of your own; else 5."
     )
     update: Literal["one", "all"] = Field(
         "one",
@@ -103,6 +110,11 @@ class SearchConfig(Section):
         "novelty",
         description="How the centre to update is chosen. novelty: with probability proportional to its novelty. "
         "round_robin: in turn. uniform: all with the same probability.",
+    )
+    top_pairs: Count | None = Field(
+        None,
+        description="ars: number of pairs from which a step is computed, those with the highest fitness of their "
+        "better member; null: all pairs.",
     )
     emitters: Count = Field(
         1,

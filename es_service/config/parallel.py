@@ -36,6 +36,6 @@ def _keys(config: RunConfig) -> tuple[str, str]:
     algorithm = config.search.algorithm
     if algorithm == "me_es":
         return "search.pairs", "search.emitters"
-    if algorithm == "es" or ":" in algorithm:
+    if algorithm in ("es", "ars") or ":" in algorithm:
         return "search.pairs", "compute.chunk_pairs"
     return "search.pairs", "search.centres" if config.search.update == "all" else "search.update"

@@ -183,13 +183,13 @@ def centre_problems(values: Mapping[str, Any]) -> list[Problem]:
     fixed = _centres_of(algorithm, values)
     if fixed is None or centres in (None, fixed):
         return []
-    why = " for es, which has one centre" if algorithm == "es" else " for me_es, which has one centre per emitter"
+    why = f" for {algorithm}, which has one centre{' per emitter' if algorithm == 'me_es' else ''}"
     return [not_allowed("search.centres", centres, f"{fixed} or auto", why=why)]
 
 
 def _centres_of(algorithm: object, values: Mapping[str, Any]) -> int | None:
     """The only number of centres that an algorithm supports; None if it supports any."""
-    return {"es": 1, "me_es": values.get("search.emitters", 1)}.get(str(algorithm))
+    return {"es": 1, "ars": 1, "me_es": values.get("search.emitters", 1)}.get(str(algorithm))
 
 
 def shape_problems(values: Mapping[str, Any]) -> list[Problem]:
@@ -208,6 +208,10 @@ def shape_problems(values: Mapping[str, Any]) -> list[Problem]:
         near = sorted(sorted(divisors, key=lambda size: abs(size - rollout))[:2])
         what = f"{rollout} does not divide compute.chunk_pairs ({chunk}); try {' or '.join(map(str, near))}, or auto"
         problems.append(unfit("compute.rollout_block_pairs", rollout, what, suggestion=near[0]))
+    top = values.get("search.top_pairs")
+    if pairs is not None and top is not None and top > pairs:
+        what = f"{top} is more than search.pairs ({pairs}); try {pairs}, or null for all"
+        problems.append(unfit("search.top_pairs", top, what, suggestion=pairs))
     if pairs is not None and gradient is not None and gradient > pairs:
         what = f"{gradient} is more than search.pairs ({pairs}); try {pairs}, or auto"
         problems.append(unfit("compute.gradient_block_pairs", gradient, what, suggestion=pairs))

@@ -1,6 +1,7 @@
-"""Adam as in the released code of the evolution-strategies papers, in NumPy float32.
+"""Steps up a gradient estimate, in NumPy float32: Adam as in the released code of the evolution-strategies papers, and
+a plain step.
 
-It differs from optax: here epsilon is added to sqrt(v) *before* the bias correction.
+This Adam differs from that of optax: epsilon is added to sqrt(v) *before* the bias correction.
 """
 
 from __future__ import annotations
@@ -59,6 +60,19 @@ def adam_ascent(
         rate = np.float32(learning_rate * math.sqrt(1.0 - BETA_2**step) / (1.0 - BETA_1**step))
         new_centre_D = centre_D - m_D * rate / (np.sqrt(v_D) + np.float32(EPSILON))
     return Adam(_float32(m_D), _float32(v_D), step), _float32(new_centre_D)
+
+
+def plain_ascent(centre_D: FloatArray, gradient_D: FloatArray, *, learning_rate: float, l2: float) -> FloatArray:
+    """The centre after one step up the gradient estimate: centre - learning_rate * (l2 * centre - gradient).
+
+    Args:
+        gradient_D: estimate of the gradient; it points to higher utility.
+        learning_rate: factor of the step.
+        l2: weight of the penalty.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # the driver refuses a centre that is not finite
+        descent_D = centre_D * np.float32(l2) - gradient_D
+        return _float32(centre_D - descent_D * np.float32(learning_rate))
 
 
 def _float32(x: np.ndarray) -> FloatArray:

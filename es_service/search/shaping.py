@@ -1,9 +1,15 @@
-"""Utilities from fitness, and from these the weights of the noise in the gradient estimate."""
+"""Utilities from fitness or novelty, and from these the weights of the noise in the gradient estimate."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from typing import Literal
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+Shaping = Literal["ranks", "signs", "returns"]
 
 
 def centred_ranks(fitness_PS: ArrayLike) -> NDArray[np.float64]:
@@ -26,6 +32,70 @@ def centred_ranks(fitness_PS: ArrayLike) -> NDArray[np.float64]:
     first_rank = np.cumsum(size) - size
     mean_rank = first_rank + (size - 1) / 2.0
     return (mean_rank[group] / (flat.size - 1) - 0.5).reshape(fitness_PS.shape)
+
+
+def pair_signs(fitness_P_S: ArrayLike) -> NDArray[np.float64]:
+    """Map fitness to 0.5 for the better member of each pair and -0.5 for the other; 0 for both if they are equal.
+
+    A member whose fitness is not finite is worse than any other; two of them are equal.
+
+    Args:
+        fitness_P_S: fitness of every member, with axes P (pairs) and S (signs [+, -]).
+
+    Returns:
+        Utilities of the same shape, so that the weight of a pair is the sign of its difference.
+    """
+    fitness_P_S = np.asarray(fitness_P_S, np.float64)
+    plus_P, minus_P = np.where(np.isfinite(fitness_P_S), fitness_P_S, -np.inf).T
+    half_P = 0.5 * (plus_P > minus_P) - 0.5 * (plus_P < minus_P)
+    return np.stack([half_P, -half_P], axis=1)
+
+
+def standardised(fitness_PS: ArrayLike) -> NDArray[np.float64]:
+    """Map fitness to utilities with mean 0 and standard deviation 1; all 0 if no two members differ.
+
+    The utilities are proportional to the fitness itself, and their scale is that of no task. Members whose fitness is
+    not finite are invalid; they count with the lowest fitness of the others.
+
+    Args:
+        fitness_PS: fitness of every member, any shape.
+
+    Returns:
+        Utilities of the same shape. Swapping members swaps their utilities, to the bit.
+    """
+    known_PS = invalid_lowest(fitness_PS)
+    spread = standard_deviation(known_PS)
+    return (known_PS - _mean(known_PS)) / spread if spread else np.zeros_like(known_PS)
+
+
+def invalid_lowest(fitness_PS: ArrayLike) -> NDArray[np.float64]:
+    """The fitness of every member, in which those that are not finite have the lowest of the others; 0 if all are."""
+    fitness_PS = np.asarray(fitness_PS, np.float64)
+    is_valid_PS = np.isfinite(fitness_PS)
+    lowest = fitness_PS[is_valid_PS].min() if is_valid_PS.any() else 0.0
+    return np.where(is_valid_PS, fitness_PS, lowest)
+
+
+def standard_deviation(values: NDArray[np.float64]) -> float:
+    """Standard deviation of all values (population formula); exactly 0 if they are equal.
+
+    Sums are rounded once, so the order of the values does not matter, nor does the processor.
+    """
+    if not np.ptp(values):
+        return 0.0  # the mean of equal values may differ from them in the last bit
+    return math.sqrt(_mean(np.square(values - _mean(values))))
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    return math.fsum(values.ravel().tolist()) / values.size
+
+
+SHAPINGS: dict[Shaping, Callable[[ArrayLike], NDArray[np.float64]]] = {
+    "ranks": centred_ranks,
+    "signs": pair_signs,
+    "returns": standardised,
+}
+"""Value of `search.shaping` -> the utilities [P, S] of the fitness (or the novelty) [P, S] of a population."""
 
 
 def pair_weights(utility_P_S: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -190,8 +190,9 @@ def test_members_follow_from_the_algorithm():
     assert load().search.centres == 1
     assert load(MINIMAL, "search.algorithm=ns_es").search.centres == 5
     assert load(MINIMAL, "search.algorithm=nsra_es", "search.centres=3").search.centres == 3
-    with pytest.raises(ConfigError, match=r"search\.centres: 3 is not allowed for es, which has one centre"):
-        load(MINIMAL, "search.centres=3")
+    for name in ("es", "ars"):
+        with pytest.raises(ConfigError, match=rf"search\.centres: 3 is not allowed for {name}, which has one centre; "):
+            load(MINIMAL, f"search.algorithm={name}", "search.centres=3")
 
 
 # Round trip and constants

@@ -34,6 +34,15 @@ def test_changed_constants_lists_both_values_and_absent_ones():
     assert changed_constants(old, new) == [("b", 2, 5), ("c", 3, "(absent)"), ("d", "(absent)", 4)]
 
 
+def test_a_key_that_is_younger_than_the_run_counts_as_its_default():
+    now = load().constants()
+    older = {name: value for name, value in now.items() if name != "search.shaping"}
+    assert changed_constants(older, now) == []
+    assert changed_constants(older, load(MINIMAL, "search.shaping=signs").constants()) == [
+        ("search.shaping", "ranks", "signs")
+    ]
+
+
 def test_refused_changes_shows_all_and_the_ways_to_make_them():
     changes = [("search.sigma", 0.02, 0.05), ("policy.hidden", [64, 64], [8, 8]), ("task.options.start", "a b", "c d")]
     error = refused_changes("runs/a", changes, besides={"budget.generations": 9})

@@ -1,7 +1,7 @@
-"""Small ES runs in memory."""
+"""Small runs in memory, of ES unless another search is named."""
 
 from es_service.api import load_config
-from es_service.config.model import worker_spec
+from es_service.config.model import policy_shape, worker_spec
 from es_service.loop import driver
 from es_service.protocol.messages import PolicyShape
 from es_service.search.algorithms import ALGORITHMS
@@ -13,10 +13,10 @@ from workers.policy import initial_parameters
 SHAPE = PolicyShape((2, 8, 8, 2))
 
 
-def small_config(**changes):
+def small_config(policy=None, **changes):
     mapping = {
         "task": {"environment": "point_maze"},
-        "policy": {"hidden": [8, 8]},
+        "policy": {"hidden": [8, 8], **(policy or {})},
         "search": {"algorithm": "es", "pairs": 48, "sigma": 0.1, "evaluation_episodes": 20, **changes},
         "budget": {"generations": 20},
         "compute": {"chunk_pairs": 16, "gradient_block_pairs": 20},
@@ -26,10 +26,10 @@ def small_config(**changes):
 
 def run_in_memory(config, evaluator=None):
     evaluator = evaluator or DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
-    first = initial_parameters(SHAPE, config.policy.init, config.seed)
+    first = initial_parameters(policy_shape(config, SHIPPED["point_maze"]), config.policy.init, config.seed)
     search = driver.Search(
         config,
-        ALGORITHMS["es"](config),
+        ALGORITHMS[config.search.algorithm](config),
         lambda: ([first], no_observations(2)),
         SHIPPED["point_maze"],
     )

@@ -40,7 +40,20 @@ def finished():
 
 def test_twenty_generations_equal_the_twin(finished):
     config, state, _, evaluator, _ = finished
-    es = twin.ES(initial_parameters(SHAPE, config.policy.init, 0), config.search.learning_rate, config.search.l2)
+    assert_equals_the_twin(config, state, evaluator)
+
+
+@pytest.mark.parametrize("shaping", ["signs", "returns"])
+def test_other_shapings_equal_the_twin(finished, shaping):
+    config = small_config(shaping=shaping)
+    state, _, evaluator, _ = run_in_memory(config)
+    assert_equals_the_twin(config, state, evaluator)
+    assert not np.allclose(state.search.centres[0].centre_D, finished[1].search.centres[0].centre_D)
+
+
+def assert_equals_the_twin(config, state, evaluator):
+    search = config.search
+    es = twin.ES(initial_parameters(SHAPE, config.policy.init, 0), search.learning_rate, search.l2, search.shaping)
     for generation in range(1, 21):
         results = [
             (chunk.chunk_id, result.fitness)

@@ -80,17 +80,31 @@ def episodes(evaluator, kind, generation, centre_D=None):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "distance"),
-    [("ns_es", "euclidean"), ("nsr_es", "euclidean"), ("nsra_es", "euclidean"), ("nsr_es", "squared_euclidean")],
+    ("algorithm", "distance", "shaping"),
+    [
+        ("ns_es", "euclidean", "ranks"),
+        ("nsr_es", "euclidean", "ranks"),
+        ("nsra_es", "euclidean", "ranks"),
+        ("nsr_es", "squared_euclidean", "ranks"),
+        ("nsr_es", "euclidean", "returns"),
+        ("nsr_es", "euclidean", "signs"),
+    ],
 )
-def test_twenty_generations_equal_the_twin(algorithm, distance):
-    config, squared = config_of(algorithm, distance), distance == "squared_euclidean"
+def test_twenty_generations_equal_the_twin(algorithm, distance, shaping):
+    config, squared = config_of(algorithm, distance, shaping=shaping), distance == "squared_euclidean"
     state, store, evaluator = run_in_memory(config)
     search = config.search
     rule = (search.fitness_weight_step, search.fitness_weight_patience, 0.0) if algorithm == "nsra_es" else None
     centres = [initial_parameters(SHAPE, config.policy.init, 0, index) for index in range(5)]
     other = twin.NoveltySearch(
-        centres, search.learning_rate, search.l2, neighbours=3, weight=STARTS[algorithm], rule=rule, squared=squared
+        centres,
+        search.learning_rate,
+        search.l2,
+        neighbours=3,
+        weight=STARTS[algorithm],
+        rule=rule,
+        squared=squared,
+        shaping=shaping,
     )
     for index, centre_D in enumerate(centres):
         _, descriptor = episodes(evaluator, EvaluationChunk, 0, centre_D)
@@ -262,8 +276,9 @@ def test_presets_are_the_published_rules():
 # Invalid results
 
 
+@pytest.mark.parametrize("shaping", ["ranks", "returns"])
 @pytest.mark.parametrize("weight", [0.0, 0.5, 1.0])
-def test_invalid_members_are_last_whatever_is_climbed(weight):
+def test_invalid_members_are_last_whatever_is_climbed(weight, shaping):
     """One would be the most novel, but its fitness is NaN; one would be the fittest, but ended nowhere."""
     fitness = np.array([[1.0, np.nan], [9.0, 2.0]], np.float32)
     descriptor = np.array([[(1.0, 0.0), (50.0, 0.0)], [(np.inf, 0.0), (2.0, 0.0)]], np.float32)
@@ -271,8 +286,9 @@ def test_invalid_members_are_last_whatever_is_climbed(weight):
     (population,) = invalidate([population], 0.5, 1)
     assert np.isnan(population.fitness).sum() == 2
     state = archived(first_state([np.zeros(1, np.float32)], 2, weight), CentreEvaluation(0, 0, True, 0.0, np.zeros(2)))
-    utility = mixed_utilities(state, weight, population, config_of("nsr_es").novelty)
-    assert utility[0, 1] == utility[1, 0] == utility.min() < utility[0, 0] < utility[1, 1] == utility.max()
+    utility = mixed_utilities(state, weight, population, config_of("nsr_es").novelty, shaping)
+    assert utility[0, 1] == utility[1, 0] == utility.min() <= utility[0, 0] < utility[1, 1] == utility.max()
+    assert (utility.min() < utility[0, 0]) == (shaping == "ranks")  # with returns, as low as the worst valid member
 
 
 class Spoiling(DirectEvaluator):

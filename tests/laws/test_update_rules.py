@@ -12,7 +12,7 @@ from es_service.loop.generation import estimate_gradients
 from es_service.protocol.messages import GradientResult
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.optimizer import adam_ascent, fresh_adam
-from es_service.search.shaping import centred_ranks, pair_weights
+from es_service.search.shaping import SHAPINGS, centred_ranks, pair_signs, pair_weights, standardised
 from tests.helpers import DirectEvaluator
 from tests.laws.es_runs import SHAPE, small_config
 from tests.twins import es as twin
@@ -30,6 +30,29 @@ def test_ranks_by_hand():
     np.testing.assert_allclose(pair_weights(centred_ranks(fitness)), [0.5, -0.4, -0.7], rtol=1e-6)
 
 
+def test_signs_by_hand():
+    # an invalid member is the worse one; of two, as of equal ones, neither is better
+    fitness = [[3.0, 1e9], [np.nan, -1e9], [2.0, 2.0], [-np.inf, np.nan]]
+    np.testing.assert_array_equal(pair_signs(fitness), [[-0.5, 0.5], [-0.5, 0.5], [0.0, 0.0], [0.0, 0.0]])
+    np.testing.assert_array_equal(pair_weights(pair_signs(fitness)), [-1.0, -1.0, 0.0, 0.0])
+
+
+def test_standardised_returns_by_hand():
+    # the invalid member counts as -2: mean 1, standard deviation sqrt((9 + 9 + 9 + 1 + 4 + 16) / 6)
+    found = standardised([[-2.0, np.nan], [4.0, 2.0], [-1.0, 5.0]])
+    np.testing.assert_allclose(found, np.array([[-3.0, -3.0], [3.0, 1.0], [-2.0, 4.0]]) / np.sqrt(8.0))
+    for without_a_difference in ([[0.1] * 2] * 3, [[np.nan, np.inf]], [[7.0, np.nan]]):
+        np.testing.assert_array_equal(standardised(without_a_difference), np.zeros_like(without_a_difference))
+
+
+@given(fitness_arrays, st.sampled_from(["signs", "returns"]), st.randoms(use_true_random=False))
+def test_other_shapings_equal_the_twin_and_no_order_of_pairs_matters(fitness, shaping, random):
+    utilities = SHAPINGS[shaping](fitness)
+    np.testing.assert_allclose(utilities.ravel(), twin.SHAPINGS[shaping](fitness.ravel()), rtol=1e-9, atol=1e-9)
+    order = random.sample(range(len(fitness)), len(fitness))
+    np.testing.assert_array_equal(SHAPINGS[shaping](fitness[order]), utilities[order])
+
+
 @given(fitness_arrays)
 def test_ranks_equal_the_twin_and_sum_to_zero(fitness):
     ranks = centred_ranks(fitness)
@@ -43,12 +66,13 @@ def test_an_increasing_map_of_the_fitness_changes_nothing(fitness):
         np.testing.assert_array_equal(centred_ranks(mapped), centred_ranks(fitness))
 
 
-def test_swapping_signs_negates_the_gradient_estimate_exactly():
+@pytest.mark.parametrize("shaping", SHAPINGS)
+def test_swapping_signs_negates_the_gradient_estimate_exactly(shaping):
     config = small_config()
     evaluator = DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
     fitness = np.random.default_rng(0).normal(size=(48, 2))
     estimates = [
-        estimate_gradients(evaluator, 1, [pair_weights(centred_ranks(values))], 20)[0]
+        estimate_gradients(evaluator, 1, [pair_weights(SHAPINGS[shaping](values))], 20)[0]
         for values in (fitness, fitness[:, ::-1])
     ]
     assert np.abs(estimates[0]).max() > 0

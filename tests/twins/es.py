@@ -14,15 +14,35 @@ def averaged_centred_ranks(fitness):
     return np.array(ranks) / (len(values) - 1) - 0.5
 
 
+def signs_of_pairs(fitness):
+    """Of each two values that follow each other, half of +1 for the higher and half of -1 for the lower."""
+    values = [f if np.isfinite(f) else -np.inf for f in fitness]
+    utilities = []
+    for plus, minus in zip(values[::2], values[1::2], strict=True):
+        better = 0 if plus == minus else 1 if plus > minus else -1
+        utilities += [better / 2, -better / 2]
+    return np.array(utilities)
+
+
+def standardised(fitness):
+    """Values less their mean, over their standard deviation; those that are not finite count as the lowest other."""
+    valid = [f for f in fitness if np.isfinite(f)]
+    values = np.array([f if np.isfinite(f) else min(valid, default=0.0) for f in fitness], np.float64)
+    return np.zeros(len(values)) if min(values) == max(values) else (values - values.mean()) / values.std()
+
+
+SHAPINGS = {"ranks": averaged_centred_ranks, "signs": signs_of_pairs, "returns": standardised}
+
+
 class ES:
-    def __init__(self, centre, learning_rate, l2):
+    def __init__(self, centre, learning_rate, l2, shaping="ranks"):
         self.centre = np.array(centre, np.float64)
-        self.learning_rate, self.l2 = learning_rate, l2
+        self.learning_rate, self.l2, self.shaped = learning_rate, l2, SHAPINGS[shaping]
         self.m, self.v, self.t = np.zeros_like(self.centre), np.zeros_like(self.centre), 0
 
     def generation(self, noise_P_D, fitness_P_S):
         """noise: standard normal, one row per pair; fitness: of centre + sigma noise and centre - sigma noise."""
-        return self.climb(noise_P_D, averaged_centred_ranks(np.ravel(fitness_P_S)).reshape(len(noise_P_D), 2))
+        return self.climb(noise_P_D, self.shaped(np.ravel(fitness_P_S)).reshape(len(noise_P_D), 2))
 
     def climb(self, noise_P_D, utility_P_S):
         """One step of Adam up the gradient estimate."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from tests.twins.es import ES, averaged_centred_ranks
+from tests.twins.es import ES, SHAPINGS
 
 
 def novelty(archive, descriptor, neighbours, squared=False, without=None):
@@ -24,12 +24,12 @@ def novelty(archive, descriptor, neighbours, squared=False, without=None):
 
 
 class NoveltySearch:
-    def __init__(self, centres, learning_rate, l2, *, neighbours, weight, rule=None, squared=False):
+    def __init__(self, centres, learning_rate, l2, *, neighbours, weight, rule=None, squared=False, shaping="ranks"):
         """rule: None, or (step, patience, minimum relative gain) of the adaptive weight."""
         self.centres = [ES(centre, learning_rate, l2) for centre in centres]
         self.archive, self.newest_entry = [], [None] * len(centres)
         self.neighbours, self.squared, self.weight, self.rule = neighbours, squared, weight, rule
-        self.record, self.stagnant = None, 0
+        self.record, self.stagnant, self.shaped = None, 0, SHAPINGS[shaping]
 
     def chosen(self, uniform):
         """Roulette over the centres' novelties, for a number drawn from [0, 1)."""
@@ -46,8 +46,8 @@ class NoveltySearch:
 
     def generation(self, centre, noise_P_D, fitness_P_S, descriptor_P_S_B):
         pairs = len(noise_P_D)
-        reward = averaged_centred_ranks(fitness_P_S.ravel())
-        novel = averaged_centred_ranks(
+        reward = self.shaped(fitness_P_S.ravel())
+        novel = self.shaped(
             [novelty(self.archive, x, self.neighbours, self.squared) for x in descriptor_P_S_B.reshape(2 * pairs, -1)]
         )
         mixed = self.weight * reward + (1 - self.weight) * novel

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
 from es_service.config.model import RunConfig
+from es_service.search.algorithms.ars import ars
 from es_service.search.algorithms.base import Algorithm
 from es_service.search.algorithms.es import es
 from es_service.search.algorithms.me_es import me_es
@@ -21,7 +22,7 @@ from es_service.search.algorithms.nsra_es import nsra_es
 from es_service.search.algorithms.own import import_factory, make_own
 
 Factory = Callable[[RunConfig], Algorithm]
-OURS: dict[str, Factory] = {"es": es, "ns_es": ns_es, "nsr_es": nsr_es, "nsra_es": nsra_es, "me_es": me_es}
+OURS: dict[str, Factory] = {"es": es, "ns_es": ns_es, "nsr_es": nsr_es, "nsra_es": nsra_es, "me_es": me_es, "ars": ars}
 
 
 class Algorithms(Mapping[str, Factory]):

@@ -31,7 +31,7 @@ from es_service.search.algorithms.base import (
 from es_service.search.maps.behaviour_map import BehaviourMap, insert, with_score
 from es_service.search.novelty import empty_archive, extended, novelty
 from es_service.search.optimizer import adam_ascent, fresh_adam
-from es_service.search.shaping import centred_ranks, pair_weights
+from es_service.search.shaping import SHAPINGS, Shaping, pair_weights
 
 CENTRE_CHOICE = 0
 """Last id of the random streams of Domain.SELECTION that choose the centre to update."""
@@ -41,6 +41,8 @@ AdaptWeight = Callable[[FitnessWeight, tuple[CentreEvaluation, ...]], FitnessWei
 
 def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight | None = None) -> Algorithm:
     """An algorithm of the family of Conti et al. 2018: ES on the utility (1 - w) * rank(novelty) + w * rank(fitness).
+
+    With another `search.shaping`, that function takes the place of the ranks.
 
     Args:
         fitness_weight: initial value of w.
@@ -54,7 +56,7 @@ def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight 
         return tuple(population(state, index, search, state.weight.value) for index in chosen)
 
     def weights(state: SearchState, asked: Ask, population: EpisodesResult) -> NDArray[np.float32]:
-        return pair_weights(mixed_utilities(state, asked.fitness_weight, population, config.novelty))
+        return pair_weights(mixed_utilities(state, asked.fitness_weight, population, config.novelty, search.shaping))
 
     def step(state: SearchState, asked: Ask, gradient_D: FloatArray) -> SearchState:
         return moved(state, asked, gradient_D, config.search)
@@ -135,23 +137,27 @@ def novelty_of_centres(state: SearchState, settings: NoveltyConfig) -> NDArray[n
 
 
 def mixed_utilities(
-    state: SearchState, w: float, population: EpisodesResult, settings: NoveltyConfig
+    state: SearchState,
+    w: float,
+    population: EpisodesResult,
+    settings: NoveltyConfig,
+    shaping: Shaping = "ranks",
 ) -> NDArray[np.float64]:
     """Utility of each member of the population, [P, S]: (1 - w) * rank(novelty) + w * rank(fitness).
 
-    Ranks are those of `centred_ranks`, in [-0.5, 0.5], taken for each objective separately, so that the scales of
-    fitness and novelty do not matter. Novelty is computed in the novelty archive as it was before the generation. An
-    invalid member (fitness NaN) has the lowest rank in both.
+    Ranks are those of `centred_ranks`, in [-0.5, 0.5], or another function of SHAPINGS. They are taken for each
+    objective separately, so that the scales of fitness and novelty do not matter. Novelty is computed in the novelty
+    archive as it was before the generation. An invalid member (fitness NaN) has the lowest rank in both.
     """
-    utility_P_S = np.zeros(population.fitness.shape)
+    utility_P_S, shaped = np.zeros(population.fitness.shape), SHAPINGS[shaping]
     if w > 0.0:
-        utility_P_S += w * centred_ranks(population.fitness)
+        utility_P_S += w * shaped(population.fitness)
     if w < 1.0:
         novelty_P_S = novelty(
             state.archive, population.descriptor, neighbours=settings.neighbours, distance=settings.distance
         )
         novelty_P_S[np.isnan(population.fitness)] = np.nan
-        utility_P_S += (1.0 - w) * centred_ranks(novelty_P_S)
+        utility_P_S += (1.0 - w) * shaped(novelty_P_S)
     return utility_P_S
 
 
