@@ -77,9 +77,9 @@ def test_the_same_bits_as_inline_and_nothing_of_the_caller_s_changed(tmp_path, r
 
 
 def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatch):
-    """One of two workers is killed in mid-generation, then both are stopped, which only our own deadline notices. Their
-    last words stay in Ray's logs."""
-    faults = {4: signal.SIGKILL, 12: signal.SIGSTOP}
+    """One of two workers is killed in mid-generation, then all that there are are stopped, which only our own deadline
+    notices. Their last words stay in Ray's logs."""
+    faults, struck = {4: signal.SIGKILL, 12: signal.SIGSTOP}, []
     send = Actors.send
 
     def send_and_strike(self, worker, key, attempt, work):
@@ -88,7 +88,9 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
             os.kill(self.places()[worker].pid, signal.SIGSTOP)  # or it might have answered before it is struck
         send(self, worker, key, attempt, work)
         if number is not None:
-            for victim in [worker] if number == signal.SIGKILL else self.places():
+            victims = [worker] if number == signal.SIGKILL else list(self.places())
+            struck.extend(victims)
+            for victim in victims:
                 os.kill(self.places()[victim].pid, number)
 
     monkeypatch.setattr(Actors, "send", send_and_strike)
@@ -97,7 +99,9 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
     assert digest_parts(tmp_path / "run") == reference
     assert not faults
     assert len(sessions() - before) == 1
-    assert outcome.run.history["lost_workers"].sum() == 3
+    assert outcome.run.history["lost_workers"].sum() == len(struck) >= 2, (
+        "the first has no successor yet on a busy machine"
+    )
     assert [notice.partition(" lost ")[0] for notice in notices] == ["generation 4:", "generation 12:"]
     assert "its process or its node died" in notices[0]
     assert "no answer to work item TrainingChunk" in notices[1]
