@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from es_service.config.fields import OPTIONS
+from es_service.config.keys import FIELDS
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, Problem, WayOut
 
@@ -81,7 +82,12 @@ def foreign_options(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> lis
 
 
 def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Differences between two results of `constants()`: (dotted key, old value, new value), ABSENT if missing."""
+    """Differences between two results of `constants()`: (dotted key, old value, new value), ABSENT if missing.
+
+    A key that the old run does not have, because it is newer than that run, counts as having had its default.
+    """
+    newer = {name: new[name] for name in FIELDS.keys() & new.keys() - old.keys() if new[name] == FIELDS[name].default}
+    old = {**old, **newer}
     return [
         (name, old.get(name, ABSENT), new.get(name, ABSENT))
         for name in {**old, **new}

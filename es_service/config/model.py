@@ -60,7 +60,9 @@ class PolicyConfig(Section):
         "layers, 0.01 in the output layer. small_columns: 0.01 in every layer. Set by the preset."
     )
     observation_normalization: Switch = Field(
-        True, description="Whether observations are shifted and scaled by the running statistics of the training."
+        True,
+        description="Whether observations are shifted and scaled by the running statistics of the training. "
+        "map_elites, which has none, allows only false, its default.",
     )
     observation_clip: Positive | None = Field(
         description="Bound on each normalised observation, in standard deviations; null for none. Set by the preset; "
@@ -92,7 +94,8 @@ class SearchConfig(Section):
     )
     centres: Count = Field(
         description="Number of centres searched side by side, each with its own optimiser. auto: 1 for es, "
-        "search.emitters for me_es (these allow no other number), 1 for a search of your own; else 5."
+        "search.emitters for me_es (these allow no other number), 32 for map_elites, whose first random policies they "
+        "are, 1 for a search of your own; else 5."
     )
     update: Literal["one", "all"] = Field(
         "one",
@@ -149,9 +152,19 @@ class SearchConfig(Section):
         "with which the elite at its start was evaluated. With elite, all elites descend from the first centre and "
         "keep its statistics, so observations are not normalised unless the run started from a policy of another run.",
     )
+    batch: Count = Field(256, description="map_elites: number of policies that a generation makes and evaluates.")
+    iso_sigma: NotNegative = Field(
+        0.005, description="map_elites: standard deviation of the noise in each parameter, in parameter units."
+    )
+    line_sigma: NotNegative = Field(
+        0.05,
+        description="map_elites: standard deviation of the step along the line through both parents, as a share of the "
+        "distance between them.",
+    )
     evaluation_episodes: Count = Field(
         30,
-        description="Noise-free episodes on which each new centre is evaluated; they count as environment steps.",
+        description="Noise-free episodes on which each new centre is evaluated; they count as environment steps. "
+        "map_elites: 1, for each policy.",
     )
     common_random_numbers: Switch = Field(
         description="Whether the two members of a pair share resets and action noise. Set by the preset."
@@ -180,7 +193,7 @@ class NoveltyConfig(Section):
 class MapConfig(Section):
     """The behaviour map, in which each cell keeps the fittest evaluated centre. Constants of the run."""
 
-    enabled: Switch = Field(True, description="Whether the run fills a map; me_es needs one.")
+    enabled: Switch = Field(True, description="Whether the run fills a map; me_es and map_elites need one.")
     kind: Literal["grid", "cvt"] = Field(
         description="grid: cells of equal size. cvt: any number of cells around centroids, for many dimensions. auto: "
         "grid for up to six dimensions, else cvt."

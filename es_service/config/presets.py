@@ -32,6 +32,8 @@ class PresetRow:
     uber: object
     source: str
     """Where both values come from, and what is our own choice."""
+    method: str | None = None
+    """The only `search.algorithm` that the row is for, before a row for all of them; None: the row is for all."""
 
 
 _ROWS = (
@@ -102,6 +104,20 @@ _ROWS = (
         "squared_euclidean",
         "literature: DNE and QDax. uber: ME-ES, which averages squared distances.",
     ),
+    PresetRow(
+        "policy.observation_normalization",
+        False,
+        False,
+        "literature: QDax, which gathers no statistics either. uber: the same, since nothing could gather them.",
+        "map_elites",
+    ),
+    PresetRow(
+        "search.evaluation_episodes",
+        1,
+        1,
+        "literature: QDax, which evaluates a policy once. uber: the same.",
+        "map_elites",
+    ),
 )
 
 
@@ -110,12 +126,16 @@ def preset_table() -> list[PresetRow]:
     return list(_ROWS)
 
 
-def preset_values(preset: str) -> dict[str, object]:
+def preset_values(preset: str, method: object = None) -> dict[str, object]:
     """Values of one preset: dotted key -> value.
+
+    Args:
+        method: the algorithm, whose own rows replace those for all algorithms; None for the latter alone.
 
     Raises:
         KeyError: `preset` is not a key of PRESETS.
     """
     if preset not in PRESETS:
         raise KeyError(preset)
-    return {row.key: getattr(row, preset) for row in _ROWS}
+    for_all = {row.key: getattr(row, preset) for row in _ROWS if row.method is None}
+    return for_all | {row.key: getattr(row, preset) for row in _ROWS if row.method == str(method)}

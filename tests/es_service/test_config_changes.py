@@ -34,6 +34,18 @@ def test_changed_constants_lists_both_values_and_absent_ones():
     assert changed_constants(old, new) == [("b", 2, 5), ("c", 3, "(absent)"), ("d", "(absent)", 4)]
 
 
+def test_a_key_that_is_newer_than_a_run_counts_as_having_had_its_default():
+    """Or no run of an older version could be resumed."""
+    new = load().constants()
+    older = {
+        key: value for key, value in new.items() if key not in ("search.batch", "search.line_sigma", "search.pairs")
+    }
+    assert changed_constants(older, new) == [("search.pairs", "(absent)", 512)], "which has no default of its own"
+    changed = new | {"search.batch": 7}
+    assert ("search.batch", "(absent)", 7) in changed_constants(older, changed)
+    assert changed_constants(new, older) != []
+
+
 def test_refused_changes_shows_all_and_the_ways_to_make_them():
     changes = [("search.sigma", 0.02, 0.05), ("policy.hidden", [64, 64], [8, 8]), ("task.options.start", "a b", "c d")]
     error = refused_changes("runs/a", changes, besides={"budget.generations": 9})
