@@ -188,6 +188,11 @@ class NoveltyConfig(Section):
     distance: Literal["euclidean", "squared_euclidean"] = Field(
         description="Distance between descriptors. Set by the preset."
     )
+    newest: Count | None = Field(
+        None,
+        description="Number of the newest entries of the novelty archive with which a descriptor is compared; null: "
+        "all. The archive keeps the others, too.",
+    )
 
 
 class MapConfig(Section):

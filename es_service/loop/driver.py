@@ -222,9 +222,10 @@ def _next_generation(
     told = tuple(centre_evaluation(generation, one.index, one.evaluation, one.population) for one in evaluated)
     learned = tell(algorithm, moved, told)
 
-    nearest = config.novelty
-    descriptors = [one.descriptor_B for one in told]
-    novelties = novelty(moved.archive, descriptors, neighbours=nearest.neighbours, distance=nearest.distance).tolist()
+    nearest, descriptors = config.novelty, [one.descriptor_B for one in told]
+    novelties = novelty(
+        moved.archive, descriptors, neighbours=nearest.neighbours, distance=nearest.distance, newest=nearest.newest
+    ).tolist()
     rows = evaluated_rows(evaluated, search.task, learned.map, generation, start_cells, novelties)
     at = fittest(told)
     shown = evaluated[at]  # the history's row is about this one

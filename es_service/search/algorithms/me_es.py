@@ -143,6 +143,7 @@ def elite_novelty(map_: BehaviourMap, archive: NoveltyArchive, settings: Novelty
         map_.descriptor_N_B,
         neighbours=settings.neighbours,
         distance=settings.distance,
+        newest=settings.newest,
         exclude_Q=_own_entries(map_, archive),
     )
 

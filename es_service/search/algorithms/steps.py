@@ -129,6 +129,7 @@ def novelty_of_centres(state: SearchState, settings: NoveltyConfig) -> NDArray[n
         state.archive.descriptor_N_B[entry_M[known_M]],
         neighbours=settings.neighbours,
         distance=settings.distance,
+        newest=settings.newest,
         exclude_Q=entry_M[known_M],
     )
     return novelty_M
@@ -148,7 +149,11 @@ def mixed_utilities(
         utility_P_S += w * centred_ranks(population.fitness)
     if w < 1.0:
         novelty_P_S = novelty(
-            state.archive, population.descriptor, neighbours=settings.neighbours, distance=settings.distance
+            state.archive,
+            population.descriptor,
+            neighbours=settings.neighbours,
+            distance=settings.distance,
+            newest=settings.newest,
         )
         novelty_P_S[np.isnan(population.fitness)] = np.nan
         utility_P_S += (1.0 - w) * centred_ranks(novelty_P_S)
