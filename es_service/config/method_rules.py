@@ -28,7 +28,7 @@ def method_problems(values: Mapping[str, Any]) -> list[Problem]:
     algorithm, problems = values.get("search.algorithm"), []
     centres, only = values.get("search.centres"), _only_centres(algorithm, values)
     if only is not None and centres not in (None, only):
-        why = " for es, which has one centre" if algorithm == "es" else " for me_es, which has one centre per emitter"
+        why = f" for {algorithm}, which has one centre{'' if algorithm == 'es' else ' per emitter'}"
         problems.append(not_allowed("search.centres", centres, f"{only} or auto", why=why))
     if algorithm == "map_elites" and values.get("policy.observation_normalization") is True:
         why = " for map_elites, which has no training episodes to gather statistics from"
@@ -40,10 +40,12 @@ def map_needed_by(values: Mapping[str, Any]) -> str:
     """What the algorithm needs a map for; empty if it needs none."""
     return {
         "me_es": "whose blocks start from elites of the map",
+        "memes": "whose emitters begin again from elites of the map",
         "map_elites": "whose policies descend from elites of the map",
     }.get(str(values.get("search.algorithm")), "")
 
 
 def _only_centres(algorithm: object, values: Mapping[str, Any]) -> int | None:
     """The only number of centres that an algorithm supports; None if it supports any."""
-    return {"es": 1, "me_es": values.get("search.emitters", 1)}.get(str(algorithm))
+    emitters = values.get("search.emitters", 1)
+    return {"es": 1, "me_es": emitters, "memes": emitters}.get(str(algorithm))

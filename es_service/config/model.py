@@ -94,8 +94,8 @@ class SearchConfig(Section):
     )
     centres: Count = Field(
         description="Number of centres searched side by side, each with its own optimiser. auto: 1 for es, "
-        "search.emitters for me_es (these allow no other number), 32 for map_elites, whose first random policies they "
-        "are, 1 for a search of your own; else 5."
+        "search.emitters for me_es and memes (these allow no other number), 32 for map_elites, whose first random "
+        "policies they are, 1 for a search of your own; else 5."
     )
     update: Literal["one", "all"] = Field(
         "one",
@@ -109,7 +109,8 @@ class SearchConfig(Section):
     )
     emitters: Count = Field(
         1,
-        description="me_es: number of blocks that run side by side, with search.pairs pairs each in every generation.",
+        description="me_es: number of blocks that run side by side, with search.pairs pairs each in every generation. "
+        "memes: number of evolution strategies, likewise; 16 if left out.",
     )
     fitness_weight_start: Fraction = Field(
         description="nsra_es: weight of fitness beside novelty at the start. Set by the preset."
@@ -127,7 +128,8 @@ class SearchConfig(Section):
     mode: Literal["explore_exploit", "explore", "exploit"] = Field(
         "explore_exploit",
         description="me_es: what a block of generations maximises. explore: novelty. exploit: fitness. "
-        "explore_exploit: one of the two, as search.alternation says.",
+        "explore_exploit: one of the two, as search.alternation says. memes: what an emitter maximises; "
+        "explore_exploit: novelty and fitness by turns, beginning with novelty for the first emitter.",
     )
     alternation: Literal["round_robin", "coin"] = Field(
         "round_robin",
@@ -146,11 +148,17 @@ class SearchConfig(Section):
         description="me_es: how the cell of that elite is drawn: as in QDax (top) or as in the released code (score); "
         "es_service/search/algorithms/me_es.py describes both. Set by the preset."
     )
+    stagnation_generations: Count = Field(
+        32,
+        description="memes: generations after which an emitter none of whose centres has entered the map since then "
+        "begins again from an elite, with a fresh optimiser.",
+    )
     parent_statistics: Literal["global", "elite"] = Field(
         "global",
-        description="me_es: observation statistics that a block uses. global: those of the whole run. elite: those "
-        "with which the elite at its start was evaluated. With elite, all elites descend from the first centre and "
-        "keep its statistics, so observations are not normalised unless the run started from a policy of another run.",
+        description="me_es, memes: observation statistics that a block uses. global: those of the whole run. elite: "
+        "those with which the elite at its start was evaluated. With elite, all elites descend from the first centre "
+        "and keep its statistics, so observations are not normalised unless the run started from a policy of another "
+        "run.",
     )
     batch: Count = Field(256, description="map_elites: number of policies that a generation makes and evaluates.")
     iso_sigma: NotNegative = Field(
@@ -198,7 +206,7 @@ class NoveltyConfig(Section):
 class MapConfig(Section):
     """The behaviour map, in which each cell keeps the fittest evaluated centre. Constants of the run."""
 
-    enabled: Switch = Field(True, description="Whether the run fills a map; me_es and map_elites need one.")
+    enabled: Switch = Field(True, description="Whether the run fills a map; me_es, memes and map_elites need one.")
     kind: Literal["grid", "cvt"] = Field(
         description="grid: cells of equal size. cvt: any number of cells around centroids, for many dimensions. auto: "
         "grid for up to six dimensions, else cvt."

@@ -6,6 +6,9 @@ from es_service.config.model import RunConfig
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK
 from es_service.protocol.policies import chunks_of
 
+WITH_EMITTERS = ("me_es", "memes")
+"""Methods with a population for each of `search.emitters`."""
+
 
 def populations(config: RunConfig) -> int:
     """Number of populations that a generation asks for; for a search of your own, the most it can ask for.
@@ -15,7 +18,8 @@ def populations(config: RunConfig) -> int:
     search = config.search
     if search.algorithm == "map_elites":
         return 0
-    return search.centres if search.algorithm == "me_es" or search.update == "all" or ":" in search.algorithm else 1
+    several = search.algorithm in WITH_EMITTERS or search.update == "all" or ":" in search.algorithm
+    return search.centres if several else 1
 
 
 def chunks_at_once(config: RunConfig) -> int:
@@ -46,7 +50,7 @@ def _keys(config: RunConfig) -> tuple[str, str]:
     algorithm = config.search.algorithm
     if algorithm == "map_elites":
         return "search.batch", "search.evaluation_episodes"
-    if algorithm == "me_es":
+    if algorithm in WITH_EMITTERS:
         return "search.pairs", "search.emitters"
     if algorithm == "es" or ":" in algorithm:
         return "search.pairs", "compute.chunk_pairs"

@@ -5,7 +5,8 @@ every value, so a later change of this table changes no existing run.
 
 Sources named below: ES-starter is OpenAI's evolution-strategies-starter (Salimans et al. 2017, arXiv:1703.03864); DNE
 is Uber's deep-neuroevolution (Conti et al. 2018, arXiv:1712.06560); ME-ES is Uber's Map-Elites-Evolutionary (Colas et
-al. 2020, arXiv:2003.01825). All values are from their code, not from the papers.
+al. 2020, arXiv:2003.01825); MEMES is adaptive-intelligent-robotics/MEMES (Flageat et al. 2024, arXiv:2303.06137). All
+values are from their code, not from the papers.
 """
 
 from __future__ import annotations
@@ -103,6 +104,55 @@ _ROWS = (
         "euclidean",
         "squared_euclidean",
         "literature: DNE and QDax. uber: ME-ES, which averages squared distances.",
+    ),
+    PresetRow(
+        "policy.observation_normalization",
+        False,
+        False,
+        "literature: the code of MEMES, which does not normalise observations. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "policy.action_noise",
+        0.0,
+        0.0,
+        "literature: the code of MEMES, which adds no noise to actions. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "search.emitters",
+        16,
+        16,
+        "literature: an eighth of the 128 of the code of MEMES, sized for one machine. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "search.pairs",
+        32,
+        32,
+        "literature: an eighth of the 512 members of the code of MEMES, sized for one machine. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "search.l2",
+        0.0,
+        0.0,
+        "literature: the code of MEMES. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "search.evaluation_episodes",
+        1,
+        1,
+        "literature: the code of MEMES, which evaluates a centre once. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "novelty.newest",
+        50_000,
+        50_000,
+        "literature: the code of MEMES, whose novelty archive keeps no more. uber: the same.",
+        "memes",
     ),
     PresetRow(
         "policy.observation_normalization",

@@ -16,6 +16,7 @@ from es_service.search.algorithms.base import Algorithm
 from es_service.search.algorithms.es import es
 from es_service.search.algorithms.map_elites import map_elites
 from es_service.search.algorithms.me_es import me_es
+from es_service.search.algorithms.memes import memes
 from es_service.search.algorithms.ns_es import ns_es
 from es_service.search.algorithms.nsr_es import nsr_es
 from es_service.search.algorithms.nsra_es import nsra_es
@@ -28,6 +29,7 @@ OURS: dict[str, Factory] = {
     "nsr_es": nsr_es,
     "nsra_es": nsra_es,
     "me_es": me_es,
+    "memes": memes,
     "map_elites": map_elites,
 }
 
