@@ -17,12 +17,12 @@ from pydantic import ValidationError
 from es_service.config.changes import foreign_options, without_followers
 from es_service.config.keys import BUDGET, FIELDS, SECTIONS, Overrides, parse_overrides, sort_keys
 from es_service.config.map_rules import map_problems
+from es_service.config.method_rules import method_problems
 from es_service.config.model import RunConfig
 from es_service.config.presets import PRESETS, preset_values
 from es_service.config.problems import nearest, not_allowed, one_of, unfit
 from es_service.config.resolution import (
     LEFT_OPEN,
-    centre_problems,
     engine_problems,
     policy_problems,
     resolve,
@@ -149,7 +149,7 @@ def _load(
     if task is not None:
         problems += task_problems(values, task) + policy_problems(values, task)
         problems += map_problems(values, task) + rollout_problems(values, task)
-    problems += centre_problems(values) + shape_problems(values) + engine_problems(values)
+    problems += method_problems(values) + shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):
         problems.append(unfit("budget", None, f"this run has no limit; set at least one of {one_of(BUDGET)}"))
@@ -169,8 +169,9 @@ def _preset_values(values: Mapping[str, Any]) -> dict[str, Any]:
     preset = values.get("search.preset", FIELDS["search.preset"].default)
     if not isinstance(preset, str) or preset not in PRESETS:
         return {}
-    filled = preset_values(preset)
-    if values.get("policy.observation_normalization") is False:
+    filled = preset_values(preset, values.get("search.algorithm"))
+    normalised = "policy.observation_normalization"
+    if values.get(normalised, filled.get(normalised)) is False:
         filled["policy.observation_clip"] = None  # the bound is in standard deviations, which are then unknown
     return filled
 

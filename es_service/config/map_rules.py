@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from es_service.config.fields import OPTIONS
+from es_service.config.method_rules import map_needed_by
 from es_service.config.problems import not_allowed, unfit
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
@@ -51,8 +52,8 @@ def default_qd_offset(values: Mapping[str, Any], task: TaskSpec) -> float:
 def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     """Problems of a map that does not fit the descriptor, is too large, or is off although the algorithm needs it."""
     problems = []
-    if values.get("search.algorithm") == "me_es" and values.get("map.enabled", True) is False:
-        why = " for me_es, whose blocks start from elites of the map"
+    if (purpose := map_needed_by(values)) and values.get("map.enabled", True) is False:
+        why = f" for {values['search.algorithm']}, {purpose}"
         problems.append(not_allowed("map.enabled", False, "true", why=why))
     names = with_options(task, options_of(values)).descriptor_names
     bounds, cells, kind = values.get("map.bounds"), values.get("map.cells"), values.get("map.kind")

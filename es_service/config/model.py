@@ -16,7 +16,6 @@ from es_service.config.fields import (
     BoundPairs,
     CellCounts,
     Count,
-    Fraction,
     NotNegative,
     Number,
     Positive,
@@ -26,6 +25,7 @@ from es_service.config.fields import (
     Text,
     Widths,
 )
+from es_service.config.search import SearchConfig
 from es_service.config.yaml_text import dump_yaml
 from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
 
@@ -60,7 +60,9 @@ class PolicyConfig(Section):
         "layers, 0.01 in the output layer. small_columns: 0.01 in every layer. Set by the preset."
     )
     observation_normalization: Switch = Field(
-        True, description="Whether observations are shifted and scaled by the running statistics of the training."
+        True,
+        description="Whether observations are shifted and scaled by the running statistics of the training. "
+        "map_elites, which has none, allows only false, its default.",
     )
     observation_clip: Positive | None = Field(
         description="Bound on each normalised observation, in standard deviations; null for none. Set by the preset; "
@@ -69,112 +71,6 @@ class PolicyConfig(Section):
     action_noise: NotNegative = Field(
         0.01,
         description="Standard deviation of the Gaussian noise added to actions in training episodes, in action units.",
-    )
-
-
-class SearchConfig(Section):
-    """The evolution strategy. Constants of the run."""
-
-    algorithm: Text = Field(
-        description="Name of the search algorithm: a shipped one, or module:function for one of your own."
-    )
-    preset: Literal["literature", "uber"] = Field(
-        "literature", description="Which column of the preset table fills in the keys that the config leaves out."
-    )
-    pairs: Count = Field(
-        description="Antithetic pairs of a population, which has twice as many members. A generation has one "
-        "population, or one for each centre with search.emitters and search.update: all. Set by the preset."
-    )
-    sigma: Positive = Field(0.02, description="Standard deviation of the parameter noise, in parameter units.")
-    learning_rate: Positive = Field(
-        0.01, description="Step size of Adam, in parameter units. ars: factor of the plain step."
-    )
-    l2: NotNegative = Field(
-        0.005, description="Weight decay, added to the gradient before Adam: lambda in -g + lambda x."
-    )
-    shaping: Literal["ranks", "signs", "returns"] = Field(
-        "ranks",
-        description="How fitness, and novelty, become utilities of members. ranks: evenly spaced by rank. signs: of "
-        "each pair, only which member is better. returns: the values, less their mean, over their standard deviation.",
-    )
-    centres: Count = Field(
-        description="Number of centres searched side by side, each with its own optimiser. auto: 1 for es and "
-        "ars, search.emitters for me_es (these allow no other number), 1 for a search of your own; else 5."
-    )
-    update: Literal["one", "all"] = Field(
-        "one",
-        description="ns_es, nsr_es, nsra_es: how many of the centres a generation updates. one: that of "
-        "search.centre_choice. all: every centre, with search.pairs pairs each.",
-    )
-    centre_choice: Literal["novelty", "round_robin", "uniform"] = Field(
-        "novelty",
-        description="How the centre to update is chosen. novelty: with probability proportional to its novelty. "
-        "round_robin: in turn. uniform: all with the same probability.",
-    )
-    top_pairs: Count | None = Field(
-        None,
-        description="ars: number of pairs from which a step is computed, those with the highest fitness of their "
-        "better member; null: all pairs.",
-    )
-    emitters: Count = Field(
-        1,
-        description="me_es: number of blocks that run side by side, with search.pairs pairs each in every generation.",
-    )
-    fitness_weight_start: Fraction = Field(
-        description="nsra_es: weight of fitness beside novelty at the start. Set by the preset."
-    )
-    fitness_weight_step: Fraction = Field(
-        0.05, description="nsra_es: how much the weight of fitness rises after an improvement or falls in stagnation."
-    )
-    fitness_weight_patience: Count = Field(
-        description="nsra_es: generations without improvement before the weight of fitness falls. Set by the preset."
-    )
-    fitness_weight_min_gain: NotNegative = Field(
-        description="nsra_es: a centre is an improvement if its fitness exceeds the record by more than this fraction "
-        "of the record's absolute value. Set by the preset."
-    )
-    mode: Literal["explore_exploit", "explore", "exploit"] = Field(
-        "explore_exploit",
-        description="me_es: what a block of generations maximises. explore: novelty. exploit: fitness. "
-        "explore_exploit: one of the two, as search.alternation says.",
-    )
-    alternation: Literal["round_robin", "coin"] = Field(
-        "round_robin",
-        description="me_es: how exploring and exploiting blocks follow each other. round_robin: in turn. coin: each "
-        "block is chosen at random, with probability 1/2.",
-    )
-    first_block: Literal["explore", "exploit"] = Field(
-        description="me_es: what the first block does with alternation round_robin. Set by the preset."
-    )
-    block_generations: Count = Field(
-        10,
-        description="me_es: generations in a block; each block starts from an elite drawn from the map, with a fresh "
-        "optimiser.",
-    )
-    cell_sampling: Literal["top", "score"] = Field(
-        description="me_es: how the cell of that elite is drawn: as in QDax (top) or as in the released code (score); "
-        "es_service/search/algorithms/me_es.py describes both. Set by the preset."
-    )
-    parent_statistics: Literal["global", "elite"] = Field(
-        "global",
-        description="me_es: observation statistics that a block uses. global: those of the whole run. elite: those "
-        "with which the elite at its start was evaluated. With elite, all elites descend from the first centre and "
-        "keep its statistics, so observations are not normalised unless the run started from a policy of another run.",
-    )
-    evaluation_episodes: Count = Field(
-        30,
-        description="Noise-free episodes on which each new centre is evaluated; they count as environment steps.",
-    )
-    common_random_numbers: Switch = Field(
-        description="Whether the two members of a pair share resets and action noise. Set by the preset."
-    )
-    max_invalid_fraction: Fraction = Field(
-        0.5, description="Share of members with a non-finite fitness or descriptor above which the run stops."
-    )
-    init_from: Text | None = Field(
-        None,
-        description="Policy of another run from which this run starts: RUN (its folder) for the centre updated last, "
-        "RUN:best for the best centre, or RUN:3,17 for a cell's elite; null for random weights.",
     )
 
 
@@ -187,12 +83,17 @@ class NoveltyConfig(Section):
     distance: Literal["euclidean", "squared_euclidean"] = Field(
         description="Distance between descriptors. Set by the preset."
     )
+    newest: Count | None = Field(
+        None,
+        description="Number of the newest entries of the novelty archive with which a descriptor is compared; null: "
+        "all. The archive keeps the others, too.",
+    )
 
 
 class MapConfig(Section):
     """The behaviour map, in which each cell keeps the fittest evaluated centre. Constants of the run."""
 
-    enabled: Switch = Field(True, description="Whether the run fills a map; me_es needs one.")
+    enabled: Switch = Field(True, description="Whether the run fills a map; me_es, memes and map_elites need one.")
     kind: Literal["grid", "cvt"] = Field(
         description="grid: cells of equal size. cvt: any number of cells around centroids, for many dimensions. auto: "
         "grid for up to six dimensions, else cvt."

@@ -5,7 +5,8 @@ every value, so a later change of this table changes no existing run.
 
 Sources named below: ES-starter is OpenAI's evolution-strategies-starter (Salimans et al. 2017, arXiv:1703.03864); DNE
 is Uber's deep-neuroevolution (Conti et al. 2018, arXiv:1712.06560); ME-ES is Uber's Map-Elites-Evolutionary (Colas et
-al. 2020, arXiv:2003.01825). All values are from their code, not from the papers.
+al. 2020, arXiv:2003.01825); MEMES is adaptive-intelligent-robotics/MEMES (Flageat et al. 2024, arXiv:2303.06137). All
+values are from their code, not from the papers.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ class PresetRow:
     uber: object
     source: str
     """Where both values come from, and what is our own choice."""
+    method: str | None = None
+    """The only `search.algorithm` that the row is for, before a row for all of them; None: the row is for all."""
 
 
 _ROWS = (
@@ -102,6 +105,69 @@ _ROWS = (
         "squared_euclidean",
         "literature: DNE and QDax. uber: ME-ES, which averages squared distances.",
     ),
+    PresetRow(
+        "policy.observation_normalization",
+        False,
+        False,
+        "literature: the code of MEMES, which does not normalise observations. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "policy.action_noise",
+        0.0,
+        0.0,
+        "literature: the code of MEMES, which adds no noise to actions. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "search.emitters",
+        16,
+        16,
+        "literature: an eighth of the 128 of the code of MEMES, sized for one machine. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "search.pairs",
+        32,
+        32,
+        "literature: an eighth of the 512 members of the code of MEMES, sized for one machine. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "search.l2",
+        0.0,
+        0.0,
+        "literature: the code of MEMES. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "search.evaluation_episodes",
+        1,
+        1,
+        "literature: the code of MEMES, which evaluates a centre once. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "novelty.newest",
+        50_000,
+        50_000,
+        "literature: the code of MEMES, whose novelty archive keeps no more. uber: the same.",
+        "memes",
+    ),
+    PresetRow(
+        "policy.observation_normalization",
+        False,
+        False,
+        "literature: QDax, which gathers no statistics either. uber: the same, since nothing could gather them.",
+        "map_elites",
+    ),
+    PresetRow(
+        "search.evaluation_episodes",
+        1,
+        1,
+        "literature: QDax, which evaluates a policy once. uber: the same.",
+        "map_elites",
+    ),
 )
 
 
@@ -110,12 +176,16 @@ def preset_table() -> list[PresetRow]:
     return list(_ROWS)
 
 
-def preset_values(preset: str) -> dict[str, object]:
+def preset_values(preset: str, method: object = None) -> dict[str, object]:
     """Values of one preset: dotted key -> value.
+
+    Args:
+        method: the algorithm, whose own rows replace those for all algorithms; None for the latter alone.
 
     Raises:
         KeyError: `preset` is not a key of PRESETS.
     """
     if preset not in PRESETS:
         raise KeyError(preset)
-    return {row.key: getattr(row, preset) for row in _ROWS}
+    for_all = {row.key: getattr(row, preset) for row in _ROWS if row.method is None}
+    return for_all | {row.key: getattr(row, preset) for row in _ROWS if row.method == str(method)}

@@ -15,6 +15,7 @@ from typing import Any
 from es_service.config.fields import OPTIONS, RESOURCES
 from es_service.config.keys import FIELDS
 from es_service.config.map_rules import default_cells, default_kind, default_qd_offset, options_of
+from es_service.config.method_rules import default_centres
 from es_service.config.model import RunConfig
 from es_service.config.problems import nearest, not_allowed, one_of, unfit
 from es_service.config.yaml_text import show
@@ -35,10 +36,6 @@ LEFT_OPEN: dict[str, str | None] = {
     "compute.gradient_block_pairs": "auto",
 }
 """Keys that this module resolves -> the value that asks for it. Leaving the key out has the same effect."""
-CENTRES = 5
-"""Default number of centres of the other algorithms (the meta-population of Conti et al. 2018). Source:
-deep-neuroevolution's Humanoid settings and the released ME-ES code."""
-
 MOST_CHUNK_PAIRS = 64
 """Upper limit: enough pairs to fill vector units and outweigh the cost of a message; a lost chunk costs little."""
 LEAST_CHUNK_PAIRS = 16
@@ -116,8 +113,7 @@ def resolve(
         if "map.qd_offset" in left_open:
             values["map.qd_offset"] = default_qd_offset(values, task)
     if "search.centres" in left_open and "search.algorithm" in values:
-        algorithm = values["search.algorithm"]
-        values["search.centres"] = _centres_of(algorithm, values) or (1 if ":" in algorithm else CENTRES)
+        values["search.centres"] = default_centres(values)
     if "compute.engine" in left_open:
         has_actor_cores = _value(values, f"{RESOURCES}cpu") not in ("auto", 1)
         for_ray = _value(values, "compute.address") is not None or has_actor_cores or _on_gpu(values)
@@ -175,21 +171,6 @@ def policy_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
 
 def _policy_shape(values: Mapping[str, Any], task: TaskSpec) -> PolicyShape:
     return PolicyShape((task.observation_size, *_value(values, "policy.hidden"), task.action_size))
-
-
-def centre_problems(values: Mapping[str, Any]) -> list[Problem]:
-    """The problem of a number of centres that the algorithm does not support."""
-    algorithm, centres = values.get("search.algorithm"), values.get("search.centres")
-    fixed = _centres_of(algorithm, values)
-    if fixed is None or centres in (None, fixed):
-        return []
-    why = f" for {algorithm}, which has one centre{' per emitter' if algorithm == 'me_es' else ''}"
-    return [not_allowed("search.centres", centres, f"{fixed} or auto", why=why)]
-
-
-def _centres_of(algorithm: object, values: Mapping[str, Any]) -> int | None:
-    """The only number of centres that an algorithm supports; None if it supports any."""
-    return {"es": 1, "ars": 1, "me_es": values.get("search.emitters", 1)}.get(str(algorithm))
 
 
 def shape_problems(values: Mapping[str, Any]) -> list[Problem]:

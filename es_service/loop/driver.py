@@ -48,7 +48,7 @@ from es_service.protocol.evaluator import DispatchCounts, Evaluator
 from es_service.protocol.messages import TaskSpec
 from es_service.search.algorithms.base import Ask
 from es_service.search.algorithms.steps import first_state
-from es_service.search.maps.behaviour_map import BehaviourMap, empty_map
+from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map
 from es_service.search.maps.geometry import make_geometry, reachable_cells
 from es_service.search.novelty import novelty
 from es_service.search.observation_statistics import merge_moments
@@ -178,8 +178,9 @@ def _next_generation(
     begun = state.search
     start_cells = algorithm.start_cells(begun, generation)
     for index, cell in start_cells.items():
-        begun = algorithm.restart(begun, index, cell, elite_from_arrays(store.part(elite_part(cell))))
-    asked = algorithm.ask(begun, generation)
+        begun = algorithm.restart(begun, index, cell, _elite(store, cell))
+    parents = {cell: _elite(store, cell) for cell in algorithm.parents(begun, generation)}
+    asked = algorithm.ask(replace(begun, elites=parents), generation)
     require_asks(asked, begun, sizes.chunk_pairs, search.task.observation_size, generation)
     asks = [ask for ask in asked if isinstance(ask, Ask)]
     policies = policies_asked(config, search.task, generation, asked)
@@ -221,9 +222,10 @@ def _next_generation(
     told = tuple(centre_evaluation(generation, one.index, one.evaluation, one.population) for one in evaluated)
     learned = tell(algorithm, moved, told)
 
-    nearest = config.novelty
-    descriptors = [one.descriptor_B for one in told]
-    novelties = novelty(moved.archive, descriptors, neighbours=nearest.neighbours, distance=nearest.distance).tolist()
+    nearest, descriptors = config.novelty, [one.descriptor_B for one in told]
+    novelties = novelty(
+        moved.archive, descriptors, neighbours=nearest.neighbours, distance=nearest.distance, newest=nearest.newest
+    ).tolist()
     rows = evaluated_rows(evaluated, search.task, learned.map, generation, start_cells, novelties)
     at = fittest(told)
     shown = evaluated[at]  # the history's row is about this one
@@ -285,6 +287,10 @@ def _keep(
     clock.lap("seconds_store")
     report(row)
     return state
+
+
+def _elite(store: Store, cell: int) -> Elite:
+    return elite_from_arrays(store.part(elite_part(cell)))
 
 
 def _reachable(search: Search, map_: BehaviourMap | None) -> Reachable:

@@ -43,6 +43,7 @@ class Domain(IntEnum):
     EVALUATION_RESET = 3
     ACTION_NOISE = 4
     SELECTION = 5
+    VARIATION = 6
 
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)

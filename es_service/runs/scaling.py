@@ -23,6 +23,7 @@ from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.ray_engine import ray_engine
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.dispatch.simulation import Costs, Phase, predict
+from es_service.errors import ConfigError
 from es_service.loop import driver
 from es_service.loop.history import evaluated_columns, history_columns
 from es_service.protocol.evaluator import DispatchCounts, Evaluator
@@ -71,8 +72,15 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
 
     Measured are the duration of each kind of chunk on one core, with the initial policy; a generation of the driver and
     the store with such results; and messages between the Ray engine and actors on this machine. A network makes
-    messages slower. Raises EvaluationError if Ray or the task cannot be used.
+    messages slower. Raises EvaluationError if Ray or the task cannot be used, ConfigError if the method asks for no
+    populations.
     """
+    if not populations(config):
+        name, why = (
+            config.search.algorithm,
+            "whose policies are sent to the workers, since only populations are measured",
+        )
+        raise ConfigError(f"bench scaling cannot predict {name}, {why}", field="search.algorithm", value=name)
     task = task_of(config)
     spec = worker_spec(config, task)
     parameters = initial_parameters(spec.policy, config.policy.init, config.seed, 0)

@@ -11,22 +11,18 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-if TYPE_CHECKING:
-    from scipy.spatial import KDTree
+from es_service.search.novelty_tree import COPIES, Tree, make_tree
 
 Distance = Literal["euclidean", "squared_euclidean"]
 
 TREE_STEP = 256
 """Least number of entries between two trees. Entries after the newest tree are compared one by one."""
-COPIES = 64
-"""Largest number of entries with equal descriptors in a tree. Policies that do not move, or that end in a corner,
-produce many such entries, and each query near them would visit them all."""
 LEAST_ROOM = 256
 """Least capacity of an archive's arrays, in entries."""
 SPARE_CANDIDATES = 6
@@ -54,21 +50,6 @@ class _Room:
 
 
 @dataclass(frozen=True)
-class _Tree:
-    """A k-d tree over the first entries of an archive."""
-
-    kd: KDTree
-    entries: int
-    """Number of those entries."""
-    entry_K: NDArray[np.int64] | None
-    """Indices of the entries that are in the tree; None for all of them."""
-
-    def entries_of(self, points: ArrayLike) -> NDArray[np.int64]:
-        """Indices of the entries for points of the tree."""
-        return np.asarray(points) if self.entry_K is None else self.entry_K[np.asarray(points)]
-
-
-@dataclass(frozen=True)
 class NoveltyArchive:
     """Descriptors of all valid centres evaluated so far, in order. It is immutable: `extended` returns a new one."""
 
@@ -77,10 +58,12 @@ class NoveltyArchive:
     """Generation in which each was evaluated; 0 for initial centres."""
     centre_N: NDArray[np.int64]
     """Index of the centre that made each entry."""
-    tree: _Tree | None = None
+    tree: Tree | None = None
     """A tree over the first entries, derived from `descriptor_N_B`; None for a small archive."""
     room: _Room | None = None
     """Storage of which the arrays are the first part; None if they are their own storage."""
+    newest: dict[int, NoveltyArchive] = field(default_factory=dict, repr=False, compare=False)
+    """Archives of only its newest entries, by their number; derived, and made when one is first needed."""
 
     @property
     def size(self) -> int:
@@ -141,6 +124,7 @@ def novelty(
     *,
     neighbours: int,
     distance: Distance,
+    newest: int | None = None,
     exclude_Q: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
     """Mean distance of each query to its `neighbours` nearest entries, or to all entries if there are fewer.
@@ -153,6 +137,7 @@ def novelty(
         neighbours: `novelty.neighbours`, k in the paper.
         distance: euclidean, in units of the descriptor, or squared_euclidean, the mean of squared distances in squared
             units, as in the released ME-ES code.
+        newest: number of the newest entries that count; None for all.
         exclude_Q: index of an entry that each query ignores, usually its own, or -1 for none; only for queries with one
             leading axis.
 
@@ -162,6 +147,9 @@ def novelty(
     shape = np.shape(descriptor_Q_B)[:-1]
     query_Q_B = np.asarray(descriptor_Q_B, np.float64).reshape(-1, archive.descriptor_N_B.shape[1])
     excluded_Q = np.full(len(query_Q_B), -1) if exclude_Q is None else np.asarray(exclude_Q)
+    if newest is not None and newest < archive.size:
+        excluded_Q = np.maximum(excluded_Q - (archive.size - newest), -1)
+        archive = _newest(archive, newest)
     finite_Q = np.atleast_1d(np.isfinite(query_Q_B).all(axis=1))
     novelty_Q = np.full(len(query_Q_B), np.nan)
 
@@ -196,7 +184,7 @@ def _copied(archive: NoveltyArchive) -> _Room:
     return room
 
 
-def _with_tree(room: _Room, tree: _Tree | None) -> NoveltyArchive:
+def _with_tree(room: _Room, tree: Tree | None) -> NoveltyArchive:
     """The archive of all entries in a room, with a tree over the entries up to a multiple of a step.
 
     `tree` is used if it covers just those entries; otherwise a new tree is built. The more entries a tree has, the
@@ -206,25 +194,18 @@ def _with_tree(room: _Room, tree: _Tree | None) -> NoveltyArchive:
     step = max(TREE_STEP, 1 << room.used.bit_length() // 2)
     covered = room.used // step * step
     if covered and (tree is None or tree.entries != covered):
-        tree = _tree(descriptor_N_B[:covered])
+        tree = make_tree(descriptor_N_B[:covered])
     return NoveltyArchive(descriptor_N_B, room.generation[: room.used], room.centre[: room.used], tree, room)
 
 
-def _tree(descriptor_N_B: NDArray[np.float64]) -> _Tree:
-    """A tree over all entries, with at most the first COPIES of those with equal descriptors."""
-    from scipy.spatial import KDTree  # imported late: it takes 0.25 s, and most runs do not need it
-
-    size = len(descriptor_N_B)
-    word_N = np.zeros(size, np.uint64)
-    for b in range(descriptor_N_B.shape[1]):  # equal descriptors give equal hashes, others almost never
-        word_N = word_N * np.uint64(0x9E3779B97F4A7C15) + np.ascontiguousarray(descriptor_N_B[:, b]).view(np.uint64)
-    sorted_N = np.sort(word_N)
-    if not (sorted_N[COPIES:] == sorted_N[:-COPIES]).any():
-        return _Tree(KDTree(descriptor_N_B), size, None)
-    order_N = np.lexsort(descriptor_N_B.T)
-    equal_N = (descriptor_N_B[order_N[COPIES:]] == descriptor_N_B[order_N[:-COPIES]]).all(axis=1)
-    entry_K = np.sort(np.concatenate([order_N[:COPIES], order_N[COPIES:][~equal_N]]))
-    return _Tree(KDTree(descriptor_N_B[entry_K]), size, entry_K)
+def _newest(archive: NoveltyArchive, count: int) -> NoveltyArchive:
+    """The archive of only the newest entries, of which there are fewer than in all."""
+    if count not in archive.newest:  # a generation asks for it once for each of its populations
+        last = slice(archive.size - count, None)
+        archive.newest[count] = archive_of(
+            archive.descriptor_N_B[last], archive.generation_N[last], archive.centre_N[last]
+        )
+    return archive.newest[count]
 
 
 def _mean_nearest(

@@ -53,6 +53,34 @@ def test_by_hand():
     assert of(archive, [(0, 1)], 2, exclude=[-1]) == [0.0]
 
 
+def test_only_the_newest_entries_count_if_the_others_are_left_out():
+    """They stay in the archive, though; an index of an entry is its place among all."""
+    archive = archive_of([(0, 0), (9, 9), (0, 2), (0, 5)])
+    ask = {"neighbours": 1, "distance": "euclidean"}
+    for newest, expected in ((None, 0.0), (9, 0.0), (4, 0.0), (3, 2.0), (2, 2.0), (1, 5.0)):
+        assert novelty(archive, [(0, 0)], newest=newest, **ask).tolist() == [expected]
+    assert novelty(archive, [(0, 2)] * 3, newest=2, exclude_Q=[2, 0, -1], **ask).tolist() == [3.0, 0.0, 0.0]
+    assert archive.size == 4
+
+
+@pytest.mark.parametrize("entries", [900, 3000])
+def test_the_newest_entries_are_searched_as_if_there_were_no_others(entries):
+    random = np.random.default_rng(0)
+    places, queries = random.normal(size=(entries, 2)), random.normal(size=(50, 2))
+    archive, own = many(places), random.integers(entries, size=50)
+    for newest in (700, 40):
+        alone = many(places[-newest:])
+        ask = {"neighbours": 5, "distance": "euclidean"}
+        np.testing.assert_array_equal(novelty(archive, queries, newest=newest, **ask), novelty(alone, queries, **ask))
+        shifted = np.where(own >= entries - newest, own - (entries - newest), -1)
+        np.testing.assert_array_equal(
+            novelty(archive, places[own], newest=newest, exclude_Q=own, **ask),
+            novelty(alone, places[own], exclude_Q=shifted, **ask),
+        )
+    longer = extended(archive, (50.0, 50.0), entries, 0)
+    assert novelty(longer, [(50.0, 50.0)], neighbours=1, distance="euclidean", newest=700).tolist() == [0.0]
+
+
 def test_nothing_is_near_in_an_empty_archive():
     """In particular no entry of zeros that was never made."""
     assert of(empty_archive(2), [(5.0, 5.0), (0.0, 0.0)]) == [0.0, 0.0]

@@ -125,6 +125,8 @@ def test_an_elite_s_own_entry_is_no_neighbour_but_an_equal_one_is():
     plain, squared = (config_of(preset, neighbours=2).novelty for preset in ("literature", "uber"))
     assert elite_novelty(map_, archive, plain).tolist() == [2.0, 8.0]  # (0 + 4) / 2, (6 + 10) / 2
     assert elite_novelty(map_, archive, squared).tolist() == [8.0, 68.0]  # (0 + 16) / 2, (36 + 100) / 2
+    newest = plain.model_copy(update={"newest": 2})  # 14 and the 10 of generation 5, which is the first elite's own
+    assert elite_novelty(map_, archive, newest).tolist() == [4.0, 8.0]
 
 
 def test_of_several_initial_centres_each_elite_leaves_out_its_own_entry():

@@ -114,13 +114,16 @@ def test_make_targets_exist():
 
 def test_preset_table_is_the_code_s():
     shown = TEXT["configs/README.md"].split("<!-- presets -->")[1].split("<!-- /presets -->")[0].strip()
-    rows = [f"| `{row.key}` | {show(row.literature)} | {show(row.uber)} |" for row in preset_table()]
+    rows = [
+        f"| `{row.key}`{f' of `{row.method}`' if row.method else ''} | {show(row.literature)} | {show(row.uber)} |"
+        for row in preset_table()
+    ]
     assert shown.splitlines()[2:] == rows
 
 
 def default(key: str) -> str:
     """A key's default as the guide writes it."""
-    by_preset = {row.key: f"{show(row.literature)} / {show(row.uber)}" for row in preset_table()}
+    by_preset = {row.key: f"{show(row.literature)} / {show(row.uber)}" for row in preset_table() if row.method is None}
     if key in by_preset:
         return by_preset[key]
     if key in LEFT_OPEN:

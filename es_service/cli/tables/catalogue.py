@@ -35,7 +35,8 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
     for name in PRESETS:
         presets.add_column(name)
     for row in preset_table():
-        presets.add_row(row.key, *(_value(getattr(row, name)) for name in PRESETS))
+        key = row.key if row.method is None else f"{row.key} of {row.method}"
+        presets.add_row(key, *(_value(getattr(row, name)) for name in PRESETS))
     console.print(presets)
 
     configs = _table("configs (es-service run NAME, es-service config NAME)")

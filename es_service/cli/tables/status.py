@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from typing import Any
 
 from rich.console import Console
 
@@ -22,7 +24,7 @@ def print_status(console: Console, run: Run) -> None:
     fields = {
         "run": str(run.folder),
         "task": f"{constants['task.environment']}, {constants['task.episode_steps']} steps an episode",
-        "search": f"{constants['search.algorithm']}, {constants['search.pairs']} pairs, seed {constants['seed']}",
+        "search": f"{constants['search.algorithm']}, {_population(constants)}, seed {constants['seed']}",
     }
     if parent:
         fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
@@ -53,7 +55,8 @@ def follow_status(console: Console, run: Run) -> None:
 def print_summary(console: Console, run: Run, reason: str) -> None:
     """Print the summary of a session at its end: the result, the folder and the next commands."""
     standing, folder = look(run), run.folder
-    doubled = {"search.sigma": float(f"{run.constants['search.sigma'] * 2:g}")}
+    sigma = "search.iso_sigma" if run.constants["search.algorithm"] == "map_elites" else "search.sigma"
+    doubled = {sigma: float(f"{run.constants[sigma] * 2:g}")}
     _print_line(console, f"\nDone: {reason}.")
     _print_fields(console, _progress(standing))
     _print_line(console, f"\nThe run is in {folder}. Next:")
@@ -65,6 +68,13 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
         ("fork", folder, *settings(doubled | more(standing))),
     ):
         _print_line(console, f"  {command(*words)}")
+
+
+def _population(constants: Mapping[str, Any]) -> str:
+    """The size of a population, in words."""
+    if constants["search.algorithm"] == "map_elites":
+        return f"{constants['search.batch']} policies"
+    return f"{constants['search.pairs']} pairs"
 
 
 def _progress(standing: Standing) -> dict[str, str]:

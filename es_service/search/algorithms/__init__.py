@@ -1,9 +1,9 @@
 """Search algorithms by name. Each method has a short file of its own; the steps that they share are functions.
 
 An algorithm is a few pure functions of a `SearchState`; it does not run episodes itself. In each generation the driver
-asks it which centres restart from elites (`start_cells`) and which centres to perturb (`ask`), then for each of these
-how to weight the noise (`weights`) and what the new centre is (`step`), and tells it the evaluations of the new centres
-(`tell`).
+asks it which centres restart from elites (`start_cells`), which elites it needs (`parents`) and which centres to
+perturb or policies to evaluate (`ask`), then for each of these centres how to weight the noise (`weights`) and what the
+new centre is (`step`), and tells it the evaluations of the new centres and of the policies (`tell`).
 """
 
 from __future__ import annotations
@@ -15,14 +15,25 @@ from es_service.config.model import RunConfig
 from es_service.search.algorithms.ars import ars
 from es_service.search.algorithms.base import Algorithm
 from es_service.search.algorithms.es import es
+from es_service.search.algorithms.map_elites import map_elites
 from es_service.search.algorithms.me_es import me_es
+from es_service.search.algorithms.memes import memes
 from es_service.search.algorithms.ns_es import ns_es
 from es_service.search.algorithms.nsr_es import nsr_es
 from es_service.search.algorithms.nsra_es import nsra_es
 from es_service.search.algorithms.own import import_factory, make_own
 
 Factory = Callable[[RunConfig], Algorithm]
-OURS: dict[str, Factory] = {"es": es, "ns_es": ns_es, "nsr_es": nsr_es, "nsra_es": nsra_es, "me_es": me_es, "ars": ars}
+OURS: dict[str, Factory] = {
+    "es": es,
+    "ns_es": ns_es,
+    "nsr_es": nsr_es,
+    "nsra_es": nsra_es,
+    "me_es": me_es,
+    "memes": memes,
+    "map_elites": map_elites,
+    "ars": ars,
+}
 
 
 class Algorithms(Mapping[str, Factory]):

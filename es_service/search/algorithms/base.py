@@ -5,7 +5,7 @@ Axes: D policy parameters, O observation, B descriptor dimensions, P antithetic 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -74,6 +74,9 @@ class SearchState:
     """Arrays of the search's own, by name. They are stored and digested with the rest. The mapping and the arrays are
     read-only; to change one, return a state with another mapping. Names and types of the arrays must stay as they are
     in `Algorithm.own`, shapes may change."""
+    elites: Mapping[int, Elite] = field(default_factory=dict)
+    """The elites of the cells that `Algorithm.parents` has named for this generation, by cell. Only `ask` sees them:
+    elites are kept in the run store, not in the state."""
 
 
 def read_only(own: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
@@ -180,6 +183,8 @@ class Algorithm:
     start_cells: Callable[[SearchState, int], Mapping[int, int]] = lambda state, generation: {}
     """(state, generation) -> index of a centre -> cell whose elite takes its place at the start of the generation; the
     other centres continue."""
+    parents: Callable[[SearchState, int], Sequence[int]] = lambda state, generation: ()
+    """(state, generation) -> cells whose elites `ask` needs; they are then in `SearchState.elites`."""
     restart: Callable[[SearchState, int, int, Elite], SearchState] = from_elite
     """(state, index of a centre, start cell, its elite) -> state in which that centre has restarted."""
     own: Mapping[str, NDArray[Any]] = field(default_factory=dict)

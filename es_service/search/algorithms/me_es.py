@@ -33,7 +33,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.model import NoveltyConfig, RunConfig, SearchConfig
+from es_service.config.model import NoveltyConfig, RunConfig
+from es_service.config.search import SearchConfig
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import Algorithm, Ask, SearchState, from_elite
 from es_service.search.algorithms.steps import novelty_search, population
@@ -143,6 +144,7 @@ def elite_novelty(map_: BehaviourMap, archive: NoveltyArchive, settings: Novelty
         map_.descriptor_N_B,
         neighbours=settings.neighbours,
         distance=settings.distance,
+        newest=settings.newest,
         exclude_Q=_own_entries(map_, archive),
     )
 

@@ -12,7 +12,8 @@ import math
 from dataclasses import replace
 from functools import partial
 
-from es_service.config.model import RunConfig, SearchConfig
+from es_service.config.model import RunConfig
+from es_service.config.search import SearchConfig
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, FitnessWeight
 from es_service.search.algorithms.steps import novelty_search
 

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.config.model import NoveltyConfig, RunConfig, SearchConfig
+from es_service.config.model import NoveltyConfig, RunConfig
+from es_service.config.search import SearchConfig
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import (
@@ -131,6 +132,7 @@ def novelty_of_centres(state: SearchState, settings: NoveltyConfig) -> NDArray[n
         state.archive.descriptor_N_B[entry_M[known_M]],
         neighbours=settings.neighbours,
         distance=settings.distance,
+        newest=settings.newest,
         exclude_Q=entry_M[known_M],
     )
     return novelty_M
@@ -154,7 +156,11 @@ def mixed_utilities(
         utility_P_S += w * shaped(population.fitness)
     if w < 1.0:
         novelty_P_S = novelty(
-            state.archive, population.descriptor, neighbours=settings.neighbours, distance=settings.distance
+            state.archive,
+            population.descriptor,
+            neighbours=settings.neighbours,
+            distance=settings.distance,
+            newest=settings.newest,
         )
         novelty_P_S[np.isnan(population.fitness)] = np.nan
         utility_P_S += (1.0 - w) * shaped(novelty_P_S)

@@ -1,0 +1,89 @@
+"""MAP-Elites: policies descend from elites of the behaviour map. Mouret and Clune 2015 (arXiv:1504.04909).
+
+A generation makes `batch` policies, evaluates each as it is, and offers it to the map. A policy has two parents, x and
+y, which are drawn with equal probability from all filled cells, and is their iso+line variation (Vassiliades and Mouret
+2018, arXiv:1804.03906):
+
+    x + iso_sigma * a + line_sigma * b * (y - x)
+
+a has a standard normal variate for each parameter, b is a single one. The default standard deviations 0.005 and 0.05
+are those of the examples of QDax. Both parents may be the same elite.
+
+The map begins with `centres` random policies, which are the initial centres; later they matter only as elites. Our own
+choices: while the map is empty (a fork emptied it), the parents are these. Policies run with mean 0 and standard
+deviation 1 of observations, since nothing gathers statistics. The novelty archive has only the initial centres.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.config.model import RunConfig
+from es_service.protocol.messages import FloatArray
+from es_service.protocol.noise import Domain, Keys, normals, stream_keys, uniforms
+from es_service.search.algorithms.base import Algorithm, CentreEvaluation, PolicyAsk, SearchState
+from es_service.search.algorithms.steps import novelty_search
+from es_service.search.maps.behaviour_map import insert
+
+PARENT_CHOICE = 3
+"""Last id of the random stream of Domain.SELECTION that draws the parents."""
+LARGE = 1 << 14
+"""Number of a policy's parameters from which several threads make a batch sooner than one does."""
+
+
+def map_elites(config: RunConfig) -> Algorithm:
+    """MAP-Elites: mutations of the map's elites, each evaluated as it is and offered to the map."""
+    search, shared = config.search, novelty_search(config, fitness_weight=1.0)
+
+    def parents(state: SearchState, generation: int) -> list[int]:
+        has_elites = state.map is not None and state.map.size
+        return np.unique(parent_cells(config, state, generation)).tolist() if has_elites else []
+
+    def ask(state: SearchState, generation: int) -> tuple[PolicyAsk, ...]:
+        known = {cell: elite.centre_D for cell, elite in state.elites.items()}
+        known = known or {index: centre.centre_D for index, centre in enumerate(state.centres)}
+        drawn_N_2 = parent_cells(config, state, generation).tolist()
+
+        def varied(number: int) -> FloatArray:
+            x_D, y_D = (known[drawn] for drawn in drawn_N_2[number])
+            key = stream_keys(config.seed, Domain.VARIATION, generation, number)
+            return variation(x_D, y_D, key, search.iso_sigma, search.line_sigma)
+
+        # The workers wait meanwhile, so each core makes some; small policies are made sooner by one thread.
+        threads = len(os.sched_getaffinity(0)) if state.centres[0].centre_D.size >= LARGE else 1
+        with ThreadPoolExecutor(threads) as pool:
+            return (PolicyAsk(np.stack(list(pool.map(varied, range(search.batch))))),)
+
+    def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
+        if evaluations[0].generation == 0:
+            return shared.tell(state, evaluations)
+        map_ = state.map
+        for one in evaluations:
+            if map_ is not None and one.valid:
+                map_, _, _ = insert(map_, one.descriptor_B, one.fitness, one.generation, one.centre, one.population_max)
+        return replace(state, map=map_)
+
+    return replace(shared, parents=parents, ask=ask, tell=tell)
+
+
+def parent_cells(config: RunConfig, state: SearchState, generation: int) -> NDArray[np.int64]:
+    """Cells of the two parents of each policy, [N, 2]; while the map is empty, indices of centres."""
+    among = state.map.cell_N if state.map is not None and state.map.size else np.arange(len(state.centres))
+    key = stream_keys(config.seed, Domain.SELECTION, generation, PARENT_CHOICE)
+    drawn_N_2 = uniforms(key, np.arange(2 * config.search.batch, dtype=np.uint32)).reshape(-1, 2)
+    return among[(drawn_N_2.astype(np.float64) * among.size).astype(np.int64)]
+
+
+def variation(x_D: FloatArray, y_D: FloatArray, key: Keys, iso_sigma: float, line_sigma: float) -> FloatArray:
+    """The iso+line variation of x, whose line goes through y, with noise of one stream.
+
+    Args:
+        key: of the stream; its coordinates 0 to D - 1 are those of the parameters, coordinate D is that of the line.
+    """
+    noise = normals(key, x_D.size + 1)
+    return x_D + np.float32(iso_sigma) * noise[:-1] + np.float32(line_sigma) * noise[-1] * (y_D - x_D)

@@ -1,0 +1,81 @@
+"""MEMES: many evolution strategies side by side on one behaviour map. Flageat et al. 2024 (arXiv:2303.06137).
+
+`emitters` evolution strategies run side by side as in ME-ES, but each keeps one objective: with `mode: explore_exploit`
+every second emitter, beginning with the first, explores, which climbs novelty, and the others exploit, which climb
+fitness. There are no blocks of a fixed length. An emitter is reset at the start of a generation if none of its centres
+has entered the map in the last `stagnation_generations` generations: an elite replaces its centre, with a fresh
+optimiser, and the count of its generations begins again. The elite is drawn with equal probability from all filled
+cells. A centre that another centre of its generation replaced at once has not entered.
+
+This follows the released code (adaptive-intelligent-robotics/MEMES), with two differences: its emitters of one
+objective come first and the others after them, and it resets one generation later (it compares with >).
+
+Our own choice: while the map is empty, no emitter is reset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from es_service.config.model import RunConfig
+from es_service.config.search import SearchConfig
+from es_service.protocol.noise import Domain, stream_keys, uniforms
+from es_service.search.algorithms.base import (
+    NO_CELL,
+    Algorithm,
+    Ask,
+    CentreEvaluation,
+    SearchState,
+    from_elite,
+    read_only,
+)
+from es_service.search.algorithms.steps import novelty_search, population
+from es_service.search.maps.behaviour_map import Elite
+
+RESET_CHOICE = 4
+"""Last id of the random stream of Domain.SELECTION that draws the cells from which emitters begin again."""
+STAGNANT = "stagnant"
+"""Name of the search's own array [emitters]: newest generations in which no centre of an emitter entered the map."""
+
+
+def memes(config: RunConfig) -> Algorithm:
+    """MAP-Elites with many ES: each explores or exploits, until its centres no longer enter the map."""
+    search = config.search
+    shared = novelty_search(config, fitness_weight=emitter_weight(search, 0))
+
+    def start_cells(state: SearchState, generation: int) -> dict[int, int]:
+        if state.map is None or not state.map.size:
+            return {}
+        key = stream_keys(config.seed, Domain.SELECTION, generation, RESET_CHOICE)
+        drawn_M = uniforms(key, np.arange(len(state.centres), dtype=np.uint32)).astype(np.float64)
+        cell_M = state.map.cell_N[(drawn_M * state.map.size).astype(np.int64)]
+        reset = np.flatnonzero(state.own[STAGNANT] >= search.stagnation_generations)
+        return {int(emitter): int(cell_M[emitter]) for emitter in reset}
+
+    def restart(state: SearchState, index: int, cell: int, elite: Elite) -> SearchState:
+        stagnant_M = np.where(np.arange(len(state.centres)) == index, 0, state.own[STAGNANT])
+        return replace(elite_restart(state, index, cell, elite), own=read_only({STAGNANT: stagnant_M}))
+
+    def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
+        return tuple(
+            population(state, emitter, search, emitter_weight(search, emitter)) for emitter in range(len(state.centres))
+        )
+
+    def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
+        state = shared.tell(state, evaluations)
+        entered_M = np.array([centre.cell != NO_CELL for centre in state.centres])
+        return replace(state, own=read_only({STAGNANT: np.where(entered_M, 0, state.own[STAGNANT] + 1)}))
+
+    elite_restart = partial(from_elite, own_statistics=search.parent_statistics == "elite")
+    own = {STAGNANT: np.zeros(search.emitters, np.int64)}
+    return replace(shared, start_cells=start_cells, restart=restart, ask=ask, tell=tell, own=own)
+
+
+def emitter_weight(search: SearchConfig, emitter: int) -> float:
+    """Weight of fitness in the utilities of an emitter: 0 if it explores, 1 if it exploits."""
+    if search.mode != "explore_exploit":
+        return float(search.mode == "exploit")
+    return float(emitter % 2)
