@@ -3,7 +3,7 @@
 from es_service.api import load_config
 from es_service.config.model import policy_shape, worker_spec
 from es_service.loop import driver
-from es_service.protocol.messages import PolicyShape
+from es_service.protocol.messages import EpisodesResult, PolicyShape
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
@@ -11,6 +11,18 @@ from workers.environments import SHIPPED
 from workers.policy import initial_parameters
 
 SHAPE = PolicyShape((2, 8, 8, 2))
+
+
+class Tampering(DirectEvaluator):
+    """Makes some members' results not finite."""
+
+    def __init__(self, worker_spec, spoil):
+        super().__init__(worker_spec)
+        self.spoil = spoil
+
+    def evaluate(self, work):
+        found = zip(work, super().evaluate(work), strict=True)
+        return [self.spoil(c, r) if isinstance(r, EpisodesResult) else r for (_, c), r in found]
 
 
 def small_config(policy=None, **changes):

@@ -11,8 +11,7 @@ from es_service.protocol.messages import TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.algorithms.ars import top_pair_weights
 from es_service.search.optimizer import plain_ascent
-from tests.laws.es_runs import run_in_memory, small_config
-from tests.laws.test_es import Tampering
+from tests.laws.es_runs import Tampering, run_in_memory, small_config
 from tests.twins import ars as twin
 from workers.environments import SHIPPED
 from workers.policy import initial_parameters

@@ -23,7 +23,7 @@ from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import merge_moments, no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
-from tests.laws.es_runs import SHAPE, run_in_memory, small_config
+from tests.laws.es_runs import SHAPE, Tampering, run_in_memory, small_config
 from tests.twins import es as twin
 from workers.environments import SHIPPED
 from workers.policy import initial_parameters
@@ -164,18 +164,6 @@ def test_the_first_spent_budget_ends_the_run(budget, generations, reason):
     state, _, _, why = run_in_memory(load_config(mapping))
     assert state.generation == generations
     assert reason in why
-
-
-class Tampering(DirectEvaluator):
-    """Makes some members' results not finite."""
-
-    def __init__(self, worker_spec, spoil):
-        super().__init__(worker_spec)
-        self.spoil = spoil
-
-    def evaluate(self, work):
-        found = zip(work, super().evaluate(work), strict=True)
-        return [self.spoil(c, r) if isinstance(r, EpisodesResult) else r for (_, c), r in found]
 
 
 def test_invalid_members_rank_last_are_counted_and_do_not_stop_the_run():

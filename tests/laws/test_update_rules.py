@@ -19,7 +19,9 @@ from tests.twins import es as twin
 from workers.environments import SHIPPED
 
 fitness_arrays = hnp.arrays(
-    np.float64, st.tuples(st.integers(1, 12), st.just(2)), elements=st.integers(-5, 5).map(float) | st.floats(-1e6, 1e6)
+    np.float64,
+    st.tuples(st.integers(1, 12), st.just(2)),
+    elements=st.integers(-5, 5).map(float) | st.floats(-1e6, 1e6, width=32),
 )
 
 
@@ -48,7 +50,7 @@ def test_standardised_returns_by_hand():
 @given(fitness_arrays, st.sampled_from(["signs", "returns"]), st.randoms(use_true_random=False))
 def test_other_shapings_equal_the_twin_and_no_order_of_pairs_matters(fitness, shaping, random):
     utilities = SHAPINGS[shaping](fitness)
-    np.testing.assert_allclose(utilities.ravel(), twin.SHAPINGS[shaping](fitness.ravel()), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(utilities.ravel(), twin.SHAPINGS[shaping](fitness.ravel()), rtol=1e-6, atol=1e-9)
     order = random.sample(range(len(fitness)), len(fitness))
     np.testing.assert_array_equal(SHAPINGS[shaping](fitness[order]), utilities[order])
 
