@@ -72,6 +72,9 @@ def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, An
     return values, unusable, problems
 
 
+MOST_NAMED = 16
+"""Most keys that a message lists."""
+
 Overrides = Iterable[str] | Mapping[str, Any]
 """Changes of a config: strings such as "search.sigma=0.05", with values in YAML, the last one for a key winning; or a
 mapping from key to value."""
@@ -132,7 +135,9 @@ def _unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:
         if near := nearest(leaf, keys):
             return unfit(name, value, f"unknown key; did you mean {keys[near]}?", suggestion=keys[near])
     if siblings := [_leaf(key) for key in (*GROUPS, *FIELDS) if key.rpartition(".")[0] == section]:
-        return unfit(name, value, f"unknown key; {section or 'the top level'} has {', '.join(siblings)}")
+        named, others = siblings[:MOST_NAMED], len(siblings) - MOST_NAMED
+        more = f" and {others} others" if others > 0 else ""
+        return unfit(name, value, f"unknown key; {section or 'the top level'} has {', '.join(named)}{more}")
     return unfit(name, value, f"unknown key; the sections are {', '.join(SECTIONS)}")
 
 

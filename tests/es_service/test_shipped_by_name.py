@@ -32,7 +32,7 @@ def test_a_name_is_taken_where_no_such_file_exists(tmp_path, monkeypatch):
     assert config_file("point_maze_me_es") == Path("point_maze_me_es")
 
 
-@pytest.mark.parametrize("missing", ["point_maze_mees", "point_maze_me_es.yml", "configs/point_maze_me_es.yaml"])
+@pytest.mark.parametrize("missing", ["point_maze_me_e", "point_maze_me_es.yml", "configs/point_maze_me_es.yaml"])
 def test_a_missing_file_with_a_similar_name_names_the_shipped_config(tmp_path, monkeypatch, missing):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match="did you mean the shipped config point_maze_me_es") as caught:

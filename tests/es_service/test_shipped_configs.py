@@ -9,6 +9,7 @@ import pytest
 
 from es_service.config.loading import load_config
 from es_service.config.model import worker_spec
+from es_service.config.parallel import WITH_EMITTERS
 from es_service.config.presets import preset_values
 from es_service.config.resolution import config_warnings
 from es_service.config.tasks import TASKS
@@ -42,12 +43,12 @@ def test_comments_of_shipped_configs_say_the_numbers_that_are_used(path):
     assert f" {inputs} observations -> {outputs} actions " in said["policy"]
     assert said["hidden"].endswith(f"; here {spec.policy.parameters:,} parameters")
     assert said["episode_steps"].endswith(f", here {spec.episode_steps:,}")
-    assert f"auto: here {list(config.map.cells)}" in said["cells"]
+    assert f"here {list(config.map.cells)}" in said["cells"]
     if config.search.algorithm == "map_elites":  # which has no pairs
         assert said["centres"].endswith(f"auto: {config.search.centres}")
         assert not said.keys() & {"pairs", "chunk_pairs", "rollout_block_pairs", "gradient_block_pairs"}
         return
-    centres = config.search.emitters if config.search.algorithm == "me_es" else 1
+    centres = config.search.emitters if config.search.algorithm in WITH_EMITTERS else 1
     assert said.get("centres", f"auto: {centres}").endswith(f"auto: {config.search.centres}")
     assert said["chunk_pairs"].endswith(f"auto: {compute.chunk_pairs} for {config.search.pairs}")
     block = compute.rollout_block_pairs

@@ -11,7 +11,7 @@ from es_service.protocol.messages import EvaluationChunk, TrainingChunk
 from es_service.search.algorithms.base import NO_CELL, CentreEvaluation
 from es_service.search.algorithms.me_es import CELL_CHOICE, block_mode
 from es_service.search.algorithms.nsra_es import adapted_weight
-from es_service.search.algorithms.steps import first_state, mapped
+from es_service.search.algorithms.steps import archived, first_state, mapped, novelty_of_centres
 from es_service.search.maps.behaviour_map import empty_map
 from es_service.search.maps.geometry import Grid
 from tests.laws.me_es_runs import (
@@ -113,6 +113,18 @@ def test_scores_of_centres_side_by_side_by_hand():
         assert state.map is not None
         assert dict(zip(state.map.cell_N.tolist(), state.map.score_N.tolist(), strict=True)) == scores
         assert [one.cell for one in state.centres] == cells
+
+
+def test_the_novelty_of_a_centre_is_measured_against_the_newest_entries_by_hand():
+    state = first_state([np.zeros(3, np.float32)] * 2, 1, 0.0)
+    for generation, (index, place) in enumerate([(0, 1.0), (0, 5.0), (1, 9.0), (0, 20.0)]):
+        state = archived(state, CentreEvaluation(generation, index, True, 0.0, np.array([place]), 0.0))
+    settings = config_of(neighbours=2).novelty
+    assert novelty_of_centres(state, settings).tolist() == [13.0, 6.0]  # (11 + 15) / 2, (4 + 8) / 2
+    newest = settings.model_copy(update={"newest": 2})
+    assert novelty_of_centres(state, newest).tolist() == [11.0, 11.0]
+    newest = settings.model_copy(update={"newest": 1})
+    assert novelty_of_centres(state, newest).tolist() == [0.0, 11.0], "one has no neighbour but itself"
 
 
 @pytest.mark.parametrize(("algorithm", "weight"), [("ns_es", 0.0), ("nsr_es", 0.5), ("nsra_es", 0.5)])

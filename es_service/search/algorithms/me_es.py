@@ -6,8 +6,7 @@ entered the map. A block either explores, which climbs novelty, or exploits, whi
 
 `emitters` blocks run side by side, each with a centre, an optimiser, a mode and a start cell of its own. All draw from
 the map and the novelty archive as they were before the generation. Block b of emitter e has the mode of block b + e of
-a single one, so that with `alternation: round_robin` half of the emitters explore at any time. (MEMES, Flageat et al.
-2024, arXiv:2303.06137, runs blocks side by side, too.)
+a single one, so that with `alternation: round_robin` half of the emitters explore at any time.
 
 The sources differ in how the elite is drawn (`cell_sampling`):
 
