@@ -62,7 +62,7 @@ KEPT = (
 
 def run_one(config: str, seed: int, settings: tuple[str, ...]) -> dict[str, Any]:
     """One run in this process -> its row."""
-    session._engine = in_this_process
+    session.make_engine = in_this_process
     folder = RUNS / "_".join([config, str(seed), *settings])
     shutil.rmtree(folder, ignore_errors=True)
     budget = (f"budget.env_steps={ENV_STEPS}", "budget.generations=null", f"seed={seed}")

@@ -121,7 +121,7 @@ class InThisProcess:
 
 @contextmanager
 def in_this_process(config: RunConfig, should_stop: Callable[[], int | None], *_: object) -> Iterator[InThisProcess]:
-    """In the place of `session._engine`."""
+    """In the place of `session.make_engine`."""
     yield InThisProcess(config, should_stop)
 
 
@@ -133,7 +133,7 @@ def folder_of(method: str, seed: int, env_steps: int, settings: tuple[str, ...])
 def run_one(method: str, seed: int, env_steps: int, settings: tuple[str, ...], engine: bool) -> dict[str, Any]:
     """One run from its config, or from where it was interrupted, to what is kept of it."""
     if not engine:
-        session._engine = in_this_process
+        session.make_engine = in_this_process
     budget = [f"budget.env_steps={env_steps}", f"budget.generations={env_steps // STEPS_AT_LEAST}"]
     config = api.load_config(
         CONFIGS / f"point_maze_{method.split()[0]}.yaml",

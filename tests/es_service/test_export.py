@@ -23,7 +23,7 @@ CONFIG = {
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    monkeypatch.setattr(session, "_engine", in_this_process)
+    monkeypatch.setattr(session, "make_engine", in_this_process)
     return api.run(api.load_config(CONFIG), tmp_path / "run").run
 
 

@@ -71,7 +71,7 @@ def test_workers_of_several_kinds_make_a_run_mixed_from_the_generation_they_join
     def engine(config, should_stop, *_):
         yield Cluster(config, should_stop)
 
-    monkeypatch.setattr(session, "_engine", engine)
+    monkeypatch.setattr(session, "make_engine", engine)
     told: list[str] = []
     run = api.run(api.load_config(CONFIG), tmp_path / "run", on_notice=told.append).run
     assert checked_parts(run.folder)[1] is mixed

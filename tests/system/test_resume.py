@@ -64,7 +64,7 @@ def test_a_spent_budget_starts_no_engine(finished, tmp_path, monkeypatch, budget
     from es_service.runs import session
 
     shutil.copytree(finished[0], tmp_path / "run")
-    monkeypatch.delattr(session, "_engine")
+    monkeypatch.delattr(session, "make_engine")
     monkeypatch.setattr(session, "platform_info", lambda: {"jax": "99.0"})  # on which nothing is computed
     notices: list[str] = []
     overrides = ["budget.generations=1000", f"budget.{budget}"]
