@@ -28,6 +28,7 @@ from es_service.config.fields import (
 )
 from es_service.config.yaml_text import dump_yaml
 from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
+from es_service.protocol.sources import worker_sources
 
 
 class TaskConfig(Section):
@@ -263,4 +264,5 @@ def worker_spec(config: RunConfig, task: TaskSpec) -> WorkerSpec:
         rollout_block_pairs=compute.rollout_block_pairs,
         gradient_block_pairs=compute.gradient_block_pairs,
         rollout=compute.rollout,
+        sources=worker_sources(settings.environment),
     )

@@ -9,7 +9,6 @@ synchronous, and readers read the copy. After a clean end, `run.db` is a single 
 from __future__ import annotations
 
 import contextlib
-import json
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -32,11 +31,11 @@ from es_service.store.codec import (
     state_sha256,
     state_sum,
     table_bytes,
-    text_sha256,
 )
 from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.lock import RunLock, acquire_lock
+from es_service.store.platforms import newest_before, record
 from es_service.store.repair import open_sound
 from es_service.store.schema import PAGE_BYTES, RunMeta, history_insert, history_select
 from es_service.store.upkeep import Upkeep
@@ -242,15 +241,13 @@ class RunStore:
             raise StoreError(
                 f"{self.folder}: generation {generation} is already stored, so its platform cannot be changed"
             )
-        text = json.dumps(platform, sort_keys=True)
         with self._transaction("recording the platform") as execute:
-            execute("DELETE FROM platform WHERE generation >= ?", (generation,))
-            latest = execute("SELECT platform FROM platform ORDER BY generation DESC LIMIT 1").fetchone()
-            differs = latest is None or latest[0] != text
-            if differs:
-                row = (generation, text, text_sha256(f"platform {generation}", text))
-                execute("INSERT INTO platform (generation, platform, sha256) VALUES (?, ?, ?)", row)
-        return differs
+            return record(execute, generation, platform)
+
+    def platform_before(self, generation: int) -> dict[str, Any] | None:
+        """The platform recorded for the generation before this one; None if there is none."""
+        with self._explaining("reading the platforms"):
+            return newest_before(self._connection.execute, generation)
 
     def close(self) -> None:
         """Make `run.db` a single file and release the lock. This may be called again.
