@@ -209,7 +209,7 @@ def fork(
     `first_block` and `alternation` take effect at once, also in the middle of a block.
 
     Args:
-        generation: one of the parent's last two generations; None: the newest.
+        generation: one whose state the parent keeps: one of its last two, or of `store.keep_every`; None: the newest.
 
     Raises:
         ConfigError: the state does not fit a change (another task, descriptor, network, algorithm or map), or a key

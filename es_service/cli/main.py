@@ -1,5 +1,5 @@
-"""The command line: `es-service run | resume | fork | status | digest | config | list | evaluate | export | submit |
-jobs | logs | stop | bench | doctor`.
+"""The command line: `es-service run | resume | fork | status | digest | config | list | evaluate | export |
+verify | submit | jobs | logs | stop | bench | doctor`.
 
 Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by SIGINT or SIGTERM.
 """
@@ -41,6 +41,7 @@ from es_service.cli.options import (
 from es_service.cli.show import config_, digest_, list_, status
 from es_service.cli.tables.progress import show_progress
 from es_service.cli.tables.status import print_summary
+from es_service.cli.verify import verify
 from es_service.config.loading import left_out
 from es_service.config.parallel import parallel_sentence
 from es_service.config.resolution import config_warnings
@@ -122,7 +123,8 @@ def resume(
 def fork(
     parent: RunArgument,
     generation: Annotated[
-        int | None, typer.Option("--generation", help="One of the parent's last two; default: the newest.")
+        int | None,
+        typer.Option("--generation", help="A generation whose state is kept; default: the newest."),
     ] = None,
     set_: SetOption = None,
     out: OutOption = None,
@@ -190,6 +192,7 @@ def export(
         print(file)
 
 
+app.command()(verify)
 app.add_typer(job_commands)
 app.add_typer(bench, name="bench")
 

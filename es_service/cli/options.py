@@ -30,6 +30,7 @@ EngineOption = Annotated[str | None, typer.Option("--engine", help="What runs th
 StrictOption = Annotated[
     bool, typer.Option("--strict", help="Refuse to continue with other code, packages or kind of processor.")
 ]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 AddressOption = Annotated[
     str | None, typer.Option("--address", help="Ray cluster to join: HOST:PORT, or auto. Implies --engine ray.")
 ]

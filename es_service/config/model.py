@@ -209,6 +209,16 @@ class BudgetConfig(Section):
     target_fitness: Number | None = Field(None, description="Mean evaluation fitness of a centre that ends the run.")
 
 
+class StoreConfig(Section):
+    """What the run folder keeps besides the newest state. May change on resume."""
+
+    keep_every: Count | None = Field(
+        None,
+        description="The states of generations whose number is a multiple of this are kept, so that a later check can "
+        "compute from them and a fork can begin there; null keeps only those of the last two generations.",
+    )
+
+
 class RunConfig(Section):
     """The config of a whole run. Equal configs give equal results, wherever and however often they run."""
 
@@ -219,6 +229,7 @@ class RunConfig(Section):
     map: MapConfig
     budget: BudgetConfig
     compute: ComputeConfig
+    store: StoreConfig
     seed: Seed = Field(0, description="Seed of all random numbers of the run.")
 
     def resolved_yaml(self) -> str:
@@ -228,7 +239,7 @@ class RunConfig(Section):
     def constants(self) -> dict[str, Any]:
         """Values that resume must not change: dotted key -> plain JSON value, in the order of the config."""
         sections = self.model_dump(mode="json")
-        del sections["budget"]
+        del sections["budget"], sections["store"]
         sections["compute"] = {key: sections["compute"][key] for key in COMPUTE_CONSTANTS}
         return flat(sections)
 

@@ -27,6 +27,7 @@ from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, open_run
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
+from es_service.store.codec import Part
 from es_service.store.writer import RunStore
 from workers.actor import WorkerActor
 from workers.policy import initial_parameters
@@ -69,6 +70,7 @@ def work(
         strict: whether workers on another platform than the run's are an error.
     """
     task = task_of(config)
+    store.keep_every = config.store.keep_every
     told = 0
 
     def tell(notice: str) -> None:
@@ -88,7 +90,7 @@ def work(
     search = driver.Search(
         config=config,
         algorithm=ALGORITHMS[config.search.algorithm](config),
-        initial=lambda: _initial(config, store),
+        initial=lambda: initial_centres(config, store.start),
         task=task,
     )
     code = code_of(config)
@@ -175,12 +177,12 @@ def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) 
     )
 
 
-def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Moments]:
+def initial_centres(config: RunConfig, start: Part | None) -> tuple[list[FloatArray], Moments]:
     """The initial centres and observation statistics: random centres without statistics, or copies of the policy of
-    `search.init_from` with its statistics."""
+    `search.init_from` with its statistics, which the run has stored as its start."""
     task, centres = task_of(config), range(config.search.centres)
-    if store.start is not None:
-        return [store.start["centre_D"] for _ in centres], moments_from_arrays(store.start)
+    if start is not None:
+        return [start["centre_D"] for _ in centres], moments_from_arrays(start)
     shape = policy_shape(config, task)
     centres = [initial_parameters(shape, config.policy.init, config.seed, centre) for centre in centres]
     return centres, no_observations(task.observation_size)

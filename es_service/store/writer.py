@@ -34,6 +34,7 @@ from es_service.store.codec import (
 )
 from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
+from es_service.store.kept import earlier_states, outdated_rows
 from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.platforms import newest_before, record
 from es_service.store.repair import open_sound
@@ -60,6 +61,9 @@ class RunStore:
     """Messages for the user about repairs at opening, and about later problems that did not end the run."""
     generation: int | None
     """Newest committed generation; None if there is none."""
+    keep_every: int | None = None
+    """Generations whose number is a multiple of this keep their states; None keeps only the last two states. States of
+    earlier generations that are kept when the run is opened remain."""
     start: Part | None
     """Arrays from which generation 0 starts; None if the run was created without them."""
 
@@ -74,13 +78,14 @@ class RunStore:
         self.meta = verdict.meta
         self.generation = verdict.good
         self._kept = verdict.kept
-        # Parts of which an older row is stored as well, which the generation before the newest needs.
-        self._doubled = [part for part, rows in self._kept.items() if len(rows) > 1]
+        # Parts that the newest generation replaced; the one before it needs their older rows.
+        self._doubled = [part for part, rows in self._kept.items() if len(rows) > 1 and max(rows) == self.generation]
         self._state_sum = 0 if self.generation is None else state_sum(rows_in_force(self._kept, self.generation))
         self._insert_history = history_insert(self.meta.columns)
         try:
             with self._explaining(f"opening {DATABASE}"):
                 self.start = load_start(self._connection)
+                self._earlier = earlier_states(self._connection, self._kept, self.generation)
                 self.upkeep = Upkeep(self._connection, folder, is_network_filesystem(folder), hook, self.notices)
             hook("opened")
         except BaseException:
@@ -191,8 +196,8 @@ class RunStore:
         total = changed_sum(self._state_sum, old, new)
         centres = table_bytes(self.meta.evaluation_columns, evaluations)
         history_values = history_row(self.meta.columns, generation, history, centres, state_sha256(total))
-        # The rows that remain make up the states of the newest generation and of the one before it.
-        outdated = [(part, at) for part in self._doubled for at in self._kept[part] if at < max(self._kept[part])]
+        # The rows that remain make up the states of the newest generation, of the one before it, and of those to keep.
+        outdated = outdated_rows(self._kept, self._doubled, self.keep_every, self._earlier)
         self._hook("before_begin")
         with self._transaction(f"storing generation {generation}") as execute:
             # Delete first, so that the new rows use the pages of the old ones.
