@@ -22,7 +22,7 @@ def outdated_rows(
 
     Args:
         kept: rows that are stored.
-        replaced: parts with a row of the newest generation and an older one; only the latest of these is considered.
+        replaced: parts with several rows, of which the last but one is considered.
         keep_every: states of generations that are multiples of this are kept; None for none.
         earlier: other generations whose states are kept.
     """

@@ -78,8 +78,8 @@ class RunStore:
         self.meta = verdict.meta
         self.generation = verdict.good
         self._kept = verdict.kept
-        # Parts that the newest generation replaced; the one before it needs their older rows.
-        self._doubled = [part for part, rows in self._kept.items() if len(rows) > 1 and max(rows) == self.generation]
+        # Parts of which an older row is stored as well, which the generation before the newest needs.
+        self._doubled = [part for part, rows in self._kept.items() if len(rows) > 1]
         self._state_sum = 0 if self.generation is None else state_sum(rows_in_force(self._kept, self.generation))
         self._insert_history = history_insert(self.meta.columns)
         try:
