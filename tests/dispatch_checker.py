@@ -22,11 +22,12 @@ def read_dispatch_log(folder: Path) -> list[dict[str, Any]]:
 def check_dispatch(folder: Path) -> dict[str, int]:
     """Assert that each chunk was delivered once, by a worker that was there and had it, and generations are contiguous.
 
-    Returns counts: sessions, generations committed, items delivered, chunks handed out again, workers lost.
+    Returns counts: sessions, generations committed, items delivered, chunks handed out again after a fault, chunks sent
+    a second time because a worker was late, workers lost.
     """
     entries = read_dispatch_log(folder)
     assert entries[0]["is"] == "Session"
-    counts = dict.fromkeys(("sessions", "generations", "delivered", "repeated", "lost"), 0)
+    counts = dict.fromkeys(("sessions", "generations", "delivered", "repeated", "copied", "lost"), 0)
     newest = None
     up: set[int] = set()
     holders: dict[tuple, set[int]] = {}
@@ -56,7 +57,9 @@ def check_dispatch(folder: Path) -> dict[str, int]:
             case "Assign":
                 assert worker in up
                 assert item_id in waiting
-                counts["repeated"] += item_id[-1] if item_id in holders else 0
+                if entry["copy"]:
+                    assert len(holders[item_id]) == 1, "of an item that one other worker has"
+                counts["copied" if entry["copy"] else "repeated"] += item_id[-1] if item_id in holders else 0
                 holders.setdefault(item_id, set()).add(worker)
             case "Result":
                 answered = item_id if worker in up and worker in holders.get(item_id, ()) else None

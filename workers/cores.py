@@ -37,13 +37,13 @@ def make_worker_with_cores(spec: WorkerSpec, cores: int) -> RunChunks:
     if cores == 1:
         return make_worker(spec)
     if spec.rollout == "simd":
-        return _divided(ThreadPoolExecutor(cores), make_worker(spec), cores)
+        return divided(ThreadPoolExecutor(cores), make_worker(spec), cores)
     context = get_context("spawn")  # a forked JAX would not work
     pool = ProcessPoolExecutor(cores, context, _begin_child, (spec, os.getpid()))
-    return _divided(pool, _run_child, cores)
+    return divided(pool, _run_child, cores)
 
 
-def _divided(pool: Executor, run: RunChunks, cores: int) -> RunChunks:
+def divided(pool: Executor, run: RunChunks, cores: int) -> RunChunks:
     """Function that runs the parts of a work item side by side."""
 
     def run_parts(work: Sequence[Work]) -> list[ChunkResult]:

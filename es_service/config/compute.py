@@ -45,7 +45,7 @@ class ComputeConfig(Section):
     workers: Literal["auto"] | Count = Field(
         "auto",
         description="Number of workers, each of which is a core. auto: every core of the machine or cluster that has "
-        "work. The number of workers never changes results.",
+        "work; with a number in worker_resources.cpu, it also asks the cluster for more. It never changes results.",
     )
     worker_resources: WorkerResources = Field(
         default_factory=lambda: WorkerResources(cpu="auto", gpu=0.0),
@@ -77,10 +77,15 @@ class ComputeConfig(Section):
         "deadline of later chunks is longer, it applies to the first one too.",
     )
     max_attempts: Count = Field(4, description="Attempts to compute a chunk before the run stops with its error.")
+    place_timeout_s: Positive | None = Field(
+        None,
+        description="With engine ray in a cluster: longest time in seconds for which the run waits for a first place, "
+        "before it stops; null: as long as it takes.",
+    )
     no_worker_timeout_s: Positive = Field(
         120.0,
-        description="Seconds without a live worker after which the run stops, also in a cluster that has no room yet. "
-        "A worker that has not started after half of this time is replaced.",
+        description="Seconds without a live worker, after the first had come up, after which the run stops. A worker "
+        "that has not started after half of this time is replaced.",
     )
     dispatch_log: Switch = Field(
         False,

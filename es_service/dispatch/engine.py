@@ -16,7 +16,15 @@ from typing import Generic, Protocol, Self, TypeVar
 from es_service.dispatch import events
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.scheduler import step
-from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, told_last_words, usual_chunk_s
+from es_service.dispatch.scheduler_state import (
+    initial_state,
+    is_waiting,
+    next_deadline,
+    pending,
+    told_last_words,
+    usual_chunk_s,
+    workers_with_place,
+)
 from es_service.errors import EvaluationError, Interrupted
 from es_service.logs import logger
 from es_service.protocol.evaluator import DispatchCounts
@@ -27,6 +35,9 @@ _RARE = (events.WorkerUp, events.WorkerLost, events.Failure, events.StopWorker)
 """Events and commands that `logging` reports at level INFO."""
 POLL_S = 0.1
 """Longest time in seconds until a request to stop is noticed."""
+NOTICE_S = 5.0
+"""Seconds without a first place after which a run is said to wait. A cluster with room takes less to start a process.
+"""
 
 
 @dataclass(frozen=True)
@@ -52,8 +63,7 @@ class Transport(Protocol):
     """
 
     def start(self, worker: int) -> None:
-        """Begin to start a worker. `WorkerUp` or `WorkerLost` follows; `Placed` comes first if the worker must wait for
-        a place."""
+        """Begin to start a worker. `Placed` follows as soon as it has a place, then `WorkerUp` or `WorkerLost`."""
         ...
 
     def kill(self, worker: int) -> str:
@@ -75,6 +85,10 @@ class Transport(Protocol):
 
     def silent(self) -> tuple[int, ...]:
         """Workers that have no place yet, and workers that may have been gone before they received their work item."""
+        ...
+
+    def shortage(self) -> str:
+        """Text, without a full stop, on why workers may have no place: what each needs, and what there is."""
         ...
 
     def receive(self, timeout_s: float) -> Message | None:
@@ -120,6 +134,7 @@ class Engine(Generic[AnyTransport]):
         limits: events.Limits,
         should_stop: Callable[[], int | None] = lambda: None,
         log: Log = no_log,
+        on_wait: Callable[[str], None] = lambda shortage: None,
     ) -> None:
         """Start `limits.workers` workers. If this raises, which the log can cause, the transport is closed.
 
@@ -129,10 +144,13 @@ class Engine(Generic[AnyTransport]):
             should_stop: called at least every POLL_S seconds while waiting. If it returns a signal number, `evaluate`
                 raises Interrupted.
             log: called with every event and every command, in their order.
+            on_wait: called with `Transport.shortage` when work has waited for a first place for NOTICE_S seconds, and
+                with "" when that wait is over.
         """
         self.transport = transport
         self._should_stop = should_stop
         self._log = log
+        self._on_wait, self._waits = on_wait, False
         self._state = initial_state(limits)
         self._phase = 0
         self._work: dict[Hashable, Sequence[Work]] = {}
@@ -161,13 +179,23 @@ class Engine(Generic[AnyTransport]):
             retries=state.retries, lost_workers=state.lost_workers, workers=state.wanted * state.limits.cores
         )
 
+    def wait_for_place(self) -> None:
+        """Return when a first worker has a place. Work may be given earlier, but then this wait is part of its time.
+
+        Raises:
+            EvaluationError: no worker got a place in time, or none starts.
+            Interrupted: a stop was requested.
+        """
+        while is_waiting(self._state):
+            self._serve()
+
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
         """Results of chunks, all of one kind, in the order of `work`.
 
         They do not depend on the number of workers or on faults. After an exception, only `close` may be called.
 
         Raises:
-            EvaluationError: a work item failed in all its attempts, or no worker starts.
+            EvaluationError: a work item failed in all its attempts, or no worker starts or gets a place.
             Interrupted: a stop was requested.
         """
         while (message := self.transport.receive(0.0)) is not None:
@@ -179,13 +207,7 @@ class Engine(Generic[AnyTransport]):
         self._work, self._results = dict(parts), {}
         self._step(events.Submit(tuple(events.WorkItem(item_id, item_id.kind, item_id.chunks) for item_id, _ in parts)))
         while pending(self._state):
-            if (number := self._should_stop()) is not None:
-                raise Interrupted(number)
-            wait_s = min(POLL_S, max(0.0, next_deadline(self._state) - time.monotonic()))
-            if (message := self.transport.receive(wait_s)) is not None:
-                self._handle(message)
-            else:  # check deadlines only if no message waits, or a late check would kill workers that have answered
-                self._step(events.Tick(self.transport.silent()))
+            self._serve()
         return [result for item_id, _ in parts for result in self._results.pop(item_id)]
 
     def close(self) -> None:
@@ -206,7 +228,9 @@ class Engine(Generic[AnyTransport]):
         if not work:
             return []
         kind, limits = type(work[0][1]).__name__, self._state.limits
-        sizes = item_sizes(len(work), self._state.wanted, usual_chunk_s(self._state, kind), limits.item_s, limits.cores)
+        # Workers that wait for a place may wait for long, and items for them would be needlessly small.
+        workers = workers_with_place(self._state) or self._state.wanted
+        sizes = item_sizes(len(work), workers, usual_chunk_s(self._state, kind), limits.item_s, limits.cores)
         ends = list(itertools.accumulate(sizes))
         firsts = [end - size for end, size in zip(ends, sizes, strict=True)]
         parts = [work[first:end] for first, end in zip(firsts, ends, strict=True)]
@@ -216,6 +240,21 @@ class Engine(Generic[AnyTransport]):
         chunk = part[0][1]
         return WorkItemId(self._phase, first, kind, chunk.generation, chunk.ask, chunk.chunk_id, len(part))
 
+    def _serve(self) -> None:
+        """Handle the next message, or check the deadlines if none arrives for a short time."""
+        if (number := self._should_stop()) is not None:
+            raise Interrupted(number)
+        wait_s = min(POLL_S, max(0.0, next_deadline(self._state) - time.monotonic()))
+        if (message := self.transport.receive(wait_s)) is not None:
+            self._handle(message)
+        else:  # check deadlines only if no message waits, or a late check would kill workers that have answered
+            self._step(events.Tick(self.transport.silent()))
+        since_s = self._state.down_since_s if is_waiting(self._state) else None
+        waits = since_s is not None and time.monotonic() >= since_s + NOTICE_S
+        if waits != self._waits:
+            self._waits = waits
+            self._on_wait(self.transport.shortage() if waits else "")
+
     def _handle(self, message: Message) -> None:
         if not isinstance(message, Answer):
             self._step(message)
@@ -224,6 +263,7 @@ class Engine(Generic[AnyTransport]):
 
     def _step(self, event: events.Event) -> bool:
         """Pass an event to the scheduler and carry out its commands; returns whether it accepted a result."""
+        is_late = isinstance(event, events.Tick) and is_waiting(self._state)
         self._state, commands = step(self._state, event, time.monotonic())
         if commands or not isinstance(event, events.Tick):
             self._tell(event)
@@ -240,7 +280,7 @@ class Engine(Generic[AnyTransport]):
                 case events.Assign(worker, item_id, attempt):
                     self.transport.send(worker, item_id, attempt, self._work[item_id])
         if self._state.failed is not None:
-            raise EvaluationError(self._state.failed)
+            raise EvaluationError(self._state.failed + (f". {self.transport.shortage()}." if is_late else ""))
         return accepted
 
     def _tell(self, entry: events.Event | events.Command) -> None:

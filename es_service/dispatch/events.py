@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 
@@ -38,6 +39,11 @@ class Limits:
     first_deadline_s: float = 600.0
     """Longest time for a worker's first item of a kind, which includes compiling, and for any item while its usual
     duration is not known. If the limit for later items is longer, that limit applies."""
+    late_factor: float = 2.0
+    """A worker is late when its item has taken late_factor x size x median of recent durations of its kind. At the end
+    of a phase, its items are then sent to an idle worker too; with infinity, no item ever is."""
+    late_by_s: float = 0.03
+    """Least time by which a late item exceeds its usual duration, since a copy of a very short item saves nothing."""
     min_deadline_s: float = 30.0
     """Lower bound of the limit for later items."""
     deadline_factor: float = 5.0
@@ -52,9 +58,11 @@ class Limits:
     max_start_failures: int = 3
     """Number of consecutive failed attempts to start workers, with no worker up, after which the run fails. All workers
     that were started before the first of them was lost count as one attempt."""
+    place_timeout_s: float = math.inf
+    """Longest wait for a first place: no worker has come up so far, and none has a place."""
     no_worker_timeout_s: float = 300.0
-    """Longest time in which work items wait and no worker is up. It only has an effect if it is longer than
-    `start_deadline_s`."""
+    """Longest time in which work items wait and no worker is up, after the first had come up. It only has an effect if
+    it is longer than `start_deadline_s`."""
     names: Mapping[str, str] = field(default_factory=dict)
     """Field -> its name in messages, by which a user can change it; other fields keep their own names."""
 
@@ -80,7 +88,7 @@ class Submit:
 
 @dataclass(frozen=True)
 class Placed:
-    """A worker that waited for a place has one and begins to come up."""
+    """A worker has a place and begins to come up."""
 
     worker: int
 
@@ -124,7 +132,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Tick:
-    """Time has passed, so deadlines are checked."""
+    """Time has passed and no message waits, so deadlines are checked, and late items are sent a second time."""
 
     silent: tuple[int, ...] = ()
     """Workers that have no place yet, and workers that may have been gone before they received their work item. If one
@@ -140,7 +148,8 @@ class Drain:
 
 @dataclass(frozen=True)
 class SetWorkers:
-    """The wanted number of workers changes; if it shrinks, the newest are drained. `step` raises ValueError below 1."""
+    """The wanted number of workers changes. If it shrinks, workers without a place are stopped first, then those that
+    have not come up; then the newest are drained. `step` raises ValueError below 1."""
 
     workers: int
 
@@ -173,6 +182,8 @@ class Assign:
     worker: int
     item_id: Hashable
     attempt: int
+    copy: bool = False
+    """Whether it is a second copy of an item that another worker is late with. It is no new attempt."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from typing import IO
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.events import Failure, Limits, WorkerLost, WorkerUp, with_last_words
+from es_service.dispatch.events import Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
 from es_service.protocol.messages import Centre, Work, WorkerSpec, forget_oldest
 from es_service.protocol.process_environment import child_environment
@@ -110,6 +110,7 @@ class ChildProcesses:
             undo.pop_all()
         theirs.close()
         self._add(worker, child, ours)
+        self._ready.append(Placed(worker))
 
     def kill(self, worker: int) -> str:
         """Kill a worker's child, wait for its end and free its resources; other workers of this child are then lost.
@@ -145,6 +146,10 @@ class ChildProcesses:
     def silent(self) -> tuple[int, ...]:
         """Empty, since sockets show at once that a child is gone."""
         return ()
+
+    def shortage(self) -> str:
+        """Empty, since every child that can be started has a place."""
+        return ""
 
     def receive(self, timeout_s: float) -> Message | None:
         """The next message of any worker. A child that closed a socket is killed before its loss is reported."""

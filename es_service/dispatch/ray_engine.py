@@ -24,8 +24,7 @@ from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_faults import error_text, fault_reason
-from es_service.dispatch.ray_nodes import Claim, demand, layout
-from es_service.errors import EvaluationError
+from es_service.dispatch.ray_nodes import Claim, Growth, emptiest, layout, shortage
 from es_service.protocol.messages import Centre, Work, WorkerPlace, WorkerSpec, forget_oldest
 
 IN_CALL_BYTES = 64 * 2**10
@@ -43,6 +42,7 @@ def ray_engine(
     gpus: float = 0.0,
     most: int | None = None,
     log: Log = no_log,
+    on_wait: Callable[[str], None] = lambda shortage: None,
 ) -> Engine[Actors]:
     """Engine whose workers are Ray actors, which are starting.
 
@@ -54,8 +54,9 @@ def ray_engine(
         cpus: cores of each worker, which must divide the number of cores in `limits`; None: in a cluster that is
             joined as many as each node has, see `actor_cores`, else 1.
         gpus: GPUs of each worker, or the share of one.
-        most: use as many cores as there is room for, up to this number and also when the room changes; None: use the
-            number in `limits`.
+        most: use as many cores as there is room for, up to this number and also when the room changes, and ask for
+            more if `cpus` is given, see `ASKED_AHEAD`; None: use the number in `limits`.
+        on_wait: as in `Engine`; not called in a Ray of our own, which has room.
 
     Raises:
         EvaluationError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
@@ -63,10 +64,10 @@ def ray_engine(
     """
     ray = connect(address, gpus=bool(gpus), cpus=limits.workers if most is None else cores())
     try:
-        claim, limits = layout(ray, limits, cpus, gpus, most, ours=address is None)
+        claim, limits, growth = layout(ray, limits, cpus, gpus, most, ours=address is None)
         watch = None if address is None else Watch(ray, claim)
-        transport = Actors(ray, spec, actor, claim, watch, None if most is None else -(-most // claim.cpus), limits)
-        return Engine(transport, limits, should_stop, log)
+        transport = Actors(ray, spec, actor, claim, watch, growth, limits.workers)
+        return Engine(transport, limits, should_stop, log, (lambda shortage: None) if watch is None else on_wait)
     except BaseException:
         disconnect(ray)
         raise
@@ -93,29 +94,30 @@ class Actors:
         actor: type,
         claim: Claim,
         watch: Watch | None,
-        most: int | None,
-        limits: Limits,
+        growth: Growth | None,
+        workers: int,
     ) -> None:
         """Make a transport without workers.
 
         Args:
             watch: watch of the cluster that was joined; None in a Ray of our own, whose only node is this machine.
-            most: when the room for workers changes, `SetWorkers` follows it up to this number; None: no `SetWorkers`.
-            limits: limits that contain the longest wait for the first place.
+            growth: when the room for workers changes, `SetWorkers` follows it; None: no `SetWorkers`.
+            workers: number of workers wanted at the start.
         """
         self._ray = ray
-        self._spec, self._claim, self._limits = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim, limits
+        self._spec, self._claim = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim
         self._class = ray.remote(
             num_cpus=claim.cpus,
             num_gpus=claim.gpus,
             max_restarts=0,
             max_task_retries=0,
-            scheduling_strategy="SPREAD",
         )(actor)
-        self._watch, self._most, self._wanted = watch, most, limits.workers
+        self._watch, self._growth, self._wanted = watch, growth, workers
         self._handles: dict[int, Any] = {}
         self._calls: dict[Any, _Call] = {}
         self._places: dict[int, WorkerPlace] = {}
+        self._planned: dict[int, str] = {}
+        """Worker id -> node, for workers that have no place yet and are to be placed on a certain node."""
         self._platforms: set[str] = set()
         self._drained: set[int] = set()
         self._has_lost = False
@@ -126,9 +128,6 @@ class Actors:
         self._inbox: deque[Message] = deque()
         self._centres: dict[int, tuple[Centre, Any]] = {}
         """By `id`, which the centre in the entry keeps from being reused."""
-        # Ray would wait for ever. The scheduler's time with the same limit starts later, so the error is raised here,
-        # where it can name the resources that are free in the cluster.
-        self._placed_by_s = time.monotonic() + limits.no_worker_timeout_s
 
     def places(self) -> dict[int, WorkerPlace]:
         """Worker id -> place, for the workers that have one."""
@@ -137,9 +136,8 @@ class Actors:
     def start(self, worker: int) -> None:
         """Ask Ray for an actor. It is up when it has a place and has built its functions."""
         try:
-            handle = self._class.remote(
-                self._spec, worker, self._claim.gpus, 1 if self._claim.gpus else self._claim.cpus
-            )
+            at = self._class.options(scheduling_strategy=self._strategy(worker))
+            handle = at.remote(self._spec, worker, self._claim.gpus, 1 if self._claim.gpus else self._claim.cpus)
             self._handles[worker] = handle
             self._calls[handle.place.remote()] = _Call(worker, "place")
             self._calls[handle.build.remote()] = _Call(worker, "build")
@@ -152,6 +150,7 @@ class Actors:
         for ref in [ref for ref, call in self._calls.items() if call.worker == worker]:
             del self._calls[ref]
         self._places.pop(worker, None)
+        self._planned.pop(worker, None)
         handle = self._handles.pop(worker, None)
         self._to_ask = set(self._handles)
         if handle is not None:
@@ -191,12 +190,12 @@ class Actors:
         """Workers that have not answered the call for their place."""
         return tuple(worker for worker, what in self._owed_first().items() if what == "place")
 
-    def receive(self, timeout_s: float) -> Message | None:
-        """The next message.
+    def shortage(self) -> str:
+        """What a worker needs and the cluster has; this waits for the head node."""
+        return shortage(self._ray, self._claim, None if self._watch is None else self._watch.latest())
 
-        Raises:
-            EvaluationError: no actor got a place in time, or the cluster does not answer any more.
-        """
+    def receive(self, timeout_s: float) -> Message | None:
+        """The next message. Raises EvaluationError if the cluster does not answer any more."""
         if self._watch is not None:
             self._follow(self._watch)
         if self._inbox:
@@ -212,14 +211,6 @@ class Actors:
             if (message := self._message(ready[0])) is not None:
                 return message
             timeout_s = 0.0  # a worker confirmed its place; another answer may be waiting, so do not return None
-        if not self._places and time.monotonic() > self._placed_by_s:
-            time_s = f"{self._limits.no_worker_timeout_s:g} s ({self._limits.name_of('no_worker_timeout_s')})"
-            if self._watch is None:  # there is a place for each worker, so the processes do not start or are very slow
-                raise EvaluationError(f"no worker's process answered within {time_s}. {demand(self._ray, self._claim)}")
-            raise EvaluationError(
-                f"no worker got a place in the cluster within {time_s}. {demand(self._ray, self._claim)}. Add nodes to "
-                "the cluster, or stop other programs that use it."
-            )
         return None
 
     def close(self) -> None:
@@ -263,7 +254,7 @@ class Actors:
             return WorkerUp(call.worker)
         is_known = call.worker in self._places  # then it was asked again, to find out whether it is alive
         self._places[call.worker] = WorkerPlace(*value)
-        self._placed_by_s = float("inf")
+        self._planned.pop(call.worker, None)
         return None if is_known else Placed(call.worker)
 
     def _follow(self, watch: Watch) -> None:
@@ -279,9 +270,19 @@ class Actors:
             self._nodes |= now.alive
             for worker in [worker for worker, place in self._places.items() if place.node in gone]:
                 self._lose(worker, f"{self._places[worker]}: its node died")
-        if self._most is not None and now.room and min(now.room, self._most) != self._wanted:
-            self._wanted = min(now.room, self._most)
-            self._inbox.append(SetWorkers(self._wanted))
+        if self._growth is not None and (wanted := self._growth.wanted(now, self._wanted)) != self._wanted:
+            self._wanted = wanted
+            self._inbox.append(SetWorkers(wanted))
+
+    def _strategy(self, worker: int) -> Any:
+        """Where Ray should place a worker: with several cores, on the node that is most free. If none is, the worker
+        waits for any node, and an autoscaler sees it; it does not see workers that wait for a certain node."""
+        free = {} if self._watch is None or self._claim.cpus == 1 else self._watch.latest().free
+        if (node := emptiest(free, self._planned.values())) is None:
+            return "SPREAD"
+        self._planned[worker] = node
+        affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
+        return affinity(node, soft=True, _spill_on_unavailable=True)
 
     def _owed_first(self) -> dict[int, str]:
         """Worker id -> method of its first unanswered call: place, build or run."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 
@@ -23,24 +24,50 @@ class Claim:
 
 
 ONE_CORE = Claim()
+ASKED_AHEAD = 32
+"""Most workers for which a cluster has no room, and for which a run with `workers: auto` still asks. An autoscaler sees
+them as demand and starts nodes for them. Each of them is an actor that Ray must keep."""
 
 
 @dataclass(frozen=True)
 class Membership:
     """The nodes of a cluster at one moment."""
 
-    room: int
-    """Number of workers for which the nodes that are alive and not leaving have room."""
+    rooms: Mapping[str, int]
+    """Node id -> number of workers for which it has room, used or not, for the nodes that are alive and not leaving."""
+    free: Mapping[str, int]
+    """Node id -> number of further workers for which it has room now, for the same nodes."""
     leaving: frozenset[str]
     """Ids of the nodes that are being drained."""
     alive: frozenset[str]
     """Ids of the nodes that are alive, including those that are being drained."""
 
+    @property
+    def room(self) -> int:
+        """Number of workers for which these nodes have room."""
+        return sum(self.rooms.values())
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How many workers a run with `workers: auto` asks a cluster for."""
+
+    most: int
+    """Number of workers for which there is work."""
+    ahead: int = 0
+    """Number of workers that it asks for beyond the room in the cluster."""
+
+    def wanted(self, nodes: Membership, before: int) -> int:
+        """Number of workers to ask for; as `before` if nothing is known of the nodes, or if all with room are gone."""
+        if not nodes.alive or not nodes.room + self.ahead:
+            return before
+        return min(nodes.room + self.ahead, self.most)
+
 
 def layout(
     ray: ModuleType, limits: Limits, cpus: int | None, gpus: float, most: int | None, *, ours: bool
-) -> tuple[Claim, Limits]:
-    """What each worker claims, and the limits with the number of workers and their cores.
+) -> tuple[Claim, Limits, Growth | None]:
+    """What each worker claims, the limits with the number of workers and their cores, and how that number changes.
 
     Args:
         limits: with the number of cores of all workers together as the number of workers.
@@ -50,16 +77,23 @@ def layout(
     Raises:
         EvaluationError: it is ours and has no room for a worker; there will never be any.
     """
+    # An autoscaler starts a node for an actor of a size that was given. One core, which stands for a cluster without
+    # nodes, would be no such size.
+    ahead = 0 if ours or cpus is None else ASKED_AHEAD
     if cpus is None:  # on one machine, actors with one core were measured to be as fast or faster
         nodes = [] if ours or gpus else cores_of_nodes(ray)
         cpus = actor_cores(nodes, limits.workers if most is None else None, most)
     claim = Claim(cpus, gpus)
-    room = look(ray, claim).room
-    if ours and not room:
+    nodes = look(ray, claim)
+    if ours and not nodes.room:
         text = f"this machine has no room for a worker. {demand(ray, claim)}. Lower compute.worker_resources."
         raise EvaluationError(text)
-    workers = limits.workers // cpus if most is None else max(1, min(room, -(-most // cpus)))
-    return claim, replace(limits, workers=workers, cores=cpus)
+    if ours:  # it has room, so a worker without a place is one whose process does not start
+        names = {**limits.names, "place_timeout_s": limits.name_of("no_worker_timeout_s")}
+        limits = replace(limits, place_timeout_s=limits.no_worker_timeout_s, names=names)
+    growth = None if most is None else Growth(-(-most // cpus), ahead)
+    workers = limits.workers // cpus if growth is None else growth.wanted(nodes, before=1)
+    return claim, replace(limits, workers=workers, cores=cpus), growth
 
 
 def actor_cores(nodes: Sequence[int], workers: int | None, most: int | None) -> int:
@@ -90,8 +124,38 @@ def look(ray: ModuleType, claim: Claim) -> Membership:
     """The nodes of the cluster now. This blocks until the head node answers."""
     leaving = frozenset(_draining(ray))
     alive = {node["NodeID"]: node["Resources"] for node in ray.nodes() if node["Alive"]}
-    room = sum(_room(resources, claim) for node, resources in alive.items() if node not in leaving)
-    return Membership(room, leaving, frozenset(alive))
+    rooms = {node: _room(resources, claim) for node, resources in alive.items() if node not in leaving}
+    unused = _unused(ray)
+    free = {node: _room(unused.get(node, {}), claim) for node in rooms}
+    return Membership(rooms, free, leaving, frozenset(alive))
+
+
+def emptiest(free: Mapping[str, int], planned: Iterable[str]) -> str | None:
+    """The node that has room for the most further workers, the first of equal ones; None if no node has any.
+
+    Args:
+        free: as in `Membership`.
+        planned: the node of each worker that is to be placed there.
+    """
+    workers = Counter(planned)
+    left = {node: room - workers[node] for node, room in free.items()}
+    node = max(left, key=left.__getitem__, default=None)
+    return node if node is not None and left[node] > 0 else None
+
+
+def shortage(ray: ModuleType, claim: Claim, nodes: Membership | None) -> str:
+    """Text, without a full stop, on why workers have no place, and what can be done about it.
+
+    Args:
+        nodes: those of the cluster that was joined; None: a Ray of our own, which has room.
+    """
+    if nodes is None:
+        advice = "The processes of the workers do not start or are very slow"
+    elif nodes.room:
+        advice = "Add nodes to the cluster, or stop other programs that use it"
+    else:
+        advice = f"No node has {claim}; add one that does, or lower compute.worker_resources"
+    return f"{demand(ray, claim)}. {advice}"
 
 
 def demand(ray: ModuleType, claim: Claim) -> str:
@@ -115,6 +179,16 @@ def _room(resources: dict[str, float], claim: Claim) -> int:
 def _resources(amounts: dict[str, float]) -> str:
     """Text with the numbers of CPUs and GPUs."""
     return ", ".join(f"{amounts.get(name, 0.0):g} {name}" for name in ("CPU", "GPU"))
+
+
+def _unused(ray: ModuleType) -> dict[str, dict[str, float]]:
+    """Node id -> resources that nobody uses now.
+
+    Ray has no public function for this. If a version of Ray lacks this one, no node counts as free, and Ray chooses.
+    """
+    with contextlib.suppress(AttributeError):
+        return ray._private.state.available_resources_per_node()
+    return {}
 
 
 def _draining(ray: ModuleType) -> dict[str, int]:

@@ -15,26 +15,26 @@ Rules:
 * Only the item that a worker was running is charged with the loss of the worker. An item that waited behind it keeps
   its attempts, and so does an item sent to a worker that was gone already, if the transport reports this. Thus the loss
   of a machine with many workers is one fault, however many of them are tried before all are known to be gone.
-* The loss of a draining worker is no fault.
-* A worker that gets no place in time is replaced, because it may have failed before it could report its place. It does
-  not count as lost.
+* The loss of a draining worker is no fault, nor is a missing place: a worker that gets none in time is replaced,
+  because it may have failed before it could report its place, and does not count as lost.
 * Workers that are lost before they come up count as a failed attempt to start workers. They count as another failed
   attempt only if they were started after the first of them was lost.
 
-assignment.py decides which worker gets which item, and sets the deadlines of items. scheduler_changes.py keeps the
-containers of the state consistent.
+assignment.py decides which worker gets which item, and sets the deadlines of items. stragglers.py decides which items
+are sent a second time. scheduler_changes.py keeps the containers of the state consistent.
 
 Cost: a step copies the containers of the state, whose copies are cheap (cheap_copies.py), and looks only at the workers
 and items that its event concerns and at those that it stops or assigns. An event takes about 12 microseconds with
-10 workers and items, and 19 with 10,000 items (tests/benchmarks/dispatch_scale.py). Only `SetWorkers`, and an event
-that makes the run fail, look at all workers. A free worker passes over those items in the queue that failed on it.
+10 workers and items, and 19 with 10,000 items (tests/benchmarks/dispatch_scale.py). Only `SetWorkers`, a failure of the
+run, and events before a first worker is up look at all workers. A free worker passes over items that failed on it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable
 
-from es_service.dispatch.assignment import assign, begin_first_slot
+from es_service.dispatch.assignment import add_duration, assign, begin_first_slot
 from es_service.dispatch.cheap_copies import Sorted, Table
 from es_service.dispatch.events import (
     Command,
@@ -55,17 +55,21 @@ from es_service.dispatch.events import (
 )
 from es_service.dispatch.scheduler_changes import append_items, drop_item, pop_worker, put_worker, return_item
 from es_service.dispatch.scheduler_state import (
+    IN_TIME,
+    LATE,
     SchedulerState,
     Worker,
+    by_progress,
+    down_limit,
     find_slot,
     holds,
+    is_down,
     late_workers,
     next_deadline,
+    with_own_containers,
     without,
 )
-
-RECENT_DURATIONS = 31
-"""Number of durations per kind of work item from which the running median is computed."""
+from es_service.dispatch.stragglers import note_late_workers, send_copies
 
 
 def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerState, list[Command]]:
@@ -80,16 +84,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
     if state.failed is not None or (isinstance(event, Tick) and now < next_deadline(state)):
         return state, []
     # Only the containers of `s` are changed in place, since no other state has them before this step returns.
-    s = state._replace(
-        starting=state.starting.copy(),
-        up=state.up.copy(),
-        draining=state.draining.copy(),
-        deadlines=state.deadlines.copy(),
-        free=state.free.copy(),
-        items=state.items.copy(),
-        places=state.places.copy(),
-        durations_s=state.durations_s.copy(),
-    )
+    s = with_own_containers(state)
     out: list[Command] = []
     match event:
         case Result(worker, item_id, attempt):
@@ -98,7 +93,8 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
             append_items(s, items)
         case Placed(worker):
             if (record := s.starting.get(worker)) is not None:
-                put_worker(s, s.starting, worker, record._replace(deadline_s=now + s.limits.start_deadline_s))
+                deadline_s = now + s.limits.start_deadline_s
+                put_worker(s, s.starting, worker, record._replace(deadline_s=deadline_s, placed=True))
         case WorkerUp(worker):
             if pop_worker(s, s.starting, worker) is not None:
                 put_worker(s, s.up, worker, Worker(s.next_rank))
@@ -108,6 +104,7 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
         case Failure():
             s = _failure(s, out, event, now)
         case Tick(silent):
+            note_late_workers(s, now)
             s = _expire(s, out, now, silent)
         case Drain(worker):
             s = _drain(s, out, worker)
@@ -115,14 +112,15 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
             if wanted < 1:
                 raise ValueError(f"SetWorkers({wanted}): the number of workers must be at least 1")
             s = s._replace(wanted=wanted)
-            for worker in sorted([*s.starting, *s.up])[wanted:]:
+            for worker in by_progress(s)[wanted:]:
                 s = _drain(s, out, worker)
     if s.failed is None:
         s = _start_workers(s, out, now)
         s = assign(s, out, now)
-        down = bool(s.items) and not s.up and not s.draining
-        if down != (s.down_since_s is not None):
-            s = s._replace(down_since_s=now if down else None)
+        if isinstance(event, Tick):
+            s = send_copies(s, out, now)
+        if is_down(s) != (s.down_since_s is not None):
+            s = s._replace(down_since_s=now if s.down_since_s is None else None)
     return s, out
 
 
@@ -132,7 +130,7 @@ def _result(
     record = s.up.get(worker) or s.draining.get(worker)
     if record is None:
         return s._replace(duplicates=s.duplicates + 1)
-    if drop_item(s, item_id):
+    if delivered := drop_item(s, item_id):
         out.append(Deliver(item_id))
         if s.losses_in_a_row:
             s = s._replace(losses_in_a_row=0)
@@ -140,14 +138,16 @@ def _result(
         s = s._replace(duplicates=s.duplicates + 1)
     index = find_slot(record, item_id, attempt)
     if index is not None:
-        item, warm = record.slots[index].item, record.warm
-        # For an answer out of order, neither its duration nor whether it included compiling is known.
-        if index == 0 and item.kind in warm:
-            duration_s = (now - record.started_s) / item.size
-            s.durations_s[item.kind] = (*s.durations_s.get(item.kind, ()), duration_s)[-RECENT_DURATIONS:]
-        elif index == 0:
+        item = record.slots[index].item
+        warm, pace = record.warm, record.pace
+        # The duration is not known of an answer out of order, nor of a superseded one, which may have been read late.
+        if index == 0 and delivered:
+            pace = IN_TIME if record.late_s > -math.inf else LATE
+            if item.kind in warm:  # else it may include compiling
+                add_duration(s, item.kind, (now - record.started_s) / item.size)
+        if index == 0 and item.kind not in warm:
             warm = warm | {item.kind}
-        record = record._replace(slots=without(record.slots, index), warm=warm, failures_in_a_row=0)
+        record = record._replace(slots=without(record.slots, index), warm=warm, pace=pace, failures_in_a_row=0)
         _close_slot(s, out, worker, record, index, now)
     return s
 
@@ -166,8 +166,7 @@ def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) 
         out.append(StopWorker(worker, reason))
         # The item that it has just begun is not charged.
         s = _lose(s, out, worker, reason, now, charge=False)
-    waiting = s.items.get(item_id)
-    if waiting is None or waiting.holder != worker:
+    if not holds(s, worker, item_id):
         return s._replace(duplicates=s.duplicates + 1)
     return_item(s, worker, item_id)
     return _charge(s, out, item_id, f"it raised an exception on worker {worker}: {event.message}")
@@ -248,7 +247,6 @@ def _fail(s: SchedulerState, out: list[Command], message: str) -> SchedulerState
 
 def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int, ...]) -> SchedulerState:
     """Stop every worker whose deadline has passed; the run fails if no worker was up for too long."""
-    limits = s.limits
     for worker in late_workers(s, now):
         if s.failed is None:
             reason = _missed_deadline(s, worker)
@@ -256,11 +254,11 @@ def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int
             is_silent = worker in silent
             has_no_place = is_silent and worker in s.starting
             s = _lose(s, out, worker, reason, now, fault=not has_no_place, charge=not is_silent)
-    if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + limits.no_worker_timeout_s:
-        for_s = f"{_plain(limits.no_worker_timeout_s)} s ({limits.name_of('no_worker_timeout_s')})"
-        return _fail(
-            s, out, f"no worker was up for {for_s} while {len(s.items)} work items waited; last loss: {s.last_loss}"
-        )
+    name, limit_s = down_limit(s)
+    if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + limit_s:
+        for_s = f"for {_plain(limit_s)} s ({s.limits.name_of(name)})"
+        text = f"was up {for_s} while {len(s.items)} work items waited" if s.next_rank else f"got a place {for_s}"
+        return _fail(s, out, f"no worker {text}; last loss: {s.last_loss}")
     return s
 
 

@@ -13,6 +13,9 @@ from typing import NamedTuple
 from es_service.dispatch.cheap_copies import Sorted, Table
 from es_service.dispatch.events import Limits, WorkItem, with_last_words
 
+IN_TIME, LATE, NEW = range(3)
+"""Values of `Worker.pace`, best first."""
+
 
 class Waiting(NamedTuple):
     """A work item that has not been delivered."""
@@ -23,6 +26,10 @@ class Waiting(NamedTuple):
     """Its place in the queue, smaller than the places of later items; None while it is assigned to a worker."""
     holder: int | None = None
     """The worker that the item is assigned to; None while it is in the queue."""
+    second: int | None = None
+    """The worker that has a second copy of the item; None if there is no copy."""
+    late: int | None = None
+    """Its place in `SchedulerState.late`; None if it is not there."""
     last_holder: int | None = None
     """The worker that last had the item without delivering it; None if there was none."""
 
@@ -45,12 +52,20 @@ class Worker(NamedTuple):
     """Time at which it began the first slot."""
     deadline_s: float = math.inf
     """Time by which it must come up, or answer the first slot."""
+    late_s: float = math.inf
+    """Time from which it is late with the first slot; infinity if the usual duration is not known, and -infinity once
+    it is known to be late."""
+    pace: int = NEW
+    """IN_TIME or LATE, as it was with its last item or is known to be with the first slot; NEW before its first answer.
+    """
     limit: str = ""
     """Field of `Limits` that determines the deadline for the first slot."""
     warm: frozenset[str] = frozenset()
     """Kinds of which it has finished a work item, so that it need not compile for them again."""
     failures_in_a_row: int = 0
     """Consecutive work items that raised an exception."""
+    placed: bool = False
+    """Whether it is starting and has reported its place."""
 
 
 class SchedulerState(NamedTuple):
@@ -66,13 +81,17 @@ class SchedulerState(NamedTuple):
     draining: Table[int, Worker]
     """Workers that finish their work items and get no others."""
     deadlines: Sorted[tuple[float, int]]
-    """(deadline, worker) of every worker of these three groups that has a deadline."""
-    free: Sorted[tuple[int, int, int]]
-    """(number of its slots, rank, worker) of every worker that can be assigned another work item."""
+    """(next time at which it is late or must be stopped, worker) of every worker of these three groups that has one."""
+    free: Sorted[tuple[int, int, int, int]]
+    """(number of its slots, pace, rank, worker) of every worker that can be assigned another work item."""
+    in_time: Sorted[tuple[int]]
+    """Every worker that is up and IN_TIME."""
     items: Table[Hashable, Waiting]
     """Work items that have not been delivered, by id."""
     places: Sorted[tuple[int, Hashable]]
     """(place, id) of every work item in the queue."""
+    late: Sorted[tuple[int, Hashable]]
+    """(place, id) of every work item that may be sent a second time, see stragglers.py."""
     durations_s: dict[str, tuple[float, ...]]
     """Kind -> recent durations of one chunk, without those that may include compiling."""
     next_worker: int = 0
@@ -88,7 +107,7 @@ class SchedulerState(NamedTuple):
     tried: int = 0
     """Workers with a lower id were started before the last of these failures was counted, and belong to it."""
     down_since_s: float | None = None
-    """Time since which work items wait and no worker is up; None if this is not so."""
+    """Time since which `is_down`; None if this is not so."""
     last_lost: int | None = None
     """The worker that was lost last."""
     last_loss: str = "no worker was lost"
@@ -99,6 +118,8 @@ class SchedulerState(NamedTuple):
     """Chunks that were assigned again, counted at each assignment of a work item after the first."""
     lost_workers: int = 0
     """Workers that were lost, or stopped because of a fault."""
+    copies: int = 0
+    """Chunks that were sent a second time because a worker was late with them; these are no retries."""
     duplicates: int = 0
     """Results and failures that were ignored: outdated, repeated, or from an unknown worker."""
 
@@ -111,7 +132,34 @@ class SchedulerState(NamedTuple):
 def initial_state(limits: Limits) -> SchedulerState:
     """State without work items and workers; the first step starts the workers, whatever its event is."""
     return SchedulerState(
-        limits, limits.workers, Table(), Table(), Table(), Sorted(), Sorted(), Table(), Sorted(), durations_s={}
+        limits,
+        limits.workers,
+        starting=Table(),
+        up=Table(),
+        draining=Table(),
+        deadlines=Sorted(),
+        free=Sorted(),
+        in_time=Sorted(),
+        items=Table(),
+        places=Sorted(),
+        late=Sorted(),
+        durations_s={},
+    )
+
+
+def with_own_containers(state: SchedulerState) -> SchedulerState:
+    """An equal state whose containers may be changed, since no other state has them."""
+    return state._replace(
+        starting=state.starting.copy(),
+        up=state.up.copy(),
+        draining=state.draining.copy(),
+        deadlines=state.deadlines.copy(),
+        free=state.free.copy(),
+        in_time=state.in_time.copy(),
+        items=state.items.copy(),
+        places=state.places.copy(),
+        late=state.late.copy(),
+        durations_s=state.durations_s.copy(),
     )
 
 
@@ -126,17 +174,66 @@ def usual_chunk_s(state: SchedulerState, kind: str) -> float | None:
     return statistics.median(durations_s) if durations_s else None
 
 
+def is_down(state: SchedulerState) -> bool:
+    """Whether work items wait and no worker is up; before the first has come up, whether none has a place.
+
+    The time in which one that has a place comes up is limited by `start_deadline_s`.
+    """
+    if state.up or state.draining:
+        return False
+    if state.next_rank:
+        return bool(state.items)
+    return not any(state.starting[worker].placed for worker in state.starting)
+
+
+def is_waiting(state: SchedulerState) -> bool:
+    """Whether the run waits for its first place: `is_down`, and no worker has come up so far."""
+    return state.down_since_s is not None and not state.next_rank
+
+
+def down_limit(state: SchedulerState) -> tuple[str, float]:
+    """Field of `Limits` that limits the time for which the state `is_down`, and its value in seconds."""
+    name = "no_worker_timeout_s" if state.next_rank else "place_timeout_s"
+    return name, getattr(state.limits, name)
+
+
+def workers_with_place(state: SchedulerState) -> int:
+    """Number of workers that can be assigned work items, now or when they have come up."""
+    return len(state.up) + sum(state.starting[worker].placed for worker in state.starting)
+
+
+def by_progress(state: SchedulerState) -> list[int]:
+    """Workers that are up, then those that start and have a place, then those that wait for one; each oldest first."""
+    return [*sorted(state.up), *sorted(state.starting, key=lambda worker: (not state.starting[worker].placed, worker))]
+
+
 def next_deadline(state: SchedulerState) -> float:
     """Time of the next deadline, at which a `Tick` has an effect; infinity if there is none."""
     if state.failed is not None:
         return math.inf
+    if state.late and has_idle_worker_for_copies(state):
+        return -math.inf
     first = state.deadlines.first()
     at_s = first[0] if first is not None else math.inf
     if len(state.starting) + len(state.up) < state.wanted:
         at_s = min(at_s, state.start_at_s)
     if state.down_since_s is not None:
-        at_s = min(at_s, state.down_since_s + state.limits.no_worker_timeout_s)
+        at_s = min(at_s, state.down_since_s + down_limit(state)[1])
     return at_s
+
+
+def next_time(worker: Worker) -> float:
+    """Next time at which a worker is late or must be stopped; infinity if there is none."""
+    late_s, deadline_s = worker.late_s, worker.deadline_s
+    return late_s if -math.inf < late_s < deadline_s else deadline_s
+
+
+def has_idle_worker_for_copies(state: SchedulerState) -> bool:
+    """Whether the queue is empty, and an idle worker can take an item of another one, as stragglers.py explains."""
+    if not state.late or state.places or state.limits.late_factor == math.inf:
+        return False
+    first = state.free.first()
+    return first is not None and (first[:2] == (0, IN_TIME) or (first[:2] == (0, LATE) and not state.in_time))
 
 
 def late_workers(state: SchedulerState, now: float) -> list[int]:
@@ -181,4 +278,4 @@ def without(slots: tuple[Slot, ...], index: int) -> tuple[Slot, ...]:
 def holds(state: SchedulerState, worker: int, item_id: Hashable) -> bool:
     """Whether a work item is assigned to a worker and has not been delivered."""
     waiting = state.items.get(item_id)
-    return waiting is not None and waiting.holder == worker
+    return waiting is not None and worker in (waiting.holder, waiting.second)

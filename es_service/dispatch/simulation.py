@@ -15,7 +15,7 @@ from itertools import count
 from es_service.dispatch import events
 from es_service.dispatch.engine import item_sizes
 from es_service.dispatch.scheduler import step
-from es_service.dispatch.scheduler_state import SchedulerState, initial_state, pending, usual_chunk_s
+from es_service.dispatch.scheduler_state import SchedulerState, initial_state, next_deadline, pending, usual_chunk_s
 
 ROUNDS = 4
 """Simulated generations; the last one counts, when the scheduler knows the durations of all kinds of chunks."""
@@ -68,6 +68,8 @@ def predict(
     cores: int,
     longest_part: Callable[[int], float],
     clock: Callable[[], float] = time.perf_counter,
+    slowness: Callable[[int], float] = lambda actor: 1.0,
+    late_factor: float = events.Limits.late_factor,
 ) -> Prediction:
     """Simulate generations.
 
@@ -76,56 +78,89 @@ def predict(
         cores: cores of each.
         longest_part: number of chunks in a work item -> number of chunks that the busiest core of an actor runs.
         clock: measures the time of the scheduler.
+        slowness: number of an actor -> how many times as long as in `costs` it takes for a chunk.
+        late_factor: as in `Limits`; infinity: no item is sent a second time.
     """
     limits = events.Limits(
-        workers=actors, cores=cores, first_deadline_s=NEVER_S, min_deadline_s=NEVER_S, start_deadline_s=NEVER_S
+        workers=actors,
+        cores=cores,
+        first_deadline_s=NEVER_S,
+        min_deadline_s=NEVER_S,
+        start_deadline_s=NEVER_S,
+        late_factor=late_factor,
     )
     state, _ = step(initial_state(limits), events.Tick(), 0.0)
     for worker in range(actors):
         state, _ = step(state, events.WorkerUp(worker), 0.0)
-    now, taken = 0.0, {}
+
+    def seconds_of(worker: int, kind: str, chunks: int) -> float:
+        return costs.chunk_s[kind] * longest_part(chunks) * slowness(worker)
+
+    cluster = _Cluster(state, costs, seconds_of, clock)
+    taken: dict[str, float] = {}
     for generation in range(ROUNDS):
-        taken = {}
         for phase in phases:
-            begun = now
-            state, now = _play(state, phase, costs, now, generation, longest_part, clock)
-            taken[phase.name] = now - begun
+            begun = cluster.now
+            cluster.play(phase, generation)
+            taken[phase.name] = cluster.now - begun
+        cluster.now += costs.driver_s
     return _judge(phases, costs, actors * cores, taken)
 
 
-def _play(
-    state: SchedulerState,
-    phase: Phase,
-    costs: Costs,
-    now: float,
-    generation: int,
-    longest_part: Callable[[int], float],
-    clock: Callable[[], float],
-) -> tuple[SchedulerState, float]:
-    """The state and the time after all chunks of a phase have been answered."""
-    limits = state.limits
-    sizes = item_sizes(phase.chunks, state.wanted, usual_chunk_s(state, phase.kind), limits.item_s, limits.cores)
-    items = tuple(events.WorkItem((generation, phase.name, i), phase.kind, size) for i, size in enumerate(sizes))
-    size_of = {item.id: item.size for item in items}
-    free_s = dict.fromkeys(state.up, 0.0)
-    answers: list[tuple[float, int, events.Result]] = []
-    number, event = count(), events.Submit(items)
-    while True:
-        began = clock()
-        state, commands = step(state, event, now)
-        now += clock() - began
+class _Cluster:
+    """Simulated workers and the driver's time, with a real scheduler."""
+
+    def __init__(
+        self,
+        state: SchedulerState,
+        costs: Costs,
+        seconds_of: Callable[[int, str, int], float],
+        clock: Callable[[], float],
+    ) -> None:
+        self.now = 0.0
+        self._state, self._costs, self._seconds_of, self._clock = state, costs, seconds_of, clock
+        self._free_s = dict.fromkeys(state.up, 0.0)
+        """Worker -> time at which it has finished what it was sent."""
+        self._answers: list[tuple[float, int, str, events.Result]] = []
+        """Heap of (time of arrival, number, kind of chunk, answer)."""
+        self._number = count()
+
+    def play(self, phase: Phase, generation: int) -> None:
+        """Pass the time until all chunks of a phase have been answered."""
+        while self._answers and self._answers[0][0] <= self.now:
+            self._read()  # second copies, whose phase has ended
+        state, limits = self._state, self._state.limits
+        sizes = item_sizes(phase.chunks, state.wanted, usual_chunk_s(state, phase.kind), limits.item_s, limits.cores)
+        items = (events.WorkItem((generation, phase.name, i), phase.kind, size) for i, size in enumerate(sizes))
+        self._step(events.Submit(tuple(items)))
+        while pending(self._state):
+            due_s = max(self.now, next_deadline(self._state))
+            if self._answers and self._answers[0][0] <= due_s:
+                self._read()
+            else:
+                self.now = due_s
+                self._step(events.Tick())
+
+    def _read(self) -> None:
+        """Wait for the next answer and receive it."""
+        arrives_s, _, kind, answer = heapq.heappop(self._answers)
+        self.now = max(self.now, arrives_s) + self._costs.message_s[kind] / 2
+        self._step(answer)
+
+    def _step(self, event: events.Event) -> None:
+        """Pass an event to the scheduler and send the work items that it assigns."""
+        began = self._clock()
+        self._state, commands = step(self._state, event, self.now)
+        self.now += self._clock() - began
         for command in commands:
             if isinstance(command, events.Assign):
-                now += costs.message_s[phase.kind] / 2
-                chunks = size_of[command.item_id]
-                takes_s = costs.chunk_s[phase.kind] * longest_part(chunks)
-                end_s = free_s[command.worker] = max(free_s[command.worker], now + costs.way_s[phase.kind]) + takes_s
-                result = events.Result(command.worker, command.item_id, command.attempt)
-                heapq.heappush(answers, (end_s + costs.way_s[phase.kind], next(number), result))
-        if not pending(state):
-            return state, now
-        arrives_s, _, event = heapq.heappop(answers)
-        now = max(now, arrives_s) + costs.message_s[phase.kind] / 2
+                worker, item = command.worker, self._state.items[command.item_id].item
+                self.now += self._costs.message_s[item.kind] / 2
+                begins_s = max(self._free_s[worker], self.now + self._costs.way_s[item.kind])
+                end_s = self._free_s[worker] = begins_s + self._seconds_of(worker, item.kind, item.size)
+                answer = events.Result(worker, item.id, command.attempt)
+                arrives_s = end_s + self._costs.way_s[item.kind]
+                heapq.heappush(self._answers, (arrives_s, next(self._number), item.kind, answer))
 
 
 def _judge(phases: Sequence[Phase], costs: Costs, workers: int, taken: Mapping[str, float]) -> Prediction:

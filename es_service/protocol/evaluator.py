@@ -14,7 +14,8 @@ class DispatchCounts:
     """Numbers of workers and of faults of an evaluator since it was made."""
 
     retries: int = 0
-    """Chunks that were sent again, including those that a lost worker had not begun."""
+    """Chunks that were sent again after a fault, including those that a lost worker had not begun. Second copies of
+    chunks that a worker was late with do not count."""
     lost_workers: int = 0
     """Workers that were lost, or stopped because of a fault."""
     workers: int = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -37,6 +38,7 @@ LIMIT_NAMES = {
     "start_deadline_s": "half of compute.no_worker_timeout_s",
     "first_deadline_s": "compute.compile_timeout_s",
     "min_deadline_s": "at least compute.chunk_timeout_s",
+    "place_timeout_s": "compute.place_timeout_s",
     "no_worker_timeout_s": "compute.no_worker_timeout_s",
 }
 """Config keys that set the engine's time limits, as its messages name them."""
@@ -83,6 +85,13 @@ def work(
             tell(notice)
         told = len(store.notices)
 
+    def tell_wait(shortage: str) -> None:
+        store.lock.say(waiting=bool(shortage))
+        limit_s = config.compute.place_timeout_s
+        until = "until there is one" if limit_s is None else f"at most {limit_s:g} s (compute.place_timeout_s)"
+        waits = f"no worker has a place in the cluster; the run waits {until}. {shortage}"
+        tell(waits if shortage else "a worker has a place in the cluster; the run begins")
+
     tell_notices()
     state = driver.stored_state(store, task)
     if state is not None and (reason := driver.spent(config.budget, state)) is not None:
@@ -105,7 +114,7 @@ def work(
         _naming_the_run(store.folder),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
         stop_on_signals() as should_stop,
-        _engine(config, should_stop, log) as engine,
+        _engine(config, should_stop, log, tell_wait) as engine,
     ):
 
         def after_generation(row: Mapping[str, Any]) -> None:
@@ -124,6 +133,7 @@ def work(
             )
             in_generation(row["generation"] + 1)
 
+        engine.wait_for_place()  # before the loop, whose time is that of the run and of its budget
         recorder = Recorder(store, engine, platform_info(), code, tell, strict=strict)
         _, reason = driver.run(search, engine, recorder, state, after_generation)
         _LOG.info("the session ends: %s", reason)
@@ -152,12 +162,15 @@ def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
         start_deadline_s=compute.no_worker_timeout_s / 2,  # so that two attempts fit into it
         first_deadline_s=compute.compile_timeout_s,
         min_deadline_s=compute.chunk_timeout_s,
+        place_timeout_s=math.inf if compute.place_timeout_s is None else compute.place_timeout_s,
         no_worker_timeout_s=compute.no_worker_timeout_s,
         names=LIMIT_NAMES,
     )
 
 
-def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) -> Engine[Any]:
+def _engine(
+    config: RunConfig, should_stop: Callable[[], int | None], log: Log, on_wait: Callable[[str], None]
+) -> Engine[Any]:
     """The configured engine, whose workers are starting."""
     spec, compute, limits = worker_spec(config, task_of(config)), config.compute, dispatch_limits(config)
     if compute.engine == "inline":
@@ -174,6 +187,7 @@ def _engine(config: RunConfig, should_stop: Callable[[], int | None], log: Log) 
         gpus=compute.worker_resources.gpu,
         most=chunks_at_once(config) if compute.workers == "auto" else None,
         log=log,
+        on_wait=on_wait,
     )
 
 

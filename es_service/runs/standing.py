@@ -1,4 +1,4 @@
-"""The standing of a run: its newest generation, its budget, and whether it is running, finished or stopped."""
+"""The standing of a run: its newest generation, its budget, and whether it waits, is running, finished or stopped."""
 
 from __future__ import annotations
 
@@ -59,11 +59,18 @@ def look(run: Run) -> Standing:
         return Standing(run, driver, row, {}, f"{run.folder / CONFIG}: {key}: {first['msg']}")
 
 
+def is_waiting(standing: Standing) -> bool:
+    """Whether the driver runs and waits for a first place in the cluster."""
+    return standing.driver is not None and standing.driver["waiting_since"] is not None
+
+
 def state(standing: Standing) -> str:
-    """The state of a run in words: running, finished or stopped, with details."""
+    """The state of a run in words: waiting, running, finished or stopped, with details."""
     if standing.driver:
-        left = to_go(standing)
-        who = f"running on {standing.driver['host']}, pid {standing.driver['pid']}"
+        where = f"on {standing.driver['host']}, pid {standing.driver['pid']}"
+        if is_waiting(standing):
+            return f"waiting for a first place in the cluster since {standing.driver['waiting_since']}; driver {where}"
+        left, who = to_go(standing), f"running {where}"
         return f"{who}; {left} left" if left else who
     if standing.problem:
         return f"stopped, and its budget cannot be read: {standing.problem}"

@@ -32,7 +32,17 @@ class RunLock:
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
+        self._identity = {"host": socket.gethostname(), "pid": os.getpid(), "since": _now()}
+        self.say(waiting=False)
         _held.add(self)
+
+    def say(self, *, waiting: bool) -> None:
+        """Write who holds the lock into its file, and since when the run has been waiting for a worker, if it is."""
+        text = json.dumps(self._identity | {"waiting_since": _now() if waiting else None}).encode()
+        # The lock itself is enough; on a full disk its file does not name the writer.
+        with contextlib.suppress(OSError):
+            # Spaces, so that a reader at this moment finds no end of a longer text, and no empty file.
+            os.pwrite(self._descriptor, text.ljust(os.fstat(self._descriptor).st_size), 0)
 
     def release(self) -> None:
         """Release the lock, so that another writer can take it. This may be called again."""
@@ -74,7 +84,6 @@ def _acquire(folder: Path, deadline: float) -> RunLock:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if _is_at(descriptor, path):
-                _write_identity(descriptor)
                 return RunLock(descriptor)
         except BlockingIOError:
             if time.monotonic() > deadline:
@@ -87,16 +96,8 @@ def _acquire(folder: Path, deadline: float) -> RunLock:
         os.close(descriptor)
 
 
-def _write_identity(descriptor: int) -> None:
-    identity = {
-        "host": socket.gethostname(),
-        "pid": os.getpid(),
-        "since": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
-    # The lock itself is enough; on a full disk its file does not name the writer.
-    with contextlib.suppress(OSError):
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, json.dumps(identity).encode(), 0)
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _is_at(descriptor: int, path: Path) -> bool:
@@ -111,7 +112,8 @@ def lock_holder(folder: Path) -> dict[str, Any] | None:
     """The process that holds the lock of the run in `folder`; None if there is none.
 
     Returns:
-        "host", "pid" and "since" (ISO time, UTC). The values are None if the writer has not written them yet.
+        "host", "pid" and "since" (ISO time, UTC), and "waiting_since" if the run waits for its first worker, else None.
+        All are None if the writer has not written them yet.
     """
     try:
         descriptor = os.open(folder / LOCK, os.O_RDONLY | os.O_CLOEXEC)
@@ -135,7 +137,7 @@ def _identity(text: bytes) -> dict[str, Any]:
     except ValueError:
         found = None
     known = found if isinstance(found, dict) else {}
-    return {key: known.get(key) for key in ("host", "pid", "since")}
+    return {key: known.get(key) for key in ("host", "pid", "since", "waiting_since")}
 
 
 def _locked(folder: Path) -> RunLockedError:

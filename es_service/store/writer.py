@@ -71,7 +71,7 @@ class RunStore:
         """Open the run in `folder`, whose lock is held. Use `create` or `open` instead."""
         self.folder = folder
         self.notices = []
-        self._lock = lock
+        self.lock = lock
         self._hook = hook
         self._closed = False
         self._connection, verdict = open_sound(folder, self.notices)
@@ -266,7 +266,7 @@ class RunStore:
             self.upkeep.finish()
         finally:
             self._connection.close()
-            self._lock.release()
+            self.lock.release()
 
     def __enter__(self) -> Self:
         return self

@@ -110,6 +110,9 @@ class InThisProcess:
         self._run = make_worker(worker_spec(config, task_of(config)))
         self._should_stop = should_stop
 
+    def wait_for_place(self) -> None:
+        """Return at once, since the caller is there."""
+
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
         if (number := self._should_stop()) is not None:
             raise Interrupted(number)
@@ -117,7 +120,7 @@ class InThisProcess:
 
 
 @contextmanager
-def in_this_process(config: RunConfig, should_stop: Callable[[], int | None], _: object) -> Iterator[InThisProcess]:
+def in_this_process(config: RunConfig, should_stop: Callable[[], int | None], *_: object) -> Iterator[InThisProcess]:
     """In the place of `session._engine`."""
     yield InThisProcess(config, should_stop)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from es_service.dispatch.events import Command, Event, Limits, StartWorker, Submit, Tick, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import step
-from es_service.dispatch.scheduler_state import SchedulerState, initial_state
+from es_service.dispatch.scheduler_state import IN_TIME, SchedulerState, initial_state, next_time
 
 LIMITS = Limits(
     workers=2,
@@ -15,6 +15,7 @@ LIMITS = Limits(
     max_attempts=3,
     start_deadline_s=50.0,
     first_deadline_s=100.0,
+    late_factor=math.inf,
     min_deadline_s=10.0,
     deadline_factor=5.0,
     max_failures_in_a_row=2,
@@ -52,12 +53,25 @@ def check_consistency(state: SchedulerState) -> None:
     for group in (state.starting, state.up, state.draining):
         records = [(worker, group[worker]) for worker in group]
         assert [record.rank for _, record in records] == sorted({record.rank for _, record in records})
-        deadlines += [(record.deadline_s, worker) for worker, record in records if record.deadline_s < math.inf]
+        deadlines += [(at_s, worker) for worker, record in records if (at_s := next_time(record)) < math.inf]
     assert list(state.deadlines) == sorted(deadlines)
-    loads = [(len(record.slots), record.rank, worker) for worker, record in ((w, state.up[w]) for w in state.up)]
+    loads = [
+        (len(record.slots), record.pace, record.rank, worker) for worker, record in ((w, state.up[w]) for w in state.up)
+    ]
     assert list(state.free) == sorted(entry for entry in loads if entry[0] < state.limits.in_flight)
+    if state.failed is None:
+        assert list(state.in_time) == sorted((worker,) for worker in state.up if state.up[worker].pace == IN_TIME)
     waiting = [(item_id, state.items[item_id]) for item_id in state.items]
     assert all((record.place is None) != (record.holder is None) for _, record in waiting)
+    assert all(record.second is None or record.second != record.holder is not None for _, record in waiting)
     if state.failed is None:
+        assert set(state.late) == {(record.late, item_id) for item_id, record in waiting if record.late is not None}
+        assert {item_id for _, item_id in state.late} == {
+            item_id
+            for item_id, record in waiting
+            if record.holder is not None
+            and record.second is record.last_holder is None
+            and (state.up.get(record.holder) or state.draining[record.holder]).pace != IN_TIME
+        }
         assert list(state.places) == sorted((r.place, item_id) for item_id, r in waiting if r.place is not None)
         assert state.queue == [item_id for _, item_id in state.places]

@@ -59,10 +59,13 @@ class World:
             first_deadline_s=8.0,
             min_deadline_s=2.0,
             deadline_factor=4.0,
+            late_factor=r.choice((1.2, 2.0, math.inf)),
+            late_by_s=r.choice((0.0, 0.3)),
             max_failures_in_a_row=r.randint(1, 3),
             restart_backoff_s=0.5,
             max_backoff_s=r.choice((4.0, 20.0)),
             max_start_failures=r.randint(2, 5),
+            place_timeout_s=r.choice((math.inf, 1.0, 4.0)),
             no_worker_timeout_s=r.choice((4.0, 12.0)),
         )
         harshness = r.choice((0.0, 0.05, 0.2, 0.5))
@@ -81,6 +84,7 @@ class World:
         self.inbox: dict[int, deque[tuple[tuple, int]]] = {}
         self.busy: set[int] = set()
         self.unplaced: set[int] = set()
+        self.waits: set[int] = set()
         self.last_word: dict[int, float] = {}
         self.poison: dict[tuple, str] = {}
         # What a correct scheduler must know.
@@ -94,9 +98,12 @@ class World:
         self.waiting: set[tuple] = set()
         self.delivered: set[tuple] = set()
         self.faults: Counter[tuple] = Counter()
+        self.assigned: set[tuple] = set()
+        self.copied: dict[tuple, int] = {}
         self.last_holder: dict[tuple, int] = {}
         self.again = self.lost = self.dropped = self.start_failures = self.tried = self.newest = 0
         self.start_due: dict[int, float] = {}
+        self.was_up = False
         self.down_since: float | None = None
         self.failed: str | None = None
 
@@ -118,12 +125,12 @@ class World:
         self.alive.add(worker)
         self.inbox[worker], self.open[worker] = deque(), []
         self.start_due[worker] = self.now + self.limits.start_deadline_s
-        if self.happens("no_place"):
-            self.unplaced.add(worker)
-            if self.random.random() < 0.5:
-                self.at(1.2 * self.limits.start_deadline_s * self.random.random(), self.give_place, worker)
-        else:
-            self.build(worker)
+        self.unplaced.add(worker)
+        if not self.happens("no_place"):
+            self.give_place(worker)
+        elif self.random.random() < 0.5:
+            self.waits.add(worker)
+            self.at(1.2 * self.limits.start_deadline_s * self.random.random(), self.give_place, worker)
 
     def give_place(self, worker: int) -> None:
         if worker in self.alive or self.happens("speaks_after_stop"):
@@ -189,6 +196,9 @@ class World:
             running = self.open[worker][0][0] if self.open[worker] else None
             if charge and running in self.waiting:
                 self.faults[running] += 1
+                self.seen["copy charged"] += running in self.copied
+        for item_id, _ in self.open[worker]:
+            self.last_holder[item_id] = worker
         self.up.discard(worker)
         self.draining.discard(worker)
         self.open[worker] = []
@@ -203,10 +213,11 @@ class World:
             case Placed(worker):
                 self.unplaced.discard(worker)
                 if worker in self.known:
-                    self.seen["placed late"] += 1
+                    self.seen["placed late"] += worker in self.waits
                     self.start_due[worker] = self.now + self.limits.start_deadline_s
             case WorkerUp(worker) if worker in self.known and worker not in self.up:
                 self.up.add(worker)
+                self.was_up = True
                 self.start_failures = 0
             case WorkerLost(worker) if worker in self.known:
                 expected = worker in self.draining
@@ -223,13 +234,17 @@ class World:
                     self.open[worker].remove((item_id, attempt))
                 if valid and item_id in self.waiting:
                     self.faults[item_id] += 1
+                    self.last_holder[item_id] = worker
                 else:
                     self.dropped += 1
             case Drain(worker) if worker in self.known:
                 self.draining.add(worker)
             case SetWorkers(wanted):
                 self.wanted = wanted
-                self.draining.update(sorted(self.known - self.draining)[wanted:])
+                by_progress = sorted(
+                    self.known - self.draining, key=lambda w: (w not in self.up, w in self.unplaced, w)
+                )
+                self.draining.update(by_progress[wanted:])
 
     def feed(self, event: Event) -> None:
         before = self.state
@@ -257,8 +272,8 @@ class World:
                     self.start_process(worker)
                 case StopWorker(worker, reason):
                     self.stop(worker, reason, event)
-                case Assign(worker, item_id, attempt):
-                    self.check_assign(worker, item_id, attempt)
+                case Assign(worker, item_id, attempt, is_copy):
+                    self.check_assign(worker, item_id, attempt, event if is_copy else None)
                 case Deliver(item_id):
                     assert isinstance(event, Result)
                     assert event.item_id == item_id
@@ -266,6 +281,7 @@ class World:
                     assert item_id in self.waiting
                     self.waiting.remove(item_id)
                     self.delivered.add(item_id)
+                    self.seen["copy was first"] += self.copied.get(item_id) == event.worker
                     accepted += 1
                 case Fail(message):
                     self.failed = message
@@ -295,21 +311,40 @@ class World:
         if self.happens("reports_stopped"):
             self.say(worker, WorkerLost(worker, "stopped"))
 
-    def check_assign(self, worker: int, item_id: tuple, attempt: int) -> None:
+    def check_assign(self, worker: int, item_id: tuple, attempt: int, copied_by: Event | None) -> None:
         assert worker in self.up - self.draining
         assert item_id in self.waiting
-        assert all(item_id != held for slots in self.open.values() for held, _ in slots)
         assert attempt == self.faults[item_id] + 1 <= self.limits.max_attempts
-        if item_id in self.last_holder:
-            self.again += self.size[item_id]
+        holders = [other for other, slots in self.open.items() for held, _ in slots if held == item_id]
+        if copied_by is not None:
+            self.check_copy(worker, item_id, holders, copied_by)
         else:
-            assert item_id == self.fresh.popleft(), "out of submission order"
-        assert self.last_holder.get(item_id) != worker or len(self.up - self.draining) == 1
-        self.last_holder[item_id] = worker
+            assert not holders
+            if item_id in self.assigned:
+                self.again += self.size[item_id]
+            else:
+                assert item_id == self.fresh.popleft(), "out of submission order"
+            assert self.last_holder.get(item_id) != worker or len(self.up - self.draining) == 1
+        self.assigned.add(item_id)
         self.open[worker].append((item_id, attempt))
         assert len(self.open[worker]) <= self.limits.in_flight
         self.inbox[worker].append((item_id, attempt))
         self.at(0.0, self.begin, worker)
+
+    def check_copy(self, worker: int, item_id: tuple, holders: list[int], event: Event) -> None:
+        """Of an item that one other worker has, and has had alone since it was submitted; nothing else waits."""
+        assert isinstance(event, Tick)
+        assert self.limits.late_factor < math.inf
+        assert not self.open[worker]
+        assert len(holders) == 1
+        assert item_id not in self.copied
+        assert item_id not in self.last_holder, "it may be poison"
+        assert not self.queued()
+        self.copied[item_id] = worker
+        self.seen["copy"] += 1
+
+    def queued(self) -> set[tuple]:
+        return self.waiting - {item_id for slots in self.open.values() for item_id, _ in slots}
 
     def check_fail(self, message: str) -> None:
         worn_out = [item_id for item_id in self.waiting if self.faults[item_id] >= self.limits.max_attempts]
@@ -321,11 +356,18 @@ class World:
             assert self.start_failures == self.limits.max_start_failures
             assert not self.up
         else:
-            self.seen["no worker"] += 1
-            assert self.waiting
-            assert not self.up
             assert self.down_since is not None
-            assert self.now - self.down_since >= self.limits.no_worker_timeout_s - 1e-9
+            down_s = self.now - self.down_since + 1e-9
+            assert not self.up
+            if "got a place" in message:
+                self.seen["no first place"] += 1
+                assert not self.was_up
+                assert down_s >= self.limits.place_timeout_s
+            else:
+                self.seen["no worker"] += 1
+                assert self.was_up
+                assert self.waiting
+                assert down_s >= self.limits.no_worker_timeout_s
 
     def check_books(self) -> None:
         state = self.state
@@ -338,12 +380,12 @@ class World:
             return
         assert all(self.faults[item_id] < self.limits.max_attempts for item_id in self.waiting), "poison went unnoticed"
         assert self.start_failures < self.limits.max_start_failures, "a broken environment went unnoticed"
-        if not self.waiting or self.up:
+        if self.up or (not self.waiting if self.was_up else self.known - self.unplaced):
             self.down_since = None
         elif self.down_since is None:
             self.down_since = self.now
         usable = self.up - self.draining
-        queued = self.waiting - {item_id for slots in self.open.values() for item_id, _ in slots}
+        queued = self.queued()
         for worker in usable if queued else ():
             if len(self.open[worker]) < self.limits.in_flight:
                 assert len(usable) > 1
@@ -411,15 +453,17 @@ def simulate(seed: int) -> World:
     world.run_until_quiet()
     if world.failed is not None:
         return world
-    scratches = world.lost, world.dropped, world.state.retries
+    scratches, dropped, copied = (world.lost, world.state.retries), world.dropped, len(world.copied)
     world.submit(3)
     world.run_until_quiet()
     assert world.failed is None
     assert not world.waiting
-    assert (world.lost, world.dropped, world.state.retries) == scratches
+    assert (world.lost, world.state.retries) == scratches
+    assert world.dropped - dropped == len(world.copied) - copied, "of two copies, one answer is dropped"
+    assert world.state.copies == sum(world.size[item_id] for item_id in world.copied)
     assert world.alive == world.known == world.up == set(world.state.up)
     assert len(world.alive) == world.wanted
     assert not world.draining
     if world.faultless:
-        assert scratches == (0, 0, 0)
+        assert (scratches, dropped) == ((0, 0), copied)
     return world

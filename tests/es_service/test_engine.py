@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import re
 import signal
@@ -318,7 +319,9 @@ def test_what_a_hung_worker_had_written_is_told_with_its_loss(monkeypatch, is_la
     transport = scripted_with_clock(monkeypatch, [0.0])
     transport.last_words = {0: "no licence; retrying", 1: "all is well"}
     transport.on_send = lambda sent: transport.inbox.append(sent.answer()) if sent.worker else None
-    limits = Limits(workers=2, first_deadline_s=1.0, min_deadline_s=1.0, max_attempts=1 if is_last else 2)
+    limits = Limits(
+        workers=2, first_deadline_s=1.0, min_deadline_s=1.0, max_attempts=1 if is_last else 2, late_factor=math.inf
+    )
     with Engine(transport, limits) as engine:
         if is_last:
             with pytest.raises(EvaluationError, match=r"failed in 1 attempts.*its process:\nno licence; retrying$"):

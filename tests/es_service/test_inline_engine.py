@@ -19,7 +19,7 @@ import pytest
 
 from es_service.dispatch import inline_engine as inline_module
 from es_service.dispatch.engine import Answer
-from es_service.dispatch.events import Limits, WorkerLost, WorkerUp
+from es_service.dispatch.events import Limits, Placed, WorkerLost, WorkerUp
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.messages import KEPT_CENTRES, TrainingChunk, Work, around, forget_oldest
@@ -140,6 +140,14 @@ def test_an_answer_that_has_begun_to_come_is_there(transport):
     sender.join()
     assert isinstance(message, Answer)
     np.testing.assert_array_equal(message.results, [LARGE])
+
+
+def test_a_child_has_its_place_before_it_comes_up():
+    """So a run with children never waits for a place."""
+    transport = inline_module.ChildProcesses(spec())
+    transport.start(0)
+    assert [transport.receive(0.0), transport.receive(60.0)] == [Placed(0), WorkerUp(0)]
+    transport.close()
 
 
 def test_a_message_that_stops_half_way_keeps_nobody_waiting(transport):

@@ -68,7 +68,7 @@ def test_workers_of_several_kinds_make_a_run_mixed_from_the_generation_they_join
             return super().evaluate(work)
 
     @contextmanager
-    def engine(config, should_stop, log):
+    def engine(config, should_stop, *_):
         yield Cluster(config, should_stop)
 
     monkeypatch.setattr(session, "_engine", engine)

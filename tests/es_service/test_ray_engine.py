@@ -5,18 +5,19 @@ from __future__ import annotations
 import pickle
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from es_service.dispatch import engine as engine_module
 from es_service.dispatch.engine import Answer, Engine
 from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_engine import IN_CALL_BYTES, Actors
-from es_service.dispatch.ray_nodes import ONE_CORE, Membership, look
-from es_service.errors import EvaluationError
+from es_service.dispatch.ray_nodes import ONE_CORE, Claim, Growth, Membership, emptiest, look
+from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.messages import KEPT_CENTRES, TrainingChunk, around
 from tests.helpers import SPEC, centre, random_parameters
 
@@ -67,9 +68,17 @@ class PretendedRay:
         self.calls: list[tuple[Any, ...]] = []
         """Arguments of each call of `run`."""
         self.stored: list[bytes] = []
+        self.strategies: list[Any] = []
+        """Where each actor was to be placed: "SPREAD", or (node, options)."""
+        affinity = SimpleNamespace(NodeAffinitySchedulingStrategy=lambda node, **options: (node, options))
+        self.util = SimpleNamespace(scheduling_strategies=affinity)
 
     def remote(self, **_: Any) -> Callable[[type], Any]:
-        return lambda cls: SimpleNamespace(remote=self._start)
+        return lambda cls: SimpleNamespace(options=self._options)
+
+    def _options(self, scheduling_strategy: Any) -> Any:
+        self.strategies.append(scheduling_strategy)
+        return SimpleNamespace(remote=self._start)
 
     def wait(self, refs: list[Ref], num_returns: int, timeout: float) -> tuple[list[Ref], list[Ref]]:
         ready = [ref for ref in refs if ref.is_ready][:num_returns]
@@ -140,7 +149,7 @@ class PretendedWatch:
     """Of a cluster that never changes, unless `now` does."""
 
     def __init__(self) -> None:
-        self.now = Membership(0, frozenset(), frozenset())
+        self.now = Membership({}, {}, frozenset(), frozenset())
 
     def latest(self) -> Membership:
         return self.now
@@ -150,9 +159,13 @@ class PretendedWatch:
 
 
 def transport(
-    ray: PretendedRay, limits: Limits, watch: PretendedWatch | None = None, most: int | None = None
+    ray: PretendedRay,
+    limits: Limits,
+    watch: PretendedWatch | None = None,
+    growth: Growth | None = None,
+    claim: Claim = ONE_CORE,
 ) -> Actors:
-    return Actors(ray, SPEC, type(None), ONE_CORE, watch, most, limits)
+    return Actors(ray, SPEC, type(None), claim, watch, growth, limits.workers)
 
 
 def ray_engine(ray: PretendedRay, limits: Limits, watch: PretendedWatch | None = None) -> Engine[Actors]:
@@ -217,19 +230,96 @@ def test_an_actor_that_is_given_no_place_is_not_lost():
 
 
 @pytest.mark.parametrize(
-    ("watch", "message"),
+    ("watch", "rooms", "advice"),
     [
-        (None, r"process answered within 0\.4 s \(no_worker_timeout_s\)\. Each worker needs 1 CPU; .*has 2 CPU"),
-        (PretendedWatch(), r"within 0\.4 s \(no_worker_timeout_s\)\. Each worker needs 1 CPU; .*2 CPU.* Add nodes"),
+        (None, {}, "do not start"),
+        (PretendedWatch(), {}, "No node has 1 CPU"),
+        (PretendedWatch(), {"n": 2}, "Add nodes"),
     ],
 )
-def test_the_wait_for_a_first_place_is_the_policy_s(watch, message):
-    """And ends before the scheduler's of the same length, which knows less. In a Ray of our own the process is slow,
-    since it has room for all: more nodes would not help."""
-    limits = Limits(1, start_deadline_s=0.2, no_worker_timeout_s=0.4)
-    with pytest.raises(EvaluationError, match=message) as caught, ray_engine(PretendedRay(0), limits, watch) as engine:
-        engine.evaluate(around(FIRST, [CHUNK]))
-    assert ("Add nodes" in str(caught.value)) == (watch is not None)
+def test_a_run_that_got_no_place_says_what_it_needs_and_what_there_is(watch, rooms, advice):
+    """In a Ray of our own, there is room for each worker, so more nodes would not help."""
+    if watch is not None:
+        watch.now = Membership(rooms, {}, frozenset(), frozenset({"head", *rooms}))
+    ray, limits = PretendedRay(0), Limits(2, start_deadline_s=0.1, place_timeout_s=0.25)
+    text = r"no worker got a place for 0\.25 s \(place_timeout_s\).* Each worker needs 1 CPU; .*has 2 CPU.*" + advice
+    with ray_engine(ray, limits, watch) as engine, pytest.raises(EvaluationError, match=text):
+        engine.wait_for_place()
+    assert {actor.state for actor in ray.actors} == {"dead"}, "none still asks for a place"
+
+
+def test_the_wait_for_a_first_place_is_told_of_twice_and_can_be_stopped(monkeypatch):
+    """When it has lasted for a while, and when it is over; work that is given meanwhile waits, too."""
+    monkeypatch.setattr(engine_module, "NOTICE_S", 0.0)
+    ray, told, calls = PretendedRay(room=0), [], []
+
+    def should_stop() -> int | None:
+        calls.append(len(ray.actors))
+        if told and "Add nodes" in told[-1] and len(calls) > 3:
+            ray.room = 2
+            ray.end(ray.actors[-1], "alive")
+        return None
+
+    watch = PretendedWatch()
+    watch.now = Membership({"node": 2}, {}, frozenset(), frozenset({"node"}))
+    limits = Limits(2, start_deadline_s=0.2)
+    with Engine(transport(ray, limits, watch), limits, should_stop, on_wait=told.append) as engine:
+        assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
+        engine.wait_for_place()
+        assert len(told) == 2
+        assert told[0].startswith("Each worker needs 1 CPU; the cluster has 2 CPU")
+        assert told[1] == ""
+    engine = Engine(transport(PretendedRay(room=0), limits), limits, lambda: 2)
+    with engine, pytest.raises(Interrupted):
+        engine.wait_for_place()
+
+
+def test_workers_of_several_cores_are_placed_one_by_one_where_there_is_most_room():
+    """Those for which no node has room, and those of one core, are left to Ray."""
+    assert emptiest({"small": 1, "large": 3}, ["large", "large", "large"]) == "small"
+    assert emptiest({"small": 1, "large": 3}, ["large", "large", "large", "small"]) is None
+    assert emptiest({}, ["gone"]) is None
+    ray, watch = PretendedRay(room=2), PretendedWatch()
+    watch.now = Membership({"small": 2, "large": 9}, {"small": 1, "large": 3}, frozenset(), frozenset())
+    actors = transport(ray, Limits(4), watch, claim=Claim(8))
+    for worker in range(5):
+        actors.start(worker)
+    while actors.receive(0.0):
+        pass
+    watch.now = replace(watch.now, free={"small": 1, "large": 2})  # since two have their places
+    actors.start(5)
+    actors.kill(2)
+    actors.start(6)
+    assert [strategy if strategy == "SPREAD" else strategy[0] for strategy in ray.strategies] == [
+        *["large", "large", "small", "large", "SPREAD"], "large", "small"
+    ]  # fmt: skip
+    assert ray.strategies[0][1] == {"soft": True, "_spill_on_unavailable": True}
+    one_core = PretendedRay()
+    transport(one_core, Limits(1), watch).start(0)
+    assert one_core.strategies == ["SPREAD"]
+
+
+def test_work_is_divided_among_the_workers_that_have_a_place():
+    """Not among those that wait for one, perhaps for ever: then there would be more and smaller messages."""
+    ray, limits = PretendedRay(room=2), Limits(9, item_s=60.0)
+    with ray_engine(ray, limits) as engine:
+        chunks = [TrainingChunk(2, chunk) for chunk in range(18)]
+        for _ in range(3):  # so that it is known how long a chunk takes
+            ray.calls.clear()
+            engine.evaluate(around(FIRST, chunks))
+        assert len(ray.calls) == 2
+
+
+def test_a_run_asks_for_more_workers_than_there_is_room_for_up_to_its_work():
+    """Whatever becomes of the nodes; an answer without any node is no information."""
+
+    def nodes(room: int) -> Membership:
+        return Membership({"node": room} if room else {}, {}, frozenset(), frozenset({"head"}))
+
+    asks, follows = Growth(10, ahead=4), Growth(10)
+    assert [asks.wanted(nodes(room), 7) for room in (0, 3, 8, 99)] == [4, 7, 10, 10]
+    assert [follows.wanted(nodes(room), 7) for room in (0, 3, 8, 99)] == [7, 3, 8, 10]
+    assert asks.wanted(Membership({}, {}, frozenset(), frozenset()), 7) == 7
 
 
 def test_a_node_that_dies_under_idle_workers_takes_none_of_the_others_along():
@@ -237,15 +327,15 @@ def test_a_node_that_dies_under_idle_workers_takes_none_of_the_others_along():
     was not seen yet, or when no node at all is seen."""
     ray, watch = PretendedRay(), PretendedWatch()
     ray.node_of = lambda number: "old" if number < 2 else "new"
-    actors = transport(ray, Limits(4), watch, most=4)
+    actors = transport(ray, Limits(4), watch, Growth(4))
     with Engine(actors, Limits(4)) as engine:
         for alive in ({"old"}, {"old", "new"}, set(), {"old", "new"}):
-            watch.now = Membership(4, frozenset(), frozenset(alive))
+            watch.now = Membership({"old": 2, "new": 2}, {}, frozenset(), frozenset(alive))
             engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
             assert engine.counts.lost_workers == 0
         for number in range(2):
             ray.end(ray.actors[number])
-        watch.now = Membership(2, frozenset(), frozenset({"new"}))
+        watch.now = Membership({"new": 2}, {}, frozenset(), frozenset({"new"}))
         assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert (engine.counts.lost_workers, engine.counts.workers, engine.counts.retries) == (2, 2, 0)
         assert "its node died" in engine.last_loss
@@ -258,29 +348,31 @@ def test_nodes_that_are_about_to_go_are_alive_and_give_no_room():
         for name, cpus in (("stays", 4), ("leaves", 2), ("dead", 1))
     ]
     state = SimpleNamespace(get_draining_nodes=lambda: {"leaves": 0})
-    ray = SimpleNamespace(nodes=lambda: nodes, _private=SimpleNamespace(state=SimpleNamespace(state=state)))
+    unused = {"stays": {"CPU": 3.0}, "leaves": {"CPU": 2.0}}
+    private = SimpleNamespace(state=SimpleNamespace(state=state, available_resources_per_node=lambda: unused))
+    ray = SimpleNamespace(nodes=lambda: nodes, _private=private)
     seen = look(ray, ONE_CORE)
-    assert seen == Membership(4, frozenset({"leaves"}), frozenset({"stays", "leaves"}))
+    assert seen == Membership({"stays": 4}, {"stays": 3}, frozenset({"leaves"}), frozenset({"stays", "leaves"}))
 
 
 def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
     """Those that leave with their node's consent, then those lost with theirs, then how many there should be."""
     ray, watch = PretendedRay(), PretendedWatch()
     ray.node_of = str
-    actors = transport(ray, Limits(3), watch, most=3)
-    watch.now = Membership(3, frozenset(), frozenset("012"))
+    actors = transport(ray, Limits(3), watch, Growth(3))
+    watch.now = Membership({"0": 1, "1": 1, "2": 1}, {}, frozenset(), frozenset("012"))
     for worker in range(3):
         actors.start(worker)
     while actors.receive(0.0):
         pass
     actors.send(0, "key", 1, around(FIRST, [CHUNK]))
-    watch.now = Membership(1, frozenset("1"), frozenset("12"))
+    watch.now = Membership({"2": 1}, {}, frozenset("1"), frozenset("12"))
     told = [actors.receive(0.0) for _ in range(4)]
     assert told[0] == Drain(1)
     assert isinstance(told[1], WorkerLost)
     assert (told[1].worker, told[1].bystander) == (0, False)
     assert told[2:] == [SetWorkers(1), None]
-    watch.now = Membership(7, frozenset("1"), frozenset("12"))
+    watch.now = Membership({"2": 7}, {}, frozenset("1"), frozenset("12"))
     assert [actors.receive(0.0) for _ in range(2)] == [SetWorkers(3), None], "no more than there is work for"
 
 

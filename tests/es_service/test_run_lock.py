@@ -34,21 +34,34 @@ def test_the_holder_is_known_while_and_only_while_it_holds(tmp_path):
     assert holder is not None
     assert (holder["host"], holder["pid"]) == (socket.gethostname(), os.getpid())
     assert holder["since"].startswith("20")
+    lock.say(waiting=True)
+    waiting = lock_holder(tmp_path)
+    assert waiting is not None
+    assert waiting["waiting_since"].startswith("20")
+    assert holder | {"waiting_since": waiting["waiting_since"]} == waiting
+    lock.say(waiting=False)
+    assert lock_holder(tmp_path) == holder
+    lock.say(waiting=True)
     lock.release()
     lock.release()
+    lock.say(waiting=True)
     assert lock_holder(tmp_path) is None
 
 
 def test_what_a_dead_writer_left_in_the_file_means_nothing(tmp_path):
-    (tmp_path / "run.lock").write_text('{"host": "elsewhere", "pid": 1, "since": "long ago"}')
+    (tmp_path / "run.lock").write_text('{"host": "elsewhere", "pid": 1, "since": "long ago", "waiting_since": "then"}')
     assert lock_holder(tmp_path) is None
-    acquire_lock(tmp_path).release()
+    lock = acquire_lock(tmp_path)
+    holder = lock_holder(tmp_path)
+    assert holder is not None
+    assert (holder["pid"], holder["waiting_since"]) == (os.getpid(), None)
+    lock.release()
 
 
 def test_a_holder_that_has_not_yet_written_its_name(tmp_path):
     with (tmp_path / "run.lock").open("w") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
-        assert lock_holder(tmp_path) == {"host": None, "pid": None, "since": None}
+        assert lock_holder(tmp_path) == {"host": None, "pid": None, "since": None, "waiting_since": None}
         with pytest.raises(RunLockedError, match=r"process \(unknown\) on host \(unknown\)"):
             acquire_lock(tmp_path)
 

@@ -22,7 +22,7 @@ from es_service.dispatch.events import (
     WorkerUp,
 )
 from es_service.dispatch.scheduler import step
-from es_service.dispatch.scheduler_state import initial_state, next_deadline
+from es_service.dispatch.scheduler_state import initial_state, is_waiting, next_deadline
 from tests.es_service.scheduler_play import LIMITS, items, play, ready
 
 
@@ -150,16 +150,63 @@ def test_what_a_silent_worker_does_not_answer_in_time_is_not_to_blame():
     assert step(state, WorkerUp(1), 101.0)[1] == [Assign(1, "a", 1)]
 
 
-def test_no_worker_for_too_long_fails_the_run():
-    state, _ = play(initial_state(LIMITS), (0.0, Tick()), (25.0, items("ab")))
-    assert next_deadline(state) == 50.0
-    assert next_deadline(play(initial_state(LIMITS), (0.0, Tick()), (5.0, items("a")))[0]) == 35.0
-    state, commands = play(state, (50.0, Tick()), (55.0, Tick()))
+def test_no_worker_for_too_long_after_the_first_had_come_up_fails_the_run():
+    state, _ = play(ready(), (5.0, WorkerLost(0, "killed")), (5.0, WorkerLost(1, "killed")), (40.0, Tick()))
+    assert state.failed is None, "nothing waits"
+    state, commands = play(state, (50.0, items("ab")), (55.0, Tick()), (79.9, Tick()))
+    assert (state.failed, next_deadline(state)) == (None, 80.0)
+    state, commands = step(state, Tick(), 80.0)
     assert commands[0] == Fail(
         "no worker was up for 30 s (no_worker_timeout_s) while 2 work items waited; "
-        "last loss: worker 1: did not come up within 50 s (start_deadline_s)"
+        "last loss: worker 2: did not come up within 50 s (start_deadline_s)"
     )
-    assert play(initial_state(LIMITS), (0.0, Tick()), (40.0, Tick()))[0].failed is None, "nothing waits"
+
+
+def test_a_run_waits_for_its_first_place_for_as_long_as_it_takes():
+    """Its workers are started anew, which is no fault; what it waits for does not depend on whether it has work."""
+    state, now = step(initial_state(LIMITS), Tick(), 0.0)[0], 0.0
+    state, _ = step(state, items("a"), 1.0)
+    for _ in range(100):
+        now += 50.0
+        assert next_deadline(state) == now
+        state, commands = step(state, Tick(tuple(state.starting)), now)
+        assert [type(command) for command in commands] == [StopWorker, StopWorker, StartWorker, StartWorker]
+        assert is_waiting(state)
+    assert (state.failed, state.lost_workers, state.start_failures) == (None, 0, 0)
+    first = min(state.starting)
+    placed, _ = step(state, Placed(first), now + 1.0)
+    assert not is_waiting(placed)
+    state, commands = step(placed, WorkerUp(first), now + 2.0)
+    assert commands == [Assign(first, "a", 1)]
+    gone, _ = step(placed, WorkerLost(first, "preempted"), now + 2.0)
+    assert is_waiting(gone), "the only one with a place is gone"
+    assert gone.down_since_s == now + 2.0
+
+
+def test_a_first_place_can_have_a_time_limit():
+    limits = replace(LIMITS, place_timeout_s=70.0, names={"place_timeout_s": "the.key"})
+    state, _ = play(initial_state(limits), (0.0, Tick()), (40.0, items("a")), (50.0, Tick((0, 1))))
+    assert next_deadline(state) == 70.0
+    assert step(state, Tick((2, 3)), 70.0)[1] == [
+        Fail("no worker got a place for 70 s (the.key); last loss: no worker was lost"),
+        StopWorker(2, "the run failed"),
+        StopWorker(3, "the run failed"),
+    ]
+    state, _ = step(state, Placed(3), 69.0)
+    assert next_deadline(state) == 100.0, "then only its start has a limit"
+    state, _ = play(state, (80.0, WorkerLost(3, "preempted")), (100.0, Tick((2,))))
+    assert (state.failed, state.down_since_s) == (None, 80.0), "the wait begins anew"
+
+
+def test_a_smaller_number_of_workers_stops_first_those_that_wait():
+    """Even if they are older: a worker that waits for a place has nothing that could be lost."""
+    state, _ = step(initial_state(replace(LIMITS, workers=4)), Tick(), 0.0)
+    state, _ = play(state, (1.0, Placed(3)), (1.0, Placed(1)), (2.0, WorkerUp(3)))
+    state, commands = step(state, SetWorkers(3), 3.0)
+    assert commands == [StopWorker(2, "drained")]
+    state, commands = step(state, SetWorkers(1), 4.0)
+    assert commands == [StopWorker(1, "drained"), StopWorker(0, "drained")]
+    assert sorted(state.up) == [3]
 
 
 def test_a_drained_worker_finishes_what_it_has_and_is_replaced_without_blame():

@@ -33,7 +33,8 @@ def test_the_simulation_reached_every_rare_case(seen):
     if seen["failed"] + seen["survived faults"] + seen["untouched"] < SEEDS:
         pytest.skip("not all simulations ran")
     rare = ("poison", "start failures", "no worker", "no place", "placed late", "quarantine", "deadline")
-    rare += ("superseded result", "lost while draining", "survived faults")
+    rare += ("no first place", "superseded result", "lost while draining", "survived faults")
+    rare += ("copy", "copy was first", "copy charged")
     too_rare = {case: seen[case] for case in rare if seen[case] < 20}
     assert not too_rare
     assert seen["failed"] < SEEDS / 2

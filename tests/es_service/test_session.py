@@ -6,7 +6,7 @@ import re
 
 from es_service.api import load_config
 from es_service.config.compute import ComputeConfig
-from es_service.dispatch.events import Result, StopWorker, Submit, Tick, WorkerUp, WorkItem
+from es_service.dispatch.events import Result, StopWorker, Submit, Tick, WorkerLost, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state
 from es_service.runs.session import LIMIT_NAMES, dispatch_limits
@@ -15,7 +15,13 @@ CONFIG = {
     "task": {"environment": "point_maze"},
     "search": {"algorithm": "es"},
     "budget": {"generations": 1},
-    "compute": {"workers": 1, "chunk_timeout_s": 5, "compile_timeout_s": 8, "no_worker_timeout_s": 20},
+    "compute": {
+        "workers": 1,
+        "chunk_timeout_s": 5,
+        "compile_timeout_s": 8,
+        "place_timeout_s": 15,
+        "no_worker_timeout_s": 20,
+    },
 }
 
 
@@ -30,9 +36,11 @@ def messages_after(*events) -> list[str]:
 
 def test_messages_of_deadlines_name_the_keys_that_set_them():
     work = Submit(tuple(WorkItem(item_id, "train") for item_id in "abcd"))
-    late = messages_after((0.0, work), (10.0, Tick()), (20.0, Tick()))
+    late = messages_after((0.0, work), (10.0, Tick()))
     assert late[0] == "did not come up within 10 s (half of compute.no_worker_timeout_s)"
-    assert "no worker was up for 20 s (compute.no_worker_timeout_s) while" in late[-1]
+    gone = messages_after((0.0, work), (1.0, WorkerUp(0)), (2.0, WorkerLost(0, "")), (12.0, Tick()), (22.0, Tick()))
+    assert "no worker was up for 20 s (compute.no_worker_timeout_s) while" in gone[-1]
+    assert "no worker got a place for 15 s (compute.place_timeout_s)" in messages_after((0.0, work), (15.0, Tick()))[-1]
     assert messages_after((0.0, work), (1.0, WorkerUp(0)), (9.0, Tick()))[0] == (
         "no answer to work item a within 8 s (compute.compile_timeout_s)"
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,9 +23,9 @@ def costs(message_s=0.0, way_s=0.0, driver_s=0.0, **chunk_s):
     return Costs(seconds, dict.fromkeys(KINDS, message_s), dict.fromkeys(KINDS, way_s), driver_s)
 
 
-def predicted(phases, paid, actors, cores=1):
+def predicted(phases, paid, actors, cores=1, **more):
     """Every core takes equally many chunks, and the scheduler no time."""
-    return predict(phases, paid, actors, cores, lambda chunks: -(-chunks // cores), lambda: 0.0)
+    return predict(phases, paid, actors, cores, lambda chunks: -(-chunks // cores), lambda: 0.0, **more)
 
 
 def test_one_worker_takes_the_sum_of_all():
@@ -67,3 +69,25 @@ def test_the_time_is_never_shorter_than_the_work_and_efficiency_is_a_share(chunk
     found = predicted(generation(chunks, 1, 1), costs(message_s=message_s, driver_s=0.01), actors, cores)
     assert found.seconds >= chunks / (actors * cores) - 1e-9
     assert 0.0 < found.efficiency <= 1.0
+
+
+@pytest.mark.parametrize("slowness", [5.0, 25.0])
+def test_a_slow_worker_holds_up_a_phase_for_two_items_however_slow_it_is(slowness):
+    """Three of four workers take an item each and one of them the slow one's too; without copies all wait for it."""
+
+    def slow(actor):
+        return slowness if actor == 0 else 1.0
+
+    phases = [Phase("rollout", "TrainingChunk", 4)]
+    assert predicted(phases, costs(), 4).seconds == pytest.approx(1.0)
+    assert predicted(phases, costs(), 4, slowness=slow).seconds == pytest.approx(2.0)
+    assert predicted(phases, costs(), 4, slowness=slow, late_factor=math.inf).seconds == pytest.approx(slowness)
+    many = [Phase("rollout", "TrainingChunk", 400)]
+    found = predicted(many, costs(), 4, slowness=slow)
+    assert found.seconds <= 400 / (3 + 1 / slowness) + 2.0
+    assert predicted(many, costs(), 4, slowness=slow, late_factor=math.inf).seconds > found.seconds
+
+
+def test_equal_workers_get_no_second_copies():
+    phases, paid = generation(64, 16, 4), costs(message_s=0.002, way_s=0.001)
+    assert predicted(phases, paid, 16) == predicted(phases, paid, 16, late_factor=math.inf)

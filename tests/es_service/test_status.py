@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import socket
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -13,6 +15,7 @@ from typer.testing import CliRunner
 from es_service import api
 from es_service.cli.commands import settings
 from es_service.cli.main import app
+from es_service.cli.tables import status
 from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.status import follow_status, print_status, print_summary
 from es_service.errors import ConfigError
@@ -121,6 +124,11 @@ def test_stopped_and_running(run, console, capsys):
         in capsys.readouterr().out
     )
     lock = acquire_lock(run.folder)
+    lock.say(waiting=True)
+    print_status(console, run)
+    assert "state              waiting for a first place in the cluster since 2" in (printed := capsys.readouterr().out)
+    assert f"; driver on {socket.gethostname()}, pid {os.getpid()}\n" in printed
+    lock.say(waiting=False)
     print_status(console, run)
     lock.release()
     assert "state              running on " in (printed := capsys.readouterr().out)
@@ -129,11 +137,24 @@ def test_stopped_and_running(run, console, capsys):
     config.write_text(text)
 
 
+def test_who_follows_a_run_is_told_once_that_it_waits(run, console, monkeypatch, capsys):
+    lock = acquire_lock(run.folder)
+    seconds = iter((False, True, True, False, True, None))
+
+    def a_second_later(_: float) -> None:
+        waits = next(seconds)
+        lock.release() if waits is None else lock.say(waiting=waits)
+
+    monkeypatch.setattr(status, "time", SimpleNamespace(sleep=a_second_later))
+    follow_status(console, run)
+    assert capsys.readouterr().out.count("waiting for a first place") == 2
+
+
 def test_time_to_go_is_that_of_the_budget_that_is_spent_first(run):
     row = {"generation": 100, "env_steps": 10**6, "wall_clock_s": 3600.0, "best_fitness": 0.0}
 
     def running(limits):
-        return state(Standing(run, {"host": "a", "pid": 1}, row, limits))
+        return state(Standing(run, {"host": "a", "pid": 1, "waiting_since": None}, row, limits))
 
     assert running({}) == running({"target_fitness": 1.0}) == "running on a, pid 1"
     assert running({"generations": 500}) == "running on a, pid 1; about 4 h left"

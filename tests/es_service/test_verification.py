@@ -39,6 +39,9 @@ class Worker(DirectEvaluator):
         self.flip = None
         """(generation, kind of result, name of its array) in which the next result has a wrong bit."""
 
+    def wait_for_place(self):
+        """Return at once."""
+
     def evaluate(self, work):
         results = super().evaluate(work)
         for (_, chunk), result in zip(work, results, strict=True):

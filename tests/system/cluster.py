@@ -21,6 +21,8 @@ ROOT = Path(__file__).parents[2]
 MARK = "ES_TEST_NODE"
 PORT = 6379
 TOKEN = "0123456789abcdef" * 4
+RAY_SETTINGS = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN, "RAY_USAGE_STATS_ENABLED": "0"}
+COLLECT_ORPHANS = "while true; do sleep infinity & wait; done"
 
 
 def missing() -> str | None:
@@ -155,6 +157,31 @@ class Hosts:
         return kept | {MARK: f"{self._id}.{node}", "PATH": path, "PYTHONPATH": str(ROOT)}
 
 
+class Machines(Hosts):
+    """Hosts with process ids of their own, so that what ends every process that it sees ends those of one host."""
+
+    namespaces = ("--mount", "--uts", "--pid", "--fork", "--kill-child", "--mount-proc")
+
+    def boot(self, *nodes: str, setup: str = "true") -> None:
+        """Make hosts, each with a first process that collects orphans, and wait for them."""
+        for node in nodes:
+            self.add(node, "bash", "-c", COLLECT_ORPHANS, setup=setup)
+        for node in nodes:
+            until = time.monotonic() + 60
+            while not self._is_up(node):
+                assert time.monotonic() < until, (self.log_folder / f"{node}.log").read_text()
+                time.sleep(0.1)
+
+    def enter(self, node: str) -> list[str]:
+        """Command whose arguments are run on a node."""
+        (first,) = children_of(self._entries[node].pid)  # `unshare --fork` itself is outside
+        return ["nsenter", f"--target={first}", "--mount", "--net", "--uts", "--pid", f"--wd={ROOT}"]
+
+    def _is_up(self, node: str) -> bool:
+        first = children_of(self._entries[node].pid)
+        return bool(first) and Path(f"/proc/{first[0]}/cmdline").read_bytes().startswith(b"bash")
+
+
 class Cluster(Hosts):
     """Nodes by name; the first is the head, with the dashboard and no CPU for workers. Use as a context manager."""
 
@@ -189,8 +216,12 @@ class Cluster(Hosts):
             time.sleep(0.1)
 
     def _environment(self, node: str) -> dict[str, str]:
-        token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN, "RAY_USAGE_STATS_ENABLED": "0"}
-        return super()._environment(node) | token
+        return super()._environment(node) | RAY_SETTINGS
+
+
+def children_of(pid: int) -> list[int]:
+    """Process ids of a process's children."""
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 def _ip(*arguments: str) -> None:

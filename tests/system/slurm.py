@@ -17,8 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.system.cluster import ROOT, Hosts
-from tests.system.processes import wait_for
+from tests.system.cluster import Machines, children_of
 
 SRUN = """#!/bin/bash
 while [[ $1 == --* ]]; do shift; done
@@ -37,9 +36,6 @@ SCONTROL = """#!/bin/bash
 """
 
 
-COLLECT_ORPHANS = "while true; do sleep infinity & wait; done"
-
-
 def write_commands(folder: Path, **commands: str) -> Path:
     """Write programs into `folder`/bin, which is returned."""
     (folder / "bin").mkdir()
@@ -56,10 +52,8 @@ def sbatch_options(script: Path) -> dict[str, str]:
     return dict(found)
 
 
-class Slurm(Hosts):
+class Slurm(Machines):
     """One job. Use as a context manager."""
-
-    namespaces = ("--mount", "--uts", "--pid", "--fork", "--kill-child", "--mount-proc")
 
     def __init__(self, folder: Path, hosts: int, cpus: int) -> None:
         super().__init__(folder)
@@ -75,20 +69,12 @@ class Slurm(Hosts):
             started.wait()
 
     def begin(self) -> None:
-        """Make the hosts. Each knows the others' names, and has a first process that collects orphans."""
+        """Make the hosts. Each knows the others' names."""
         names = [f"node{number}" for number in range(self._hosts)]
         hosts = self.log_folder / "hosts"
         lines = [f"{self.ip(number)} {name}" for number, name in enumerate(names)]
         hosts.write_text("\n".join(["127.0.0.1 localhost", *lines, ""]))
-        for name in names:
-            self.add(name, "bash", "-c", COLLECT_ORPHANS, setup=f"mount --bind {hosts} /etc/hosts")
-        for name in names:
-            wait_for(lambda name=name: self._is_ready(name))
-
-    def enter(self, node: str) -> list[str]:
-        """Command whose arguments are run on a node."""
-        (first,) = _children(self._entries[node].pid)  # `unshare --fork` itself is outside
-        return ["nsenter", f"--target={first}", "--mount", "--net", "--uts", "--pid", f"--wd={ROOT}"]
+        self.boot(*names, setup=f"mount --bind {hosts} /etc/hosts")
 
     def sbatch(self, script: Path, *arguments: object) -> None:
         """Submit the job, which starts at once."""
@@ -111,7 +97,7 @@ class Slurm(Hosts):
     def warn(self) -> None:
         """Send the script, and only it, the signal that it has asked for."""
         assert self.options["signal"].startswith("B:TERM@")
-        (pid,) = _children(self._script.pid)
+        (pid,) = children_of(self._script.pid)
         os.kill(pid, signal.SIGTERM)
 
     def output(self) -> str:
@@ -122,10 +108,6 @@ class Slurm(Hosts):
     def exit_code(self) -> int | None:
         """Of the script; None while it runs."""
         return self._script.poll()
-
-    def _is_ready(self, node: str) -> bool:
-        first = _children(self._entries[node].pid)
-        return bool(first) and Path(f"/proc/{first[0]}/cmdline").read_bytes().startswith(b"bash")
 
     def _start(self) -> None:
         (self.log_folder / "state").write_text("RUNNING\n")
@@ -175,8 +157,3 @@ class Slurm(Hosts):
     def _environment(self, node: str) -> dict[str, str]:
         environment = super()._environment(node)
         return environment | {"PATH": f"{self._commands}{os.pathsep}{environment['PATH']}"}
-
-
-def _children(pid: int) -> list[int]:
-    """Process ids of a process's children."""
-    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]

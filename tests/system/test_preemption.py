@@ -10,7 +10,7 @@ import yaml
 from tests.system import cluster
 from tests.system.cluster import Cluster
 from tests.system.processes import wait_for
-from tests.system.test_cluster import CONFIG, entries, repeated_episodes, stop_a_little_later
+from tests.system.test_cluster import CONFIG, entries, episodes_begun_again, stop_a_little_later
 
 pytestmark = [pytest.mark.long, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
 
@@ -33,23 +33,28 @@ def test_a_node_that_is_told_to_stop_hands_its_work_over(tmp_path):
         stop_a_little_later(hosts, driver, run)
     assert {entry["reason"] for entry in entries(run, "StopWorker", since)} == {"drained"}
     assert not entries(run, "WorkerLost", since)
-    assert repeated_episodes(run, since) == 0
+    assert episodes_begun_again(run, since)[0] == 0
     assert seconds < 25.0, "it was idle and ended by itself; Ray's limit is 30 s"
 
 
 def test_a_run_asks_an_autoscaler_for_all_of_its_workers_and_begins_with_the_first_node(tmp_path):
-    """Without a number of workers it asks for one, since it follows the room in the cluster."""
+    """Without a number of workers it asks for all that have work, if it knows how large they are; else for one."""
     config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump(CONFIG | {"compute": CONFIG["compute"] | {"dispatch_log": True}}))
-    every = ("--workers", "4", "--set", "compute.worker_resources.cpu=2")
+    size = ("--set", "compute.worker_resources.cpu=2")
+    every = (*size, "--workers", "4")
     with Cluster(tmp_path) as hosts:
-        for options, demand in (((), "{'CPU': 1.0}: 1+ pending"), (every, "{'CPU': 2.0}: 2+ pending")):
+        for options, demand in (
+            ((), "{'CPU': 1.0}: 1+ pending"),
+            (size, "{'CPU': 2.0}: 4+ pending"),
+            (every, "{'CPU': 2.0}: 2+ pending"),
+        ):
             run = tmp_path / f"run{len(options)}"
             driver = hosts.popen(
                 "head", "es-service", "run", config, "--out", run, "--address", hosts.address, *options
             )
             wait_for(lambda demand=demand: demand in hosts.run("head", "ray", "status")[1])
-            if options:
+            if options == every:
                 hosts.start("one", 2)
                 wait_for(lambda run=run: len(entries(run, "Committed", 0.0)) > 3)
                 assert len(entries(run, "WorkerUp", 0.0)) == 1

@@ -77,16 +77,19 @@ def test_the_same_bits_as_inline_and_nothing_of_the_caller_s_changed(tmp_path, r
 
 
 def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatch):
-    """One of two workers is killed in mid-generation, then one is stopped, which only our own deadline notices. Their
+    """One of two workers is killed in mid-generation, then both are stopped, which only our own deadline notices. Their
     last words stay in Ray's logs."""
     faults = {4: signal.SIGKILL, 12: signal.SIGSTOP}
     send = Actors.send
 
     def send_and_strike(self, worker, key, attempt, work):
-        send(self, worker, key, attempt, work)
         number = faults.pop(key.generation, None) if key.kind == "TrainingChunk" else None
         if number is not None:
-            os.kill(self.places()[worker].pid, number)
+            os.kill(self.places()[worker].pid, signal.SIGSTOP)  # or it might have answered before it is struck
+        send(self, worker, key, attempt, work)
+        if number is not None:
+            for victim in [worker] if number == signal.SIGKILL else self.places():
+                os.kill(self.places()[victim].pid, number)
 
     monkeypatch.setattr(Actors, "send", send_and_strike)
     notices, before = [], sessions()
@@ -94,13 +97,36 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
     assert digest_parts(tmp_path / "run") == reference
     assert not faults
     assert len(sessions() - before) == 1
-    assert outcome.run.history["lost_workers"].sum() == 2
+    assert outcome.run.history["lost_workers"].sum() == 3
     assert [notice.partition(" lost ")[0] for notice in notices] == ["generation 4:", "generation 12:"]
     assert "its process or its node died" in notices[0]
     assert "no answer to work item TrainingChunk" in notices[1]
     counts = check_dispatch(tmp_path / "run")
     assert (counts["sessions"], counts["generations"]) == (1, 31)
-    assert counts["repeated"] == outcome.run.history["retries"].sum() >= 2
+    assert counts["repeated"] == outcome.run.history["retries"].sum()
+    assert counts["repeated"] + counts["copied"] >= 2, "a worker may be late before its loss is known"
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_a_run_goes_on_without_an_actor_that_hangs(tmp_path, reference, monkeypatch, cores):
+    """The other one computes what it has, long before the deadline; a copy is no retry."""
+    stopped, send, begun = [], Actors.send, time.monotonic()
+
+    def send_and_stop(self, worker, key, attempt, work):
+        send(self, worker, key, attempt, work)
+        if not stopped and key.generation == 4:
+            stopped.append(worker)
+            os.kill(self.places()[worker].pid, signal.SIGSTOP)
+
+    monkeypatch.setattr(Actors, "send", send_and_stop)
+    resources = {"workers": 2 * cores, "worker_resources": {"cpu": cores}}
+    outcome = run(tmp_path / "run", chunk_timeout_s=400.0, **resources)
+    assert time.monotonic() - begun < 300.0
+    assert digest_parts(tmp_path / "run") == reference
+    assert outcome.run.history[["lost_workers", "retries"]].sum().sum() == 0
+    counts = check_dispatch(tmp_path / "run")
+    assert (counts["repeated"], counts["lost"]) == (0, 0)
+    assert counts["copied"] > 0
 
 
 @pytest.mark.parametrize("rollout", ["simd", "xla"])

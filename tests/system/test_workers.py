@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -90,22 +91,38 @@ def test_order_of_chunks(tmp_path, reference, monkeypatch):
     ("number", "after", "chunk_timeout_s"), [(signal.SIGKILL, (4, 8), 30.0), (signal.SIGSTOP, (4,), 1.0)]
 )
 def test_a_worker_killed_or_stopped_in_mid_generation(tmp_path, reference, number, after, chunk_timeout_s):
-    """Only the deadline tells that one was stopped."""
+    """Only the deadline tells that workers were stopped; all are, or the others would do without the one."""
     hit, notices = [], []
 
     def strike(row):
         if row["generation"] in after:  # the next generation has begun when the timer fires
-            victim = children()[-1]
-            hit.append(victim)
-            timer = threading.Timer(0.01, os.kill, (victim, number))
+            victims = children()[-1:] if number == signal.SIGKILL else children()
+            hit.extend(victims)
+            timer = threading.Timer(0.01, lambda: [os.kill(victim, number) for victim in victims])
             timer.start()
 
     outcome = run(tmp_path / "run", strike, notices.append, chunk_timeout_s=chunk_timeout_s)
     history = outcome.run.history
-    assert len(hit) == len(after)
-    assert [notice.partition(";")[0] for notice in notices] == [f"generation {g + 1}: lost a worker" for g in after]
-    assert history["lost_workers"].sum() == len(after)
-    assert history["retries"].sum() >= 1
+    what = "a worker" if number == signal.SIGKILL else "2 workers"
+    assert [notice.partition(";")[0] for notice in notices] == [f"generation {g + 1}: lost {what}" for g in after]
+    assert history["lost_workers"].sum() == len(hit)
+    assert digest_parts(tmp_path / "run") == reference
+    assert children() == []
+
+
+def test_a_run_goes_on_without_a_worker_that_hangs(tmp_path, reference):
+    """The other one computes what it has, long before the deadline."""
+    stopped, begun = [], time.monotonic()
+
+    def strike(row):
+        if row["generation"] == 4:
+            stopped.append(children()[-1])
+            os.kill(stopped[0], signal.SIGSTOP)
+
+    outcome = run(tmp_path / "run", strike, chunk_timeout_s=400.0)
+    assert time.monotonic() - begun < 300.0
+    assert stopped
+    assert outcome.run.history[["lost_workers", "retries"]].sum().sum() == 0
     assert digest_parts(tmp_path / "run") == reference
     assert children() == []
 

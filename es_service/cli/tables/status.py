@@ -8,7 +8,7 @@ from rich.console import Console
 
 from es_service.cli.commands import command, settings, way_command
 from es_service.cli.tables.progress import plain_line
-from es_service.runs.standing import Standing, look, more, state, way_on
+from es_service.runs.standing import Standing, is_waiting, look, more, state, way_on
 from es_service.runs.view import Run
 from es_service.store.reader import read_totals
 
@@ -16,7 +16,7 @@ FOLLOW_INTERVAL_S = 1.0
 
 
 def print_status(console: Console, run: Run) -> None:
-    """Print the settings of a run, its state (running, stopped or finished) and its progress."""
+    """Print the settings of a run, its state (waiting, running, stopped or finished) and its progress."""
     standing = look(run)
     constants, parent = run.constants, run.meta.parent
     fields = {
@@ -33,10 +33,13 @@ def print_status(console: Console, run: Run) -> None:
 
 
 def follow_status(console: Console, run: Run) -> None:
-    """Print a line for the newest generation, at most one a second, until no driver is running."""
-    next_generation = 0
+    """Print a line for the newest generation, at most one a second, until no driver is running; and one for a wait."""
+    next_generation, was_waiting = 0, False
     while True:
         standing = look(run)
+        if (waits := is_waiting(standing)) and not was_waiting:
+            _print_line(console, state(standing))
+        was_waiting = waits
         if standing.row and standing.row["generation"] >= next_generation:
             next_generation = standing.row["generation"] + 1
             console.print(plain_line(standing.row), highlight=False, soft_wrap=True)
