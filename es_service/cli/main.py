@@ -24,6 +24,7 @@ from es_service.cli.options import (
     AddressOption,
     ConfigArgument,
     EngineOption,
+    JsonOption,
     LogLevelOption,
     OutOption,
     RunArgument,
@@ -198,11 +199,11 @@ app.add_typer(bench, name="bench")
 
 
 @app.command()
-def doctor() -> None:
+def doctor(as_json: JsonOption = False) -> None:
     """Check that this machine can run searches, and show what their results depend on."""
     from es_service.cli.doctor import examine
 
-    raise typer.Exit(0 if examine(console) else 1)
+    raise typer.Exit(0 if examine(console, as_json=as_json) else 1)
 
 
 def main() -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from typing import Annotated
 
 import typer
 
 from es_service import api
+from es_service.cli.data import print_json
 from es_service.cli.options import JsonOption, LogLevelOption, RunArgument, console, print_note
 from es_service.runs.verification import Recomputed
 from es_service.runs.verification import verify as recompute
@@ -33,7 +33,7 @@ def verify(
             console.print(_line(one), highlight=False, markup=False, soft_wrap=True)
     equal = not any(one.differences for one in found)
     if as_json:
-        print(json.dumps({"digest": digest, "equal": equal, "recomputed": [asdict(one) for one in found]}, indent=2))
+        print_json({"digest": digest, "equal": equal, "recomputed": [asdict(one) for one in found]})
     else:
         again = sum(one.last - one.first + 1 for one in found)
         print(f"{digest}  {'equal' if equal else 'different'}")
