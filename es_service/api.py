@@ -25,6 +25,7 @@ from es_service.loop.history import evaluated_columns, history_columns
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
+from es_service.runs.identity import require_unchanged
 from es_service.runs.lineage import fork_config, forked, started
 from es_service.runs.session import OnGeneration, OnNotice, Outcome, work
 from es_service.runs.standing import Standing, look
@@ -84,6 +85,7 @@ def resume(
     folder: str | os.PathLike[str],
     overrides: Overrides = (),
     *,
+    strict: bool = False,
     on_generation: OnGeneration = _ignore,
     on_notice: OnNotice = _warn,
     hook: Callable[[str], None] = no_hook,
@@ -92,9 +94,12 @@ def resume(
 
     Args:
         overrides: only budget, engine, workers and time limits may change; the run's `config.yaml` records the change.
+        strict: whether to refuse to continue with other code, other packages or another kind of processor than those
+            that computed the newest generation. If not, this is a notice, and the digest is marked `mixed`.
 
     Raises:
-        ConfigError: a constant of the run would change (all are listed). Otherwise as `run`.
+        ConfigError: a constant of the run would change (all are listed), or `strict` is set and something has changed.
+            Otherwise as `run`.
     """
 
     def changed(store: RunStore) -> RunConfig:
@@ -103,7 +108,7 @@ def resume(
         source = recorded if recorded.exists() else store.meta.config
         return changed_config(source, overrides)
 
-    return _go_on(Path(folder), changed, on_generation, on_notice, hook)
+    return _go_on(Path(folder), changed, on_generation, on_notice, hook, strict=strict)
 
 
 def run_or_resume(
@@ -131,6 +136,8 @@ def _go_on(
     on_generation: OnGeneration,
     on_notice: OnNotice,
     hook: Callable[[str], None] = no_hook,
+    *,
+    strict: bool = False,
 ) -> Outcome:
     """Open a run, check that the config of this session fits it, and continue it."""
     with RunStore.open(folder, hook=hook) as store, in_run(store.meta.run_id):
@@ -158,11 +165,13 @@ def _go_on(
                 run=folder,
                 ways_out=[WayOut("fork", "continue from its state in a new run", str(folder))],
             )
+        if strict:
+            require_unchanged(store, config)
         try:
             write_config(folder, config.resolved_yaml())
         except OSError as error:
             raise explained(error, folder, f"writing {CONFIG}") from error
-        return work(config, store, on_generation, on_notice)
+        return work(config, store, on_generation, on_notice, strict=strict)
 
 
 def _budget_of_a_fork(config: RunConfig, standing: Standing) -> dict[str, Any]:
@@ -201,7 +210,7 @@ def fork(
     `first_block` and `alternation` take effect at once, also in the middle of a block.
 
     Args:
-        generation: one of the parent's last two generations; None: the newest.
+        generation: one whose state the parent keeps: one of its last two, or of `store.keep_every`; None: the newest.
 
     Raises:
         ConfigError: the state does not fit a change (another task, descriptor, network, algorithm or map), or a key

@@ -13,7 +13,12 @@ from collections.abc import Callable, Sequence
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import ChunkResult, Work, WorkerPlace
 from es_service.protocol.process_environment import worker_environment
+from es_service.protocol.sources import why_refused
 from workers.xla_cache import xla_cache_settings
+
+
+class OtherCodeError(Exception):
+    """The driver's code is not that of this host; the message names the host and the files."""
 
 
 class WorkerActor:
@@ -41,14 +46,21 @@ class WorkerActor:
         return WorkerPlace(socket.gethostname(), os.getpid(), ray.get_runtime_context().get_node_id())
 
     def build(self) -> str:
-        """Import JAX with the settings of all workers and build the run's functions; returns the platform's text."""
+        """Import JAX with the settings of all workers and build the run's functions; returns the platform's text.
+
+        Raises:
+            OtherCodeError: the driver's code is not that of this host.
+        """
+        spec = pickle.loads(self._spec)
+        if problem := why_refused(spec.sources, spec.environment):
+            raise OtherCodeError(problem)
         environment = worker_environment(os.environ, self._gpus)
         for name in set(os.environ) - set(environment):
             del os.environ[name]
         os.environ.update(environment | xla_cache_settings())
         from workers.cores import make_worker_with_cores
 
-        self._run_chunks = make_worker_with_cores(pickle.loads(self._spec), self._cores)
+        self._run_chunks = make_worker_with_cores(spec, self._cores)
         if not self._gpus:
             return platform_text(platform_info())
         import jax

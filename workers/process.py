@@ -18,6 +18,7 @@ from operator import attrgetter
 from typing import Any
 
 from es_service.protocol.messages import Subject, forget_oldest
+from es_service.protocol.sources import why_refused
 from es_service.protocol.wire import framed, receive
 from workers.xla_cache import xla_cache_settings
 
@@ -66,7 +67,9 @@ def _descriptor(control: socket.socket) -> int | None:
 
 
 def _make_run_chunks(spec: Any) -> Callable[..., Any] | str:
-    """Function that runs chunks, or the traceback of the error that prevented making it."""
+    """Function that runs chunks, or the reason why there is none: other code, or the traceback of an error."""
+    if problem := why_refused(spec.sources, spec.environment):
+        return problem
     os.environ.update(xla_cache_settings())
     try:
         from workers.worker import make_worker

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +11,16 @@ import typer
 
 from es_service import api
 from es_service.cli.commands import command
-from es_service.cli.options import ConfigArgument, SeedOption, SetOption, WorkersOption, overrides, print_note
+from es_service.cli.data import print_json
+from es_service.cli.options import (
+    ConfigArgument,
+    JsonOption,
+    SeedOption,
+    SetOption,
+    WorkersOption,
+    overrides,
+    print_note,
+)
 from es_service.config.keys import parse_overrides
 from es_service.config.shipped import read_config
 from es_service.errors import ConfigError
@@ -54,9 +64,13 @@ def _require_absolute_start(config: Path, wanted: list[str]) -> None:
 
 
 @of_jobs(name="jobs")
-def jobs_(address: JobsOption) -> None:
+def jobs_(address: JobsOption, as_json: JsonOption = False) -> None:
     """List the jobs of a cluster, newest first: id, state, run folder."""
-    for job in jobs.list_jobs(address):
+    found = jobs.list_jobs(address)
+    if as_json:
+        print_json([asdict(job) for job in found])
+        return
+    for job in found:
         print(f"{job.id}  {job.state:<9}  {job.folder}")
 
 

@@ -1,5 +1,5 @@
 """The command line: `es-service run | resume | fork | status | digest | config | list | evaluate | export | report |
-submit | jobs | logs | stop | bench | doctor`.
+verify | submit | jobs | logs | stop | bench | doctor`.
 
 Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by SIGINT or SIGTERM.
 """
@@ -24,11 +24,13 @@ from es_service.cli.options import (
     AddressOption,
     ConfigArgument,
     EngineOption,
+    JsonOption,
     LogLevelOption,
     OutOption,
     RunArgument,
     SeedOption,
     SetOption,
+    StrictOption,
     WorkersOption,
     console,
     errors,
@@ -38,20 +40,17 @@ from es_service.cli.options import (
     print_note,
 )
 from es_service.cli.report import report
-from es_service.cli.tables.catalogue import print_catalogue
-from es_service.cli.tables.overview import print_overview
+from es_service.cli.show import config_, digest_, list_, status
 from es_service.cli.tables.progress import show_progress
-from es_service.cli.tables.status import follow_status, print_status, print_summary
+from es_service.cli.tables.status import print_summary
+from es_service.cli.verify import verify
 from es_service.config.loading import left_out
 from es_service.config.parallel import parallel_sentence
 from es_service.config.resolution import config_warnings
-from es_service.config.shipped import shipped_text
-from es_service.config.tasks import TASKS, no_vectors, task_of
+from es_service.config.tasks import no_vectors, task_of
 from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError
 from es_service.loop.history import Row
 from es_service.protocol.machine import VERSION
-from es_service.runs.standing import newest_runs
-from es_service.store import digest
 from es_service.store.folder import holds_run
 
 app = typer.Typer(
@@ -114,18 +113,20 @@ def resume(
     workers: WorkersOption = None,
     engine: EngineOption = None,
     address: AddressOption = None,
+    strict: StrictOption = False,
     log_level: LogLevelOption = None,
 ) -> None:
     """Continue a run; only budget, engine, workers and time limits may change."""
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
-    _session(folder, partial(api.resume, folder, wanted))
+    _session(folder, partial(api.resume, folder, wanted, strict=strict))
 
 
 @app.command()
 def fork(
     parent: RunArgument,
     generation: Annotated[
-        int | None, typer.Option("--generation", help="One of the parent's last two; default: the newest.")
+        int | None,
+        typer.Option("--generation", help="A generation whose state is kept; default: the newest."),
     ] = None,
     set_: SetOption = None,
     out: OutOption = None,
@@ -140,57 +141,10 @@ def fork(
     _session(folder, partial(api.fork, parent, wanted, generation=generation, out=folder))
 
 
-@app.command()
-def status(
-    folders: Annotated[
-        list[Path] | None, typer.Argument(help="Folders of runs; default: the newest under runs/.", show_default=False)
-    ] = None,
-    follow: Annotated[bool, typer.Option("--follow", help="Watch one run until its driver ends.")] = False,
-) -> None:
-    """Show the state of a run, also while it is running; for several runs, print one line each."""
-    if follow and len(folders or ()) != 1:
-        raise ConfigError(f"--follow: needs exactly one folder, got {len(folders or ())}; give one, or omit --follow")
-    if not folders:
-        folders = newest_runs(api.RUNS_FOLDER)
-        if not folders:
-            print_note(f"there is no run under {api.RUNS_FOLDER}/ in this folder; give the folder of a run")
-            return
-        print_overview(console, folders)
-        return
-    if len(folders) > 1:
-        raise typer.Exit(0 if print_overview(console, folders) else 1)
-    run = api.open_run(folders[0])
-    if follow:
-        follow_status(console, run)
-    else:
-        print_status(console, run)
-
-
-@app.command(name="digest")
-def digest_(
-    folder: RunArgument,
-    parts: Annotated[bool, typer.Option("--parts", help="Also print a line for each part of the run.")] = False,
-) -> None:
-    """Check all data of a run and print a SHA-256 of everything deterministic in it."""
-    found, mixed = digest.checked_parts(folder)
-    if parts:
-        for name, value in found.items():
-            print(f"{value}  {name}")
-    print(f"{digest.digest_of(found)}{'  mixed' if mixed else ''}")
-
-
-@app.command(name="config")
-def config_(
-    name: Annotated[str, typer.Argument(help="Name of a shipped config, as `list` shows it.", show_default=False)],
-) -> None:
-    """Print a shipped config, which you can save as a file and edit."""
-    print(shipped_text(name), end="")
-
-
-@app.command(name="list")
-def list_() -> None:
-    """Show tasks, algorithms, presets and shipped configs."""
-    print_catalogue(console, TASKS)
+app.command()(status)
+app.command(name="digest")(digest_)
+app.command(name="config")(config_)
+app.command(name="list")(list_)
 
 
 @app.command()
@@ -241,16 +195,17 @@ def export(
 
 
 app.command()(report)
+app.command()(verify)
 app.add_typer(job_commands)
 app.add_typer(bench, name="bench")
 
 
 @app.command()
-def doctor() -> None:
+def doctor(as_json: JsonOption = False) -> None:
     """Check that this machine can run searches, and show what their results depend on."""
     from es_service.cli.doctor import examine
 
-    raise typer.Exit(0 if examine(console) else 1)
+    raise typer.Exit(0 if examine(console, as_json=as_json) else 1)
 
 
 def main() -> None:

@@ -27,6 +27,10 @@ OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the new
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Seed of all random numbers.")]
 WorkersOption = Annotated[int | None, typer.Option("--workers", help="Number of workers; default: as configured.")]
 EngineOption = Annotated[str | None, typer.Option("--engine", help="What runs the workers: inline or ray.")]
+StrictOption = Annotated[
+    bool, typer.Option("--strict", help="Refuse to continue with other code, packages or kind of processor.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 AddressOption = Annotated[
     str | None, typer.Option("--address", help="Ray cluster to join: HOST:PORT, or auto. Implies --engine ray.")
 ]

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from es_service.config.fields import Count, NotNegative, Positive, Section, Switch, Text
+from es_service.config.fields import Count, NotNegative, Patience, Positive, Section, Switch, Text
 
 
 class WorkerResources(Section):
@@ -82,10 +82,10 @@ class ComputeConfig(Section):
         description="With engine ray in a cluster: longest time in seconds for which the run waits for a first place, "
         "before it stops; null: as long as it takes.",
     )
-    no_worker_timeout_s: Positive = Field(
+    no_worker_timeout_s: Patience = Field(
         120.0,
         description="Seconds without a live worker, after the first had come up, after which the run stops. A worker "
-        "that has not started after half of this time is replaced.",
+        "that has not started after half of this time is replaced; on a busy machine a start takes up to ten seconds.",
     )
     dispatch_log: Switch = Field(
         False,

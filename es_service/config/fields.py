@@ -31,6 +31,7 @@ def _tuples(value: Any) -> Any:
 
 Count = Annotated[int, Field(ge=1), "a whole number, at least 1"]
 Positive = Annotated[float, Field(gt=0), "a number above 0"]
+Patience = Annotated[float, Field(ge=20), "a number, at least 20"]
 NotNegative = Annotated[float, Field(ge=0), "a number, at least 0"]
 Number = Annotated[float, "a number"]
 Fraction = Annotated[float, Field(ge=0, le=1), "a number from 0 to 1"]

@@ -28,6 +28,7 @@ from es_service.config.fields import (
 from es_service.config.search import SearchConfig
 from es_service.config.yaml_text import dump_yaml
 from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
+from es_service.protocol.sources import worker_sources
 
 
 class TaskConfig(Section):
@@ -121,6 +122,16 @@ class BudgetConfig(Section):
     target_fitness: Number | None = Field(None, description="Mean evaluation fitness of a centre that ends the run.")
 
 
+class StoreConfig(Section):
+    """What the run folder keeps besides the newest state. May change on resume."""
+
+    keep_every: Count | None = Field(
+        None,
+        description="The states of generations whose number is a multiple of this are kept, so that a later check can "
+        "compute from them and a fork can begin there; null keeps only those of the last two generations.",
+    )
+
+
 class RunConfig(Section):
     """The config of a whole run. Equal configs give equal results, wherever and however often they run."""
 
@@ -131,6 +142,7 @@ class RunConfig(Section):
     map: MapConfig
     budget: BudgetConfig
     compute: ComputeConfig
+    store: StoreConfig
     seed: Seed = Field(0, description="Seed of all random numbers of the run.")
 
     def resolved_yaml(self) -> str:
@@ -140,7 +152,7 @@ class RunConfig(Section):
     def constants(self) -> dict[str, Any]:
         """Values that resume must not change: dotted key -> plain JSON value, in the order of the config."""
         sections = self.model_dump(mode="json")
-        del sections["budget"]
+        del sections["budget"], sections["store"]
         sections["compute"] = {key: sections["compute"][key] for key in COMPUTE_CONSTANTS}
         return flat(sections)
 
@@ -176,4 +188,5 @@ def worker_spec(config: RunConfig, task: TaskSpec) -> WorkerSpec:
         rollout_block_pairs=compute.rollout_block_pairs,
         gradient_block_pairs=compute.gradient_block_pairs,
         rollout=compute.rollout,
+        sources=worker_sources(settings.environment),
     )

@@ -18,6 +18,9 @@ VERSION = "0.8.0"
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "brax", "mujoco", "mujoco-mjx", "llvmlite")
 """Other packages whose version can change a bit of a result."""
 
+CODE = "code"
+"""Key under which a run's platform has the hashes of its code, `sources.Sources`."""
+
 
 def platform_info() -> dict[str, str]:
     """Package versions and CPU kind of this machine, by name. Equal platforms give the same results bit for bit."""
@@ -43,9 +46,17 @@ def computed_on(driver: Mapping[str, Any], workers: Collection[str]) -> dict[str
 
 
 def is_mixed(platforms: Iterable[Mapping[str, Any]]) -> bool:
-    """Whether generations were computed on several platforms, or one generation by workers on several platforms."""
+    """Whether generations were computed on several platforms or with several versions of the code, or one generation by
+    workers on several platforms. Code that was not recorded, as in old runs, is not compared."""
     found = list(platforms)
-    return len({platform_text(one) for one in found}) > 1 or any(len(one.get("workers", ())) > 1 for one in found)
+    machines = {platform_text(without_code(one)) for one in found}
+    codes = {platform_text(one[CODE]) for one in found if CODE in one}
+    return max(len(machines), len(codes)) > 1 or any(len(one.get("workers", ())) > 1 for one in found)
+
+
+def without_code(platform: Mapping[str, Any]) -> dict[str, Any]:
+    """A recorded platform without the hashes of the code."""
+    return {name: value for name, value in platform.items() if name != CODE}
 
 
 def cpu_kind() -> str:

@@ -114,6 +114,8 @@ class WorkerSpec:
     """Pairs whose weighted noise is summed into one partial gradient."""
     rollout: Literal["xla", "simd"] = "xla"
     """Implementation that computes episodes and gradients."""
+    sources: dict[str, str] = field(default_factory=dict)
+    """`sources.worker_sources` of the driver, which a worker must have as well; empty if this is not checked."""
 
 
 class WorkerPlace(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,13 +20,15 @@ from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError, WayOut
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
-from es_service.loop.parts import Arrays, moments_from_arrays
-from es_service.protocol.machine import computed_on, is_mixed, platform_info
+from es_service.loop.parts import moments_from_arrays
+from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments
+from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, open_run
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
+from es_service.store.codec import Part
 from es_service.store.writer import RunStore
 from workers.actor import WorkerActor
 from workers.policy import initial_parameters
@@ -56,9 +58,21 @@ class Outcome:
     """Which part of the budget is spent, in words."""
 
 
-def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_notice: OnNotice) -> Outcome:
-    """Run generations until the budget is spent."""
+def work(
+    config: RunConfig,
+    store: RunStore,
+    on_generation: OnGeneration,
+    on_notice: OnNotice,
+    *,
+    strict: bool = False,
+) -> Outcome:
+    """Run generations until the budget is spent.
+
+    Args:
+        strict: whether workers on another platform than the run's are an error.
+    """
     task = task_of(config)
+    store.keep_every = config.store.keep_every
     told = 0
 
     def tell(notice: str) -> None:
@@ -85,9 +99,11 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
     search = driver.Search(
         config=config,
         algorithm=ALGORITHMS[config.search.algorithm](config),
-        initial=lambda: _initial(config, store),
+        initial=lambda: initial_centres(config, store.start),
         task=task,
     )
+    code = code_of(config)
+    tell_of_other_code(store, code, tell)
     in_generation(0 if store.generation is None else store.generation + 1)
     compute, most = config.compute, chunks_at_once(config)
     _LOG.info("working on %s: engine %s, rollout %s", store.folder, compute.engine, compute.rollout)
@@ -118,39 +134,10 @@ def work(config: RunConfig, store: RunStore, on_generation: OnGeneration, on_not
             in_generation(row["generation"] + 1)
 
         engine.wait_for_place()  # before the loop, whose time is that of the run and of its budget
-        _, reason = driver.run(search, engine, _OnPlatforms(store, engine, tell), state, after_generation)
+        recorder = Recorder(store, engine, platform_info(), code, tell, strict=strict)
+        _, reason = driver.run(search, engine, recorder, state, after_generation)
         _LOG.info("the session ends: %s", reason)
     return Outcome(open_run(store.folder), reason)
-
-
-class _OnPlatforms:
-    """The run's store for the loop, which records the platform of a generation before it commits the generation."""
-
-    def __init__(self, store: RunStore, engine: Engine[Any], on_notice: OnNotice) -> None:
-        self._store, self._engine, self._on_notice = store, engine, on_notice
-        self._driver = platform_info()
-        self._workers: frozenset[str] | None = None
-        self.part = store.part
-
-    def commit(
-        self,
-        generation: int,
-        parts: Mapping[str, Arrays],
-        history: driver.HistoryRow,
-        evaluations: Sequence[driver.HistoryRow],
-    ) -> None:
-        """Record the platform if it has changed, with a notice if the run becomes mixed by that; then commit."""
-        workers = self._engine.platforms
-        if workers != self._workers:
-            platform = computed_on(self._driver, workers)
-            is_other = self._store.record_platform(generation, platform)
-            if is_other and (generation or is_mixed([platform])):
-                self._on_notice(
-                    f"from generation {generation} on, this run is computed on another platform, or on several: "
-                    f"{platform}. Its digest is now marked `mixed`."
-                )
-            self._workers = workers
-        self._store.commit(generation, parts, history, evaluations)
 
 
 @contextmanager
@@ -216,12 +203,12 @@ def make_engine(
     )
 
 
-def _initial(config: RunConfig, store: RunStore) -> tuple[list[FloatArray], Moments]:
+def initial_centres(config: RunConfig, start: Part | None) -> tuple[list[FloatArray], Moments]:
     """The initial centres and observation statistics: random centres without statistics, or copies of the policy of
-    `search.init_from` with its statistics."""
+    `search.init_from` with its statistics, which the run has stored as its start."""
     task, centres = task_of(config), range(config.search.centres)
-    if store.start is not None:
-        return [store.start["centre_D"] for _ in centres], moments_from_arrays(store.start)
+    if start is not None:
+        return [start["centre_D"] for _ in centres], moments_from_arrays(start)
     return [initial_policy(config, centre) for centre in centres], no_observations(task.observation_size)
 
 

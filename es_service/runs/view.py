@@ -49,7 +49,8 @@ class Run:
 
     @property
     def present_config(self) -> dict[str, Any]:
-        """`config` with the budget, engine, workers and time limits that were set last, as `resume` would use them.
+        """`config` with the budget, engine, workers, time limits and kept states that were set last, as `resume` would
+        use them.
 
         Other edits of the folder's `config.yaml` are ignored here; `resume` refuses them. Raises ConfigError if that
         file cannot be read.
@@ -59,9 +60,10 @@ class Run:
             return self.config
         recorded = read_yaml_file(file)
         budget, compute = (recorded.get(section, self.config[section]) for section in ("budget", "compute"))
+        store = recorded.get("store", self.config.get("store", {}))  # runs of older versions have no such section
         if isinstance(compute, Mapping):
             compute = {**compute, **{key: self.config["compute"][key] for key in COMPUTE_CONSTANTS}}
-        return self.config | {"budget": budget, "compute": compute}
+        return self.config | {"budget": budget, "compute": compute, "store": store}
 
     @property
     def constants(self) -> dict[str, Any]:
@@ -109,12 +111,15 @@ class Run:
     def parts(
         self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True
     ) -> tuple[int, dict[str, dict[str, np.ndarray]]]:
-        """A generation (None: the newest, else one of the last two) and its verified state parts, those `wanted`."""
+        """A generation (None: the newest) and its verified state parts, those `wanted`.
+
+        Raises StoreError if the state is not kept: the last two are, and those of `store.keep_every`.
+        """
         return reader.read_parts(self.folder, generation, wanted)
 
     def at(self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True) -> Moment:
-        """The state after a generation (None: the newest, else one of the last two), with the parts whose names are
-        `wanted`. All parts together take as much memory as all of the map's policies."""
+        """The state after a generation, with the arguments of `parts`. All parts together take as much memory as all of
+        the map's policies."""
         return Moment(self.folder, self.meta, *self.parts(generation, wanted))
 
     @property

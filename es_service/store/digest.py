@@ -52,7 +52,7 @@ def digest_parts(folder: Path) -> dict[str, str]:
 
 
 def digest_at(folder: Path, generation: int) -> str | None:
-    """Digest of the run after one of its last two generations; None if the state of that generation is not stored."""
+    """Digest of the run after a generation; None if the state of that generation is not kept."""
     with reading(folder) as (connection, meta):
         kept = kept_states(connection)
         return digest_of(_parts(folder, connection, meta, generation)) if generation in kept else None

@@ -15,22 +15,26 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
+from es_service.store.beginning import load_start
 from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict, table_rows
 from es_service.store.folder import COPY, DATABASE, explained, is_network_filesystem, require_run_folder
+from es_service.store.kept import whole_states
 from es_service.store.lock import lock_holder
 from es_service.store.schema import Damaged, RunMeta, history_select, load_meta, quoted
-from es_service.store.verify import KeptRows, is_no_damage, row_is_sound, rows_in_force, sound_platforms, state_in_force
+from es_service.store.verify import KeptRows, is_no_damage, row_is_sound, rows_in_force, sound_platforms
 
 _BUSY_S = 5.0
 EvaluatedCentres = list[dict[str, int | float]]
 """The centres that one generation evaluated, as values by column name; NaN stands for no value."""
 
 
-class _HistoryRow(NamedTuple):
+class HistoryRow(NamedTuple):
     """A history row whose SHA-256 was checked."""
 
     values: dict[str, int | float]
     evaluations: bytes
+    state: str
+    """`codec.state_sha256` of the state after the generation."""
 
 
 @contextlib.contextmanager
@@ -146,6 +150,24 @@ def read_newest(folder: Path) -> dict[str, int | float] | None:
         return rows[-1].values if rows else None
 
 
+def read_row(folder: Path, generation: int) -> HistoryRow:
+    """All that is stored of one generation in the history.
+
+    Raises:
+        StoreError: the row is missing or does not match its SHA-256.
+    """
+    with reading(folder) as (connection, meta):
+        if not (rows := _sound_rows(connection, meta, generation, 1)):
+            raise Damaged(f"the history row of generation {generation} is missing")
+        return rows[0]
+
+
+def read_start(folder: Path) -> dict[str, NDArray[Any]] | None:
+    """Arrays from which generation 0 of the run starts; None if it was created without them."""
+    with reading(folder) as (connection, _):
+        return load_start(connection)
+
+
 def read_totals(folder: Path, names: Sequence[str]) -> list[int | float]:
     """Sums of columns over the whole history, in the order of `names`. Rows are not checked against their SHA-256."""
     sums = ", ".join(f"coalesce(sum(history.{quoted(name)}), 0)" for name in names)
@@ -155,17 +177,17 @@ def read_totals(folder: Path, names: Sequence[str]) -> list[int | float]:
 
 def _sound_rows(
     connection: sqlite3.Connection, meta: RunMeta, first: int, limit: int | None = None
-) -> list[_HistoryRow]:
+) -> list[HistoryRow]:
     """History rows from generation `first` on. Raises Damaged if a row is missing or does not match its SHA-256."""
     query = history_select(meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation LIMIT ?"
     columns = column_bytes(meta.columns)
-    rows: list[_HistoryRow] = []
+    rows: list[HistoryRow] = []
     for *values, evaluations, state, sha256 in connection.execute(query, (first, -1 if limit is None else limit)):
         row = tuple(values)
         named = row_dict(meta.columns, row)
         if not row_is_sound(columns, row, evaluations, state, sha256) or named["generation"] != first + len(rows):
             raise Damaged(f"the history row of generation {first + len(rows)} is damaged or missing")
-        rows.append(_HistoryRow(named, evaluations))
+        rows.append(HistoryRow(named, evaluations, state))
     # Damage can hide the end of a table even from SQLite. The state shows it, since every generation has state rows.
     newest = connection.execute("SELECT max(generation) FROM state").fetchone()[0]
     if newest is not None and newest >= first + len(rows) and len(rows) != limit:
@@ -187,17 +209,19 @@ def read_parts(
         StoreError: the state of this generation is not stored, or does not match its SHA-256.
     """
     with reading(folder) as (connection, _):
-        kept, states, whole = _kept(connection)
-        if not states:
+        newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
+        if newest is None:
             way_out = WayOut("resume", "continue it", str(folder))
             raise StoreError(f"{folder} has no generation yet", run=folder, ways_out=[way_out])
-        asked = max(states) if generation is None else generation
+        asked = newest if generation is None else generation
+        kept = _kept_rows(connection)
+        whole = whole_states(connection, kept)
         if asked not in whole:
-            if asked in states and asked == max(states):
+            if asked == newest:
                 raise Damaged(f"the state of generation {asked} is damaged")
             raise StoreError(
                 f"{folder} does not keep the state of generation {asked}; it keeps the states of generations {whole}, "
-                f"and its history ends at generation {max(states)}",
+                f"and its history ends at generation {newest}",
                 field="generation",
                 value=asked,
                 allowed=str(whole),
@@ -215,19 +239,23 @@ def read_parts(
         return asked, parts
 
 
+def read_kept(folder: Path) -> tuple[KeptRows, list[int]]:
+    """Stored state rows (part -> generation -> SHA-256), and the generations whose whole state is stored."""
+    with reading(folder) as (connection, _):
+        kept = _kept_rows(connection)
+        return kept, whole_states(connection, kept)
+
+
 def kept_states(connection: sqlite3.Connection) -> list[int]:
-    """Generations whose whole state is stored, at most two."""
-    return _kept(connection)[2]
+    """Generations whose whole state is stored: at most the last two, unless the run keeps others."""
+    return whole_states(connection, _kept_rows(connection))
 
 
-def _kept(connection: sqlite3.Connection) -> tuple[KeptRows, dict[int, str], list[int]]:
-    """Stored state rows, `state_sha256` of each of the last two generations, and those whose whole state is stored."""
+def _kept_rows(connection: sqlite3.Connection) -> KeptRows:
     kept: KeptRows = {}
     for part, at, sha256 in connection.execute("SELECT part, generation, sha256 FROM state"):
         kept.setdefault(part, {})[at] = sha256
-    states = dict(connection.execute("SELECT generation, state_sha256 FROM history ORDER BY generation DESC LIMIT 2"))
-    whole = [at for at, state in states.items() if rows_in_force(kept, at) and state_in_force(kept, at) == state]
-    return kept, states, sorted(whole)
+    return kept
 
 
 def state_payload(connection: sqlite3.Connection, part: str, generation: int) -> bytes:

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError
 from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict, table_rows
 from es_service.store.folder import COPY
+from es_service.store.kept import whole_states
 from es_service.store.reader import EvaluatedCentres, connected_to, platforms, reading, state_payload
 from es_service.store.schema import Damaged, RunMeta, history_select
-from es_service.store.verify import KeptRows, row_is_sound, rows_in_force, state_in_force
+from es_service.store.verify import KeptRows, row_is_sound, rows_in_force
 
 Arrays = dict[str, NDArray[Any]]
 Kept = Callable[[str, Arrays], Arrays | None]
@@ -125,8 +126,7 @@ def _state(connection: sqlite3.Connection, kept: Kept, problems: list[str]) -> t
         stored.setdefault(part, {})[at] = sha256
     if not stored:
         return None, {}
-    states = dict(connection.execute("SELECT generation, state_sha256 FROM history ORDER BY generation DESC LIMIT 2"))
-    whole = [at for at, state in states.items() if rows_in_force(stored, at) and state_in_force(stored, at) == state]
+    whole = whole_states(connection, stored)
     newest = max(at for rows in stored.values() for at in rows)
     generation = max(whole, default=newest)
     if generation not in whole:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from es_service.errors import StoreError
 from es_service.logs import logger
 from es_service.store.folder import COPY, DATABASE, is_disk_full
 from es_service.store.repair import make_copy
@@ -38,7 +39,12 @@ class Upkeep:
         hook: Callable[[str], None],
         notices: list[str],
     ) -> None:
-        """Set the journal: WAL on a local disk, a synchronous rollback journal on a network file system."""
+        """Set the journal: WAL on a local disk; where that is impossible, and on a network file system, a synchronous
+        rollback journal.
+
+        Raises:
+            StoreError: SQLite keeps another journal on a network file system.
+        """
         self._connection = connection
         self._folder = folder
         self._network = network
@@ -50,8 +56,17 @@ class Upkeep:
         self._is_copied = False
         self._pending_bytes = 0
         self._checkpointed_at = time.monotonic()
-        connection.execute(f"PRAGMA journal_mode = {'DELETE' if network else 'WAL'}")
-        connection.execute(f"PRAGMA synchronous = {'FULL' if network else 'NORMAL'}")
+        wanted = "delete" if network else "wal"
+        journal = connection.execute(f"PRAGMA journal_mode = {wanted}").fetchone()[0]
+        if network and journal != wanted:
+            raise StoreError(
+                f"{folder / DATABASE}: SQLite uses the journal {journal} instead of {wanted}, as it must here"
+            )
+        if journal != wanted:  # the run is safe with any other journal as well, but commits take longer
+            notices.append(
+                f"{folder / DATABASE}: SQLite cannot use a write-ahead log on this disk; its journal is {journal}"
+            )
+        connection.execute(f"PRAGMA synchronous = {'NORMAL' if journal == 'wal' else 'FULL'}")
         # This class makes the checkpoints, so that the cost of a commit is known and tests can kill it around them.
         connection.execute("PRAGMA wal_autocheckpoint = 0")
         # Pages of deleted states need not be overwritten with zeros before they are used again.

@@ -194,8 +194,3 @@ def rows_in_force(kept: Mapping[str, Mapping[int, str]], generation: int) -> dic
     """Rows that make up the state at a generation: part -> (generation, sha256) of its newest row up to then."""
     newest = {part: max((at for at in rows if at <= generation), default=None) for part, rows in kept.items()}
     return {part: (at, kept[part][at]) for part, at in newest.items() if at is not None}
-
-
-def state_in_force(kept: Mapping[str, Mapping[int, str]], generation: int) -> str:
-    """`state_sha256` of the state at a generation, computed from the stored rows."""
-    return state_sha256(state_sum(rows_in_force(kept, generation)))

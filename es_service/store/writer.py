@@ -9,7 +9,6 @@ synchronous, and readers read the copy. After a clean end, `run.db` is a single 
 from __future__ import annotations
 
 import contextlib
-import json
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -32,11 +31,12 @@ from es_service.store.codec import (
     state_sha256,
     state_sum,
     table_bytes,
-    text_sha256,
 )
 from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
+from es_service.store.kept import earlier_states, outdated_rows
 from es_service.store.lock import RunLock, acquire_lock
+from es_service.store.platforms import newest_before, record
 from es_service.store.repair import open_sound
 from es_service.store.schema import PAGE_BYTES, RunMeta, history_insert, history_select
 from es_service.store.upkeep import Upkeep
@@ -61,6 +61,9 @@ class RunStore:
     """Messages for the user about repairs at opening, and about later problems that did not end the run."""
     generation: int | None
     """Newest committed generation; None if there is none."""
+    keep_every: int | None = None
+    """Generations whose number is a multiple of this keep their states; None keeps only the last two states. States of
+    earlier generations that are kept when the run is opened remain."""
     start: Part | None
     """Arrays from which generation 0 starts; None if the run was created without them."""
 
@@ -82,6 +85,7 @@ class RunStore:
         try:
             with self._explaining(f"opening {DATABASE}"):
                 self.start = load_start(self._connection)
+                self._earlier = earlier_states(self._connection, self._kept, self.generation)
                 self.upkeep = Upkeep(self._connection, folder, is_network_filesystem(folder), hook, self.notices)
             hook("opened")
         except BaseException:
@@ -192,8 +196,8 @@ class RunStore:
         total = changed_sum(self._state_sum, old, new)
         centres = table_bytes(self.meta.evaluation_columns, evaluations)
         history_values = history_row(self.meta.columns, generation, history, centres, state_sha256(total))
-        # The rows that remain make up the states of the newest generation and of the one before it.
-        outdated = [(part, at) for part in self._doubled for at in self._kept[part] if at < max(self._kept[part])]
+        # The rows that remain make up the states of the newest generation, of the one before it, and of those to keep.
+        outdated = outdated_rows(self._kept, self._doubled, self.keep_every, self._earlier)
         self._hook("before_begin")
         with self._transaction(f"storing generation {generation}") as execute:
             # Delete first, so that the new rows use the pages of the old ones.
@@ -242,15 +246,13 @@ class RunStore:
             raise StoreError(
                 f"{self.folder}: generation {generation} is already stored, so its platform cannot be changed"
             )
-        text = json.dumps(platform, sort_keys=True)
         with self._transaction("recording the platform") as execute:
-            execute("DELETE FROM platform WHERE generation >= ?", (generation,))
-            latest = execute("SELECT platform FROM platform ORDER BY generation DESC LIMIT 1").fetchone()
-            differs = latest is None or latest[0] != text
-            if differs:
-                row = (generation, text, text_sha256(f"platform {generation}", text))
-                execute("INSERT INTO platform (generation, platform, sha256) VALUES (?, ?, ?)", row)
-        return differs
+            return record(execute, generation, platform)
+
+    def platform_before(self, generation: int) -> dict[str, Any] | None:
+        """The platform recorded for the generation before this one; None if there is none."""
+        with self._explaining("reading the platforms"):
+            return newest_before(self._connection.execute, generation)
 
     def close(self) -> None:
         """Make `run.db` a single file and release the lock. This may be called again.

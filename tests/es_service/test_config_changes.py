@@ -86,8 +86,10 @@ def changes(*overrides: str, config: RunConfig | None = None) -> list[str]:
 
 
 def test_budget_workers_and_limits_are_no_constants():
-    config = changed("budget.generations=9", "compute.workers=2", "compute.chunk_timeout_s=5", "compute.max_attempts=1")
+    limits = ("compute.chunk_timeout_s=5", "compute.max_attempts=1")
+    config = changed("budget.generations=9", "compute.workers=2", "store.keep_every=50", *limits)
     assert (config.budget.generations, config.compute.workers, config.compute.max_attempts) == (9, 2, 1)
+    assert (config.store.keep_every, load().store.keep_every) == (50, None)
     assert config.constants() == load().constants()
 
 
@@ -132,7 +134,7 @@ def test_a_run_outlives_the_run_it_started_from(tmp_path):
 
 def test_every_key_of_the_science_is_a_constant():
     config = load()
-    sections = {name for name, value in config.model_dump().items() if isinstance(value, dict)} - {"budget"}
+    sections = {name for name, value in config.model_dump().items() if isinstance(value, dict)} - {"budget", "store"}
     assert {name.split(".")[0] for name in config.constants() if "." in name} == sections
     for section in sections - {"compute"}:
         keys = {name.split(".")[1] for name in config.constants() if name.startswith(f"{section}.")}

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import sqlite3
 import tempfile
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from es_service.errors import StoreError
 from es_service.store import folder as run_folder
 from es_service.store import reader as store_reader
+from es_service.store import repair as store_repair
 from es_service.store import upkeep as store_upkeep
 from es_service.store import verify as store_verify
 from es_service.store import writer as store
@@ -44,6 +46,44 @@ def test_a_clean_end_leaves_one_file_that_a_read_only_folder_can_hold(tmp_path):
                 RunStore.open(folder)
         assert len(list(folder.iterdir())) == 3
         os.chmod(folder, 0o755)
+
+
+def test_a_disk_without_a_write_ahead_log_is_told_and_gets_synchronous_commits(tmp_path, monkeypatch):
+    """SQLite's locking by files has no shared memory, as on some disks that containers share."""
+    folder = tmp_path / "run"
+    create(folder, generations=1).close()
+
+    def connect(file):
+        return sqlite3.connect(f"{file.as_uri()}?vfs=unix-dotfile", uri=True, isolation_level=None)
+
+    monkeypatch.setattr(store_repair, "connect", connect)
+    with RunStore.open(folder) as run:
+        (notice,) = run.notices
+        assert notice == f"{folder}/run.db: SQLite cannot use a write-ahead log on this disk; its journal is delete"
+        full = 2
+        assert run._connection.execute("PRAGMA synchronous").fetchone() == (full,)
+        advance(run, 5)
+    monkeypatch.undo()
+    assert_same_history(read_history(folder), 6)
+    with RunStore.open(folder) as run:
+        assert (run.generation, run.notices) == (5, [])
+        assert run._connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+
+
+def test_a_write_ahead_log_that_stays_on_a_network_is_refused(tmp_path, monkeypatch):
+    class Stubborn(sqlite3.Connection):
+        """Answers that its journal is what it was before."""
+
+        def execute(self, sql, *values):
+            return super().execute("SELECT 'wal'" if sql == "PRAGMA journal_mode = delete" else sql, *values)
+
+    create(tmp_path / "run", generations=1).close()
+    monkeypatch.setattr(store, "is_network_filesystem", lambda folder: True)
+    monkeypatch.setattr(
+        store_repair, "connect", lambda file: sqlite3.connect(file, isolation_level=None, factory=Stubborn)
+    )
+    with pytest.raises(StoreError, match="uses the journal wal instead of delete"):
+        RunStore.open(tmp_path / "run")
 
 
 def test_a_reader_that_holds_on_does_not_fail_the_end(tmp_path, monkeypatch):

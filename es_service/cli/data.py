@@ -1,0 +1,55 @@
+"""What `--json` prints: the content of the tables as data, in which null stands for NaN and infinities."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from es_service.config.presets import preset_table
+from es_service.config.shipped import shipped_configs
+from es_service.protocol.messages import TaskSpec
+from es_service.runs.standing import Standing, state
+from es_service.search.algorithms import ALGORITHMS
+
+
+def print_json(value: object) -> None:
+    """Print a value as JSON on stdout."""
+    print(json.dumps(_finite(value), indent=1, allow_nan=False))
+
+
+def standing_data(standing: Standing) -> dict[str, Any]:
+    """What `status` shows of a run; `newest` is the newest row of its history."""
+    run = standing.run
+    return {
+        "run": str(run.folder),
+        "run_id": run.run_id,
+        "task": run.constants["task.environment"],
+        "algorithm": run.constants["search.algorithm"],
+        "seed": run.constants["seed"],
+        "state": state(standing),
+        "driver": standing.driver,
+        "limits": standing.limits,
+        "newest": standing.row,
+    }
+
+
+def catalogue_data(tasks: Mapping[str, TaskSpec]) -> dict[str, Any]:
+    """What `list` shows: the shipped tasks, algorithms, presets and configs."""
+    return {
+        "tasks": [asdict(task) for task in tasks.values()],
+        "algorithms": list(ALGORITHMS),
+        "presets": [asdict(row) for row in preset_table()],
+        "configs": list(shipped_configs()),
+    }
+
+
+def _finite(value: Any) -> Any:
+    """The value with null for each number that JSON does not have."""
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

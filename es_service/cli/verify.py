@@ -1,0 +1,52 @@
+"""The command `verify`: compute generations of a run again, and tell whether the bits are equal."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from es_service import api
+from es_service.cli.data import print_json
+from es_service.cli.options import JsonOption, LogLevelOption, RunArgument, console, print_note
+from es_service.runs.verification import Recomputed
+from es_service.runs.verification import verify as recompute
+
+
+def verify(
+    folder: RunArgument,
+    generations: Annotated[
+        int, typer.Option("--generations", min=1, help="Generations to compute from each state that is kept.")
+    ] = 1,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
+    as_json: JsonOption = False,
+    log_level: LogLevelOption = None,
+) -> None:
+    """Compute generations of a run again on this machine and compare every bit; exit code 1 if one differs."""
+    run = api.open_run(folder)
+    digest = run.digest()  # raises if stored data are damaged
+    found: list[Recomputed] = []
+    for one in recompute(run, generations, workers):
+        found.append(one)
+        if not as_json:
+            console.print(_line(one), highlight=False, markup=False, soft_wrap=True)
+    equal = not any(one.differences for one in found)
+    if as_json:
+        print_json({"digest": digest, "equal": equal, "recomputed": [asdict(one) for one in found]})
+    else:
+        again = sum(one.last - one.first + 1 for one in found)
+        print(f"{digest}  {'equal' if equal else 'different'}")
+        print_note(f"{again:,} of {(run.generation or 0) + 1:,} generations were computed again")
+    raise typer.Exit(0 if equal else 1)
+
+
+def _line(one: Recomputed) -> str:
+    which = f"generation {one.first}" if one.first == one.last else f"generations {one.first} to {one.last}"
+    if not one.differences:
+        line = f"{which}: equal"
+    elif one.first == one.last:
+        line = f"{which} differs: {', '.join(one.differences)}"
+    else:
+        line = f"{which}: generation {one.last} differs: {', '.join(one.differences)}"
+    return line + (f"; since the run computed it: {', '.join(one.changes)}" if one.changes else "")

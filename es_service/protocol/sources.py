@@ -1,0 +1,187 @@
+"""Which code computes a run: the SHA-256 of each source file on which its bits depend, by the file's name.
+
+Workers compute with `workers/`, `protocol/` and the modules of a user's task; the driver besides with `loop/`,
+`search/`, `config/` and the modules of a user's search. Other folders of es_service never count: what they do changes
+no bit. Names do not contain the place of an installation, so equal code has equal hashes everywhere. A changed comment
+is a change, because only the bytes of a file are compared.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib.machinery
+import importlib.util
+import os
+import socket
+import sys
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+
+Sources = Mapping[str, str]
+"""Name of a source file, such as `workers/episode.py` -> the first half of its SHA-256, in hexadecimal digits."""
+OURS = ("es_service", "workers")
+WORKERS = ("workers", "es_service.protocol")
+"""Packages with which workers compute."""
+DRIVER = ("es_service.loop", "es_service.search", "es_service.config")
+"""Packages with which the driver computes besides."""
+_SHARED_FOLDERS = ("site-packages", "dist-packages")
+"""Names of folders in which the packages of several projects are installed side by side."""
+
+
+def worker_sources(environment: str) -> dict[str, str]:
+    """Sources with which a worker computes.
+
+    Those of this project are read once per process, because a process goes on with what it has imported. Those of the
+    task are read anew, because the driver asks for them without importing them.
+
+    Args:
+        environment: the value of `task.environment`.
+    """
+    return _package_sources(*WORKERS) | (_module_sources(environment) if _is_own(environment) else {})
+
+
+def driver_sources(algorithm: str) -> dict[str, str]:
+    """Sources with which the driver computes besides those of the workers; each is read once per process.
+
+    Args:
+        algorithm: the value of `search.algorithm`.
+    """
+    return _package_sources(*DRIVER) | (_imported_sources(algorithm) if _is_own(algorithm) else {})
+
+
+def other_files(ours: Sources, theirs: Sources) -> list[str]:
+    """Names of the files that differ, or that only one side has, in alphabetical order."""
+    return sorted(name for name in {*ours, *theirs} if ours.get(name) != theirs.get(name))
+
+
+def in_words(files: list[str], most: int = 5) -> str:
+    """The first `most` of some names of files, and how many others there are."""
+    return ", ".join(files[:most]) + (f" and {len(files) - most} others" if len(files) > most else "")
+
+
+def why_refused(expected: Sources, environment: str) -> str:
+    """Why this process must not work for a driver, naming the host and the files; empty if its code is the driver's.
+
+    Args:
+        expected: `worker_sources` of the driver; empty if the driver does not ask for it.
+        environment: the value of `task.environment`.
+    """
+    if not expected or not (other := other_files(expected, worker_sources(environment))):
+        return ""
+    return (
+        f"{socket.gethostname()} has other code than the driver had when it started, so it must not compute for this "
+        f"run: {in_words(other)}. Give every host the same files, or start the driver again if they were changed on "
+        "purpose"
+    )
+
+
+def _is_own(name: str) -> bool:
+    """Whether a task or an algorithm is the user's, `package.module:name`."""
+    return ":" in name and not name.startswith("brax:")
+
+
+@cache
+def _package_sources(*packages: str) -> dict[str, str]:
+    """All Python files in packages of this project, which are importable here."""
+    found: dict[str, str] = {}
+    for package in packages:
+        spec = importlib.util.find_spec(package)
+        for folder in map(Path, (spec and spec.submodule_search_locations) or ()):
+            for file in folder.rglob("*.py"):
+                found["/".join((*package.split("."), *file.relative_to(folder).parts))] = _sha256(file)
+    return found
+
+
+@cache
+def _imported_sources(path: str) -> dict[str, str]:
+    return _module_sources(path)
+
+
+def _module_sources(path: str) -> dict[str, str]:
+    """The module of `package.module:name`, its packages, and what they import from the same place, directly or not.
+
+    Nothing is imported, so that the driver need not load what only the workers use: the modules are found by the import
+    statements. The same place is the top package, and the folder that contains it, unless packages of several projects
+    are installed there. Other packages count by their versions, if at all.
+    """
+    name = path.partition(":")[0]
+    top = _find(name.partition(".")[0], None)
+    if top is None or top.name in sys.stdlib_module_names or not (place := _place(top)):
+        return {}
+    is_shared = os.path.basename(place) in _SHARED_FOLDERS
+    found: dict[str, str] = {}
+    seen: set[str] = set()
+    wanted = [name]
+    while wanted:
+        for spec in _chain(wanted.pop()):
+            top_name = spec.name.partition(".")[0]
+            if spec.name in seen or top_name in OURS or (is_shared and top_name != top.name) or _place(spec) != place:
+                continue
+            seen.add(spec.name)
+            if spec.origin is None:
+                continue  # a package without a file of its own
+            file, is_package = Path(spec.origin), spec.submodule_search_locations is not None
+            found["/".join(file.parts[-1 - spec.name.count(".") - is_package :])] = _sha256(file)
+            if file.suffix == ".py":
+                wanted += _imports(file, spec.name if is_package else spec.name.rpartition(".")[0])
+    return found
+
+
+def _chain(name: str) -> Iterator[importlib.machinery.ModuleSpec]:
+    """The specs of a module and of the packages that contain it, outermost first, as far as they exist."""
+    path = None
+    parts = name.split(".")
+    for count in range(1, len(parts) + 1):
+        spec = _find(".".join(parts[:count]), path)
+        if spec is None:
+            return
+        yield spec
+        if spec.submodule_search_locations is None:
+            return
+        path = list(spec.submodule_search_locations)
+
+
+def _find(name: str, path: list[str] | None) -> importlib.machinery.ModuleSpec | None:
+    """The spec of a module, without importing it or its packages; None if there is none.
+
+    Args:
+        path: folders of the package that contains it; None for a top module, which may also be in the current folder.
+    """
+    for finder in sys.meta_path:
+        if (spec := finder.find_spec(name, path)) is not None:
+            return spec
+    return importlib.machinery.PathFinder.find_spec(name, [os.getcwd()]) if path is None else None
+
+
+def _place(spec: importlib.machinery.ModuleSpec) -> str:
+    """Folder that contains the top package of a module; empty if the module is not in a file."""
+    if spec.submodule_search_locations:
+        own = next(iter(spec.submodule_search_locations))
+    elif spec.has_location and spec.origin is not None:
+        own = spec.origin
+    else:
+        return ""
+    return str(Path(os.path.abspath(own)).parents[spec.name.count(".")])
+
+
+def _imports(file: Path, package: str) -> list[str]:
+    """Names of the modules that a file may import, also inside its functions."""
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (SyntaxError, ValueError):
+        return []  # its import is going to fail
+    found: list[str] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = package.rsplit(".", node.level - 1)[0] if node.level > 1 else package
+            base = ".".join(filter(None, (above if node.level else "", node.module)))
+            found += [base, *(f"{base}.{alias.name}" for alias in node.names)]
+    return [name for name in found if name]
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:32]

@@ -1,0 +1,208 @@
+"""Computing generations of a run again on this machine, from the states that the run keeps, and comparing the bits.
+
+Every generation has in its history the SHA-256 of its whole state, so a recomputed generation can be judged even if its
+state is not kept: a kept state is only needed as a beginning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from es_service.config.compute import ENGINE_IMPLIES
+from es_service.config.model import BudgetConfig, worker_spec
+from es_service.config.tasks import task_of
+from es_service.dispatch.inline_engine import inline_engine
+from es_service.errors import NotInRunError, WayOut
+from es_service.loop import driver
+from es_service.loop.history import HistoryRow
+from es_service.loop.parts import Arrays
+from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.machine import CODE, platform_info
+from es_service.runs.checked_config import changed_config
+from es_service.runs.identity import code_changes, code_of, platform_changes
+from es_service.runs.session import dispatch_limits, initial_centres
+from es_service.runs.signals import stop_on_signals
+from es_service.runs.view import Run
+from es_service.search.algorithms import ALGORITHMS
+from es_service.store import reader
+from es_service.store.codec import (
+    changed_sum,
+    encode_part,
+    part_sha256,
+    row_values,
+    state_sha256,
+    state_sum,
+    table_bytes,
+)
+from es_service.store.verify import KeptRows, rows_in_force
+
+
+@dataclass(frozen=True)
+class Recomputed:
+    """Neighbouring generations that were computed again, up to the first that differs."""
+
+    first: int
+    last: int
+    differences: tuple[str, ...]
+    """What differs in generation `last`, in words; empty if all of these generations are equal."""
+    changes: tuple[str, ...]
+    """Differences in platform and code between what computed `last` in the run and what computed it now, in words. They
+    may, but need not, cause other bits."""
+
+
+def verify(run: Run, generations: int = 1, workers: int | None = None) -> Iterator[Recomputed]:
+    """Compute generations of a run again on this machine and compare them with what is stored, bit for bit.
+
+    The run is only read. Each kept state is a beginning, and so is the start of the run, unless it is a fork.
+
+    Args:
+        generations: number of generations to compute from each beginning, at most up to the next one. With the number
+            of all generations, the whole run is computed again.
+        workers: number of worker processes; None: one per core.
+
+    Raises:
+        NotInRunError: the run has no generation that can be computed again.
+        EvaluationError: the rollouts cannot continue.
+        Interrupted: SIGINT or SIGTERM arrived.
+    """
+    overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": workers or "auto"}
+    config = changed_config(run.present_config, overrides)
+    task, code, platforms = task_of(config), code_of(config), reader.read_platforms(run.folder)
+    plan = _plan(run, generations)
+    budget = BudgetConfig.model_validate({"generations": (run.generation or 0) + 1})  # not spent before the plan is
+    search = driver.Search(
+        config=config.model_copy(update={"budget": budget}),
+        algorithm=ALGORITHMS[config.search.algorithm](config),
+        initial=lambda: initial_centres(config, reader.read_start(run.folder)),
+        task=task,
+    )
+    with (
+        stop_on_signals() as should_stop,
+        inline_engine(worker_spec(config, task), dispatch_limits(config), should_stop) as engine,
+    ):
+        for begin, last in plan:
+            reached, differences = _recompute(run, search, engine, begin, last)
+            then = next((platform for first, platform in reversed(platforms) if first <= reached), {})
+            now = {**platform_info(), CODE: code}
+            yield Recomputed(0 if begin is None else begin + 1, reached, differences, tuple(_changes(then, now)))
+
+
+def _plan(run: Run, generations: int) -> list[tuple[int | None, int]]:
+    """(beginning, last generation) of each part of the run to compute; None stands for the start of the run."""
+    newest = run.generation
+    parent = run.meta.parent
+    begins: list[int | None] = [*reader.read_kept(run.folder)[1]]
+    if parent is None or reader.read_start(run.folder) is not None:
+        begins.insert(0, None)
+    if newest is None or begins in ([], [newest]):
+        raise NotInRunError(
+            f"{run.folder} has no generation that can be computed again from a state that it keeps",
+            run=run.folder,
+            ways_out=[WayOut("resume", "compute more generations", str(run.folder))],
+        )
+    ends = [*(at for at in begins[1:] if at is not None), newest]
+    lasts = [min(end, (-1 if begin is None else begin) + generations) for begin, end in zip(begins, ends, strict=True)]
+    return [(begin, last) for begin, last in zip(begins, lasts, strict=True) if begin is None or last > begin]
+
+
+def _changes(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """What has changed since, in words; for workers on other platforms than their driver, of each of them."""
+    *workers, driver_then = [*then.get("workers", ()), {**then, "workers": None}]
+    changes = platform_changes(driver_then, {**now, "workers": None})
+    changes += [f"worker's {change}" for worker in workers for change in platform_changes(worker, now)]
+    if CODE not in then:
+        return [*changes, "the code of that time was not recorded"]
+    return changes + [f"other code in {file}" for file in code_changes(then, now)]
+
+
+def _recompute(
+    run: Run, search: driver.Search, evaluator: Evaluator, begin: int | None, last: int
+) -> tuple[int, tuple[str, ...]]:
+    """The generation that was reached, and what differs in it."""
+    store = _Comparison(run, begin, last)
+    state = driver.stored_state(store, search.task)
+    with suppress(_End):
+        driver.run(search, evaluator, store, state, lambda row: None)
+    return store.reached, store.differences
+
+
+class _End(Exception):  # noqa: N818 (ends the loop, which has no other end before its budget)
+    """The last wanted generation was computed, or one differs."""
+
+
+class _Comparison:
+    """A store for the loop that compares each generation with the run instead of storing it."""
+
+    def __init__(self, run: Run, begin: int | None, last: int) -> None:
+        self.generation = begin
+        self.reached = -1
+        self.differences: tuple[str, ...] = ()
+        self._run, self._last = run, last
+        self._stored, self._whole = reader.read_kept(run.folder)
+        self._in_force = {} if begin is None else rows_in_force(self._stored, begin)
+        self._sum = state_sum(self._in_force)
+        self._changed: dict[str, Mapping[str, Any]] = {}
+
+    def load(self, without: str | None = None) -> dict[str, Arrays]:
+        """The state at the beginning, without the parts whose names begin with a prefix."""
+        wanted = lambda part: without is None or not part.startswith(without)  # noqa: E731
+        return self._run.parts(self.generation, wanted)[1]
+
+    def last_history(self) -> HistoryRow:
+        return {}
+
+    def part(self, name: str) -> Arrays:
+        """A part of the newest state: as it was computed, or else as it was at the beginning."""
+        if name in self._changed:
+            return dict(self._changed[name])
+        return self._run.parts(self.generation, lambda part: part == name)[1][name]
+
+    def commit(
+        self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow, evaluations: Sequence[HistoryRow]
+    ) -> None:
+        """Compare a generation. Raises _End after the last one, and after one that differs."""
+        new = {part: (generation, part_sha256(part, generation, encode_part(new))) for part, new in parts.items()}
+        old = {part: self._in_force[part] for part in new if part in self._in_force}
+        self._sum = changed_sum(self._sum, old, new)
+        self._in_force |= new
+        self._changed |= parts
+        self.reached = generation
+        stored = reader.read_row(self._run.folder, generation)
+        found = _history_differences(self._run, generation, stored.values, history)
+        if table_bytes(self._run.meta.evaluation_columns, evaluations) != stored.evaluations:
+            found.append("the evaluated centres")
+        if state_sha256(self._sum) != stored.state:
+            found += _state_differences(self._stored, generation in self._whole, generation, new) or ["the state"]
+        self.differences = tuple(found)
+        if found or generation == self._last:
+            raise _End
+
+
+def _history_differences(run: Run, generation: int, stored: Mapping[str, Any], computed: HistoryRow) -> list[str]:
+    """Deterministic columns of the history that differ, with both values."""
+    columns = [column for column in run.meta.columns if column.deterministic]
+    named = {column.name: computed.get(column.name) for column in columns}
+    values = row_values(columns, generation, named)
+    before = row_values(columns, generation, {column.name: stored[column.name] for column in columns})
+    return [
+        f"{column.name} is {_shown(new)} instead of {_shown(old)}"
+        for column, old, new in zip(columns, before, values, strict=True)
+        if old != new
+    ]
+
+
+def _shown(value: float | None) -> str:
+    return "missing" if value is None else repr(value)
+
+
+def _state_differences(
+    stored: KeptRows, is_whole: bool, generation: int, computed: Mapping[str, tuple[int, str]]
+) -> list[str]:
+    """Parts of the state that differ, as far as the run still has those of this generation."""
+    at_generation = {part: rows[generation] for part, rows in stored.items() if generation in rows}
+    here = {part: sha256 for part, (_, sha256) in computed.items()}
+    names = sorted({*at_generation, *(here if is_whole else ())})
+    return [f"state/{name}" for name in names if here.get(name) != at_generation.get(name)]

@@ -1,0 +1,175 @@
+"""Which files are the code of a run, and what counts as another version of it."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from es_service.dispatch.events import Limits
+from es_service.dispatch.inline_engine import inline_engine
+from es_service.errors import EvaluationError
+from es_service.protocol.machine import CODE, is_mixed
+from es_service.protocol.messages import TrainingChunk
+from es_service.protocol.sources import driver_sources, in_words, other_files, why_refused, worker_sources
+from tests.helpers import SPEC, centre, random_parameters
+from workers.actor import OtherCodeError, WorkerActor
+
+ROOT = Path(__file__).parents[2]
+WORKERS, DRIVER = worker_sources("point_maze"), driver_sources("es")
+PRINT = """
+import json
+from es_service.protocol.sources import driver_sources, worker_sources
+print(json.dumps([worker_sources("point_maze"), driver_sources("es")]))
+"""
+
+
+def test_the_folders_that_compute_count_and_no_others():
+    def files(*folders: str) -> set[str]:
+        return {str(file.relative_to(ROOT)) for folder in folders for file in (ROOT / folder).rglob("*.py")}
+
+    assert WORKERS.keys() == files("workers", "es_service/protocol")
+    assert DRIVER.keys() == files("es_service/loop", "es_service/search", "es_service/config")
+
+
+@pytest.fixture(scope="module")
+def elsewhere(tmp_path_factory):
+    """Another checkout, and a function that returns what a process there says of its code."""
+    folder = tmp_path_factory.mktemp("elsewhere") / "checkout"
+    for package in ("es_service", "workers"):
+        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+
+    def said():
+        run = subprocess.run(
+            [sys.executable, "-c", PRINT], cwd=folder, env={"PYTHONPATH": str(folder)}, capture_output=True, check=True
+        )
+        return json.loads(run.stdout)
+
+    return folder, said
+
+
+def test_an_unchanged_checkout_at_another_path_has_the_same_code(elsewhere):
+    folder, said = elsewhere
+    for file, old, new in (
+        ("es_service/cli/options.py", 'help="Change one key', 'help="Set one key'),
+        ("es_service/cli/main.py", "import typer\n", "import typer  # a comment\n"),
+        ("es_service/api.py", "RUNS_FOLDER", "WHERE_RUNS_ARE"),
+        ("es_service/runs/view.py", "import os\n", "import os  # a comment\n"),
+    ):
+        text = (folder / file).read_text()
+        assert old in text
+        (folder / file).write_text(text.replace(old, new))
+    assert said() == [WORKERS, DRIVER]
+
+
+@pytest.mark.parametrize(
+    ("file", "of_workers"),
+    [
+        ("workers/simd/graph/folding.py", True),
+        ("es_service/protocol/noise.py", True),
+        ("es_service/search/optimizer.py", False),
+        ("es_service/loop/driver.py", False),
+        ("es_service/config/presets.py", False),
+    ],
+)
+def test_an_edited_file_is_named_to_the_side_that_computes_with_it(elsewhere, file, of_workers):
+    folder, said = elsewhere
+    sound = (folder / file).read_bytes()
+    (folder / file).write_bytes(sound + b"\nx = 1\n")
+    workers, driver = said()
+    (folder / file).write_bytes(sound)
+    assert other_files(WORKERS, workers) == ([file] if of_workers else [])
+    assert other_files(DRIVER, driver) == ([] if of_workers else [file])
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A user's folder: a task with its physics, a search in a package, and modules that neither of them uses."""
+    for name, text in {
+        "my_task.py": "import json\nimport numpy\n\ndef f():\n    from my_physics import g\n",
+        "my_physics.py": "import my_constants\nimport workers.policy\n",
+        "my_constants.py": "raise RuntimeError('imported')",
+        "my_notes.py": "",
+        "my_searches/__init__.py": "",
+        "my_searches/first.py": "from . import steps\nfrom .deep.down import h\n",
+        "my_searches/steps.py": "",
+        "my_searches/deep/__init__.py": "",
+        "my_searches/deep/down.py": "from ..extra import e\n",
+        "my_searches/extra.py": "",
+        "my_searches/second.py": "",
+    }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_user_s_modules_count_with_what_they_import_from_the_same_place(own):
+    task = worker_sources("my_task:Maze")
+    assert set(other_files(WORKERS, task)) == {"my_task.py", "my_physics.py", "my_constants.py"}
+    search = driver_sources("my_searches.first:search")
+    names = ("__init__", "first", "steps", "extra", "deep/__init__", "deep/down")
+    assert set(other_files(DRIVER, search)) == {f"my_searches/{name}.py" for name in names}
+    assert not {"my_task", "my_constants", "my_searches"} & sys.modules.keys()
+    (own / "my_notes.py").write_text("x = 1")
+    assert worker_sources("my_task:Maze") == task
+    (own / "my_constants.py").write_text("x = 1")
+    assert other_files(task, worker_sources("my_task:Maze")) == ["my_constants.py"]
+    (own / "my_physics.py").unlink()
+    assert other_files(task, worker_sources("my_task:Maze")) == ["my_constants.py", "my_physics.py"]
+
+
+def test_a_search_that_this_process_has_imported_stays_what_it_was(own):
+    """The driver goes on with the module that it has; new workers would import a task anew."""
+    before = driver_sources("my_searches.second:search")
+    (own / "my_searches/second.py").write_text("x = 1")
+    assert driver_sources("my_searches.second:search") == before
+
+
+@pytest.mark.parametrize("name", ["brax:ant", "no_such_module:Class", "sys:path", "rich.table:Table", "json:loads"])
+def test_other_packages_count_by_their_versions(name):
+    """An installed package counts if the task itself is in it, but not the packages that are installed beside it."""
+    found = worker_sources(name).keys() - WORKERS.keys()
+    assert all(file.startswith("rich/") for file in found)
+    assert bool(found) == (name == "rich.table:Table")
+
+
+def test_many_files_are_told_in_few_words():
+    assert in_words(["a"]) == "a"
+    assert in_words([f"{n}.py" for n in range(7)]) == "0.py, 1.py, 2.py, 3.py, 4.py and 2 others"
+
+
+OTHER = {**WORKERS, "workers/policy.py": "0" * 32, "workers/gone.py": "0" * 32}
+
+
+def test_a_worker_with_other_code_names_host_and_files(monkeypatch):
+    monkeypatch.setattr("socket.gethostname", lambda: "node-7")
+    assert why_refused(WORKERS, "point_maze") == why_refused({}, "point_maze") == ""
+    problem = why_refused(OTHER, "point_maze")
+    assert problem.startswith("node-7 has other code")
+    assert "workers/gone.py, workers/policy.py." in problem
+    with pytest.raises(OtherCodeError, match=r"node-7 has other code.*workers/policy\.py"):
+        WorkerActor(pickle.dumps(replace(SPEC, sources=OTHER)), 0).build()
+
+
+@pytest.mark.parametrize("threads", [False, True])
+def test_a_child_with_other_code_is_refused(threads):
+    spec, limits = replace(SPEC, sources=OTHER), Limits(workers=2, restart_backoff_s=0.0)
+    with inline_engine(spec, limits, threads=threads) as engine, pytest.raises(EvaluationError) as caught:
+        engine.evaluate([(centre(random_parameters()), TrainingChunk(1, 0))])
+    assert "has other code than the driver" in str(caught.value)
+    assert "workers/gone.py, workers/policy.py" in str(caught.value)
+
+
+def test_other_code_makes_a_run_mixed_and_unknown_code_does_not():
+    old, new, unknown = {"cpu": "a", CODE: {"f": "1"}}, {"cpu": "a", CODE: {"f": "2"}}, {"cpu": "a"}
+    assert is_mixed([old, new])
+    assert is_mixed([old, unknown, new])
+    assert not is_mixed([unknown, old, old])
+    assert is_mixed([unknown, {**old, "cpu": "b"}])
