@@ -16,8 +16,8 @@ from es_service.cli.options import (
     EngineOption,
     LogLevelOption,
     SetOption,
-    WorkersOption,
     console,
+    errors,
     overrides,
     print_config_notes,
     print_error,
@@ -28,7 +28,6 @@ from es_service.config.keys import parse_overrides
 from es_service.config.yaml_text import split_values
 from es_service.errors import ConfigError, Interrupted, Problem
 from es_service.runs.sweep import SweptRun, run_planned
-from es_service.runs.sweep_cores import shared
 from es_service.runs.sweep_plan import plan
 
 SeedsOption = Annotated[
@@ -50,7 +49,9 @@ def sweep(
         int | None,
         typer.Option("--parallel", min=1, help="Runs at a time, which share the cores; default: one per core."),
     ] = None,
-    workers: WorkersOption = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Workers of each run; default: an equal share of the cores.")
+    ] = None,
     engine: EngineOption = None,
     address: AddressOption = None,
     log_level: LogLevelOption = None,
@@ -83,13 +84,11 @@ def run_sweep(
 ) -> None:
     """Run a sweep to its end and write the comparison; exit with code 1 if a run failed."""
     planned = plan(config, out, grid, None if seeds is None else seeds_of(seeds), wanted)
-    shares = shared([run.config for run in planned], parallel)
     print_config_notes(config, [(run.overrides, run.config) for run in planned])
-    print_note(f"{len(planned)} runs in {out}, {shares.at_once} at a time; workers of each: {shares.workers[0]}")
     options = ("--log-level", log_level) if log_level else ()
     try:
-        with show_sweep(console, str(out)) as show:
-            runs = run_planned(planned, shares, out, show, options)
+        with show_sweep(console, errors, str(out)) as (show, note):
+            runs = run_planned(planned, out, parallel, show, note, options)
     except Interrupted:
         print_note(
             "interrupted; every finished generation of every run is saved. The same command again, with "

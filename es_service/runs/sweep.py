@@ -7,7 +7,6 @@ its runs, and the same sweep again resumes each from its last finished generatio
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import time
 from collections import deque
@@ -20,19 +19,23 @@ from typing import IO, Literal
 
 from es_service.config.keys import Overrides
 from es_service.config.loading import Source
-from es_service.config.model import RunConfig
 from es_service.errors import Interrupted, RunLockedError, StoreError
+from es_service.logs import logger
 from es_service.loop.budget import limits_of, spent
 from es_service.loop.history import Row
 from es_service.protocol.parent import bound
 from es_service.protocol.process_environment import same_imports
+from es_service.runs.session import OnNotice
 from es_service.runs.signals import stop_on_signals
-from es_service.runs.sweep_cores import Shares, shared
+from es_service.runs.sweep_cores import shared
 from es_service.runs.sweep_plan import Grid, PlannedRun, plan
 from es_service.store.folder import explained, holds_run
 from es_service.store.lock import acquire_lock
 from es_service.store.reader import read_newest
 
+_LOG = logger(__name__)
+_Command = tuple[str, list[str]]
+"""Name of a run, and the words that start its process."""
 INSIDE = ".sweep"
 """Folder beside those of the runs, with the config that each is given and what it prints."""
 POLL_S = 0.1
@@ -98,67 +101,66 @@ def sweep(
             the folder cannot be used, or another sweep is running in it. EvaluationError: the cluster cannot be
             reached. Interrupted: SIGINT or SIGTERM arrived; all runs were stopped as single ones are.
     """
-    planned = plan(config, Path(out), grid, seeds, overrides)
-    return run_planned(planned, shared([run.config for run in planned], parallel), Path(out), on_progress)
+    return run_planned(plan(config, Path(out), grid, seeds, overrides), Path(out), parallel, on_progress)
 
 
 def run_planned(
     planned: Sequence[PlannedRun],
-    shares: Shares,
     out: Path,
+    parallel: int | None = None,
     on_progress: OnProgress = _ignore,
+    on_notice: OnNotice = _LOG.info,
     options: Sequence[str] = (),
 ) -> list[SweptRun]:
     """Run what `plan` has returned for the folder `out`; otherwise as `sweep`.
 
     Args:
+        on_notice: called with a sentence on how the cores are shared.
         options: further options of `es-service run` for each run.
     """
-    commands: dict[str, list[str]] = {}
-    running: dict[str, _Child] = {}
-    read_s = float("-inf")
     with _locked(out) as inside, stop_on_signals() as should_stop:
         runs = {run.name: _at_first(run) for run in planned}
-        waiting = deque(name for name, run in runs.items() if run.state == "waiting")
-        for run, workers in zip(planned, shares.workers, strict=True):
-            if run.name in waiting:
-                config = _write_config(inside / f"{run.name}.yaml", run.config, workers)
-                words = ("run", str(config), "--or-resume", "--out", str(run.folder), *options)
-                commands[run.name] = bound("es_service", *words)
-        on_progress(list(runs.values()))
+        left = [run for run in planned if runs[run.name].state == "waiting"]
+        shares = shared([run.config for run in left], parallel)  # a few that are left have more cores each
+        waiting = deque(
+            _given(run, workers, inside, options) for run, workers in zip(left, shares.workers, strict=True)
+        )
+        if left:
+            on_notice(f"{len(left)} runs to do, {shares.at_once} at a time; workers of each: {shares.workers[0]}")
+        running: dict[str, _Child] = {}
+        shown, read_s = None, float("-inf")
         try:
-            while waiting or running:
+            while shown is None or waiting or running:
                 if (number := should_stop()) is not None:
                     raise Interrupted(number)
-                changed = False
-                while waiting and len(running) < shares.at_once:
-                    name = waiting.popleft()
-                    changed = True
-                    try:
-                        running[name] = _start(commands[name], inside / f"{name}.log")
-                        runs[name] = replace(runs[name], state="running")
-                    except OSError as error:
-                        runs[name] = replace(runs[name], state="failed", reason=f"it cannot be started: {error}")
                 for name in [name for name, child in running.items() if child.process.poll() is not None]:
                     runs[name] = _ended(runs[name], running.pop(name))
-                    changed = True
+                while waiting and len(running) < shares.at_once:
+                    _start(waiting.popleft(), inside, runs, running)
                 if time.monotonic() - read_s > ROWS_S:
-                    read_s, changed = time.monotonic(), True
+                    read_s = time.monotonic()
                     runs |= {name: replace(runs[name], row=_newest(runs[name].folder)) for name in running}
-                if changed:
-                    on_progress(list(runs.values()))
-                time.sleep(POLL_S)
+                if (now := list(runs.values())) != shown:
+                    on_progress(shown := now)
+                if running:
+                    time.sleep(POLL_S)
         except BaseException:
-            for child in running.values():
-                child.process.terminate()
-            for name, child in running.items():
-                child.process.wait()  # a second signal ends this process at once, and with it its children
-                ended = _ended(runs[name], child)
-                runs[name] = ended if ended.state == "finished" else replace(ended, state="stopped", reason="")
+            _stop(runs, running)
             with suppress(Exception):
                 on_progress(list(runs.values()))
             raise
     return list(runs.values())
+
+
+def _given(run: PlannedRun, workers: int | Literal["auto"], inside: Path, options: Sequence[str]) -> _Command:
+    """The command of a run. Its config is resolved now, so that an edited file does not reach runs that start later."""
+    compute = run.config.compute.model_copy(update={"workers": workers})
+    file = inside / f"{run.name}.yaml"
+    try:
+        file.write_text(run.config.model_copy(update={"compute": compute}).resolved_yaml())
+    except OSError as error:
+        raise explained(error, inside, f"writing {file.name}", "start the sweep again") from error
+    return run.name, bound("es_service", "run", str(file), "--or-resume", "--out", str(run.folder), *options)
 
 
 @dataclass(eq=False)
@@ -172,18 +174,35 @@ class _Child:
     """Where in the log its own output begins."""
 
 
-def _start(command: Sequence[str], file: Path) -> _Child:
-    log = open(file, "ab+")  # noqa: SIM115
-    begin = log.seek(0, os.SEEK_END)
-    process = subprocess.Popen(
-        command,
-        env=os.environ | same_imports(),
-        stdin=subprocess.DEVNULL,
-        stdout=log,
-        stderr=log,
-        start_new_session=True,  # Ctrl-C in the terminal reaches this process alone, which stops its runs
-    )
-    return _Child(process, log, begin)
+def _start(command: _Command, inside: Path, runs: dict[str, SweptRun], running: dict[str, _Child]) -> None:
+    """Start the process of a run; the run has failed if that is impossible."""
+    name, words = command
+    try:
+        log = open(inside / f"{name}.log", "ab+")  # noqa: SIM115
+        begin = log.seek(0, os.SEEK_END)
+        process = subprocess.Popen(
+            words,
+            env=os.environ | same_imports(),
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,  # Ctrl-C in the terminal reaches this process alone, which stops its runs
+        )
+    except OSError as error:
+        runs[name] = replace(runs[name], state="failed", reason=f"its process cannot be started: {error}")
+        return
+    running[name], runs[name] = _Child(process, log, begin), replace(runs[name], state="running")
+
+
+def _stop(runs: dict[str, SweptRun], running: Mapping[str, _Child]) -> None:
+    """Ask all processes to end as Ctrl-C would, and wait for them. A second signal to this process ends it at once, and
+    with it all that are bound to it."""
+    for child in running.values():
+        child.process.terminate()
+    for name, child in running.items():
+        child.process.wait()
+        ended = _ended(runs[name], child)
+        runs[name] = ended if ended.state == "finished" else replace(ended, state="stopped", reason="")
 
 
 def _ended(run: SweptRun, child: _Child) -> SweptRun:
@@ -194,10 +213,11 @@ def _ended(run: SweptRun, child: _Child) -> SweptRun:
         lines = log.read(LAST_WORDS_BYTES).decode(errors="replace").strip().splitlines()
     if code == 0:
         return replace(run, state="finished", row=row, reason=_reason(run.limits, row))
-    how = f"ended by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+    how = f"it ended with signal {-code}" if code < 0 else f"it ended with exit code {code}"
     errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
-    what = errors[-1] if errors else lines[-1] if lines else "it printed nothing"
-    return replace(run, state="failed", row=row, reason=f"{what} ({how}; all that it printed is in {log.name})")
+    last = f"{how}; its last line is: {lines[-1]}" if lines else how
+    why = errors[-1] if errors else last
+    return replace(run, state="failed", row=row, reason=f"{why} (all that it printed is in {log.name})")
 
 
 def _at_first(planned: PlannedRun) -> SweptRun:
@@ -237,13 +257,3 @@ def _locked(out: Path) -> Iterator[Path]:
         yield inside
     finally:
         lock.release()
-
-
-def _write_config(file: Path, config: RunConfig, workers: int | Literal["auto"]) -> Path:
-    """Write the config that a run is given: resolved, so that an edited file does not reach runs that start later."""
-    compute = config.compute.model_copy(update={"workers": workers})
-    try:
-        file.write_text(config.model_copy(update={"compute": compute}).resolved_yaml())
-    except OSError as error:
-        raise explained(error, file.parent, f"writing {file.name}", "start the sweep again") from error
-    return file

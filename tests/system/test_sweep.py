@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from es_service import api, open_run, sweep
+from es_service import api, open_run, sweep, write_comparison
 from es_service.runs import sweep as sweeps
 from es_service.store.digest import digest_parts
 from tests.system.command_line import PROGRAM, es
@@ -68,6 +68,9 @@ def test_a_sweep_killed_and_given_again_ends_as_if_it_had_not_been_and_a_failed_
     settings = {"search.sigma": 0.02, "seed": 1, "budget.generations": generations}
     api.run(api.load_config(SMALL, settings), tmp_path / "undisturbed")
     assert digest_parts(out / NAMES[1]) == digest_parts(tmp_path / "undisturbed")
+    assert write_comparison([str(out / NAMES[0]), out / NAMES[3]], str(tmp_path / "two.html")) == [
+        tmp_path / "two.html"
+    ]
     page = (out / "report.html").read_text()
     assert all(f"search.sigma {sigma}" in page for sigma in (0.02, 0.05))
 
@@ -80,7 +83,7 @@ def test_a_sweep_killed_and_given_again_ends_as_if_it_had_not_been_and_a_failed_
     runs = sweep(SMALL, out, grid=axes, seeds=range(2), overrides=wanted, on_progress=seen.append)
     assert [(run.name, run.state) for run in runs] == [(name, "finished") for name in NAMES]
     assert [run.row["generation"] for run in runs] == [generations] * 4
-    assert [run.state for run in seen[0]] == ["finished", "finished", "waiting", "finished"]
+    assert [run.state for run in seen[0]] == ["finished", "finished", "running", "finished"]
     assert [path.stat().st_mtime_ns for path in untouched] == times
 
 

@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from es_service.cli.tables.progress import short
+from es_service.cli.tables.progress import ShowNotice, print_notice, short
 from es_service.runs.sweep import OnProgress, SweptRun
 
 STATES = ("running", "failed", "stopped", "waiting", "finished")
@@ -22,17 +22,18 @@ ROWS_AROUND = 9
 
 
 @contextmanager
-def show_sweep(console: Console, title: str) -> Iterator[OnProgress]:
-    """Yield a function to call with all runs of a sweep whenever they have changed."""
+def show_sweep(console: Console, errors: Console, title: str) -> Iterator[tuple[OnProgress, ShowNotice]]:
+    """Yield two functions: one to call with all runs of a sweep when they have changed, one with every notice."""
     if not console.is_terminal or console.is_dumb_terminal:
-        yield partial(_print_changes, console, {})
+        yield partial(_print_changes, console, {}), partial(print_notice, errors)
         return
     with Live(console=console, refresh_per_second=4) as live:
 
         def show(runs: Sequence[SweptRun]) -> None:
-            live.update(live_table(title, runs, console.width, console.height))
+            with suppress(SystemExit):  # rich's answer to a closed output; the runs continue
+                live.update(live_table(title, runs, console.width, console.height))
 
-        yield show
+        yield show, partial(print_notice, live.console)
 
 
 def live_table(title: str, runs: Sequence[SweptRun], width: int, height: int) -> Group:
