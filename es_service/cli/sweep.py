@@ -60,7 +60,7 @@ def sweep(
     if not grid and seeds is None:
         raise ConfigError("a sweep needs --grid KEY=A,B or --seeds A:B, or both")
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
-    run_sweep(config, out, wanted, grid_of(grid or ()), seeds, parallel, log_level)
+    run_sweep(config, out, wanted, grid_of(grid or ()), seeds, parallel, _options_of_each(log_level))
 
 
 def run_seeds(
@@ -70,7 +70,12 @@ def run_seeds(
     if seed is not None:
         raise ConfigError("--seed and --seeds cannot be combined; give one of them")
     folder = out if out is not None else api.default_folder(api.load_config(config, wanted), "seeds")
-    run_sweep(config, folder, wanted, {}, seeds, None, log_level)
+    run_sweep(config, folder, wanted, {}, seeds, None, _options_of_each(log_level))
+
+
+def _options_of_each(log_level: str | None) -> list[str]:
+    """Options of this command that its runs get."""
+    return [] if log_level is None else ["--log-level", log_level]
 
 
 def run_sweep(
@@ -80,12 +85,11 @@ def run_sweep(
     grid: dict[str, list[Any]],
     seeds: str | None,
     parallel: int | None,
-    log_level: str | None,
+    options: Sequence[str],
 ) -> None:
     """Run a sweep to its end and write the comparison; exit with code 1 if a run failed."""
     planned = plan(config, out, grid, None if seeds is None else seeds_of(seeds), wanted)
     print_config_notes(config, [(run.overrides, run.config) for run in planned])
-    options = ("--log-level", log_level) if log_level else ()
     try:
         with show_sweep(console, errors, str(out)) as (show, note):
             runs = run_planned(planned, out, parallel, show, note, options)

@@ -33,6 +33,15 @@ def descendants(pid: int) -> list[str]:
     return [str(one) for one in found[1:]]
 
 
+def end(pids: list[str]) -> None:
+    """Wait until processes have ended by themselves; those that have not are killed."""
+    try:
+        wait_for(lambda: not any(map(is_running, pids)))
+    finally:
+        for pid in filter(is_running, pids):
+            os.kill(int(pid), signal.SIGKILL)
+
+
 def both_begun(out: Path, names: list[str]):
     return lambda: all((committed(out / name) or 0) >= 5 for name in names)
 
@@ -50,7 +59,7 @@ def test_a_sweep_killed_and_given_again_ends_as_if_it_had_not_been_and_a_failed_
         started = descendants(process.pid)
         process.kill()
     assert len(started) == 4, "two runs, each with a worker"
-    wait_for(lambda: not any(map(is_running, started)))
+    end(started)
     before = {name: committed(out / name) or 0 for name in NAMES[:2]}
     ids = {name: open_run(out / name).run_id for name in NAMES[:2]}
     assert not (out / NAMES[3]).exists()
@@ -118,4 +127,4 @@ def test_a_signal_stops_all_runs_and_a_second_one_ends_at_once(config, tmp_path)
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)
     assert process.returncode == 130
-    wait_for(lambda: not any(map(is_running, started)))
+    end(started)
