@@ -48,14 +48,15 @@ class _NoteHandler(logging.Handler):
         print_note(self.format(record))
 
 
-def _print_log(level: str | None) -> None:
-    """Print the log records of es_service from a level on; none without a level."""
+def _print_log(level: str | None) -> str | None:
+    """Print the log records of es_service from a level on; none without a level. Returns the value of the option."""
     if level is not None:
         handler = _NoteHandler(level.upper())
         handler.setFormatter(logging.Formatter(FORMAT))
         log = logging.getLogger("es_service")
         log.addHandler(handler)
         log.setLevel(level.upper())
+    return level
 
 
 LogLevelOption = Annotated[

@@ -9,13 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
+from typer.testing import CliRunner
 
 from es_service.api import load_config
+from es_service.cli.main import app
 from es_service.cli.sweep import grid_of, seeds_of
 from es_service.cli.tables.sweep import live_table
 from es_service.config.yaml_text import split_values
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.errors import ConfigError
+from es_service.runs import sweep_cores
 from es_service.runs.sweep import SweptRun
 from es_service.runs.sweep_cores import divide, share
 from es_service.runs.sweep_plan import plan
@@ -119,6 +122,18 @@ def test_values_are_split_at_the_commas_between_them_alone(values):
     assert split_values(",".join(values)) == values
 
 
+def test_options_that_contradict_each_other_are_refused(tmp_path):
+    for words, message in (
+        (("sweep", "point_maze_es", "--out", tmp_path / "a"), "a sweep needs --grid KEY=A,B or --seeds A:B"),
+        (("run", "point_maze_es", "--seeds", "0:2", "--seed", 1), "--seed and --seeds cannot be combined"),
+        (("run", "point_maze_es", "--seeds", "0:2", "--set", "search.sigma=x", "--out", tmp_path), "sigma: x is not"),
+    ):
+        result = CliRunner().invoke(app, [str(word) for word in words])
+        assert isinstance(result.exception, ConfigError)
+        assert message in str(result.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
 def config(**compute):
     return load_config(MINIMAL | {"search": {"algorithm": "es", "pairs": 512}, "compute": compute})
 
@@ -143,6 +158,23 @@ def test_runs_share_the_cores_of_a_machine():
     assert divided(None, gpu, gpu) == (1, ("auto", "auto"))
     two = config(engine="ray", worker_resources={"cpu": 2})
     assert divided(4, *[two] * 4) == (4, (2,) * 4), "workers are a multiple of the cores of an actor"
+
+
+def test_a_cluster_is_asked_for_its_nodes_only_if_runs_share_it(monkeypatch):
+    nodes, asked = [], []
+    monkeypatch.setattr(sweep_cores, "nodes_of_cluster", lambda address: asked.append(address) or nodes)
+    auto, two = config(engine="ray", address="head:6379"), config(engine="ray", address="head:6379", workers=2)
+    assert sweep_cores.shared([auto, auto], 1).workers == ("auto", "auto")
+    assert sweep_cores.shared([auto], 4).workers == ("auto",)
+    assert sweep_cores.shared([two, two], 2).workers == (2, 2)
+    assert asked == []
+    with pytest.raises(ConfigError, match="the cluster at head:6379 has no cores yet that runs could share"):
+        sweep_cores.shared([auto, auto], 2)
+    nodes += [4, 4, 4, 4]
+    assert sweep_cores.shared([auto] * 3, 3).workers == (4, 4, 4)
+    assert asked == ["head:6379"] * 2
+    with pytest.raises(ConfigError, match="parallel: 0 is not allowed"):
+        sweep_cores.shared([auto], 0)
 
 
 @given(st.integers(1, 9), st.integers(1, 64), st.integers(1, 40))

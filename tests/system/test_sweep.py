@@ -99,7 +99,8 @@ def test_a_sweep_killed_and_given_again_ends_as_if_it_had_not_been_and_a_failed_
 @pytest.mark.slow
 def test_a_signal_stops_all_runs_and_a_second_one_ends_at_once(config, tmp_path):
     out = tmp_path / "runs"
-    command = ("run", config, "--seeds", "0:2", "--set", "budget.generations=1000000", "--workers", 1, "--out", out)
+    endless = ("--set", "budget.generations=1000000", "--workers", 1, "--log-level", "info")
+    command = ("run", config, "--seeds", "0:2", *endless, "--out", out)
     names = ["seed=0", "seed=1"]
     with running(PROGRAM, *command) as process:
         wait_until(process, both_begun(out, names))
@@ -113,7 +114,10 @@ def test_a_signal_stops_all_runs_and_a_second_one_ends_at_once(config, tmp_path)
     assert [line.split()[:2] for line in printed.splitlines()[-2:]] == [[name, "stopped"] for name in names]
     assert started
     assert not any(map(is_running, started))
-    assert all("interrupted; " in (out / sweeps.INSIDE / f"{name}.log").read_text() for name in names)
+    for name in names:
+        log = (out / sweeps.INSIDE / f"{name}.log").read_text()
+        assert "interrupted; " in log
+        assert "INFO es_service.runs.session " in log
 
     with running(PROGRAM, *command) as process:
         before = [committed(out / name) for name in names]
