@@ -126,7 +126,8 @@ def run_planned(
             _given(run, workers, inside, options) for run, workers in zip(left, shares.workers, strict=True)
         )
         if left:
-            on_notice(f"{len(left)} runs to do, {shares.at_once} at a time; workers of each: {shares.workers[0]}")
+            todo = f"{len(left)} of {len(runs)} runs to do in {out}, {shares.at_once} at a time"
+            on_notice(f"{todo}; workers of each: {shares.workers[0]}")
         running: dict[str, _Child] = {}
         shown, read_s = None, float("-inf")
         try:

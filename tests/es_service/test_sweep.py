@@ -19,7 +19,7 @@ from es_service.config.yaml_text import split_values
 from es_service.dispatch.ray_nodes import actor_cores
 from es_service.errors import ConfigError
 from es_service.runs import sweep_cores
-from es_service.runs.sweep import SweptRun
+from es_service.runs.sweep import INSIDE, SweptRun, sweep
 from es_service.runs.sweep_cores import divide, share
 from es_service.runs.sweep_plan import plan
 from tests.es_service.config_examples import MINIMAL
@@ -132,6 +132,15 @@ def test_options_that_contradict_each_other_are_refused(tmp_path):
         assert isinstance(result.exception, ConfigError)
         assert message in str(result.exception)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_cannot_be_started_has_failed_and_the_others_are_tried(tmp_path):
+    names = ["seed=0", "seed=1"]
+    for name in names:
+        (tmp_path / INSIDE / f"{name}.log").mkdir(parents=True)
+    runs = sweep(MINIMAL, tmp_path, seeds=range(2))
+    assert [(run.name, run.state) for run in runs] == [(name, "failed") for name in names]
+    assert all("its process cannot be started" in run.reason for run in runs)
 
 
 def config(**compute):
