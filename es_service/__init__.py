@@ -1,6 +1,6 @@
 """Evolution strategies for neuro-evolution: `from es_service import load_config, run, open_run`, and `plots`.
 
-Names are imported from `es_service.api` at their first use, so that importing one module does not import everything.
+Names are imported at their first use, so that importing one module does not import everything.
 """
 
 from __future__ import annotations
@@ -11,10 +11,30 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from es_service.api import evaluator, fork, load_config, open_run, resume, run
     from es_service.report import plots
+    from es_service.report.write import write_comparison, write_report
+    from es_service.runs.sweep import sweep
 
     __version__: str
 
-__all__ = ["__version__", "evaluator", "fork", "load_config", "open_run", "plots", "resume", "run"]
+__all__ = [
+    "__version__",
+    "evaluator",
+    "fork",
+    "load_config",
+    "open_run",
+    "plots",
+    "resume",
+    "run",
+    "sweep",
+    "write_comparison",
+    "write_report",
+]
+_MODULES = {
+    "sweep": "es_service.runs.sweep",
+    "write_comparison": "es_service.report.write",
+    "write_report": "es_service.report.write",
+}
+"""Name -> its module, if that is not `es_service.api`."""
 
 
 def __getattr__(name: str) -> Any:
@@ -26,6 +46,4 @@ def __getattr__(name: str) -> Any:
         return VERSION
     if name == "plots":
         return importlib.import_module("es_service.report.plots")
-    from es_service import api
-
-    return getattr(api, name)
+    return getattr(importlib.import_module(_MODULES.get(name, "es_service.api")), name)

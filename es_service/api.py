@@ -227,12 +227,13 @@ def fork(
     return outcome
 
 
-def default_folder(config: RunConfig) -> Path:
-    """A new folder under `runs/`, named after task, algorithm, seed, time and process id, so that runs that start at
-    the same time get different folders. Colons become underscores, because scp and others read HOST:PATH."""
+def default_folder(config: RunConfig, which: str = "") -> Path:
+    """A new folder under `runs/`, named after task, algorithm, `which` or the seed, time and process id, so that runs
+    that start at the same time get different folders. Colons become underscores, because scp and others read HOST:PATH.
+    """
     when = datetime.now().strftime("%Y%m%d-%H%M%S")
     kind = f"{config.task.environment}_{config.search.algorithm}".replace(":", "_")
-    name = f"{kind}_seed{config.seed}_{when}-{os.getpid()}"
+    name = f"{kind}_{which or f'seed{config.seed}'}_{when}-{os.getpid()}"
     names = (name if number == 1 else f"{name}-{number}" for number in count(1))
     return next(RUNS_FOLDER / name for name in names if not (RUNS_FOLDER / name).exists())
 

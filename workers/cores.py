@@ -17,7 +17,7 @@ from typing import TypeVar
 
 from es_service.protocol.gradient_tree import with_neighbours_added
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec
-from workers.process import end_with
+from es_service.protocol.parent import end_with
 from workers.worker import make_worker
 
 PARTS_PER_CORE = 2

@@ -6,9 +6,7 @@ before this interpreter starts, so the results never depend on the parent's use 
 
 from __future__ import annotations
 
-import ctypes
 import os
-import signal
 import socket
 import sys
 import threading
@@ -18,12 +16,10 @@ from operator import attrgetter
 from typing import Any
 
 from es_service.protocol.messages import Subject, forget_oldest
+from es_service.protocol.parent import end_with
 from es_service.protocol.sources import why_refused
 from es_service.protocol.wire import framed, receive
 from workers.xla_cache import xla_cache_settings
-
-PR_SET_PDEATHSIG = 1
-"""Linux's `prctl` option that sets the signal sent to a process when its parent dies."""
 
 
 def main(descriptor: int, parent: int) -> None:
@@ -43,13 +39,6 @@ def main(descriptor: int, parent: int) -> None:
         except Exception:
             traceback.print_exc()
     os._exit(0)  # do not wait for threads, which may be in the middle of a chunk
-
-
-def end_with(parent: int) -> None:
-    """Have this process killed when its parent ends, for whatever reason; end it if the parent has ended already."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 def _descriptor(control: socket.socket) -> int | None:

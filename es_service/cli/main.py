@@ -1,5 +1,5 @@
-"""The command line: `es-service run | resume | fork | status | digest | config | list | evaluate | export | report |
-verify | submit | jobs | logs | stop | bench | doctor`.
+"""The command line: `es-service run | resume | fork | sweep | status | digest | config | list | evaluate | export |
+report | verify | submit | jobs | logs | stop | bench | doctor`.
 
 Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by SIGINT or SIGTERM.
 """
@@ -26,6 +26,7 @@ from es_service.cli.options import (
     EngineOption,
     JsonOption,
     LogLevelOption,
+    OrResumeOption,
     OutOption,
     RunArgument,
     SeedOption,
@@ -36,18 +37,17 @@ from es_service.cli.options import (
     errors,
     overrides,
     place_of,
+    print_config_notes,
     print_error,
     print_note,
 )
 from es_service.cli.report import report
 from es_service.cli.show import config_, digest_, list_, status
+from es_service.cli.sweep import SeedsOption, run_seeds, sweep
 from es_service.cli.tables.progress import show_progress
 from es_service.cli.tables.status import print_summary
 from es_service.cli.verify import verify
-from es_service.config.loading import left_out
 from es_service.config.parallel import parallel_sentence
-from es_service.config.resolution import config_warnings
-from es_service.config.tasks import no_vectors, task_of
 from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError
 from es_service.loop.history import Row
 from es_service.protocol.machine import VERSION
@@ -81,25 +81,23 @@ def run(
     set_: SetOption = None,
     out: OutOption = None,
     seed: SeedOption = None,
+    seeds: SeedsOption = None,
     workers: WorkersOption = None,
     engine: EngineOption = None,
     address: AddressOption = None,
     log_level: LogLevelOption = None,
-    or_resume: Annotated[
-        bool, typer.Option("--or-resume", help="Resume the run if the --out folder already holds it.")
-    ] = False,
+    or_resume: OrResumeOption = False,
 ) -> None:
-    """Start a run from a config file."""
+    """Start a run from a config file; with --seeds, a run for each seed."""
     wanted = overrides(set_, seed=seed, workers=workers, engine=engine, address=address)
+    if seeds is not None:
+        run_seeds(config, seeds, out, wanted, seed, log_level)
+        return
     if or_resume and out is None:
         raise ConfigError("--or-resume needs --out: add --out FOLDER to name the folder of the run to start or resume")
     begun = or_resume and out is not None and holds_run(out)
     loaded = api.load_config(config, wanted, new=not begun)
-    if foreign := left_out(config, wanted):
-        task = loaded.task.environment
-        print_note(f"note: ignored {', '.join(foreign)} of {config}, since {task} replaces its task (default options)")
-    for warning in config_warnings(loaded, task_of(loaded), no_vectors()):
-        print_note(f"note: {warning}")
+    print_config_notes(config, [(wanted, loaded)])
     with contextlib.suppress(SystemExit):  # rich's answer to a closed output
         console.print(parallel_sentence(loaded), highlight=False, markup=False, soft_wrap=True)
     folder = out if out is not None else api.default_folder(loaded)
@@ -194,6 +192,7 @@ def export(
         print(file)
 
 
+app.command()(sweep)
 app.command()(report)
 app.command()(verify)
 app.add_typer(job_commands)

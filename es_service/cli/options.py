@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,6 +13,11 @@ from rich.console import Console
 
 from es_service.cli.commands import assignments, error_message
 from es_service.config.compute import implied_by
+from es_service.config.keys import Overrides
+from es_service.config.loading import left_out
+from es_service.config.model import RunConfig
+from es_service.config.resolution import config_warnings
+from es_service.config.tasks import no_vectors, task_of
 from es_service.errors import ConfigError, ServiceError
 from es_service.logs import FORMAT
 
@@ -24,6 +30,9 @@ SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one key, e.g. search.sigma=0.05.")
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the new run; default: a new one under runs/.")]
+OrResumeOption = Annotated[
+    bool, typer.Option("--or-resume", help="Resume the run if the --out folder already holds it.")
+]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Seed of all random numbers.")]
 WorkersOption = Annotated[int | None, typer.Option("--workers", help="Number of workers; default: as configured.")]
 EngineOption = Annotated[str | None, typer.Option("--engine", help="What runs the workers: inline or ray.")]
@@ -43,14 +52,15 @@ class _NoteHandler(logging.Handler):
         print_note(self.format(record))
 
 
-def _print_log(level: str | None) -> None:
-    """Print the log records of es_service from a level on; none without a level."""
+def _print_log(level: str | None) -> str | None:
+    """Print the log records of es_service from a level on; none without a level. Returns the value of the option."""
     if level is not None:
         handler = _NoteHandler(level.upper())
         handler.setFormatter(logging.Formatter(FORMAT))
         log = logging.getLogger("es_service")
         log.addHandler(handler)
         log.setLevel(level.upper())
+    return level
 
 
 LogLevelOption = Annotated[
@@ -92,6 +102,19 @@ def print_error(error: ServiceError | str) -> None:
     """Print an error message and its ways out."""
     message = error_message(error) if isinstance(error, ServiceError) else error
     print_note(f"error: {message}", style="red")
+
+
+def print_config_notes(source: Path, configs: Sequence[tuple[Overrides, RunConfig]]) -> None:
+    """Print what a user should know before a run about the config made from `source` with each of the overrides:
+    ignored keys, and settings that are probably not intended. What several configs have in common is printed once."""
+    notes: dict[str, None] = {}
+    for wanted, config in configs:
+        if foreign := left_out(source, wanted):
+            task = config.task.environment
+            notes[f"ignored {', '.join(foreign)} of {source}, since {task} replaces its task (default options)"] = None
+        notes |= dict.fromkeys(config_warnings(config, task_of(config), no_vectors()))
+    for note in notes:
+        print_note(f"note: {note}")
 
 
 def place_of(text: str, option: str = "--cell") -> tuple[int, ...]:

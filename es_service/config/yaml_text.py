@@ -116,6 +116,20 @@ def parse_value(text: str) -> object:
         raise ValueError("not YAML that a config needs: nested too deeply") from None
 
 
+def split_values(text: str) -> list[str]:
+    """Texts of values between commas: "0.05,0.1" -> ["0.05", "0.1"], "[8, 8],[16]" -> ["[8, 8]", "[16]"].
+
+    Raises:
+        ValueError: one of them is empty, or not YAML.
+    """
+    inside = f"[{text}]"
+    try:
+        values = _yaml().compose(inside).value
+    except (YAMLError, RecursionError):
+        raise ValueError(f"{text} is no list of values between commas") from None
+    return [inside[value.start_mark.index : value.end_mark.index] for value in values]
+
+
 def dump_yaml(value: object) -> str:
     """Text that reads back as the same value: keys in their own order, lists on one line."""
     return _dump(value, flow=False, width=120)

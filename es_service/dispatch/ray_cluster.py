@@ -20,7 +20,7 @@ from types import ModuleType
 from typing import Any
 
 from es_service.config.compute import ENGINE_IMPLIES
-from es_service.dispatch.ray_nodes import Claim, Membership, look
+from es_service.dispatch.ray_nodes import Claim, Membership, cores_of_nodes, look
 from es_service.dispatch.ray_side_effects import environment_kept, signal_handlers_kept
 from es_service.errors import EvaluationError, Interrupted, WayOut
 from es_service.logs import logger
@@ -134,6 +134,15 @@ def disconnect(ray: ModuleType, *, forget: bool = False) -> None:
         with contextlib.suppress(OSError):
             if not latest.exists():  # Ray does not replace a link whose target is missing
                 latest.unlink()
+
+
+def nodes_of_cluster(address: str) -> list[int]:
+    """Cores of each node of a cluster, which is joined for this question only. Raises EvaluationError as `connect`."""
+    ray = connect(address, gpus=False, cpus=1)
+    try:
+        return cores_of_nodes(ray)
+    finally:
+        disconnect(ray)
 
 
 class Watch:

@@ -36,10 +36,14 @@ def worker_environment(environment: Mapping[str, str], gpus: float = 0.0) -> dic
     return kept | threads | GPU_SETTINGS | {"XLA_CLIENT_MEM_FRACTION": f"{GPU_MEMORY_FRACTION * min(gpus, 1.0):g}"}
 
 
-def child_environment() -> dict[str, str]:
-    """Environment variables of a child process without a GPU, which imports from the same places as this process.
+def same_imports() -> dict[str, str]:
+    """Environment variables with which a child process imports from the same places as this process.
 
     PYTHONSAFEPATH excludes the current folder, where a user's `workers.py` would hide the package of that name.
     """
-    path = os.pathsep.join(path or os.getcwd() for path in sys.path)
-    return worker_environment(os.environ) | {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
+    return {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path), "PYTHONSAFEPATH": "1"}
+
+
+def child_environment() -> dict[str, str]:
+    """Environment variables of a worker process without a GPU, which imports from the same places as this process."""
+    return worker_environment(os.environ) | same_imports()

@@ -118,13 +118,17 @@ def _explaining(constants: Sequence[Mapping[str, Any]], differing: Sequence[str]
 def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.float64]]:
     """A chart for each column that all runs have, and the places of its points on an axis of AXES, [K].
 
-    A curve ends where the first run of its group ends, so that every point is over all of its runs.
+    A curve ends where the first run of its group ends, so that every point is over all of its runs. It is empty if that
+    is before another run begins; so the charts are the same ones on every axis.
     """
     last = max(float(np.nanmax(run.history[axis])) for group in groups for run in group.runs)
     x_K = np.linspace(0.0, last, POINTS)
     found = []
     for column, (title, note, percent) in COLUMNS.items():
-        if not all(column in run.history for group in groups for run in group.runs):
+        runs = [run for group in groups for run in group.runs]
+        if not all(column in run.history for run in runs) or not any(
+            np.isfinite(run.history[column]).any() for run in runs
+        ):
             continue
         lines = []
         for group in groups:
@@ -132,8 +136,7 @@ def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.
             low_K, median_K, high_K = np.quantile(y_R_K, [0.25, 0.5, 0.75], axis=0)  # NaN where a run has no value
             several = len(group.runs) > 1
             lines.append(Line(group.name, column, median_K, (low_K, high_K) if several else None))
-        if any(np.isfinite(line.y_K).any() for line in lines):
-            found.append(Chart(title, note, tuple(lines), None, percent))
+        found.append(Chart(title, note, tuple(lines), None, percent))
     return found, x_K
 
 

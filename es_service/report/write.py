@@ -15,6 +15,7 @@ from es_service.report.replays import MOST_CELLS, replay_section
 
 REPORT = "report.html"
 """Name of a run's report in its folder."""
+AnyPath = str | os.PathLike[str]
 
 
 def python_call(folder: Path) -> Evaluate:
@@ -28,13 +29,13 @@ def python_call(folder: Path) -> Evaluate:
 
 
 def write_report(
-    folder: Path,
-    out: Path | None = None,
+    folder: AnyPath,
+    out: AnyPath | None = None,
     *,
     best: bool = True,
     cells: Sequence[Sequence[int]] = (),
     evaluate: Evaluate | None = None,
-    figures: Path | None = None,
+    figures: AnyPath | None = None,
 ) -> list[Path]:
     """Write the report of one run and return the files written, the page first.
 
@@ -49,6 +50,7 @@ def write_report(
         ConfigError: too many cells, or figures without matplotlib. NotInRunError: a cell does not exist or is empty.
             StoreError: the run cannot be read, or the file cannot be written.
     """
+    folder = Path(folder)
     if len(cells) > MOST_CELLS:
         raise ConfigError(
             f"{len(cells)} cells are too many for replays in one page; choose at most {MOST_CELLS}",
@@ -59,16 +61,16 @@ def write_report(
     data = read_run(folder)
     found = bool(data.history["generation"].size) and (best or bool(cells))
     replays = replay_section(data, best=best, cells=cells) if found else None
-    page = write_page(run_page(data, evaluate or python_call(folder), replays), out or folder / REPORT)
-    return [page, *(write_figures([data], figures) if figures is not None else [])]
+    page = write_page(run_page(data, evaluate or python_call(folder), replays), Path(out or folder / REPORT))
+    return [page, *(write_figures([data], Path(figures)) if figures is not None else [])]
 
 
 def write_comparison(
-    folders: Sequence[Path],
-    out: Path,
+    folders: Sequence[AnyPath],
+    out: AnyPath,
     group_by: Sequence[str] = (),
     threshold: float | None = None,
-    figures: Path | None = None,
+    figures: AnyPath | None = None,
 ) -> list[Path]:
     """Write the page that compares runs of one task and return the files written, the page first.
 
@@ -81,9 +83,9 @@ def write_comparison(
         ConfigError: the runs cannot be compared or grouped, or figures without matplotlib. NotInRunError: a run has no
             finished generation. StoreError: a run cannot be read, or a file cannot be written.
     """
-    runs = [read_run(folder, paths=False, digest=False) for folder in folders]
-    page = write_page(comparison_page(runs, group_by, threshold), out)
-    return [page, *(write_figures(runs, figures, group_by) if figures is not None else [])]
+    runs = [read_run(Path(folder), paths=False, digest=False) for folder in folders]
+    page = write_page(comparison_page(runs, group_by, threshold), Path(out))
+    return [page, *(write_figures(runs, Path(figures), group_by) if figures is not None else [])]
 
 
 def write_page(page: str, file: Path) -> Path:

@@ -2,6 +2,7 @@
 
 import re
 import sqlite3
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -82,6 +83,17 @@ def test_curves_are_medians_of_all_runs_of_a_group_and_end_with_the_first(runs):
     assert line.range_K[0][k] == np.quantile(values, 0.25)
     assert np.isnan(line.y_K[x_K > 21_000]).all()
     assert np.isfinite(line.y_K[(x_K >= 1000) & (x_K <= 21_000)]).all()
+
+
+def test_runs_that_begin_after_others_have_ended_are_compared_on_both_axes(runs):
+    """Short runs on a busy machine: the first generation of one took longer than all of another."""
+    late = replace(runs[1], history={**runs[1].history, "wall_clock_s": runs[1].history["wall_clock_s"] + 1e6})
+    groups = compare.grouped([runs[0], late])
+    on_seconds, on_steps = (compare.charts(groups, axis)[0] for axis in ("wall_clock_s", "env_steps"))
+    assert [chart.title for chart in on_seconds] == [chart.title for chart in on_steps]
+    assert not np.isfinite(on_seconds[0].lines[0].y_K).any()
+    assert np.isfinite(on_steps[0].lines[0].y_K).any()
+    assert "2 runs on point_maze" in comparison_page([runs[0], late])
 
 
 def test_solved_runs_are_counted_with_their_steps(runs):

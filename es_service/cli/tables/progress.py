@@ -29,7 +29,7 @@ _PARTS = ("rollout", "gradient", "evaluation", "driver", "store")
 def show_progress(console: Console, errors: Console, title: str) -> Iterator[tuple[ShowRow, ShowNotice]]:
     """Yield two functions: one to call with every history row, one with every notice."""
     if not console.is_terminal or console.is_dumb_terminal:  # a dumb terminal cannot redraw a table
-        yield _plain_lines(console), partial(_print_notice, errors)
+        yield _plain_lines(console), partial(print_notice, errors)
         return
     recent: deque[Row] = deque(maxlen=RATE_WINDOW)
     with Live(Text(f"{title}: starting workers"), console=console, refresh_per_second=5) as live:
@@ -38,10 +38,11 @@ def show_progress(console: Console, errors: Console, title: str) -> Iterator[tup
             recent.append(row)
             live.update(live_table(title, recent, console.width, console.height))
 
-        yield show, partial(_print_notice, live.console)  # notices appear above the table
+        yield show, partial(print_notice, live.console)  # notices appear above the table
 
 
-def _print_notice(console: Console, notice: str) -> None:
+def print_notice(console: Console, notice: str) -> None:
+    """Print a notice on a line of its own."""
     console.print(f"note: {notice}", highlight=False, markup=False, soft_wrap=True)
 
 

@@ -1,0 +1,175 @@
+"""The command `sweep`, and `run --seeds`: several runs of one config, and the page that compares them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from es_service import api
+from es_service.cli.options import (
+    AddressOption,
+    ConfigArgument,
+    EngineOption,
+    LogLevelOption,
+    SetOption,
+    console,
+    errors,
+    overrides,
+    print_config_notes,
+    print_error,
+    print_note,
+)
+from es_service.cli.tables.sweep import show_sweep
+from es_service.config.keys import parse_overrides
+from es_service.config.yaml_text import split_values
+from es_service.errors import ConfigError, Interrupted, Problem
+from es_service.runs.sweep import SweptRun, run_planned
+from es_service.runs.sweep_plan import plan
+
+SeedsOption = Annotated[
+    str | None,
+    typer.Option("--seeds", metavar="A:B", help="A run for each seed from A to B-1, or of a list such as 0,7."),
+]
+
+
+def sweep(
+    config: ConfigArgument,
+    out: Annotated[Path, typer.Option("--out", help="Folder, in which each run gets a folder.", show_default=False)],
+    grid: Annotated[
+        list[str] | None,
+        typer.Option("--grid", metavar="KEY=A,B", help="Run with each value of a key; several keys are combined."),
+    ] = None,
+    seeds: SeedsOption = None,
+    set_: SetOption = None,
+    parallel: Annotated[
+        int | None,
+        typer.Option("--parallel", min=1, help="Runs at a time, which share the cores; default: one per core."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Workers of each run; default: an equal share of the cores.")
+    ] = None,
+    engine: EngineOption = None,
+    address: AddressOption = None,
+    log_level: LogLevelOption = None,
+) -> None:
+    """Run a config with several settings and seeds, and compare the runs. The same command again continues it."""
+    if not grid and seeds is None:
+        raise ConfigError("a sweep needs --grid KEY=A,B or --seeds A:B, or both")
+    wanted = overrides(set_, workers=workers, engine=engine, address=address)
+    run_sweep(config, out, wanted, grid_of(grid or ()), seeds, parallel, _options_of_each(log_level))
+
+
+def run_seeds(
+    config: Path, seeds: str, out: Path | None, wanted: Sequence[str], seed: int | None, log_level: str | None
+) -> None:
+    """`run --seeds`: a sweep without a grid."""
+    if seed is not None:
+        raise ConfigError("--seed and --seeds cannot be combined; give one of them")
+    folder = out if out is not None else api.default_folder(api.load_config(config, wanted), "seeds")
+    run_sweep(config, folder, wanted, {}, seeds, None, _options_of_each(log_level))
+
+
+def _options_of_each(log_level: str | None) -> list[str]:
+    """Options of this command that its runs get."""
+    return [] if log_level is None else ["--log-level", log_level]
+
+
+def run_sweep(
+    config: Path,
+    out: Path,
+    wanted: Sequence[str],
+    grid: dict[str, list[Any]],
+    seeds: str | None,
+    parallel: int | None,
+    options: Sequence[str],
+) -> None:
+    """Run a sweep to its end and write the comparison; exit with code 1 if a run failed."""
+    planned = plan(config, out, grid, None if seeds is None else seeds_of(seeds), wanted)
+    print_config_notes(config, [(run.overrides, run.config) for run in planned])
+    try:
+        with show_sweep(console, errors, str(out)) as (show, note):
+            runs = run_planned(planned, out, parallel, show, note, options)
+    except Interrupted:
+        print_note(
+            "interrupted; every finished generation of every run is saved. The same command again, with "
+            f"--out {out}, continues"
+        )
+        raise
+    constants = {key for run in planned for key in run.config.constants()}
+    _compare(runs, out, [key for key, values in grid.items() if len(values) > 1 and key in constants])
+    failed = [run for run in runs if run.state == "failed"]
+    for run in failed:
+        print_error(f"{run.name} failed: {run.reason}")
+    if failed:
+        print_note("the same command again resumes the runs that failed")
+        raise typer.Exit(1)
+
+
+def _compare(runs: Sequence[SweptRun], out: Path, keys: Sequence[str]) -> None:
+    """Write the page that compares the runs with a finished generation; a note if they cannot be compared."""
+    from es_service.report.write import REPORT, write_comparison
+
+    folders = [run.folder for run in runs if run.row is not None]
+    if not folders:
+        return
+    try:
+        for file in write_comparison(folders, out / REPORT, keys):
+            print(file)
+    except ConfigError as error:
+        print_note(f"note: there is no comparison, since {error.sentence}")
+
+
+def seeds_of(text: str) -> list[int]:
+    """Seeds from text such as 0:5, which is 0 to 4, or 0,7 or 0:3,10:12."""
+    found: list[int] = []
+    for part in text.split(","):
+        if (match := re.fullmatch(r"\s*(\d+)(?::(\d+))?\s*", part)) is None:
+            raise ConfigError(
+                f"--seeds {text}: {part or 'an empty part'} is no seed; must be a range such as 0:5, which is 0 to 4, "
+                "or seeds separated by commas, such as 0,7",
+                field="seeds",
+                value=text,
+            )
+        first, last = int(match[1]), int(match[2]) if match[2] else int(match[1]) + 1
+        if last <= first:
+            raise ConfigError(
+                f"--seeds {text}: {part} has no seed, since a range ends before its second number; "
+                f"did you mean {last}:{first + 1}?",
+                field="seeds",
+                value=text,
+                suggestion=f"{last}:{first + 1}",
+            )
+        found += range(first, last)
+    return found
+
+
+def grid_of(words: Sequence[str]) -> dict[str, list[Any]]:
+    """Values by key, from words such as "search.sigma=0.05,0.1". Raises ConfigError with all problems."""
+    grid: dict[str, list[Any]] = {}
+    problems: list[Problem] = []
+    for word in words:
+        key, equals, text = (part.strip() for part in word.partition("="))
+        if not equals or not key or not text:
+            problems.append(Problem(f"--grid {word}: write KEY=A,B, such as search.sigma=0.05,0.1", key))
+        elif key in grid:
+            problems.append(Problem(f"--grid {word}: {key} has values already; give all of them at once", key))
+        else:
+            try:
+                texts = split_values(text)
+            except ValueError as error:
+                problems.append(Problem(f"--grid {word}: {error}", key, text))
+                continue
+            grid[key] = []
+            for one in texts:
+                values, wrong = parse_overrides([f"{key}={one}"])
+                problems += wrong
+                if wrong:
+                    break  # an unknown key is unknown with every value
+                grid[key].append(values[key])
+    if problems:
+        raise ConfigError.listing("--grid: " + ("1 problem" if len(problems) == 1 else "several problems"), problems)
+    return grid

@@ -1,0 +1,260 @@
+"""Sweeps: several runs of one config, each in a child process, so that one that fails does not touch the others.
+
+A child is `es-service run CONFIG --or-resume --out FOLDER`. It is bound to this process: if the sweep is killed, so are
+its runs, and the same sweep again resumes each from its last finished generation.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import IO, Literal
+
+from es_service.config.keys import Overrides
+from es_service.config.loading import Source
+from es_service.errors import Interrupted, RunLockedError, StoreError
+from es_service.logs import logger
+from es_service.loop.budget import limits_of, spent
+from es_service.loop.history import Row
+from es_service.protocol.parent import bound
+from es_service.protocol.process_environment import same_imports
+from es_service.runs.session import OnNotice
+from es_service.runs.signals import stop_on_signals
+from es_service.runs.sweep_cores import shared
+from es_service.runs.sweep_plan import Grid, PlannedRun, plan
+from es_service.store.folder import explained, holds_run
+from es_service.store.lock import acquire_lock
+from es_service.store.reader import read_newest
+
+_LOG = logger(__name__)
+_Command = tuple[str, list[str]]
+"""Name of a run, and the words that start its process."""
+INSIDE = ".sweep"
+"""Folder beside those of the runs, with the config that each is given and what it prints."""
+POLL_S = 0.1
+ROWS_S = 1.0
+"""Seconds between two readings of the newest generation of each run."""
+LAST_WORDS_BYTES = 4000
+"""At most this many bytes of what a failed run printed are searched for its error."""
+
+
+@dataclass(frozen=True)
+class SweptRun:
+    """A run of a sweep at one moment."""
+
+    name: str
+    """Its settings in the sweep, such as "sigma=0.05_seed=0"."""
+    folder: Path
+    limits: Mapping[str, float]
+    """Limits of its budget, by key."""
+    state: Literal["waiting", "running", "finished", "failed", "stopped"]
+    row: Row | None
+    """History row of the newest generation; None before the first."""
+    reason: str = ""
+    """Why it has finished or failed."""
+
+
+OnProgress = Callable[[Sequence[SweptRun]], None]
+"""Called with all runs of a sweep, in their order, when a run starts or ends and about once a second."""
+
+
+def _ignore(runs: Sequence[SweptRun]) -> None:
+    """Do nothing; the default for `on_progress`."""
+
+
+def sweep(
+    config: Source,
+    out: str | os.PathLike[str],
+    *,
+    grid: Grid = MappingProxyType({}),
+    seeds: Iterable[int] | None = None,
+    overrides: Overrides = (),
+    parallel: int | None = None,
+    on_progress: OnProgress = _ignore,
+) -> list[SweptRun]:
+    """Run a config with every combination of some settings and every seed; each run has a folder in `out`.
+
+    The same call continues after any interruption: finished runs are left alone, interrupted and failed ones are
+    resumed. A run that fails does not stop the others.
+
+    Args:
+        config: a YAML file, the name of a shipped config, or a mapping with the content of one.
+        out: folder of the sweep, which is created with its parents.
+        grid: key of the config -> its values, such as {"search.sigma": [0.05, 0.1]}.
+        seeds: such as range(5); None: the seed of the config.
+        overrides: settings of all runs, as in `load_config`.
+        parallel: number of runs at a time, which share the cores of the machine or the cluster unless
+            `compute.workers` is a number; None: as many as there are cores, or one if they use GPUs.
+
+    Returns:
+        The runs, each "finished" or "failed", for example for `write_comparison`.
+
+    Raises:
+        ConfigError: a config, the grid or the seeds are wrong, or a folder holds a run with other settings. StoreError:
+            the folder cannot be used, or another sweep is running in it. EvaluationError: the cluster cannot be
+            reached. Interrupted: SIGINT or SIGTERM arrived; all runs were stopped as single ones are.
+    """
+    return run_planned(plan(config, Path(out), grid, seeds, overrides), Path(out), parallel, on_progress)
+
+
+def run_planned(
+    planned: Sequence[PlannedRun],
+    out: Path,
+    parallel: int | None = None,
+    on_progress: OnProgress = _ignore,
+    on_notice: OnNotice = _LOG.info,
+    options: Sequence[str] = (),
+) -> list[SweptRun]:
+    """Run what `plan` has returned for the folder `out`; otherwise as `sweep`.
+
+    Args:
+        on_notice: called with a sentence on how the cores are shared.
+        options: further options of `es-service run` for each run.
+    """
+    with _locked(out) as inside, stop_on_signals() as should_stop:
+        runs = {run.name: _at_first(run) for run in planned}
+        left = [run for run in planned if runs[run.name].state == "waiting"]
+        shares = shared([run.config for run in left], parallel)  # a few that are left have more cores each
+        waiting = deque(
+            _given(run, workers, inside, options) for run, workers in zip(left, shares.workers, strict=True)
+        )
+        if left:
+            todo = f"{len(left)} of {len(runs)} runs to do in {out}, {shares.at_once} at a time"
+            on_notice(f"{todo}; workers of each: {shares.workers[0]}")
+        running: dict[str, _Child] = {}
+        shown, read_s = None, float("-inf")
+        try:
+            while shown is None or waiting or running:
+                if (number := should_stop()) is not None:
+                    raise Interrupted(number)
+                for name in [name for name, child in running.items() if child.process.poll() is not None]:
+                    runs[name] = _ended(runs[name], running.pop(name))
+                while waiting and len(running) < shares.at_once:
+                    _start(waiting.popleft(), inside, runs, running)
+                if time.monotonic() - read_s > ROWS_S:
+                    read_s = time.monotonic()
+                    runs |= {name: replace(runs[name], row=_newest(runs[name].folder)) for name in running}
+                if (now := list(runs.values())) != shown:
+                    on_progress(shown := now)
+                if running:
+                    time.sleep(POLL_S)
+        except BaseException:
+            _stop(runs, running)
+            with suppress(Exception):
+                on_progress(list(runs.values()))
+            raise
+    return list(runs.values())
+
+
+def _given(run: PlannedRun, workers: int | Literal["auto"], inside: Path, options: Sequence[str]) -> _Command:
+    """The command of a run. Its config is resolved now, so that an edited file does not reach runs that start later."""
+    compute = run.config.compute.model_copy(update={"workers": workers})
+    file = inside / f"{run.name}.yaml"
+    try:
+        file.write_text(run.config.model_copy(update={"compute": compute}).resolved_yaml())
+    except OSError as error:
+        raise explained(error, inside, f"writing {file.name}", "start the sweep again") from error
+    return run.name, bound("es_service", "run", str(file), "--or-resume", "--out", str(run.folder), *options)
+
+
+@dataclass(eq=False)
+class _Child:
+    """The process of a run."""
+
+    process: subprocess.Popen[bytes]
+    log: IO[bytes]
+    """What it prints, after what earlier processes of the same run printed."""
+    begin: int
+    """Where in the log its own output begins."""
+
+
+def _start(command: _Command, inside: Path, runs: dict[str, SweptRun], running: dict[str, _Child]) -> None:
+    """Start the process of a run; the run has failed if that is impossible."""
+    name, words = command
+    try:
+        log = open(inside / f"{name}.log", "ab+")  # noqa: SIM115
+        begin = log.seek(0, os.SEEK_END)
+        process = subprocess.Popen(
+            words,
+            env=os.environ | same_imports(),
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,  # Ctrl-C in the terminal reaches this process alone, which stops its runs
+        )
+    except OSError as error:
+        runs[name] = replace(runs[name], state="failed", reason=f"its process cannot be started: {error}")
+        return
+    running[name], runs[name] = _Child(process, log, begin), replace(runs[name], state="running")
+
+
+def _stop(runs: dict[str, SweptRun], running: Mapping[str, _Child]) -> None:
+    """Ask all processes to end as Ctrl-C would, and wait for them. A second signal to this process ends it at once, and
+    with it all that are bound to it."""
+    for child in running.values():
+        child.process.terminate()
+    for name, child in running.items():
+        child.process.wait()
+        ended = _ended(runs[name], child)
+        runs[name] = ended if ended.state == "finished" else replace(ended, state="stopped", reason="")
+
+
+def _ended(run: SweptRun, child: _Child) -> SweptRun:
+    """A run after its process has ended."""
+    code, row = child.process.returncode, _newest(run.folder)
+    with child.log as log:
+        log.seek(max(child.begin, log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
+        lines = log.read(LAST_WORDS_BYTES).decode(errors="replace").strip().splitlines()
+    if code == 0:
+        return replace(run, state="finished", row=row, reason=_reason(run.limits, row))
+    how = f"it ended with signal {-code}" if code < 0 else f"it ended with exit code {code}"
+    errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
+    last = f"{how}; its last line is: {lines[-1]}" if lines else how
+    why = errors[-1] if errors else last
+    return replace(run, state="failed", row=row, reason=f"{why} (all that it printed is in {log.name})")
+
+
+def _at_first(planned: PlannedRun) -> SweptRun:
+    """A run before the sweep has started it: finished, if a former one has spent its budget."""
+    limits = limits_of(planned.config.budget)
+    row = _newest(planned.folder)
+    reason = _reason(limits, row)
+    return SweptRun(planned.name, planned.folder, limits, "finished" if reason else "waiting", row, reason)
+
+
+def _reason(limits: Mapping[str, float], row: Row | None) -> str:
+    """Why a run is over; empty if it is not."""
+    return next(iter(spent(limits, row).values()), "") if row else ""
+
+
+def _newest(folder: Path) -> Row | None:
+    """Newest history row of a run; None if there is none, or if the run cannot be read, which its own process tells."""
+    try:
+        return read_newest(folder) if holds_run(folder) else None
+    except StoreError:
+        return None
+
+
+@contextmanager
+def _locked(out: Path) -> Iterator[Path]:
+    """The folder `.sweep` of a sweep, in which no other process runs a sweep meanwhile."""
+    inside = out / INSIDE
+    try:
+        inside.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"cannot create {inside}: {error.strerror}; choose another folder", run=out) from error
+    try:
+        lock = acquire_lock(inside)
+    except RunLockedError as error:
+        raise StoreError(f"another sweep is running in {out}: {error.sentence}", run=out) from None
+    try:
+        yield inside
+    finally:
+        lock.release()

@@ -1,0 +1,141 @@
+"""Which runs a sweep has: one for each combination of settings and each seed, with its name, folder and config."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from es_service.config.changes import changed_constants
+from es_service.config.keys import Overrides, parse_overrides
+from es_service.config.loading import Source
+from es_service.config.model import RunConfig
+from es_service.config.yaml_text import in_line, show
+from es_service.errors import ConfigError, Problem, StoreError
+from es_service.runs.checked_config import load_config
+from es_service.runs.view import open_run
+from es_service.store.folder import holds_run
+
+SEED = "seed"
+Grid = Mapping[str, Sequence[Any]]
+"""Key of the config -> its values; a sweep has every combination of them."""
+_MOST_CHARACTERS = 60
+"""Longest part of a run's name that is made of one value, since the name of a folder has at most 255 characters."""
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """A run of a sweep."""
+
+    name: str
+    """Its settings in the sweep, such as "sigma=0.05_seed=0"."""
+    folder: Path
+    overrides: Mapping[str, Any]
+    """Every key of the config that the sweep sets."""
+    config: RunConfig
+
+
+def plan(
+    source: Source,
+    out: Path,
+    grid: Grid = MappingProxyType({}),
+    seeds: Iterable[int] | None = None,
+    overrides: Overrides = (),
+) -> list[PlannedRun]:
+    """The runs of a sweep, the seed changing fastest, then the last key of the grid.
+
+    The name of a run depends only on its own settings, so a sweep with more values or seeds has the same runs and more.
+
+    Args:
+        out: folder in which each run has a folder.
+        seeds: None: the seed of the config.
+        overrides: settings of all runs.
+
+    Raises:
+        ConfigError: a config, the grid or the seeds are wrong (all problems are listed), or the folder of a run holds
+            a run with other settings, or `out` is a run itself.
+    """
+    if holds_run(out):
+        raise ConfigError(f"{out} is the folder of a run; choose another folder for the sweep", field="out", run=out)
+    common, problems = parse_overrides(overrides)
+    by_seed = {} if seeds is None else {SEED: list(seeds)}
+    axes = {key: list(values) for key, values in grid.items()} | by_seed
+    problems += _axis_problems(axes, SEED in grid, common)
+    if problems:
+        raise _refused(source, problems)
+    combinations = [dict(zip(axes, values, strict=True)) for values in product(*axes.values())]
+    named = {_name(settings): settings for settings in combinations}
+    if len(named) < len(combinations):
+        what = "two combinations of these values give folders with the same name; use a sweep for each"
+        raise _refused(source, [Problem(f"{', '.join(axes)}: {what}")])
+    found: list[PlannedRun] = []
+    wrong: dict[str, Problem] = {}  # by sentence, since most problems are those of several runs
+    for name, settings in named.items():
+        wanted, folder = {**common, **settings}, out / name
+        try:
+            found.append(PlannedRun(name, folder, wanted, load_config(source, wanted, new=not holds_run(folder))))
+        except ConfigError as error:
+            whole = Problem(error.sentence, error.field, error.value, error.allowed, error.suggestion)
+            wrong |= {problem.sentence: problem for problem in error.problems or (whole,)}
+    if wrong:
+        raise _refused(source, list(wrong.values()))
+    for run in found:
+        _require_same_constants(run)
+    return found
+
+
+def _refused(source: Source, problems: Sequence[Problem]) -> ConfigError:
+    count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+    return ConfigError.listing(f"{'config' if isinstance(source, Mapping) else source}: {count}", problems)
+
+
+def _axis_problems(axes: Mapping[str, Sequence[Any]], has_seed: bool, common: Mapping[str, Any]) -> list[Problem]:
+    """Problems of the keys and numbers of values; values themselves are checked with the config that they are in."""
+    problems = []
+    if has_seed:
+        problems.append(Problem("the grid cannot have the key seed; give the seeds separately, such as 0:5", SEED))
+    for key, values in axes.items():
+        if not values:
+            problems.append(Problem(f"{key}: there is no value; give at least one", key))
+        texts = [in_line(value) for value in values]
+        twice = dict.fromkeys(text for text in texts if texts.count(text) > 1)
+        problems += [Problem(f"{key}: {text} is there twice; give each value once", key, text) for text in twice]
+        if key in common:
+            what = f"it has values in the sweep, and {show(common[key])} for all runs; leave one out"
+            problems.append(Problem(f"{key}: {what}", key, common[key]))
+    return problems
+
+
+def _name(settings: Mapping[str, Any]) -> str:
+    """Name of a run: each key without its section, and its value."""
+    return "_".join(f"{key.rpartition('.')[2]}={_in_name(value)}" for key, value in settings.items()) or "run"
+
+
+def _in_name(value: Any) -> str:
+    """A value as part of a folder's name, without characters that mean something to a shell, `scp` or a file system."""
+    text = in_line(value).replace(", ", ",").strip("[]{}'\"")
+    return re.sub(r"[^\w.,+-]+", "-", text)[:_MOST_CHARACTERS]
+
+
+def _require_same_constants(run: PlannedRun) -> None:
+    """Raise ConfigError if the folder holds a run with other constants than the planned one."""
+    if not holds_run(run.folder):
+        return
+    try:
+        there = open_run(run.folder).constants
+    except StoreError:
+        return  # it may be repaired when the run is resumed, which also compares the constants
+    if changes := changed_constants(there, run.config.constants()):
+        problems = [
+            Problem(f"{key}: {show(old)} -> {show(new)}", key, new, show(old), old) for key, old, new in changes
+        ]
+        raise ConfigError.listing(
+            f"{run.folder} holds a run with other settings, which cannot be changed:",
+            problems,
+            "choose another folder for this sweep, or give the settings that the run has",
+            run=run.folder,
+        )

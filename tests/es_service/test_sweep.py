@@ -1,0 +1,222 @@
+"""What a sweep consists of, what is refused before it starts, and how its runs share cores.
+
+Sweeps themselves are in `tests/system/test_sweep.py`.
+"""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+from typer.testing import CliRunner
+
+from es_service.api import load_config
+from es_service.cli.main import app
+from es_service.cli.sweep import grid_of, seeds_of
+from es_service.cli.tables.sweep import live_table
+from es_service.config.yaml_text import split_values
+from es_service.dispatch.ray_nodes import actor_cores
+from es_service.errors import ConfigError
+from es_service.runs import sweep_cores
+from es_service.runs.sweep import INSIDE, SweptRun, sweep
+from es_service.runs.sweep_cores import divide, share
+from es_service.runs.sweep_plan import plan
+from tests.es_service.config_examples import MINIMAL
+from tests.run_examples import write_run
+
+
+def test_every_combination_and_seed_is_a_run_in_a_folder_named_after_it(tmp_path):
+    grid = {"search.sigma": [0.05, 0.1], "map.cells": [[20, 20]], "search.learning_rate": [1e-3]}
+    runs = plan(MINIMAL, tmp_path, grid, range(3), ["search.pairs=64"])
+    assert [run.name for run in runs] == [
+        f"sigma={sigma}_cells=20,20_learning_rate=0.001_seed={seed}" for sigma in (0.05, 0.1) for seed in range(3)
+    ]
+    for run in runs:
+        assert run.folder == tmp_path / run.name
+        assert run.name.startswith(f"sigma={run.config.search.sigma}_")
+        assert run.name.endswith(f"_seed={run.config.seed}")
+        assert (run.config.search.pairs, run.config.map.cells) == (64, (20, 20))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_larger_sweep_has_the_runs_of_the_smaller_one(tmp_path):
+    small = plan(MINIMAL, tmp_path, {"search.sigma": [0.1]}, [1])
+    large = plan(MINIMAL, tmp_path, {"search.sigma": [0.05, 0.1]}, range(3))
+    assert all(run in large for run in small)
+
+
+def test_all_problems_of_all_runs_are_one_message(tmp_path):
+    grid = {"search.sigma": [0.05, "big", -1.0], "search.pairs": [100]}
+    with pytest.raises(ConfigError) as error:
+        plan(MINIMAL, tmp_path, grid, range(5), ["compute.chunk_pairs=16"])
+    assert sorted(str(problem.field) for problem in error.value.problems) == ["search.pairs"] + ["search.sigma"] * 2
+    assert "search.sigma: big is not allowed; must be a number above 0" in str(error.value)
+    assert "search.pairs: 100 is not a multiple of compute.chunk_pairs (16)" in str(error.value)
+    for wrong, message in (
+        ({"search.sgima": [1.0]}, "did you mean search.sigma?"),
+        ({"seed": [0, 1]}, "give the seeds separately"),
+        ({"search.sigma": []}, "search.sigma: there is no value"),
+        ({"search.sigma": [0.1, 0.10]}, "search.sigma: 0.1 is there twice"),
+        ({"compute.chunk_pairs": [16]}, "compute.chunk_pairs: it has values in the sweep, and 16 for all runs"),
+    ):
+        with pytest.raises(ConfigError) as error:
+            plan(MINIMAL, tmp_path, wrong, [0], ["compute.chunk_pairs=16"])
+        assert message in str(error.value)
+    with pytest.raises(ConfigError, match="seed: it has values in the sweep, and 3 for all runs"):
+        plan(MINIMAL, tmp_path, {}, range(3), ["seed=3"])
+    with pytest.raises(ConfigError, match="seed: 1 is there twice"):
+        plan(MINIMAL, tmp_path, {}, [1, 2, 1])
+    with pytest.raises(ConfigError, match="folders with the same name"):
+        plan(MINIMAL, tmp_path, {"search.algorithm": ["a:b", "a-b"]})
+
+
+def test_a_folder_that_holds_a_run_with_other_settings_is_refused(tmp_path):
+    settings = {"search.sigma": 0.05, "seed": 1}
+    write_run(tmp_path / "sigma=0.05_seed=1", settings)
+    source = {"task": {"environment": "point_maze"}, "search": {"algorithm": "me_es"}, "budget": {"generations": 9}}
+    assert len(plan(source, tmp_path, {"search.sigma": [0.05]}, range(2))) == 2
+    with pytest.raises(ConfigError) as error:
+        plan(source, tmp_path, {"search.sigma": [0.05]}, range(2), {"policy.hidden": [16]})
+    assert "sigma=0.05_seed=1 holds a run with other settings" in str(error.value)
+    assert "policy.hidden: [64, 64] -> [16]" in str(error.value)
+    with pytest.raises(ConfigError, match="is the folder of a run"):
+        plan(source, tmp_path / "sigma=0.05_seed=1", {}, range(2))
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("0:5", [0, 1, 2, 3, 4]), ("7", [7]), ("0,7", [0, 7]), ("0:2, 10:12", [0, 1, 10, 11])]
+)
+def test_seeds_are_ranges_without_their_end_and_single_ones(text, seeds):
+    assert seeds_of(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "a", "0-5", "-1", "0:5:2", "1,,2", ":5", "5:5", "5:0"])
+def test_other_seeds_are_refused(text):
+    with pytest.raises(ConfigError, match="--seeds") as error:
+        seeds_of(text)
+    assert (error.value.field, error.value.value) == ("seeds", text)
+    assert error.value.suggestion == {"5:0": "0:6", "5:5": "5:6"}.get(text)
+
+
+def test_values_of_the_grid_are_those_of_set(tmp_path):
+    words = ["policy.hidden=[64, 64],[16]", "task.options.start=corner,off", "search.sigma = 1e-2, 0.1"]
+    grid = {"policy.hidden": [[64, 64], [16]], "task.options.start": ["corner", "off"], "search.sigma": [0.01, 0.1]}
+    assert grid_of(words) == grid
+    for word, message in (
+        ("search.sigma", "write KEY=A,B"),
+        ("search.sigma=", "write KEY=A,B"),
+        ("search.sigma=0.1,,0.2", "is no list of values between commas"),
+        ("search.sgima=0.1,0.2", "did you mean search.sigma?"),
+        ("search=1,2", "search is a section"),
+    ):
+        with pytest.raises(ConfigError) as error:
+            grid_of([word])
+        assert (message in str(error.value), len(error.value.problems)) == (True, 1)
+    with pytest.raises(ConfigError, match="has values already"):
+        grid_of(["search.sigma=0.1", "search.sigma=0.2"])
+
+
+@given(st.lists(st.sampled_from(["1", "[1, 2]", "{a: [1]}", "'x, y'", "brax:ant", "null", "-1e-3"]), min_size=1))
+def test_values_are_split_at_the_commas_between_them_alone(values):
+    assert split_values(",".join(values)) == values
+
+
+def test_options_that_contradict_each_other_are_refused(tmp_path):
+    for words, message in (
+        (("sweep", "point_maze_es", "--out", tmp_path / "a"), "a sweep needs --grid KEY=A,B or --seeds A:B"),
+        (("run", "point_maze_es", "--seeds", "0:2", "--seed", 1), "--seed and --seeds cannot be combined"),
+        (("run", "point_maze_es", "--seeds", "0:2", "--set", "search.sigma=x", "--out", tmp_path), "sigma: x is not"),
+    ):
+        result = CliRunner().invoke(app, [str(word) for word in words])
+        assert isinstance(result.exception, ConfigError)
+        assert message in str(result.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_cannot_be_started_has_failed_and_the_others_are_tried(tmp_path):
+    names = ["seed=0", "seed=1"]
+    for name in names:
+        (tmp_path / INSIDE / f"{name}.log").mkdir(parents=True)
+    runs = sweep(MINIMAL, tmp_path, seeds=range(2))
+    assert [(run.name, run.state) for run in runs] == [(name, "failed") for name in names]
+    assert all("its process cannot be started" in run.reason for run in runs)
+
+
+def config(**compute):
+    return load_config(MINIMAL | {"search": {"algorithm": "es", "pairs": 512}, "compute": compute})
+
+
+def test_runs_share_the_cores_of_a_machine():
+    def divided(parallel, *runs, cores=12):
+        found = divide(runs, parallel, [cores], drivers=cores)
+        return found.at_once, found.workers
+
+    auto, three = config(), config(workers=3)
+    assert divided(4, *[auto] * 5) == (4, (3,) * 5)
+    assert divided(None, auto, auto) == (2, (6, 6))
+    assert divided(None, *[auto] * 20) == (12, (1,) * 20)
+    assert divided(5, *[auto] * 20) == (5, (2,) * 20)
+    assert divided(40, *[auto] * 20) == (20, (1,) * 20)
+    assert divided(1, auto, auto) == (1, ("auto", "auto"))
+    assert divided(None, auto) == (1, ("auto",))
+    assert divided(None, *[three] * 20) == (4, (3,) * 20)
+    assert divided(6, *[three] * 20) == (6, (3,) * 20)
+    assert divided(2, auto, auto, cores=64) == (2, (8, 8)), "a generation has eight chunks of work"
+    gpu = config(engine="ray", worker_resources={"gpu": 1})
+    assert divided(None, gpu, gpu) == (1, ("auto", "auto"))
+    two = config(engine="ray", worker_resources={"cpu": 2})
+    assert divided(4, *[two] * 4) == (4, (2,) * 4), "workers are a multiple of the cores of an actor"
+
+
+def test_a_cluster_is_asked_for_its_nodes_only_if_runs_share_it(monkeypatch):
+    nodes, asked = [], []
+    monkeypatch.setattr(sweep_cores, "nodes_of_cluster", lambda address: asked.append(address) or nodes)
+    auto, two = config(engine="ray", address="head:6379"), config(engine="ray", address="head:6379", workers=2)
+    assert sweep_cores.shared([auto, auto], 1).workers == ("auto", "auto")
+    assert sweep_cores.shared([auto], 4).workers == ("auto",)
+    assert sweep_cores.shared([two, two], 2).workers == (2, 2)
+    assert asked == []
+    with pytest.raises(ConfigError, match="the cluster at head:6379 has no cores yet that runs could share"):
+        sweep_cores.shared([auto, auto], 2)
+    nodes += [4, 4, 4, 4]
+    assert sweep_cores.shared([auto] * 3, 3).workers == (4, 4, 4)
+    assert asked == ["head:6379"] * 2
+    with pytest.raises(ConfigError, match="parallel: 0 is not allowed"):
+        sweep_cores.shared([auto], 0)
+
+
+@given(st.integers(1, 9), st.integers(1, 64), st.integers(1, 40))
+def test_every_run_has_room_on_equal_nodes(nodes, cores, at_once):
+    """With actors of the size that a run then chooses, on which it waits for a node with so many free cores."""
+    each = share([cores] * nodes, at_once)
+    assert 1 <= each <= max(1, nodes * cores // at_once)
+    if at_once > nodes * cores:
+        return
+    size = actor_cores([cores] * nodes, each, None)
+    assert nodes * (cores // size) >= at_once * (each // size)
+
+
+def test_unequal_nodes_have_actors_of_one_core():
+    assert share([4, 16], 3) == 6
+    assert actor_cores([4, 16], 6, None) == 1
+
+
+ROW = {"generation": 12_345, "best_fitness": -1234.5, "env_steps": 10**10, "steps_per_second": 1e6, "map_cells": 400}
+
+
+@pytest.mark.parametrize(("width", "height"), [(40, 24), (80, 24), (80, 10), (120, 40)])
+def test_the_table_fits_the_screen_and_keeps_the_runs_that_run(tmp_path, width, height):
+    states = ["finished"] * 30 + ["failed"] + ["running"] * 3 + ["waiting"] * 30
+    runs = [
+        SweptRun(f"sigma=0.05_[x]_seed={number}", tmp_path, {"generations": 20_000}, state, ROW)
+        for number, state in enumerate(states)
+    ]
+    console = Console(width=width, height=height, force_terminal=False)
+    with console.capture() as capture:
+        console.print(live_table("[sweep]", runs, width, height))
+    lines = capture.get().splitlines()
+    assert len(lines) <= height
+    assert all(len(line) <= width for line in lines)
+    assert sum("running" in line for line in lines if "│" in line) == (3 if height >= 24 else 1)
+    assert "3 running, 1 failed, 30 waiting, 30 finished" in " ".join(" ".join(lines).split())
