@@ -2,6 +2,7 @@
 
 import base64
 import json
+import os
 import re
 import sqlite3
 from dataclasses import replace
@@ -197,6 +198,12 @@ def test_a_report_is_written_into_the_folder_or_elsewhere(tmp_path):
     assert write_report(folder, elsewhere, best=False) == [elsewhere]
     assert elsewhere.read_text() == (folder / "report.html").read_text()
     assert [path.name for path in elsewhere.parent.iterdir()] == ["page.html"]
+
+
+def test_a_folder_whose_name_is_no_utf_8_has_a_page(tmp_path):
+    folder = write_run(tmp_path / os.fsdecode(b"run\xff"))
+    [page] = write_report(folder, best=False)
+    assert "<h1>run?: me_es on point_maze</h1>" in page.read_text(encoding="utf-8")
 
 
 def test_colours_rise_evenly_in_lightness():
