@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,6 +25,7 @@ from es_service.cli.options import (
     ConfigArgument,
     EngineOption,
     LogLevelOption,
+    LogOption,
     OutOption,
     RunArgument,
     SeedOption,
@@ -37,7 +38,7 @@ from es_service.cli.options import (
     print_error,
     print_note,
 )
-from es_service.cli.report import report
+from es_service.cli.report import export, report
 from es_service.cli.tables.catalogue import print_catalogue
 from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.progress import show_progress
@@ -51,6 +52,7 @@ from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceEr
 from es_service.loop.history import Row
 from es_service.protocol.machine import VERSION
 from es_service.runs.standing import newest_runs
+from es_service.runs.tracking import tracked
 from es_service.store import digest
 from es_service.store.folder import holds_run
 
@@ -85,6 +87,7 @@ def run(
     workers: WorkersOption = None,
     engine: EngineOption = None,
     address: AddressOption = None,
+    log: LogOption = None,
     log_level: LogLevelOption = None,
     or_resume: Annotated[
         bool, typer.Option("--or-resume", help="Resume the run if the --out folder already holds it.")
@@ -104,7 +107,7 @@ def run(
     with contextlib.suppress(SystemExit):  # rich's answer to a closed output
         console.print(parallel_sentence(loaded), highlight=False, markup=False, soft_wrap=True)
     folder = out if out is not None else api.default_folder(loaded)
-    _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder))
+    _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder), log)
 
 
 @app.command()
@@ -114,11 +117,12 @@ def resume(
     workers: WorkersOption = None,
     engine: EngineOption = None,
     address: AddressOption = None,
+    log: LogOption = None,
     log_level: LogLevelOption = None,
 ) -> None:
     """Continue a run; only budget, engine, workers and time limits may change."""
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
-    _session(folder, partial(api.resume, folder, wanted))
+    _session(folder, partial(api.resume, folder, wanted), log)
 
 
 @app.command()
@@ -132,12 +136,13 @@ def fork(
     workers: WorkersOption = None,
     engine: EngineOption = None,
     address: AddressOption = None,
+    log: LogOption = None,
     log_level: LogLevelOption = None,
 ) -> None:
     """Start a new run from another run's state, with changed settings."""
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
     folder = out if out is not None else api.default_folder(api.fork_config(parent, wanted))
-    _session(folder, partial(api.fork, parent, wanted, generation=generation, out=folder))
+    _session(folder, partial(api.fork, parent, wanted, generation=generation, out=folder), log)
 
 
 @app.command()
@@ -227,19 +232,7 @@ def evaluate(
         print_evaluations(console, found, results, write, every=every)
 
 
-@app.command()
-def export(
-    folder: RunArgument,
-    to: Annotated[str, typer.Option("--to", help="Format: csv, parquet, npz or ribs.", show_default=False)],
-    out: Annotated[Path | None, typer.Option("--out", help="Folder to write into; default: RUN/export.")] = None,
-) -> None:
-    """Write history, novelty archive and behaviour map as tables, or the policies as arrays."""
-    from es_service.runs.export import export as write
-
-    for file in write(api.open_run(folder), to, out if out is not None else folder / "export"):
-        print(file)
-
-
+app.command()(export)
 app.command()(report)
 app.add_typer(job_commands)
 app.add_typer(bench, name="bench")
@@ -272,8 +265,9 @@ def main() -> None:
         sys.exit(1)
 
 
-def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
-    """Show the progress of a run, and a summary at its end. The run continues if the output is closed."""
+def _session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] | None) -> None:
+    """Show the progress of a run, send it to trackers, and show a summary at its end. The run continues if the output
+    is closed."""
     began = False
 
     def tell(show: Callable[[Any], None], what: Row | str) -> None:
@@ -286,9 +280,13 @@ def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
         nonlocal began
         began = True  # remembered, since the folder may be renamed later
         tell(show, row)
+        send(row)
 
     try:
-        with show_progress(console, errors, str(folder)) as (show, note):
+        with (
+            show_progress(console, errors, str(folder)) as (show, note),
+            tracked(folder, log or (), partial(tell, note)) as send,
+        ):
             outcome = work(on_generation=partial(tell_generation, show), on_notice=partial(tell, note))
     except Interrupted:
         if began or holds_run(folder):
