@@ -248,7 +248,8 @@ def _paths(data: RunData, frame: Frame | None) -> tuple[dict[str, Any], Markup |
     path_N_T_B = np.stack([data.paths[cell] for cell in known]).astype(np.float64)
     points = path_N_T_B.shape[1]
     if frame is not None:
-        lines = np.stack([frame.across(path_N_T_B[..., 0]), frame.down(path_N_T_B[..., 1])], axis=-1)
+        inside_N_T_B = np.clip(path_N_T_B, *np.array(map_.geometry.bounds).T)  # an episode may leave the map meanwhile
+        lines = np.stack([frame.across(inside_N_T_B[..., 0]), frame.down(inside_N_T_B[..., 1])], axis=-1)
         return found | {"points": points, "paths": packed(TENTHS * lines, "int16")}, None
     shown = min(len(data.names), PAIRED_DIMENSIONS)
     time = Frame(
