@@ -85,7 +85,7 @@ def write_comparison(
     """
     if figures is not None:
         empty_figure()
-    different = {folder.resolve(): folder for folder in folders}  # a run that is given twice counts once
+    different = {Path(folder).resolve(): Path(folder) for folder in folders}  # a run that is given twice counts once
     runs = [read_run(folder, paths=False, digest=False) for folder in different.values()]
     page = write_page(comparison_page(runs, group_by, threshold), out)
     return [page, *(write_figures(runs, figures, group_by) if figures is not None else [])]
