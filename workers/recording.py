@@ -46,8 +46,8 @@ def record(spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
 
 def _record(environment: Environment, watched, spec: WorkerSpec, request: RecordRequest) -> Recording:
     centre, population = request.centre, (request.ask,) if request.ask else ()
-    keys_E = stream_keys(spec.seed, Domain.EVALUATION_RESET, centre.generation, np.arange(16), *population)
-    carry_T = watched(centre.parameters_D, centre.observation_mean_O, centre.observation_std_O, keys_E[request.episode])
+    key = stream_keys(spec.seed, Domain.EVALUATION_RESET, centre.generation, request.episode, *population)
+    carry_T = watched(centre.parameters_D, centre.observation_mean_O, centre.observation_std_O, key)
     end = int(np.asarray(carry_T.episode.steps)[-1]) + 1
     carry_T = jax.tree.map(lambda leaf: np.asarray(leaf)[:end], carry_T)
     poses = None

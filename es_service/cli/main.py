@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,6 +26,7 @@ from es_service.cli.options import (
     EngineOption,
     JsonOption,
     LogLevelOption,
+    LogOption,
     OrResumeOption,
     OutOption,
     RunArgument,
@@ -41,7 +42,7 @@ from es_service.cli.options import (
     print_error,
     print_note,
 )
-from es_service.cli.report import report
+from es_service.cli.report import export, report
 from es_service.cli.show import config_, digest_, list_, status
 from es_service.cli.sweep import SeedsOption, run_seeds, sweep
 from es_service.cli.tables.progress import show_progress
@@ -51,6 +52,7 @@ from es_service.config.parallel import parallel_sentence
 from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError
 from es_service.loop.history import Row
 from es_service.protocol.machine import VERSION
+from es_service.runs.tracking import tracked
 from es_service.store.folder import holds_run
 
 app = typer.Typer(
@@ -85,6 +87,7 @@ def run(
     workers: WorkersOption = None,
     engine: EngineOption = None,
     address: AddressOption = None,
+    log: LogOption = None,
     log_level: LogLevelOption = None,
     or_resume: OrResumeOption = False,
 ) -> None:
@@ -101,7 +104,7 @@ def run(
     with contextlib.suppress(SystemExit):  # rich's answer to a closed output
         console.print(parallel_sentence(loaded), highlight=False, markup=False, soft_wrap=True)
     folder = out if out is not None else api.default_folder(loaded)
-    _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder))
+    _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder), log)
 
 
 @app.command()
@@ -112,11 +115,12 @@ def resume(
     engine: EngineOption = None,
     address: AddressOption = None,
     strict: StrictOption = False,
+    log: LogOption = None,
     log_level: LogLevelOption = None,
 ) -> None:
     """Continue a run; only budget, engine, workers and time limits may change."""
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
-    _session(folder, partial(api.resume, folder, wanted, strict=strict))
+    _session(folder, partial(api.resume, folder, wanted, strict=strict), log)
 
 
 @app.command()
@@ -131,12 +135,13 @@ def fork(
     workers: WorkersOption = None,
     engine: EngineOption = None,
     address: AddressOption = None,
+    log: LogOption = None,
     log_level: LogLevelOption = None,
 ) -> None:
     """Start a new run from another run's state, with changed settings."""
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
     folder = out if out is not None else api.default_folder(api.fork_config(parent, wanted))
-    _session(folder, partial(api.fork, parent, wanted, generation=generation, out=folder))
+    _session(folder, partial(api.fork, parent, wanted, generation=generation, out=folder), log)
 
 
 app.command()(status)
@@ -179,20 +184,8 @@ def evaluate(
         print_evaluations(console, found, results, write, every=every)
 
 
-@app.command()
-def export(
-    folder: RunArgument,
-    to: Annotated[str, typer.Option("--to", help="Format: csv, parquet, npz or ribs.", show_default=False)],
-    out: Annotated[Path | None, typer.Option("--out", help="Folder to write into; default: RUN/export.")] = None,
-) -> None:
-    """Write history, novelty archive and behaviour map as tables, or the policies as arrays."""
-    from es_service.runs.export import export as write
-
-    for file in write(api.open_run(folder), to, out if out is not None else folder / "export"):
-        print(file)
-
-
 app.command()(sweep)
+app.command()(export)
 app.command()(report)
 app.command()(verify)
 app.add_typer(job_commands)
@@ -226,8 +219,9 @@ def main() -> None:
         sys.exit(1)
 
 
-def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
-    """Show the progress of a run, and a summary at its end. The run continues if the output is closed."""
+def _session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] | None) -> None:
+    """Show the progress of a run, send it to trackers, and show a summary at its end. The run continues if the output
+    is closed."""
     began = False
 
     def tell(show: Callable[[Any], None], what: Row | str) -> None:
@@ -240,9 +234,13 @@ def _session(folder: Path, work: Callable[..., api.Outcome]) -> None:
         nonlocal began
         began = True  # remembered, since the folder may be renamed later
         tell(show, row)
+        send(row)
 
     try:
-        with show_progress(console, errors, str(folder)) as (show, note):
+        with (
+            show_progress(console, errors, str(folder)) as (show, note),
+            tracked(folder, log or (), partial(tell, note)) as send,
+        ):
             outcome = work(on_generation=partial(tell_generation, show), on_notice=partial(tell, note))
     except Interrupted:
         if began or holds_run(folder):

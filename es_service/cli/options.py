@@ -45,6 +45,17 @@ AddressOption = Annotated[
 ]
 
 
+LogOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--log",
+        metavar="TRACKER",
+        help="Send the history to tensorboard, wandb or mlflow; can be repeated.",
+        show_default=False,
+    ),
+]
+
+
 class _NoteHandler(logging.Handler):
     """Prints a log record on stderr, above a live table if there is one."""
 

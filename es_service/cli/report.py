@@ -1,4 +1,4 @@
-"""The command `report`: what runs found, as a page that opens without a network, and as figures."""
+"""The commands `report` and `export`: what runs found, as pages and figures, and as files for other programs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
+from es_service import api
 from es_service.cli.commands import command
-from es_service.cli.options import place_of, print_note
+from es_service.cli.options import RunArgument, place_of, print_note
 from es_service.errors import ConfigError
 
 
@@ -61,4 +62,18 @@ def report(
         return command("evaluate", folder, *(["--best"] if name == "best" else ["--cell", name]))
 
     for file in write_report(folder, out, best="best" in wanted, cells=cells, evaluate=evaluate, figures=figures):
+        print(file)
+
+
+def export(
+    folder: RunArgument,
+    to: Annotated[
+        str, typer.Option("--to", help="Format: csv, parquet, npz, ribs or tensorboard.", show_default=False)
+    ],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write into; default: RUN/export.")] = None,
+) -> None:
+    """Write history, novelty archive and behaviour map as tables, the policies as arrays, or the history as events."""
+    from es_service.runs.export import export as write
+
+    for file in write(api.open_run(folder), to, out if out is not None else folder / "export"):
         print(file)

@@ -29,6 +29,13 @@ COLUMNS = {
     "qd_score": ("QD-score", "Sum over all elites of fitness less map.qd_offset.", False),
 }
 """History column -> title, explanation, whether it is a fraction."""
+LABELS = {
+    "best_fitness": "best fitness",
+    "goal_distance": "distance to the goal",
+    "coverage": "coverage",
+    "qd_score": "QD-score",
+}
+"""History column -> its name on an axis or in a table."""
 OWN_TO_A_RUN = ("seed", "compute.", RESOURCES)
 """Keys, or beginnings of keys, by which runs are not grouped unless a user says so."""
 
@@ -132,12 +139,17 @@ def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.
             continue
         lines = []
         for group in groups:
-            y_R_K = np.stack([at(run.history[axis], run.history[column], x_K) for run in group.runs])
-            low_K, median_K, high_K = np.quantile(y_R_K, [0.25, 0.5, 0.75], axis=0)  # NaN where a run has no value
+            low_K, median_K, high_K = quartiles_at(group, column, axis, x_K)
             several = len(group.runs) > 1
             lines.append(Line(group.name, column, median_K, (low_K, high_K) if several else None))
         found.append(Chart(title, note, tuple(lines), None, percent))
     return found, x_K
+
+
+def quartiles_at(group: Group, column: str, axis: str, x_K: NDArray[np.float64]) -> NDArray[np.float64]:
+    """First quartile, median and third quartile over the runs of a group [3, K]; NaN where a run has no value."""
+    y_R_K = np.stack([at(run.history[axis], run.history[column], x_K) for run in group.runs])
+    return np.quantile(y_R_K, [0.25, 0.5, 0.75], axis=0)
 
 
 def at(x_G: NDArray[np.float64], y_G: NDArray[np.float64], x_K: NDArray[np.float64]) -> NDArray[np.float64]:

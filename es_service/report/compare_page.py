@@ -20,14 +20,8 @@ from es_service.runs.standing import state
 
 UNITS = {"coverage": (100.0, " %"), "env_steps": (1e-6, "")}
 """History column -> factor and unit in which it is shown."""
-HEADS = {
-    "best_fitness": "best fitness",
-    "goal_distance": "distance to the goal",
-    "coverage": "coverage",
-    "qd_score": "QD-score",
-    "env_steps": "million steps",
-    "wall_clock_s": "seconds",
-}
+HEADS = {**compare.LABELS, "env_steps": "million steps", "wall_clock_s": "seconds"}
+"""History column of the final table -> its heading."""
 
 
 def comparison_page(runs: Sequence[RunData], keys: Sequence[str] = (), threshold: float | None = None) -> str:
@@ -112,14 +106,15 @@ def _final(groups: Sequence[Group], threshold: float | None) -> Markup:
         )
         rows.append((one.group.name, f"{runs}", *reached, *cells))
     heads = ("group", "runs", *solved, *(HEADS[column] for column in columns))
-    note = tag("p", "Median (first quartile to third quartile) over the runs of a group.", class_="note")
+    note = tag("p", "Median over the runs of a group; below it, first to third quartile.", class_="note")
     return Markup(table(rows, heads, "numbers") + note)
 
 
-def _shown(values: Quartiles, column: str) -> str:
+def _shown(values: Quartiles, column: str) -> Markup:
     scale, unit = UNITS.get(column, (1.0, ""))
     median, low, high = (number(scale * value) for value in values)
-    return f"{median}{unit}" if low == high else f"{median}{unit} ({low} to {high})"
+    range_ = None if low == high else tag("div", f"{low} to {high}", class_="note")
+    return tag("div", f"{median}{unit}", range_)
 
 
 def _maps(groups: Sequence[Group]) -> list[Markup]:
@@ -143,7 +138,7 @@ def _maps(groups: Sequence[Group]) -> list[Markup]:
                 class_="note",
             ),
             tag("div", *figures, class_="side"),
-            maps.colour_bar(colours),
+            maps.colour_bar(colours, cells=all(maps.has_area(run.map) for _, run in shown if run.map is not None)),
             id_="maps",
         )
     ]

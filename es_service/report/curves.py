@@ -177,8 +177,9 @@ def phase_figure(
     for values in curves.values():
         sums.append((below, below + 1e3 * values))
         below = below + 1e3 * values
-    # One slow generation, such as the first, which compiles, must not flatten all others.
-    top = float(np.quantile(below, 0.98)) * 1.3 if below.size else 1.0
+    # Slow generations, such as the first two, which compile, must not flatten all others.
+    top = min(3.0 * float(np.median(below)), 1.05 * float(below.max())) if below.size else 1.0
+    caption = f"Milliseconds of a generation, by phase{'; higher peaks are cut off' if (below > top).any() else ''}"
     first, last = (float(x_K[0]), float(x_K[-1])) if x_K.size else (0.0, 1.0)
     frame = Frame((first, last if last > first else first + 1.0), (0.0, top or 1.0), _LEFT, _TOP,
                   WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM)  # fmt: skip
@@ -194,7 +195,7 @@ def phase_figure(
             tag(
                 "div",
                 table(rows, ("phase", "seconds", "share"), "numbers"),
-                tag("figure", tag("figcaption", "Milliseconds of a generation, by phase"), chart, class_="chart"),
+                tag("figure", tag("figcaption", caption), chart, class_="chart"),
                 class_="columns",
             ),
         ]

@@ -5,7 +5,6 @@ Axes: G generations, N evaluated centres, T points of a path, B descriptor dimen
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,7 +127,7 @@ def read_run(folder: Path, *, paths: bool = True, digest: bool = True) -> RunDat
     return RunData(
         folder=folder,
         meta=found.meta,
-        task=task_from_fields(json.loads(json.dumps(found.meta.task))),
+        task=task_from_fields(found.meta.task),
         history=_columns([column.name for column in found.meta.columns], found.history),
         centres=_centres(found),
         map=_map(found, problems),

@@ -123,7 +123,7 @@ def time_sentence(data: RunData) -> str:
 
 
 def number(value: float) -> str:
-    """A number with about four significant digits, such as -24.31, 68,959 or 1.3e-05."""
+    """A number with three digits or more, such as -24.31, 68,959 or 1.30e-05."""
     if not math.isfinite(value):
         return "none" if math.isnan(value) else f"{value:g}"
     size = abs(value)

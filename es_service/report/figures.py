@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from es_service.errors import StoreError
+from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.report import compare, plots
 from es_service.report.colours import value_range
 from es_service.report.data import RunData
@@ -16,6 +17,16 @@ from es_service.report.data import RunData
 DPI = 200
 SIZE = (4.6, 3.4)
 """Width and height of a figure in inches."""
+
+
+def empty_figure() -> Any:
+    """A figure of matplotlib that draws into files, whatever a notebook draws into. Raises ConfigError without it."""
+    try:
+        made_by = importlib.import_module("matplotlib.figure")
+    except ImportError as error:
+        ways_out = [WayOut("install", "install it", extra="figures")]
+        raise ConfigError("figures need matplotlib", field="figures", ways_out=ways_out) from error
+    return made_by.Figure(figsize=SIZE, layout="compressed")
 
 
 def write_figures(runs: Sequence[RunData], folder: Path, keys: Sequence[str] = ()) -> list[Path]:
@@ -27,7 +38,6 @@ def write_figures(runs: Sequence[RunData], folder: Path, keys: Sequence[str] = (
     Raises:
         ConfigError: matplotlib is missing, or the runs cannot be compared. StoreError: the folder cannot be written.
     """
-    pyplot = plots.pyplot()
     found: dict[str, Callable[[Any], Any]] = {}
     for column in compare.COLUMNS:
         if all(column in run.history for run in runs):
@@ -48,12 +58,11 @@ def write_figures(runs: Sequence[RunData], folder: Path, keys: Sequence[str] = (
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, draw in found.items():
-            figure, axes = pyplot.subplots(figsize=SIZE, layout="constrained")
-            draw(axes)
+            figure = empty_figure()
+            draw(figure.subplots())
             for kind in ("svg", "png"):
                 written.append(folder / f"{name}.{kind}")
                 figure.savefig(written[-1], dpi=DPI)
-            pyplot.close(figure)
     except OSError as error:
         raise StoreError(f"cannot write into {folder}: {error.strerror or error}; choose another folder") from error
     return written
@@ -61,7 +70,7 @@ def write_figures(runs: Sequence[RunData], folder: Path, keys: Sequence[str] = (
 
 def _map(run: RunData, axes: Any, colours: tuple[float, float] | None = None, title: str = "") -> None:
     axes.figure.colorbar(plots.behaviour_map(run, axes, colours), label="fitness")
-    axes.set_title(title, parse_math=False)
+    axes.set_title(title, parse_math=False)  # a name may contain a $
 
 
 def _path(run: RunData, axes: Any) -> None:

@@ -44,7 +44,7 @@ def ground(frame: Frame, names: Sequence[str]) -> Markup:
     middle = frame.top + frame.height / 2
     content += [
         tag("text", names[0], x=frame.left + frame.width / 2, y=bottom + 33, class_="label middle"),
-        tag("text", names[1], transform=f"translate(12 {middle:.1f}) rotate(-90)", class_="label middle"),
+        tag("text", names[1], transform=f"translate(8 {middle:.1f}) rotate(-90)", class_="label middle"),
     ]
     return joined(content)
 
@@ -57,6 +57,7 @@ def walls_and_goal(frame: Frame, task: TaskSpec) -> Markup:
         content.append(tag("line", x1=ends[0], x2=ends[1], y1=ends[2], y2=ends[3], class_="wall"))
     if task.goal is not None:
         x, y = float(frame.across(task.goal[0])), float(frame.down(task.goal[1]))
+        content.append(tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=7, class_="goal-under"))
         content.append(tag("circle", tag("title", "goal"), cx=f"{x:.1f}", cy=f"{y:.1f}", r=7, class_="goal"))
         content.append(tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=2, class_="goal-middle"))
     return joined(content)

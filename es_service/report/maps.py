@@ -84,8 +84,22 @@ def draw_map(
     return _stacked(data, level_N)
 
 
-def colour_bar(colours: Range, label: str = "fitness") -> Markup:
-    """Legend of the colours of values."""
+def has_area(map_: BehaviourMap) -> bool:
+    """Whether the figure of a map is covered by its cells, so that empty ones are seen."""
+    dimensions = len(map_.geometry.bounds)
+    return dimensions == 2 or (dimensions > 2 and isinstance(map_.geometry, Grid))
+
+
+def empty_pattern() -> Markup:
+    """Hatching of empty cells, which no colour of the scale is like, also in print; a page with maps needs it once."""
+    lines = tag("path", d="M-1 1l2-2M0 6l6-6M5 7l2-2", class_="hatch")
+    pattern = tag("pattern", tag("rect", width=6, height=6, class_="hatched"), lines, id="empty", width=6, height=6,
+                  patternUnits="userSpaceOnUse")  # fmt: skip
+    return tag("svg", tag("defs", pattern), class_="defined", aria_hidden="true")
+
+
+def colour_bar(colours: Range, label: str = "fitness", *, cells: bool = False) -> Markup:
+    """Legend of the colours of values; `cells`: with the hatching of empty cells."""
     steps = [tag("rect", x=f"{100 * i / LEVELS:.3f}%", width="3.3%", height=12, fill=SCALE[i]) for i in range(LEVELS)]
     return tag(
         "div",
@@ -93,8 +107,10 @@ def colour_bar(colours: Range, label: str = "fitness") -> Markup:
         tag("svg", *steps, class_="scale", height=12, role="img", aria_label=f"Colours of {label}"),
         tag("span", number(colours[1])),
         tag("span", label, class_="note"),
+        tag("span", tag("svg", tag("rect", width=22, height=10, class_="ground"), class_="swatch cells"), "empty cell",
+            class_="key") if cells else None,
         class_="legend",
-    )
+    )  # fmt: skip
 
 
 def _overlay() -> Markup:
@@ -102,8 +118,9 @@ def _overlay() -> Markup:
     return tag("g", class_="path")
 
 
-def _svg(content: list[Markup], width: float, height: float, class_: str = "map") -> Markup:
-    return tag("svg", *content, viewBox=f"0 0 {width:.0f} {height:.0f}", class_=class_, role="img",
+def _svg(content: list[Markup], width: float, height: float, class_: str = "map cells") -> Markup:
+    outline = tag("g", class_="outline")  # of the chosen cell, above its neighbours
+    return tag("svg", *content, outline, viewBox=f"0 0 {width:.0f} {height:.0f}", class_=class_, role="img",
                aria_label="Behaviour map")  # fmt: skip
 
 
@@ -231,7 +248,8 @@ def _paths(data: RunData, frame: Frame | None) -> tuple[dict[str, Any], Markup |
     path_N_T_B = np.stack([data.paths[cell] for cell in known]).astype(np.float64)
     points = path_N_T_B.shape[1]
     if frame is not None:
-        lines = np.stack([frame.across(path_N_T_B[..., 0]), frame.down(path_N_T_B[..., 1])], axis=-1)
+        inside_N_T_B = np.clip(path_N_T_B, *np.array(map_.geometry.bounds).T)  # an episode may leave the map meanwhile
+        lines = np.stack([frame.across(inside_N_T_B[..., 0]), frame.down(inside_N_T_B[..., 1])], axis=-1)
         return found | {"points": points, "paths": packed(TENTHS * lines, "int16")}, None
     shown = min(len(data.names), PAIRED_DIMENSIONS)
     time = Frame(

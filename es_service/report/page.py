@@ -52,13 +52,13 @@ def document(title: str, sections: list[Markup], scripts: Mapping[str, Any], lib
     )
     data = [data_script(f"data-{name}", value) for name, value in scripts.items()]
     code = [tag("script", Markup(text)) for text in (*(libraries or []), asset("page.js"))]
-    body = tag("body", tag("header", tag("h1", title)), tag("main", *sections), *data, *code)
+    body = tag("body", maps.empty_pattern(), tag("header", tag("h1", title)), tag("main", *sections), *data, *code)
     return f"<!DOCTYPE html>\n{tag('html', head, body, lang='en')}\n"
 
 
 def asset(name: str) -> str:
     """Text of a file of `assets`."""
-    return (resources.files("es_service.report") / "assets" / name).read_text()
+    return (resources.files("es_service.report") / "assets" / name).read_text(encoding="utf-8")
 
 
 def section(title: str, *content: object, id_: str) -> Markup:
@@ -73,11 +73,6 @@ def axis_choice(axes: Mapping[str, str]) -> Markup:
         for index, (column, label) in enumerate(axes.items())
     ]
     return tag("div", tag("span", "against"), *buttons, class_="choice", role="radiogroup")
-
-
-def colour_legend(data: RunData) -> Markup | None:
-    """Colours of the map's fitness."""
-    return maps.colour_bar(value_range(data.map.fitness_N)) if data.map is not None else None
 
 
 def _head(data: RunData) -> Markup:
@@ -107,8 +102,9 @@ def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
     together = series.groups(generations)[0]
     grouped = None
     if together > 1:
-        grouped = tag("p", f"Each point stands for {together} neighbouring generations: the last value "
-                      "where values count so far, else the mean.", class_="note")  # fmt: skip
+        text = f"Each point summarises {together} neighbouring generations: the best centre so far, coverage and "
+        text += "QD-score by their last value, everything else by the mean."
+        grouped = tag("p", text, class_="note")
     return section(
         "Curves",
         axis_choice(series.X_AXES),
@@ -135,7 +131,7 @@ def _map(data: RunData, evaluate: Evaluate, scripts: dict[str, Any]) -> Markup:
         tag("p", f"{view.explanation} Point at a cell for its values; click it for its elite's path.", class_="note"),
         tag(
             "div",
-            tag("div", view.figure, colour_legend(data)),
+            tag("div", view.figure, maps.colour_bar(value_range(data.map.fitness_N), cells=maps.has_area(data.map))),
             tag(
                 "div",
                 tag("h3", "Chosen cell"),
@@ -162,9 +158,17 @@ def _cloud(data: RunData, scripts: dict[str, Any]) -> Markup:
     return section(
         "Evaluated centres",
         tag("p", found.explanation, class_="note"),
-        found.figure,
-        tag("div", slider, tag("span", id="until-text", class_="readout"), class_="slider"),
-        maps.colour_bar(found.colours),
+        tag(
+            "div",
+            found.figure,
+            tag(
+                "div",
+                tag("h3", "Until a generation"),
+                tag("div", slider, tag("span", id="until-text", class_="readout"), class_="slider"),
+                maps.colour_bar(found.colours),
+            ),
+            class_="columns",
+        ),
         id_="centres",
     )
 

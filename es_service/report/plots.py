@@ -12,11 +12,11 @@ import importlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from es_service.errors import ConfigError, NotInRunError, WayOut
+from es_service.errors import ConfigError, NotInRunError
 from es_service.report import compare
 from es_service.report.colours import value_range
 from es_service.report.data import RunData, read_run
@@ -62,7 +62,8 @@ def behaviour_map(run: Source, axes: Axes, colours: tuple[float, float] | None =
     if len(data.names) == 1:
         bars = collections.PolyCollection(_bars(data), array=map_.fitness_N, **style)
         axes.add_collection(bars)
-        axes.set(xlim=data.bounds[0], xlabel=data.names[0], ylabel="fitness")
+        axes.set(xlim=data.bounds[0])
+        _name_axes(axes, data.names[0], "fitness")
         axes.set_ylim(min(low, float(map_.fitness_N.min(initial=low))), high)
         return bars
     _plane(data, axes)
@@ -83,7 +84,8 @@ def centres(run: Source, axes: Axes) -> Any:
     x, fitness = data.centres[data.names[0]], data.centres["fitness_mean"]
     if len(data.names) == 1:
         y = fitness
-        axes.set(xlim=data.bounds[0], xlabel=data.names[0], ylabel="fitness")
+        axes.set(xlim=data.bounds[0])
+        _name_axes(axes, data.names[0], "fitness")
     else:
         y = data.centres[data.names[1]]
         _plane(data, axes)
@@ -93,11 +95,11 @@ def centres(run: Source, axes: Axes) -> Any:
     )
 
 
-def trajectory(run: Source, axes: Axes, cell: int | Sequence[int] | Literal["best"] = "best", **style: Any) -> None:
+def trajectory(run: Source, axes: Axes, cell: int | Sequence[int] | None = None, **style: Any) -> None:
     """Draw the path of an elite's first evaluation episode, as the run stored it.
 
     Args:
-        cell: place of the elite's cell; "best": the fittest elite.
+        cell: place of the elite's cell; None: that of the fittest elite.
         style: passed on to `Axes.plot`.
 
     Raises NotInRunError for an empty or missing cell, or a descriptor without two dimensions.
@@ -106,12 +108,11 @@ def trajectory(run: Source, axes: Axes, cell: int | Sequence[int] | Literal["bes
     opened = Run(data.folder)
     if len(data.names) != 2:
         raise NotInRunError(f"the descriptor of {data.folder} is no place in the plane", run=data.folder)
-    if cell == "best":
+    if cell is None:
         map_ = opened.behaviour_map
         if not map_.size:
             raise NotInRunError(f"the map of {data.folder} is empty", run=data.folder)
         cell = map_.geometry.index_of(int(map_.cell_N[map_.fitness_N.argmax()]))
-    assert not isinstance(cell, str)
     _plane(data, axes)
     axes.plot(*opened.elite(cell).trace_T_B.T, **{"color": PATH, "linewidth": 1.4, "zorder": 4} | style)
 
@@ -143,25 +144,16 @@ def curves(
         if len(found) == 1:
             axes.plot(group.runs[0].history[against], group.runs[0].history[column], **style)
             continue
-        y_R_K = np.stack([compare.at(run.history[against], run.history[column], x_K) for run in group.runs])
-        low_K, median_K, high_K = np.quantile(y_R_K, [0.25, 0.5, 0.75], axis=0)
+        low_K, median_K, high_K = compare.quartiles_at(group, column, against, x_K)
         axes.plot(x_K, median_K, label=group.name, **style)
         axes.fill_between(x_K, low_K, high_K, color=style["color"], alpha=0.18, linewidth=0)
-    axes.set(xlabel=X_AXES[against], ylabel=column.replace("_", " "))
+    axes.set(xlabel=X_AXES[against], ylabel=compare.LABELS.get(column, column))
+    if against == "env_steps":
+        axes.xaxis.set_major_formatter(importlib.import_module("matplotlib.ticker").EngFormatter(sep=""))
     axes.spines[["top", "right"]].set_visible(False)
     if len(groups) > 1:
-        axes.legend(frameon=False)
-
-
-def pyplot() -> Any:
-    """matplotlib's pyplot, which draws into files. Raises ConfigError if matplotlib is not installed."""
-    try:
-        matplotlib = importlib.import_module("matplotlib")
-    except ImportError as error:
-        ways_out = [WayOut("install", "install it", extra="figures")]
-        raise ConfigError("figures need matplotlib", field="figures", ways_out=ways_out) from error
-    matplotlib.use("Agg")
-    return importlib.import_module("matplotlib.pyplot")
+        for text in axes.legend(frameon=False).get_texts():
+            text.set_parse_math(False)
 
 
 def _data(run: Source) -> RunData:
@@ -180,9 +172,16 @@ def _bars(data: RunData) -> list[list[tuple[float, float]]]:
     ]
 
 
+def _name_axes(axes: Axes, x: str, y: str) -> None:
+    """Label both axes; what a user named is never read as a formula."""
+    axes.set_xlabel(x, parse_math=False)
+    axes.set_ylabel(y, parse_math=False)
+
+
 def _plane(data: RunData, axes: Axes) -> None:
     """The plane of the first two dimensions, its walls and its goal."""
-    axes.set(xlim=data.bounds[0], ylim=data.bounds[1], xlabel=data.names[0], ylabel=data.names[1])
+    axes.set(xlim=data.bounds[0], ylim=data.bounds[1])
+    _name_axes(axes, *data.names[:2])
     if not is_plan(data.task, data.names):
         return
     axes.set_aspect("equal")

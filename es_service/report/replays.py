@@ -8,7 +8,6 @@ reported.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from es_service.report.facts import number
 from es_service.report.markup import Markup, packed, spread, tag
 from es_service.report.page import asset, section
 from es_service.runs.replay import Replay, record
-from es_service.runs.view import Run
 
 MOST_CELLS = 8
 """Elites that are replayed in one page, besides the best centre; each ant takes half a megabyte."""
@@ -36,8 +34,7 @@ def replay_section(data: RunData, *, best: bool, cells: Sequence[Sequence[int]])
     A task that cannot be run on this machine, such as a user's task whose package is missing, has a section that says
     so. Errors about cells are raised: NotInRunError.
     """
-    run = Run(Path(data.folder))
-    run.__dict__["meta"] = data.meta
+    run = data.standing.run
     for place in cells:
         run.cell(place)
     try:
@@ -51,7 +48,6 @@ def replay_section(data: RunData, *, best: bool, cells: Sequence[Sequence[int]])
         }
     solid = bool(found.shapes) and all(one.recording.poses_T_L_7 is not None for one in replays)
     scripts = {"replay": _solid(data, replays, found) if solid else _flat(data, replays)}
-    scripts["replay"]["names"] = [_title(one) for one in replays]
     libraries = [asset("three.bundle.js")] if solid else []
     return {
         "section": _section(data, replays, solid=solid),
@@ -84,9 +80,10 @@ def _section(data: RunData, replays: Sequence[Replay], *, solid: bool) -> Markup
     speeds = [tag("option", f"{speed:g} x", value=speed, selected="" if speed == 1 else None) for speed in SPEEDS]
     longest = max(one.recording.returns_T.size for one in replays) - 1
     scrub = Markup(f'<input type="range" id="scrub" min="0" max="{longest}" value="0" step="1" aria-label="step">')
-    follow = Markup('<input type="checkbox" id="follow">')
+    # Walls are seen best from afar, a body on its own from nearby.
+    follow = Markup(f'<input type="checkbox" id="follow"{"" if data.task.walls else " checked"}>')
     frame = _frame(data, replays)
-    plan = tag("svg", floor.ground(frame, _labels(data)), floor.walls_and_goal(frame, data.task),
+    plan = tag("svg", floor.ground(frame, _labels(data, replays)), floor.walls_and_goal(frame, data.task),
                tag("g", class_="path"), viewBox="0 0 {:.0f} {:.0f}".format(*floor.size(frame)), class_="map",
                role="img", aria_label="Path from above")  # fmt: skip
     stage = tag("div", tag("canvas", id="stage"), class_="stage", id="stage-box") if solid else None
@@ -105,22 +102,34 @@ def _section(data: RunData, replays: Sequence[Replay], *, solid: bool) -> Markup
         stage,
         tag("div", plan, class_="stage flat", id="plan", hidden="" if solid else None),
         *(tag("p", _notes(one), class_="note episode", hidden="" if i else None) for i, one in enumerate(replays)),
-        tag("p", "Drag to turn, scroll to come nearer, drag with the right button to move.", class_="note")
+        tag(
+            "p",
+            "Drag to turn; scroll or pinch to zoom; drag with the right button or with two fingers to move.",
+            class_="note",
+        )
         if solid
         else None,
         id_="replay",
     )
 
 
-def _labels(data: RunData) -> tuple[str, str]:
+def _labels(data: RunData, replays: Sequence[Replay]) -> tuple[str, str]:
     first, *others = data.names
+    if _shows_body(data, replays[0]):
+        return "x", "y"
     return (first, others[0]) if others else ("step of the episode", first)
 
 
+def _shows_body(data: RunData, one: Replay) -> bool:
+    """Whether the path is that of the first body, because the descriptor is no place on the floor."""
+    return one.recording.poses_T_L_7 is not None and not floor.is_plan(data.task, data.names)
+
+
 def _plane(data: RunData, one: Replay) -> tuple[np.ndarray, np.ndarray]:
-    """x and y of a path in the plane: the first two dimensions, or one dimension against time."""
+    """x and y of a path in the plane: of a body, or the first two dimensions, or one dimension against time."""
     way_T_B = one.recording.descriptor_T_B
-    if one.recording.poses_T_L_7 is not None and not floor.is_plan(data.task, data.names):
+    if _shows_body(data, one):
+        assert one.recording.poses_T_L_7 is not None
         return one.recording.poses_T_L_7[:, 0, 0], one.recording.poses_T_L_7[:, 0, 1]
     if way_T_B.shape[1] == 1:
         return np.arange(len(way_T_B), dtype=float), way_T_B[:, 0]

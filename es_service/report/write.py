@@ -9,7 +9,7 @@ from pathlib import Path
 from es_service.errors import ConfigError, StoreError
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import read_run
-from es_service.report.figures import write_figures
+from es_service.report.figures import empty_figure, write_figures
 from es_service.report.page import Evaluate, run_page
 from es_service.report.replays import MOST_CELLS, replay_section
 
@@ -58,6 +58,8 @@ def write_report(
             value=len(cells),
             allowed=f"at most {MOST_CELLS} cells",
         )
+    if figures is not None:
+        empty_figure()  # a missing matplotlib is reported before episodes are recorded
     data = read_run(folder)
     found = bool(data.history["generation"].size) and (best or bool(cells))
     replays = replay_section(data, best=best, cells=cells) if found else None
@@ -83,7 +85,10 @@ def write_comparison(
         ConfigError: the runs cannot be compared or grouped, or figures without matplotlib. NotInRunError: a run has no
             finished generation. StoreError: a run cannot be read, or a file cannot be written.
     """
-    runs = [read_run(Path(folder), paths=False, digest=False) for folder in folders]
+    if figures is not None:
+        empty_figure()
+    different = {Path(folder).resolve(): Path(folder) for folder in folders}  # a run that is given twice counts once
+    runs = [read_run(folder, paths=False, digest=False) for folder in different.values()]
     page = write_page(comparison_page(runs, group_by, threshold), Path(out))
     return [page, *(write_figures(runs, Path(figures), group_by) if figures is not None else [])]
 
@@ -93,7 +98,8 @@ def write_page(page: str, file: Path) -> Path:
     half = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        half.write_text(page)
+        # A folder's name may be no UTF-8; then it is shown with question marks.
+        half.write_text(page, encoding="utf-8", errors="replace")
         half.replace(file)
     except OSError as error:
         half.unlink(missing_ok=True)

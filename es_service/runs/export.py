@@ -1,4 +1,4 @@
-"""Export of a run as tables (csv, parquet), as NumPy arrays (npz) or as a pyribs archive (ribs)."""
+"""Export of a run as tables (csv, parquet), arrays (npz), a pyribs archive (ribs) or files of TensorBoard."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from es_service.config.problems import did_you_mean, nearest, one_of
 from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
 from es_service.runs.moment import map_places
+from es_service.runs.trackers import TensorBoard, check_trackers, fill
 from es_service.runs.view import Run, is_no_elite
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.maps.geometry import Grid
@@ -205,10 +206,21 @@ def _ribs(run: Run, folder: Path) -> list[Path]:
     return [file]
 
 
+def _tensorboard(run: Run, folder: Path) -> list[Path]:
+    check_trackers(["tensorboard"])
+    tracker = TensorBoard(run, folder)
+    for file in tracker.files():
+        file.unlink()
+    fill(tracker, run, -1)
+    tracker.close()
+    return tracker.files()
+
+
 FORMATS: dict[str, Callable[[Run, Path], list[Path]]] = {
     "csv": _csv,
     "parquet": _parquet,
     "npz": _npz,
     "ribs": _ribs,
+    "tensorboard": _tensorboard,
 }
 """Function that writes each format."""

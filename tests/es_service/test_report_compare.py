@@ -2,6 +2,7 @@
 
 import re
 import sqlite3
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,9 @@ from es_service.errors import ConfigError, NotInRunError
 from es_service.report import compare
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import read_run
-from es_service.report.figures import write_figures
-from es_service.report.write import write_comparison
-from tests.es_service.test_report_page import Elements, task_with
+from es_service.report.figures import empty_figure, write_figures
+from es_service.report.write import write_comparison, write_report
+from tests.es_service.test_report_page import EVIL, Elements, task_with
 from tests.run_examples import write_run
 
 
@@ -145,12 +146,61 @@ def test_figures_are_written_as_svg_and_png(folders, runs, tmp_path):
     assert {"best_fitness.svg", "behaviour_map_0.png", "behaviour_map_1.png"} <= {file.name for file in several}
 
 
+def test_figures_without_matplotlib_are_refused_before_anything_is_recorded(folders, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    for write in (
+        lambda: write_report(folders[0], tmp_path / "page.html", figures=tmp_path / "figures"),
+        lambda: write_comparison(folders, tmp_path / "page.html", figures=tmp_path / "figures"),
+    ):
+        with pytest.raises(ConfigError, match="figures need matplotlib") as caught:
+            write()
+        assert caught.value.way_out.extra == "figures"
+    assert not list(tmp_path.iterdir())
+
+
+def named_runs(top, name, value):
+    """Two runs whose dimensions and folders have a name, and which differ in the value of an option."""
+    made = task_with(2, options={"way": ("a", value)})
+    task = replace(made, name=f"made:{name}", descriptor_names=(f"x{name}", f"y{name}"))
+    folders = [top / f"{number}{name.replace('/', '')}" for number in range(2)]
+    return [
+        write_run(folder, {"task.options.way": way}, task=task)
+        for folder, way in zip(folders, ("a", value), strict=True)
+    ]
+
+
+def test_all_text_of_a_user_is_escaped(tmp_path):
+    """Also what is said of a damaged run; the page has no element but its own."""
+    pages = []
+    for name, value in ((EVIL, f"v{EVIL}"), ("", "b")):
+        folders = named_runs(tmp_path / str(len(name)), name, value)
+        with sqlite3.connect(folders[0] / "run.db") as connection:
+            connection.execute("DELETE FROM history WHERE generation = 7")
+        pages.append(comparison_page([read_run(folder) for folder in folders], ["task.options.way"]))
+    page, plain = pages
+    found = Elements(page)
+    assert {*found.names} == {*Elements(plain).names}
+    assert "onerror" not in {name for name, _ in found.attributes}
+    assert not re.search(r"<(?!/?[a-z!])", page.split("</style>")[1].split("<script>")[0])
+    assert "are damaged or missing" in page
+    assert page.count("v&lt;/script&gt;") > 3  # the name of the group, in figures and tables
+
+
+def test_names_are_no_formulas_in_figures(tmp_path):
+    """matplotlib reads what is between two $ as a formula, and refuses one that is wrong."""
+    runs = [read_run(folder) for folder in named_runs(tmp_path, r"$\frac$", r"v$\frac$")]
+    assert write_figures(runs[:1], tmp_path / "one")
+    assert write_figures(runs, tmp_path / "two", ["task.options.way"])
+
+
+def test_a_run_that_is_given_twice_counts_once(folders, tmp_path):
+    page, *_ = write_comparison([folders[0], folders[1], folders[0]], tmp_path / "page.html")
+    assert "<h1>2 runs on point_maze</h1>" in page.read_text()
+
+
 @pytest.fixture
 def axes():
-    pyplot = plots.pyplot()
-    figure, axes = pyplot.subplots()
-    yield axes
-    pyplot.close(figure)
+    return empty_figure().subplots()
 
 
 def test_a_plot_of_a_map_has_its_values_where_they_are(folders, runs, axes):

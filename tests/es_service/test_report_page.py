@@ -2,6 +2,7 @@
 
 import base64
 import json
+import os
 import re
 import sqlite3
 from dataclasses import replace
@@ -148,6 +149,11 @@ def test_cells_and_paths_are_drawn_where_they_are(tmp_path):
     points = np.frombuffer(base64.b64decode(view.cells["paths"]), "<i2").reshape(400, 64, 2) / 10
     end = points[view.cells["order"].index(cell), -1]
     np.testing.assert_allclose(end, [x + width / 2, y + height / 2], atol=0.2)
+    # A path that leaves the map meanwhile is drawn along its edge, not over the text beside it.
+    assert any((data.paths[cell] < -1.0).any() for cell in data.paths)
+    low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+    assert (low >= [x - 0.1, y - 0.1]).all()
+    assert (high <= [x + 20 * width + 0.1, y + 20 * height + 0.1]).all()
 
 
 def test_voronoi_cells_fill_the_map_and_hold_their_centroids(tmp_path):
@@ -197,6 +203,12 @@ def test_a_report_is_written_into_the_folder_or_elsewhere(tmp_path):
     assert write_report(folder, elsewhere, best=False) == [elsewhere]
     assert elsewhere.read_text() == (folder / "report.html").read_text()
     assert [path.name for path in elsewhere.parent.iterdir()] == ["page.html"]
+
+
+def test_a_folder_whose_name_is_no_utf_8_has_a_page(tmp_path):
+    folder = write_run(tmp_path / os.fsdecode(b"run\xff"))
+    [page] = write_report(folder, best=False)
+    assert "<h1>run?: me_es on point_maze</h1>" in page.read_text(encoding="utf-8")
 
 
 def test_colours_rise_evenly_in_lightness():

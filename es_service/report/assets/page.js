@@ -54,8 +54,12 @@
     let chosen = null;
     const choose = (cell) => {
       chosen = cell;
-      document.querySelectorAll(".chosen").forEach((one) => one.classList.remove("chosen"));
-      document.querySelectorAll(`[data-c="${cell}"]`).forEach((one) => one.classList.add("chosen"));
+      document.querySelectorAll(".outline").forEach((outline) => outline.replaceChildren());
+      document.querySelectorAll(`[data-c="${cell}"]`).forEach((one) => {
+        const shape = one.cloneNode();
+        delete shape.dataset.c;
+        one.ownerSVGElement.querySelector(".outline").append(shape);
+      });
       show(cell);
       byId("command").textContent = map.evaluate[cell];
       groups.forEach((group) => group.replaceChildren());
@@ -87,14 +91,18 @@
       const [shown, text] = cloud.stops[byId("until").value];
       byId("until-text").textContent = text;
       pen.clearRect(0, 0, canvas.width, canvas.height);
-      const side = shown > 5000 ? 4 : 7;
-      pen.globalAlpha = shown > 1000 ? 0.75 : 1;
-      for (let k = 0; k < shown; k++) {
+      const side = shown > 5000 ? 5 : 7;
+      const edge = getComputedStyle(document.documentElement).getPropertyValue("--edge");
+      for (let k = 0; k < shown; k++) { // an edge, since the ends of the scale are like a dark or a light ground
+        const left = x[k] / 5 - side / 2, top = y[k] / 5 - side / 2; // tenths of a pixel on two per pixel
+        pen.fillStyle = edge;
+        pen.fillRect(left - 1, top - 1, side + 2, side + 2);
         pen.fillStyle = cloud.colours[level[k]];
-        pen.fillRect(x[k] / 5 - side / 2, y[k] / 5 - side / 2, side, side); // tenths of a pixel on two per pixel
+        pen.fillRect(left, top, side, side);
       }
     };
     byId("until").addEventListener("input", draw);
+    window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
     draw();
   }
 })();

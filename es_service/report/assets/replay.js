@@ -33,14 +33,16 @@ window.addEventListener("DOMContentLoaded", () => {
     },
   };
 
+  const dark = window.matchMedia("(prefers-color-scheme: dark)");
   const solid = () => {
     const T = window.THREE, canvas = byId("stage"), box = byId("stage-box");
     const renderer = new T.WebGLRenderer({ canvas, antialias: true });
-    const scene = new T.Scene(), camera = new T.PerspectiveCamera(45, 1, 0.05, 500);
+    const scene = new T.Scene(), camera = new T.PerspectiveCamera(45, 1, 0.1, 500);
     camera.up.set(0, 0, 1);
     const orbit = new T.OrbitControls(camera, canvas);
     orbit.maxPolarAngle = Math.PI * 0.495;
-    scene.add(new T.HemisphereLight(0xffffff, 0x8a939c, 2.2));
+    const sky = new T.HemisphereLight(0xffffff, 0x8a939c);
+    scene.add(sky);
     const sun = new T.DirectionalLight(0xffffff, 1.8);
     sun.position.set(0.5, -1, 2);
     scene.add(sun);
@@ -71,7 +73,7 @@ window.addEventListener("DOMContentLoaded", () => {
       goal.position.set(data.goal[0], data.goal[1], 0.05);
       scene.add(goal);
     }
-    const floor = new T.Mesh(new T.PlaneGeometry(1, 1), new T.MeshLambertMaterial());
+    const floor = new T.Mesh(new T.PlaneGeometry(1, 1), new T.MeshLambertMaterial({ polygonOffset: true, polygonOffsetFactor: 4, polygonOffsetUnits: 4 }));
     floor.position.z = -0.005;
     scene.add(floor);
     let grid = null, path = null;
@@ -83,6 +85,7 @@ window.addEventListener("DOMContentLoaded", () => {
     const dress = () => {
       scene.background = colour("--ground");
       floor.material.color = colour("--paper");
+      sky.intensity = dark.matches ? 4 : 2.2; // bodies are often dark
     };
     const aim = () => { // from the south and above; near enough to see the body, or the whole path
       const { low, size } = episodes[current];
@@ -192,7 +195,7 @@ window.addEventListener("DOMContentLoaded", () => {
   byId("episode").addEventListener("change", () => { stop(); load(); });
   byId("follow")?.addEventListener("change", () => { if (view.aim) { view.aim(); show(); } });
   window.addEventListener("resize", show);
-  window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", show);
+  dark.addEventListener("change", show);
   load();
   view.listen?.(() => view.draw());
 });
