@@ -94,7 +94,7 @@ def run(
     """Start a run from a config file; with --seeds, a run for each seed."""
     wanted = overrides(set_, seed=seed, workers=workers, engine=engine, address=address)
     if seeds is not None:
-        run_seeds(config, seeds, out, wanted, seed, log_level)
+        run_seeds(config, seeds, out, wanted, seed, log, log_level)
         return
     if or_resume and out is None:
         raise ConfigError("--or-resume needs --out: add --out FOLDER to name the folder of the run to start or resume")

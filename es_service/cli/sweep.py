@@ -15,6 +15,7 @@ from es_service.cli.options import (
     ConfigArgument,
     EngineOption,
     LogLevelOption,
+    LogOption,
     SetOption,
     console,
     errors,
@@ -29,6 +30,7 @@ from es_service.config.yaml_text import split_values
 from es_service.errors import ConfigError, Interrupted, Problem
 from es_service.runs.sweep import SweptRun, run_planned
 from es_service.runs.sweep_plan import plan
+from es_service.runs.trackers import check_trackers
 
 SeedsOption = Annotated[
     str | None,
@@ -54,28 +56,37 @@ def sweep(
     ] = None,
     engine: EngineOption = None,
     address: AddressOption = None,
+    log: LogOption = None,
     log_level: LogLevelOption = None,
 ) -> None:
     """Run a config with several settings and seeds, and compare the runs. The same command again continues it."""
     if not grid and seeds is None:
         raise ConfigError("a sweep needs --grid KEY=A,B or --seeds A:B, or both")
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
-    run_sweep(config, out, wanted, grid_of(grid or ()), seeds, parallel, _options_of_each(log_level))
+    run_sweep(config, out, wanted, grid_of(grid or ()), seeds, parallel, _options_of_each(log, log_level))
 
 
 def run_seeds(
-    config: Path, seeds: str, out: Path | None, wanted: Sequence[str], seed: int | None, log_level: str | None
+    config: Path,
+    seeds: str,
+    out: Path | None,
+    wanted: Sequence[str],
+    seed: int | None,
+    log: list[str] | None,
+    log_level: str | None,
 ) -> None:
     """`run --seeds`: a sweep without a grid."""
     if seed is not None:
         raise ConfigError("--seed and --seeds cannot be combined; give one of them")
     folder = out if out is not None else api.default_folder(api.load_config(config, wanted), "seeds")
-    run_sweep(config, folder, wanted, {}, seeds, None, _options_of_each(log_level))
+    run_sweep(config, folder, wanted, {}, seeds, None, _options_of_each(log, log_level))
 
 
-def _options_of_each(log_level: str | None) -> list[str]:
-    """Options of this command that its runs get."""
-    return [] if log_level is None else ["--log-level", log_level]
+def _options_of_each(trackers: list[str] | None, log_level: str | None) -> list[str]:
+    """Options of this command that its runs get. Raises ConfigError if a tracker cannot be used."""
+    check_trackers(trackers or ())
+    level = [] if log_level is None else ["--log-level", log_level]
+    return [*(f"--log={tracker}" for tracker in trackers or ()), *level]
 
 
 def run_sweep(

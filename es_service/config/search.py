@@ -119,7 +119,7 @@ class SearchConfig(Section):
     evaluation_episodes: Count = Field(
         30,
         description="Noise-free episodes on which each new centre is evaluated; they count as environment steps. "
-        "map_elites: 1, for each policy.",
+        "memes, and map_elites for each policy: 1 if left out.",
     )
     common_random_numbers: Switch = Field(
         description="Whether the two members of a pair share resets and action noise. Set by the preset."

@@ -59,7 +59,7 @@ _CELL = (
     "dimension first, so that of 20 by 20 cells 90 is 4,10; the map's table has both"
 )
 _MAP = (
-    Column("start_cell", "INTEGER", True, "me_es: cell whose elite this generation began with; none inside a block"),
+    Column("start_cell", "INTEGER", True, "me_es, memes: cell whose elite this generation began with, if it drew one"),
     Column("cell", "INTEGER", True, _CELL),
     Column("map_cells", "INTEGER", True, "filled cells of the map after this generation"),
     Column("coverage", "REAL", True, "filled cells as a fraction of all"),
@@ -105,7 +105,9 @@ def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
     """Columns of the evaluated centres, of which a generation may have several; `generation` comes before them."""
     return (
         Column("centre", "INTEGER", True, "index of the centre"),
-        Column("fitness_weight", "REAL", True, "weight of fitness in its utilities; me_es: 0 explores, 1 exploits"),
+        Column(
+            "fitness_weight", "REAL", True, "weight of fitness in its utilities; me_es, memes: 0 explores, 1 exploits"
+        ),
         *(
             (
                 Column("start_cell", "INTEGER", True, "cell whose elite it started from in this generation"),

@@ -76,11 +76,9 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
     populations.
     """
     if not populations(config):
-        name, why = (
-            config.search.algorithm,
-            "whose policies are sent to the workers, since only populations are measured",
-        )
-        raise ConfigError(f"bench scaling cannot predict {name}, {why}", field="search.algorithm", value=name)
+        name = config.search.algorithm
+        why = f"bench scaling cannot predict {name}, which has policies instead of populations"
+        raise ConfigError(why, field="search.algorithm", value=name)
     task = task_of(config)
     spec = worker_spec(config, task)
     parameters = initial_parameters(spec.policy, config.policy.init, config.seed, 0)

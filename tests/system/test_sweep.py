@@ -99,7 +99,7 @@ def test_a_sweep_killed_and_given_again_ends_as_if_it_had_not_been_and_a_failed_
 @pytest.mark.slow
 def test_a_signal_stops_all_runs_and_a_second_one_ends_at_once(config, tmp_path):
     out = tmp_path / "runs"
-    endless = ("--set", "budget.generations=1000000", "--workers", 1, "--log-level", "info")
+    endless = ("--set", "budget.generations=1000000", "--workers", 1, "--log-level", "info", "--log", "tensorboard")
     command = ("run", config, "--seeds", "0:2", *endless, "--out", out)
     names = ["seed=0", "seed=1"]
     with running(PROGRAM, *command) as process:
@@ -118,6 +118,7 @@ def test_a_signal_stops_all_runs_and_a_second_one_ends_at_once(config, tmp_path)
         log = (out / sweeps.INSIDE / f"{name}.log").read_text()
         assert "interrupted; " in log
         assert "INFO es_service.runs.session " in log
+        assert list((out / name / "tensorboard").iterdir())
 
     with running(PROGRAM, *command) as process:
         before = [committed(out / name) for name in names]
