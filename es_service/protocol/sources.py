@@ -89,7 +89,7 @@ def _package_sources(*packages: str) -> dict[str, str]:
     for package in packages:
         spec = importlib.util.find_spec(package)
         for folder in map(Path, (spec and spec.submodule_search_locations) or ()):
-            for file in folder.rglob("*.py"):
+            for file in filter(Path.is_file, folder.rglob("*.py")):  # editors leave links that lead nowhere
                 found["/".join((*package.split("."), *file.relative_to(folder).parts))] = _sha256(file)
     return found
 
