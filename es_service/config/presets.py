@@ -168,6 +168,20 @@ _ROWS = (
         "literature: QDax, which evaluates a policy once. uber: the same.",
         "map_elites",
     ),
+    PresetRow(
+        "policy.action_noise",
+        0.0,
+        0.0,
+        "literature: Mania et al. 2018, which adds no noise to actions. uber: the same.",
+        "ars",
+    ),
+    PresetRow(
+        "search.l2",
+        0.0,
+        0.0,
+        "literature: Mania et al. 2018, which has no weight decay. uber: the same.",
+        "ars",
+    ),
 )
 
 

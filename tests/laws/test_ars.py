@@ -104,3 +104,8 @@ def test_only_differences_count_and_neither_scale_nor_shift_of_the_fitness(fitne
 def test_a_plain_step_by_hand():
     found = plain_ascent(np.float32([1.0, -2.0]), np.float32([4.0, 0.0]), learning_rate=0.5, l2=0.25)
     np.testing.assert_array_equal(found, np.float32([1.0 + 0.5 * (4.0 - 0.25), -2.0 + 0.5 * 0.5]))
+
+
+def test_by_default_there_is_neither_weight_decay_nor_action_noise():
+    config = small_config(algorithm="ars")
+    assert (config.search.l2, config.policy.action_noise) == (0.0, 0.0)
