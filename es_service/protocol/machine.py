@@ -5,6 +5,7 @@ The driver and the workers each have a platform; a worker in a cluster reports i
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
 from collections.abc import Collection, Iterable, Mapping
@@ -57,6 +58,11 @@ def is_mixed(platforms: Iterable[Mapping[str, Any]]) -> bool:
 def without_code(platform: Mapping[str, Any]) -> dict[str, Any]:
     """A recorded platform without the hashes of the code."""
     return {name: value for name, value in platform.items() if name != CODE}
+
+
+def code_text(code: Mapping[str, str]) -> str:
+    """The hashes of a run's code in one line, such as `87 files, SHA-256 1f0c95d2ab37`; equal code has equal lines."""
+    return f"{len(code)} files, SHA-256 {hashlib.sha256(platform_text(code).encode()).hexdigest()[:12]}"
 
 
 def cpu_kind() -> str:

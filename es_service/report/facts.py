@@ -7,9 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from es_service.protocol.machine import CODE, code_text
+from es_service.protocol.sources import in_words
 from es_service.report.data import RunData
 from es_service.report.series import phase_seconds
-from es_service.runs.standing import state
+from es_service.runs.identity import code_changes
+from es_service.runs.standing import population_size, state
 
 
 class Fault(NamedTuple):
@@ -49,18 +52,18 @@ def what_was_run(data: RunData) -> list[tuple[str, str]]:
     constants, limits = data.constants, data.standing.limits
     fields = [
         ("task", f"{constants['task.environment']}, {constants['task.episode_steps']:,} steps an episode"),
-        ("search", f"{constants['search.algorithm']}, {constants['search.pairs']:,} pairs, seed {constants['seed']}"),
+        ("search", f"{constants['search.algorithm']}, {population_size(constants)}, seed {constants['seed']}"),
         ("state", state(data.standing)),
     ]
     if data.history["generation"].size:
-        of = {key: f" of {limit:,g}" for key, limit in limits.items()}
+        of = {key: f" of {limit:,.0f}" for key, limit in limits.items()}
         fields += [
             ("generations", f"{data.last('generation'):,.0f}{of.get('generations', '')}"),
             (
                 "environment steps",
                 f"{data.last('env_steps'):,.0f}{of.get('env_steps', '')} in {data.last('episodes'):,.0f} episodes",
             ),
-            ("time", f"{duration(data.last('wall_clock_s'))} on {data.last('workers'):,.0f} workers"),
+            ("time", f"{duration(data.last('wall_clock_s'))} on {count(int(data.last('workers')), 'worker')}"),
         ]
     if data.meta.parent:
         parent = data.meta.parent
@@ -70,7 +73,7 @@ def what_was_run(data: RunData) -> list[tuple[str, str]]:
 
 def provenance(data: RunData) -> list[tuple[str, str]]:
     """Versions, machine, digest and identity, as (label, text)."""
-    fields = []
+    fields, before = [], {}
     for at, platform in data.platforms:
         since = f" since generation {at:,}" if len(data.platforms) > 1 else ""
         fields += [
@@ -80,6 +83,12 @@ def provenance(data: RunData) -> list[tuple[str, str]]:
         for other in platform.get("workers", ()):
             versions = ", ".join(f"{name} {text}" for name, text in other.items() if _is_version(name))
             fields.append((f"workers{since}", f"{other.get('cpu', '?')}; {versions}"))
+        if CODE in platform:
+            changed = code_changes(before, platform)
+            fields.append(
+                (f"code{since}", code_text(platform[CODE]) + (f"; {in_words(changed)} changed" if changed else ""))
+            )
+        before = platform
     digest = data.digest or ("not computed while a driver is writing" if data.standing.driver else "not available")
     return [
         *fields,
@@ -150,4 +159,4 @@ def duration(seconds: float) -> str:
 
 
 def _is_version(name: str) -> bool:
-    return name not in ("cpu", "workers")
+    return name not in ("cpu", "workers", CODE)

@@ -13,6 +13,7 @@ from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.report import compare, plots
 from es_service.report.colours import value_range
 from es_service.report.data import RunData
+from es_service.report.overview import draw_overview
 
 DPI = 200
 SIZE = (4.6, 3.4)
@@ -29,11 +30,14 @@ def empty_figure() -> Any:
     return made_by.Figure(figsize=SIZE, layout="compressed")
 
 
-def write_figures(runs: Sequence[RunData], folder: Path, keys: Sequence[str] = ()) -> list[Path]:
+def write_figures(
+    runs: Sequence[RunData], folder: Path, keys: Sequence[str] = (), threshold: float | None = None
+) -> list[Path]:
     """Write all figures of one run, or of the comparison of several; return the files.
 
     Args:
         keys: config keys that group the runs.
+        threshold: fitness from which a run of a comparison counts as solved; see `draw_overview`.
 
     Raises:
         ConfigError: matplotlib is missing, or the runs cannot be compared. StoreError: the folder cannot be written.
@@ -41,25 +45,31 @@ def write_figures(runs: Sequence[RunData], folder: Path, keys: Sequence[str] = (
     found: dict[str, Callable[[Any], Any]] = {}
     for column in compare.COLUMNS:
         if all(column in run.history for run in runs):
-            found[column] = lambda axes, column=column: plots.curves(list(runs), axes, column, group_by=keys)
+            found[column] = lambda figure, column=column: plots.curves(
+                list(runs), figure.subplots(), column, group_by=keys
+            )
     mapped = [run for run in runs if run.map is not None and run.map.size and len(run.names) <= 2]
     if len(runs) == 1:
         if mapped:
-            found["behaviour_map"] = lambda axes: _map(mapped[0], axes)
+            found["behaviour_map"] = lambda figure: _map(mapped[0], figure.subplots())
             if len(mapped[0].names) == 2:
-                found["trajectory"] = lambda axes: _path(mapped[0], axes)
-        found["centres"] = lambda axes: axes.figure.colorbar(plots.centres(runs[0], axes), label="fitness")
-    elif mapped:
-        colours = value_range(np.concatenate([run.map.fitness_N for run in mapped if run.map is not None]))
-        for index, group in enumerate(compare.grouped(runs, keys)):
-            if (run := compare.median_run(group)) in mapped:
-                found[f"behaviour_map_{index}"] = lambda axes, run=run, name=group.name: _map(run, axes, colours, name)
+                found["trajectory"] = lambda figure: _path(mapped[0], figure.subplots())
+        found["centres"] = lambda figure: figure.colorbar(plots.centres(runs[0], figure.subplots()), label="fitness")
+    else:
+        found["overview"] = lambda figure: draw_overview(runs, figure, keys, threshold)
+        if mapped:
+            colours = value_range(np.concatenate([run.map.fitness_N for run in mapped if run.map is not None]))
+            for index, group in enumerate(compare.grouped(runs, keys)):
+                if (run := compare.median_run(group)) in mapped:
+                    found[f"behaviour_map_{index}"] = lambda figure, run=run, name=group.name: _map(
+                        run, figure.subplots(), colours, name
+                    )
     written = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, draw in found.items():
             figure = empty_figure()
-            draw(figure.subplots())
+            draw(figure)
             for kind in ("svg", "png"):
                 written.append(folder / f"{name}.{kind}")
                 figure.savefig(written[-1], dpi=DPI)

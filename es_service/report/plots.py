@@ -75,21 +75,28 @@ def behaviour_map(run: Source, axes: Axes, colours: tuple[float, float] | None =
     return axes.scatter(*geometry.centroid_C_B[map_.cell_N].T, c=map_.fitness_N, marker="h", zorder=1, **style)
 
 
-def centres(run: Source, axes: Axes) -> Any:
+def centres(run: Source, axes: Axes, colours: tuple[float, float] | None = None) -> Any:
     """Draw all evaluated centres of a run at the first two dimensions of their descriptors, coloured by fitness.
 
-    With one dimension, the vertical axis is fitness. Returns what `Figure.colorbar` takes.
+    With one dimension, the vertical axis is fitness. Where centres overlap, the fittest is seen.
+
+    Args:
+        colours: fitness of the first and last colour; None: those of this run.
+
+    Returns:
+        what `Figure.colorbar` takes.
     """
     data = _data(run)
-    x, fitness = data.centres[data.names[0]], data.centres["fitness_mean"]
+    order = np.argsort(data.centres["fitness_mean"], kind="stable")
+    x, fitness = data.centres[data.names[0]][order], data.centres["fitness_mean"][order]
     if len(data.names) == 1:
         y = fitness
         axes.set(xlim=data.bounds[0])
         _name_axes(axes, data.names[0], "fitness")
     else:
-        y = data.centres[data.names[1]]
+        y = data.centres[data.names[1]][order]
         _plane(data, axes)
-    low, high = value_range(fitness)
+    low, high = colours or value_range(fitness)
     return axes.scatter(
         x, y, c=fitness, cmap="viridis", vmin=low, vmax=high, s=4, linewidths=0, zorder=2, rasterized=True
     )

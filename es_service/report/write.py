@@ -90,7 +90,7 @@ def write_comparison(
     different = {Path(folder).resolve(): Path(folder) for folder in folders}  # a run that is given twice counts once
     runs = [read_run(folder, paths=False, digest=False) for folder in different.values()]
     page = write_page(comparison_page(runs, group_by, threshold), Path(out))
-    return [page, *(write_figures(runs, Path(figures), group_by) if figures is not None else [])]
+    return [page, *(write_figures(runs, Path(figures), group_by, threshold) if figures is not None else [])]
 
 
 def write_page(page: str, file: Path) -> Path:

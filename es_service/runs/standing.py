@@ -39,6 +39,13 @@ class Standing:
         return spent(self.limits, self.row) if self.row else {}
 
 
+def population_size(constants: Mapping[str, Any]) -> str:
+    """The size of a run's population, in words."""
+    if constants["search.algorithm"] == "map_elites":
+        return f"{constants['search.batch']:,} policies"
+    return f"{constants['search.pairs']:,} pairs"
+
+
 def newest_runs(folder: Path, most: int = 10) -> list[Path]:
     """The runs directly below a folder that were written last, newest first; empty if the folder does not exist."""
     written = {path.parent: path.stat().st_mtime for path in folder.glob(f"*/{DATABASE}")}

@@ -14,6 +14,7 @@ from es_service.report import compare
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import read_run
 from es_service.report.figures import empty_figure, write_figures
+from es_service.report.overview import draw_overview
 from es_service.report.write import write_comparison, write_report
 from tests.es_service.test_report_page import EVIL, Elements, task_with
 from tests.run_examples import write_run
@@ -143,7 +144,8 @@ def test_figures_are_written_as_svg_and_png(folders, runs, tmp_path):
     assert all(file.stat().st_size > 2000 for file in one)
     page, *several = write_comparison(folders, tmp_path / "all.html", figures=tmp_path / "several")
     assert page.name == "all.html"
-    assert {"best_fitness.svg", "behaviour_map_0.png", "behaviour_map_1.png"} <= {file.name for file in several}
+    names = {"overview.png", "best_fitness.svg", "behaviour_map_0.png", "behaviour_map_1.png"}
+    assert names <= {file.name for file in several}
 
 
 def test_figures_without_matplotlib_are_refused_before_anything_is_recorded(folders, tmp_path, monkeypatch):
@@ -213,6 +215,22 @@ def test_a_plot_of_a_map_has_its_values_where_they_are(folders, runs, axes):
     assert len(axes.lines) == 3  # two walls and the goal
 
 
+def test_an_overview_has_all_centres_of_each_group_in_the_same_colours(runs):
+    figure = empty_figure()
+    draw_overview(runs, figure, threshold=float(runs[0].history["best_fitness"][-1]))
+    above, below = figure.subfigs
+    panels = {axes.get_title().splitlines()[0]: axes for axes in above.axes if axes.get_title()}
+    assert panels.keys() == {"me_es", "es"}
+    for name, axes in panels.items():
+        group = [run for run in runs if run.constants["search.algorithm"] == name]
+        assert [len(points.get_offsets()) for points in axes.collections] == [len(run.centres["x"]) for run in group]
+        solved = sum(run.last("best_fitness") >= runs[0].last("best_fitness") for run in group)
+        assert axes.get_title().splitlines()[1].startswith(f"{solved} of {len(group)} reach ")
+    assert len({points.get_clim() for axes in panels.values() for points in axes.collections}) == 1
+    assert [axes.get_ylabel() for axes in below.axes] == ["best fitness", "coverage"]
+    assert [text.get_text() for text in below.legends[0].get_texts()] == ["me_es", "es"]
+
+
 def test_a_plot_of_a_path_is_the_stored_path(folders, axes):
     table = open_run(folders[0]).map
     fittest = table.loc[table.fitness.idxmax()]
@@ -225,7 +243,7 @@ def test_a_plot_of_a_path_is_the_stored_path(folders, axes):
 
 def test_plots_of_centres_and_curves(folders, runs, axes):
     points = plots.centres(folders[0], axes)
-    np.testing.assert_array_equal(points.get_array(), runs[0].centres["fitness_mean"])
+    np.testing.assert_array_equal(points.get_array(), np.sort(runs[0].centres["fitness_mean"]))  # the fittest on top
     axes.clear()
     plots.curves(folders, axes, "coverage")
     assert [line.get_label() for line in axes.lines] == ["me_es", "es"]

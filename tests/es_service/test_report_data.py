@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
+from es_service.protocol.machine import CODE, code_text
 from es_service.report import facts, series, settings
 from es_service.report.data import read_run
 from es_service.runs.view import open_run
@@ -209,6 +210,19 @@ def test_a_run_that_is_being_written_is_read_as_of_one_generation(tmp_path):
     assert dict(facts.what_was_run(data))["state"].startswith("running on")
     assert dict(facts.provenance(data))["digest"] == "not computed while a driver is writing"
     assert read_run(folder).digest == open_run(folder).digest()
+
+
+def test_code_is_told_in_a_line_and_a_change_of_it_by_its_files(tmp_path):
+    """Not by the hash of each of a hundred files."""
+    data = read_run(write_run(tmp_path / "run"))
+    before, after = {"loop/a.py": "1" * 64, "loop/b.py": "2" * 64}, {"loop/a.py": "1" * 64, "loop/b.py": "3" * 64}
+    platforms = [(0, {"cpu": "x", "jax": "1.0", CODE: before}), (9, {"cpu": "x", "jax": "1.0", CODE: after})]
+    fields = dict(facts.provenance(replace(data, platforms=platforms)))
+    assert fields["versions since generation 0"] == "jax 1.0"
+    first, second = (fields[f"code since generation {at}"] for at in (0, 9))
+    assert first == code_text(before)
+    assert second == f"{code_text(after)}; loop/b.py changed"
+    assert code_text(before) == code_text(dict(reversed(before.items()))) != code_text(after)
 
 
 def test_an_interrupted_run_is_shown_as_one(tmp_path):

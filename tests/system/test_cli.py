@@ -16,7 +16,7 @@ from tests.system.session import ROOT, SMALL
 def test_run_ends_in_a_summary_with_the_next_commands(finished):
     folder, printed = finished
     assert "Done: the budget of 30 generations is spent." in printed
-    for command in ("status", "evaluate", "digest", "resume", "fork"):
+    for command in ("status", "report", "evaluate", "digest", "resume", "fork"):
         assert f"{PROGRAM} {command} {folder}" in printed
     assert {path.name for path in folder.iterdir()} == {"config.yaml", "run.db", "run.lock"}
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from typing import Any
 
 from rich.console import Console
 
 from es_service.cli.commands import command, settings, way_command
 from es_service.cli.tables.progress import plain_line
-from es_service.runs.standing import Standing, is_waiting, look, more, state, way_on
+from es_service.runs.standing import Standing, is_waiting, look, more, population_size, state, way_on
 from es_service.runs.view import Run
 from es_service.store.reader import read_totals
 
@@ -24,7 +22,7 @@ def print_status(console: Console, run: Run) -> None:
     fields = {
         "run": str(run.folder),
         "task": f"{constants['task.environment']}, {constants['task.episode_steps']} steps an episode",
-        "search": f"{constants['search.algorithm']}, {_population(constants)}, seed {constants['seed']}",
+        "search": f"{constants['search.algorithm']}, {population_size(constants)}, seed {constants['seed']}",
     }
     if parent:
         fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
@@ -62,19 +60,13 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
     _print_line(console, f"\nThe run is in {folder}. Next:")
     for words in (
         ("status", folder),
+        ("report", folder),
         ("evaluate", folder),
         ("digest", folder),
         ("resume", folder, *settings(more(standing))),
         ("fork", folder, *settings(doubled | more(standing))),
     ):
         _print_line(console, f"  {command(*words)}")
-
-
-def _population(constants: Mapping[str, Any]) -> str:
-    """The size of a population, in words."""
-    if constants["search.algorithm"] == "map_elites":
-        return f"{constants['search.batch']} policies"
-    return f"{constants['search.pairs']} pairs"
 
 
 def _progress(standing: Standing) -> dict[str, str]:
