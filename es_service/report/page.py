@@ -18,6 +18,8 @@ Evaluate = Callable[[str], str]
 MOST_FAULTS = 20
 """Generations with faults that are listed one by one."""
 
+MAP_NOTE = "Point at a cell for its values; click it for its elite's path, which straight lines join from points of the episode."
+
 
 def run_page(data: RunData, evaluate: Evaluate, replays: Mapping[str, Any] | None = None) -> str:
     """HTML of the report of a run.
@@ -128,7 +130,7 @@ def _map(data: RunData, evaluate: Evaluate, scripts: dict[str, Any]) -> Markup:
     scripts["map"]["first"] = fittest
     return section(
         "Behaviour map",
-        tag("p", f"{view.explanation} Point at a cell for its values; click it for its elite's path.", class_="note"),
+        tag("p", f"{view.explanation} {MAP_NOTE}", class_="note"),
         tag(
             "div",
             tag("div", view.figure, maps.colour_bar(value_range(data.map.fitness_N), cells=maps.has_area(data.map))),
