@@ -18,7 +18,7 @@ Evaluate = Callable[[str], str]
 MOST_FAULTS = 20
 """Generations with faults that are listed one by one."""
 
-MAP_NOTE = "Point at a cell for its values; click it for its elite's path, which straight lines join from points of the episode."
+MAP_NOTE = "Point at a cell for its values; click it for its elite's path, a line through points of the episode."
 
 
 def run_page(data: RunData, evaluate: Evaluate, replays: Mapping[str, Any] | None = None) -> str:
