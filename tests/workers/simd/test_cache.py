@@ -61,6 +61,35 @@ def test_a_folder_that_cannot_be_written_is_no_hindrance(tmp_path: Path, capsys:
     assert "could not save a compiled kernel" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("mode", [0o770, 0o707])
+def test_a_folder_into_which_others_may_write_is_not_used_and_this_is_said_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], mode: int
+) -> None:
+    """Its entries would be executed."""
+    wanted = kernel(tmp_path)(X)
+    entries = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    tmp_path.chmod(mode)
+    for _ in range(2):
+        again = kernel(tmp_path)
+        assert not again.facts.cached
+        np.testing.assert_array_equal(again(X), wanted)
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert f"other users may write into it (mode {mode:o})" in said[0]
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == entries, "nor is it written"
+    tmp_path.chmod(0o755)
+    assert kernel(tmp_path).facts.cached
+
+
+def test_a_folder_of_another_user_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kernel(tmp_path)
+    monkeypatch.setattr(os, "geteuid", lambda: tmp_path.stat().st_uid + 1)
+    assert not kernel(tmp_path).facts.cached
+    assert f"it belongs to user {tmp_path.stat().st_uid}, not to this user" in capsys.readouterr().err
+
+
 def test_the_folder_is_the_users_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache.cache_folder() == tmp_path / "es-service" / "kernels"

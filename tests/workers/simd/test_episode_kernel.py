@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
-from es_service.protocol.noise import KEY_WORDS
+from es_service.protocol.noise import KEY_WORDS, Domain, stream_keys
 from tests.helpers import SPEC, random_parameters
 from workers.environments import make_environment
 from workers.simd.episodes.compiled import compile_episodes
+from workers.simd.episodes.rollout import make_gradient_sum
 
 LANES = 6
 
@@ -28,5 +32,46 @@ def test_arrays_of_other_sizes_are_refused(training: bool) -> None:
     wrong = [(enough, LANES, LANES - 1), (enough, 1, LANES), (None if training else LANES // 2, LANES, LANES)]
     wrong += [(enough - 1, LANES, LANES), (enough, LANES, LANES, 3)] if enough else []
     for sizes in wrong:
-        with pytest.raises(AssertionError):
+        with pytest.raises(ValueError, match="must not be called with these arrays"):
             run(*sizes)
+
+
+def test_memory_is_protected_without_assertions_too() -> None:
+    """`python -O` removes assertions: arrays must stay alive during a call, and wrong ones must still be refused."""
+    program = """
+import numpy as np
+from tests.workers.simd.test_episode_kernel import test_arrays_of_other_sizes_are_refused as refused
+from es_service.protocol.noise import Domain, stream_keys
+from workers.simd.episodes.rollout import make_gradient_sum
+for training in (True, False):
+    refused(training)
+gradient_sum, keys_P = make_gradient_sum(100), stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(3))
+print(gradient_sum(np.ones(3, np.float32), keys_P).tobytes().hex())
+try:
+    gradient_sum(np.ones(4, np.float32), keys_P)
+except ValueError:
+    print("refused")
+"""
+    printed = [
+        subprocess.run([sys.executable, *options, "-c", program], capture_output=True, text=True, check=True).stdout
+        for options in ([], ["-O"])
+    ]
+    assert printed[0] == printed[1]
+    assert printed[0].endswith("refused\n")
+
+
+def test_no_pair_and_no_step_is_nothing() -> None:
+    """A loop without a trip runs none, where memory would be read that is not there."""
+    weights_P, keys_P = np.ones(0, np.float32), np.zeros((0, KEY_WORDS), np.uint32)
+    assert not make_gradient_sum(50)(weights_P, keys_P).any()
+    kernel = compile_episodes(make_environment("point_maze", {}), SPEC, np.arange(2), training=False)
+    keys_L, weights = (
+        stream_keys(1, Domain.EVALUATION_RESET, 0, np.arange(LANES)),
+        kernel.network.pack(random_parameters()),
+    )
+    carries, go = kernel._begun(weights, 0.0, np.zeros(2, np.float32), np.ones(2, np.float32), None, keys_L, keys_L)
+    before = carries.copy()
+    go(0)
+    np.testing.assert_array_equal(carries, before)
+    go(1)
+    assert (carries != before).any()

@@ -17,6 +17,7 @@ from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import SHIPPED, describe_environment, make_environment
 from workers.simd.episodes import noise, rollout
 from workers.simd.episodes.compiled import compile_episodes
+from workers.simd.frontend.primitives.registry import PRIMITIVES
 from workers.simd.graph.unsupported import UnsupportedError
 
 
@@ -83,4 +84,16 @@ def test_a_step_without_a_text_of_its_own_is_refused_beforehand(monkeypatch: pyt
         raise ValueError("<function at 0x7f>")
 
     monkeypatch.setattr(workers.simd.episodes.program, "jaxpr_digest", nameless)
-    assert rollout.why_not(SHIPPED["point_maze"]) == "ValueError: <function at 0x7f>"
+    why = rollout.why_not(SHIPPED["point_maze"])
+    assert why == "a fault of es-service's compiler, please report it (ValueError: <function at 0x7f>)"
+
+
+def test_a_fault_of_the_compiler_asks_for_a_report_and_an_unsupported_task_does_not(monkeypatch: pytest.MonkeyPatch):
+    def broken(*_: Any) -> Any:
+        raise KeyError("add")
+
+    sorting = rollout.why_not(describe_environment("tests.examples.sorting:Sorting"))
+    assert "report" not in sorting
+    monkeypatch.setitem(PRIMITIVES, "add", broken)
+    why = rollout.why_not(SHIPPED["point_maze"])
+    assert why.startswith("a fault of es-service's compiler, please report it (KeyError: 'add')")

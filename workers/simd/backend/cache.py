@@ -1,10 +1,15 @@
-"""Cache of compiled kernels on disk, by content, target and versions. Incomplete entries are not used."""
+"""Cache of compiled kernels on disk, by content, target and versions.
+
+Its entries are executed. So the folder must belong to this user, and nobody else may write into it; incomplete entries
+are not used.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
 import os
+import stat
 import sys
 import tempfile
 from pathlib import Path
@@ -13,6 +18,7 @@ MAGIC = b"es-service kernel 1\n"
 MOST_ENTRIES = 100
 """Most entries in the cache; when there are more, the least recently used ones are removed."""
 KEY_LENGTH, UNFINISHED = 64, ".unfinished-"
+_TOLD: set[Path] = set()
 
 
 def cache_folder() -> Path | None:
@@ -20,6 +26,28 @@ def cache_folder() -> Path | None:
     named = os.environ.get("XDG_CACHE_HOME", "")
     base = Path(named) if os.path.isabs(named) else Path(os.path.expanduser("~"), ".cache")
     return base / "es-service" / "kernels" if base.is_absolute() else None
+
+
+def why_not_trusted(folder: Path) -> str:
+    """Why code from a folder must not be executed; empty if it may be, or if there is no such folder yet."""
+    try:
+        found = folder.stat()
+    except OSError:
+        return ""
+    if found.st_uid != os.geteuid():
+        return f"it belongs to user {found.st_uid}, not to this user ({os.geteuid()})"
+    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return f"other users may write into it (mode {stat.S_IMODE(found.st_mode):o}); chmod 700 it"
+    return ""
+
+
+def trusted(folder: Path) -> bool:
+    """Whether code from a folder may be executed; if not, the first call of a process says so on stderr."""
+    why = why_not_trusted(folder)
+    if why and folder not in _TOLD:
+        _TOLD.add(folder)
+        print(f"the cache of kernels {folder} is not used: {why}", file=sys.stderr)
+    return not why
 
 
 def load(folder: Path, key: str) -> bytes | None:

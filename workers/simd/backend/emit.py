@@ -36,8 +36,7 @@ def emit(graph: Graph, outputs: Sequence[int], inputs: int, width: int) -> str:
         inside.do(f"call void @block(ptr {block_in}, ptr {block_out})")
         return []
 
-    some = inside.value("icmp sgt i64 %blocks, 0")
-    inside.when(some, lambda: inside.loop("%blocks", one))
+    inside.loop("%blocks", one)
     return module([block, inside])
 
 

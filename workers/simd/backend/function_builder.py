@@ -123,17 +123,23 @@ class FunctionBuilder:
         carries: Sequence[tuple[str, str]] = (),
         until: Callable[[], str] | None = None,
     ) -> Values:
-        """Repeat a body at least once; returns the carried values after the last trip.
+        """Repeat a body; returns the carried values after the last trip, or the first ones if there is no trip.
 
         Args:
-            trips: number of trips.
+            trips: number of trips, or the name of an i64 that has it.
             body: function (number of the trip, carried values) -> carried values of the next trip.
             carries: (type, first value) of each carried value.
             until: function that gives an i1 at the end of each trip, which ends the loop early if it is true.
         """
+        if isinstance(trips, int) and trips < 1:
+            return [first for _, first in carries]
         self._names += 1
         label, before = f"loop{self._names}", self._label
-        self.do(f"br label %{label}")
+        if isinstance(trips, int):
+            self.do(f"br label %{label}")
+        else:
+            some = self.value(f"icmp sgt i64 {trips}, 0")
+            self.do(f"br i1 {some}, label %{label}, label %{label}_after")
         self.label(label)
         place = len(self.lines)
         names = [f"%{label}_c{k}" for k in range(len(carries))]
@@ -150,7 +156,12 @@ class FunctionBuilder:
         self.do(f"%{label}_again = select i1 {stop}, i1 false, i1 %{label}_more")
         self.do(f"br i1 %{label}_again, label %{label}, label %{label}_after")
         self.label(f"{label}_after")
-        return outs
+        if isinstance(trips, int):
+            return outs
+        return [
+            self.value(f"phi {llvm_type} [ {first}, %{before} ], [ {out}, %{label}_end ]")
+            for (llvm_type, first), out in zip(carries, outs, strict=True)
+        ]
 
     def any(self, words: str, lanes: int | None = None) -> str:
         """An i1 that is true if any word of an integer vector is not 0."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from workers.simd.backend import cache
 from workers.simd.backend.target import Target, compile_object, compiler_version, load_object
@@ -27,6 +28,12 @@ class Native(NamedTuple):
     cached: bool
     """Whether the code came from the cache."""
 
+    def function(self, *arguments: Any) -> Callable[..., None]:
+        """The function `kernel` for arguments of these ctypes; the code lives as long as it does."""
+        found = ctypes.CFUNCTYPE(None, *arguments)(self.address)
+        found.code = self.alive  # pyright: ignore[reportAttributeAccessIssue]
+        return found
+
 
 def load_compiled(name: str, text: Callable[[], str], target: Target, folder: Path | None = None) -> Native:
     """Compile LLVM IR, or load the machine code from the cache.
@@ -38,6 +45,8 @@ def load_compiled(name: str, text: Callable[[], str], target: Target, folder: Pa
         folder: folder of the cache; the user's cache if None.
     """
     folder = folder or cache.cache_folder()
+    if folder and not cache.trusted(folder):
+        folder = None
     versions = f"{target} {compiler_version()} {OWN_VERSION}"
     key = hashlib.sha256(f"{name} {versions}".encode()).hexdigest()
     kept = cache.load(folder, key) if folder else None

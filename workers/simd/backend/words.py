@@ -15,6 +15,15 @@ ALIGNMENT = 64
 """Alignment of arrays of words, in bytes."""
 
 
+def require(condition: bool, what: str) -> None:
+    """Raise ValueError unless a condition of native code is met, which would otherwise use memory that is not its own.
+
+    An assertion would not do, because `python -O` removes it.
+    """
+    if not condition:
+        raise ValueError(f"native code must not be called with these arrays: {what}")
+
+
 def words_of(aval: Any) -> int:
     """Number of words of one lane of an array."""
     return math.prod(aval.shape)
@@ -35,7 +44,7 @@ def pack(leaves: Sequence[Any], width: int) -> Words:
     columns = []
     for leaf in leaves:
         array = np.asarray(leaf)
-        assert len(array) == lanes, (array.shape, lanes)
+        require(len(array) == lanes, f"an array has {len(array)} lanes and another {lanes}")
         array = array.astype(np.uint32) if array.itemsize < 4 else np.ascontiguousarray(array).view(np.uint32)
         columns.append(array.reshape(lanes, math.prod(array.shape[1:])))
     rows = columns[0] if len(columns) == 1 else np.concatenate([np.zeros((lanes, 0), np.uint32), *columns], axis=1)

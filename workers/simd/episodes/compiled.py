@@ -10,7 +10,6 @@ import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -21,7 +20,7 @@ from workers.environments import Environment
 from workers.episode import Carry, Episodes
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import Target, host_target
-from workers.simd.backend.words import ALIGNMENT, aligned, filled, pack, unpack, words_of
+from workers.simd.backend.words import ALIGNMENT, aligned, filled, pack, require, unpack, words_of
 from workers.simd.episodes.kernel import compile_resets
 from workers.simd.episodes.layout import Network
 from workers.simd.episodes.program import write_episodes
@@ -47,7 +46,6 @@ class EpisodeKernel:
     episode_words: int
     """Number of words of an episode's result."""
     _call: Callable[..., None]
-    _alive: Any
 
     def run(
         self,
@@ -102,10 +100,12 @@ class EpisodeKernel:
     ) -> tuple[np.ndarray, Callable[[int], None]]:
         """Words of the carries after the reset [block, word, lane], and a function that runs so many more steps."""
         width, lanes = self.network.width, len(reset_keys_L)
-        # Native code would read beyond the end of a shorter array without an error.
-        assert (noise_keys_P is not None) == self.training
-        assert action_keys_L.shape == reset_keys_L.shape == (lanes, KEY_WORDS)
-        assert noise_keys_P is None or (noise_keys_P.shape[1:] == (KEY_WORDS,) and 2 * len(noise_keys_P) >= lanes)
+        require(
+            (noise_keys_P is not None) == self.training
+            and action_keys_L.shape == reset_keys_L.shape == (lanes, KEY_WORDS)
+            and (noise_keys_P is None or (noise_keys_P.shape[1:] == (KEY_WORDS,) and 2 * len(noise_keys_P) >= lanes)),
+            "there must be keys for each lane, and in training for each pair",
+        )
         carries = self.begin(reset_keys_L)
         blocks = len(carries)
         carries[-1, self.alive_word, lanes - width * (blocks - 1) :] = 0  # lanes without an episode
@@ -115,25 +115,25 @@ class EpisodeKernel:
         room = aligned((len(self.inputs_O) + self.network.outputs + self.network.hidden_vectors, width))
         keys, noise = np.zeros((0, KEY_WORDS), np.uint32), np.zeros(0, np.int8)
         if self.own_weights:
-            assert len(statistics[0]) == len(weights) == lanes
+            require(len(statistics[0]) == len(weights) == lanes, "each lane must have weights and statistics")
             weights = filled(weights, blocks * width)
             noise = aligned((len(self.network.places) - self.network.vectors, width)).view(np.int8)  # single weights
         else:
-            assert weights.ctypes.data % ALIGNMENT == 0
-            assert weights.shape == (self.network.rows, width)
-            assert len(constants) == 1
+            whole = weights.ctypes.data % ALIGNMENT == 0 and weights.shape == (self.network.rows, width)
+            require(whole and len(constants) == 1, "the centre must be packed and have one mean and standard deviation")
         if noise_keys_P is not None:
             pairs = width // 2
             keys = filled(noise_keys_P, blocks * pairs)
             noise = np.empty(self.network.noise_bytes, np.int8)
         arrays = (carries, actions, constants, weights, keys, self.network.places, noise, room)
-        assert [array.dtype.char for array in arrays] == list("IIILIIbI" if self.own_weights else "IIIfIIbI")
-        assert all(array.flags.c_contiguous for array in arrays)
-        pointers = [array.ctypes.data for array in arrays]
+        require(
+            [array.dtype.char for array in arrays] == list("IIILIIbI" if self.own_weights else "IIIfIIbI")
+            and all(array.flags.c_contiguous for array in arrays),
+            "they must be contiguous and have the dtypes of the kernel",
+        )
 
         def go(steps: int) -> None:
-            assert all(array is not None for array in arrays)  # their memory must live as long as this function
-            self._call(*pointers, np.float32(unit), blocks, steps)
+            self._call(*[array.ctypes.data for array in arrays], np.float32(unit), blocks, steps)
 
         return carries, go
 
@@ -176,6 +176,5 @@ def compile_episodes(
         alive_word=program.alive_word,
         carry=carry,
         episode_words=sum(map(words_of, carry.episode)),
-        _call=ctypes.CFUNCTYPE(None, *signature)(native.address),
-        _alive=native.alive,
+        _call=native.function(*signature),
     )

@@ -17,7 +17,7 @@ from es_service.protocol.noise import KEY_WORDS
 from workers.simd.backend.emit import emit
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import Target, host_target
-from workers.simd.backend.words import ALIGNMENT, Words, aligned, pack, unpack, words_of
+from workers.simd.backend.words import ALIGNMENT, Words, aligned, pack, require, unpack, words_of
 from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.graph import live
@@ -48,7 +48,6 @@ class Kernel:
     out_avals: tuple[Any, ...]
     facts: Facts
     _function: Callable[[int, int, int], None]
-    _alive: Any
 
     @property
     def words_in(self) -> int:
@@ -66,25 +65,30 @@ class Kernel:
         Both must be aligned to 64 bytes, as `aligned` makes them. The call releases the GIL.
         """
         blocks = len(words)
-        assert words.shape == (blocks, self.words_in, self.target.width), words.shape
-        assert out.shape == (blocks, self.words_out, self.target.width), out.shape
+        require(
+            words.shape == (blocks, self.words_in, self.target.width)
+            and out.shape == (blocks, self.words_out, self.target.width),
+            f"shapes {words.shape} and {out.shape}",
+        )
         for array in (words, out):
-            assert array.dtype == np.uint32
-            assert array.flags.c_contiguous
-            assert array.size == 0 or array.ctypes.data % ALIGNMENT == 0
-        assert out.flags.writeable
-        assert words is not out
+            require(
+                array.dtype == np.uint32
+                and array.flags.c_contiguous
+                and (array.size == 0 or array.ctypes.data % ALIGNMENT == 0),
+                "they must be aligned, contiguous and of dtype uint32",
+            )
+        require(out.flags.writeable and words is not out, "the results need an array of their own")
         self._function(words.ctypes.data, out.ctypes.data, blocks)
 
     def __call__(self, *arguments: Any) -> Any:
         """Apply the function to pytrees whose leaves have a leading axis of lanes; returns NumPy arrays."""
         leaves, tree = jax.tree.flatten(arguments)
-        assert tree == self.in_tree, f"the arguments are {tree}, but the kernel was compiled for {self.in_tree}"
+        require(tree == self.in_tree, f"the arguments are {tree}, but the kernel was compiled for {self.in_tree}")
         lanes = len(leaves[0]) if leaves else 1
         for leaf, aval in zip(leaves, self.in_avals, strict=True):
             array = np.asarray(leaf)
-            assert array.dtype == aval.dtype, (array.dtype, aval)
-            assert array.shape == (lanes, *aval.shape), (array.shape, aval)
+            given = array.dtype == aval.dtype and array.shape == (lanes, *aval.shape)
+            require(given, f"an argument is {array.dtype}{array.shape}, but the kernel takes {aval} of each lane")
         words = pack(leaves, self.target.width)
         out = aligned((len(words), self.words_out, self.target.width))
         self.run(words, out)
@@ -127,8 +131,7 @@ def compile_kernel(
         out_tree=out_tree,
         out_avals=tuple(leaves),
         facts=Facts(jaxpr_s, computed, native.code_bytes, native.cached),
-        _function=ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(native.address),
-        _alive=native.alive,
+        _function=native.function(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64),
     )
 
 

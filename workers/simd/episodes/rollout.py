@@ -16,12 +16,12 @@ from workers.environments import Environment, make_environment
 from workers.episode import Carry, Episodes
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import WIDTHS, Target, host_target
-from workers.simd.backend.words import aligned
+from workers.simd.backend.words import aligned, require
 from workers.simd.episodes.compiled import EpisodeKernel, compile_episodes
 from workers.simd.episodes.noise import UNROLLED, definition, gradient_module
 from workers.simd.episodes.program import write_episodes
 from workers.simd.frontend.trace import trace_jaxpr
-from workers.simd.graph.unsupported import UnsupportedError
+from workers.simd.graph.unsupported import UnsupportedError, fault
 
 KEPT_PACKED = 4
 """Number of centres whose packed weights are kept, for work items that share centres."""
@@ -56,7 +56,7 @@ def why_not(task: TaskSpec) -> str:
     except UnsupportedError as error:
         return str(error)
     except Exception as error:  # also after a fault of the compiler, xla can run the task
-        return f"{type(error).__name__}: {error}"
+        return fault(error)
     return ""
 
 
@@ -105,7 +105,7 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Callable[
         rows = aligned((sum(map(len, parameters_G_N_D)), stride)).view(np.float32)
         np.concatenate(parameters_G_N_D, out=rows[:, :parameters])
         addresses_L = (rows.ctypes.data + policy_L * rows.strides[0]).astype(np.uint64)
-        assert 0 <= policy_L.min() <= policy_L.max() < len(rows)
+        require(0 <= policy_L.min() <= policy_L.max() < len(rows), "policy_L names rows that are not there")
         return kernel.run(addresses_L, 0.0, mean_L_O, std_L_O, None, reset_keys_L, reset_keys_L)
 
     return rollout
@@ -183,15 +183,13 @@ def make_gradient_sum(parameters: int, target: Target | None = None) -> Callable
     target = target or host_target()
     native = load_compiled(f"gradient {definition()}", lambda: gradient_module(target.width), target)
     signature = [*[ctypes.c_void_p] * 2, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64]
-    call = ctypes.CFUNCTYPE(None, *signature)(native.address)
+    call = native.function(*signature)
     group = UNROLLED * target.width
     groups = -(-parameters // group)
 
     def gradient_sum(weights_P: np.ndarray, noise_keys_P: np.ndarray) -> np.ndarray:
-        assert native.alive
         weights_P, keys_P = np.ascontiguousarray(weights_P, np.float32), np.ascontiguousarray(noise_keys_P)
-        assert keys_P.dtype == np.uint32
-        assert keys_P.shape == (len(weights_P), KEY_WORDS)
+        require(keys_P.dtype == np.uint32 and keys_P.shape == (len(weights_P), KEY_WORDS), "a key for each weight")
         sums = aligned((groups, group)).view(np.float32)
         call(weights_P.ctypes.data, keys_P.ctypes.data, len(weights_P), sums.ctypes.data, groups)
         return sums.reshape(-1)[:parameters]

@@ -27,4 +27,9 @@ def refusing() -> Iterator[None]:
     except (UnsupportedError, MemoryError):
         raise
     except Exception as error:
-        raise UnsupportedError(f"{type(error).__name__}: {error}") from error
+        raise UnsupportedError(fault(error)) from error
+
+
+def fault(error: Exception) -> str:
+    """Text of an exception that no rule foresaw: not a task that is not supported, but a fault of this compiler."""
+    return f"a fault of es-service's compiler, please report it ({type(error).__name__}: {error})"
