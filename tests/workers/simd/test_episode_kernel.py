@@ -69,7 +69,7 @@ def test_no_pair_and_no_step_is_nothing() -> None:
         stream_keys(1, Domain.EVALUATION_RESET, 0, np.arange(LANES)),
         kernel.network.pack(random_parameters()),
     )
-    carries, go = kernel._begun(weights, 0.0, np.zeros(2, np.float32), np.ones(2, np.float32), None, keys_L, keys_L)
+    carries, go = kernel.started(weights, 0.0, np.zeros(2, np.float32), np.ones(2, np.float32), None, keys_L, keys_L)
     before = carries.copy()
     go(0)
     np.testing.assert_array_equal(carries, before)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from jax import lax
 
-from tests.twins.scalar_graph import evaluate
 from tests.workers.simd.rollouts import isas
 from workers.environments import make_environment
 from workers.simd.backend import target
@@ -21,6 +20,7 @@ from workers.simd.episodes.kernel import Kernel, compile_kernel
 from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.operations import OPERATIONS
+from workers.simd.graph.twin import evaluate
 
 LANES = 100
 

@@ -15,7 +15,7 @@ from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingC
 from es_service.protocol.noise import Domain, normal_integers, stream_keys
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import SHIPPED, describe_environment, make_environment
-from workers.simd.episodes import noise, rollout
+from workers.simd.episodes import check, noise, rollout
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.frontend.primitives.registry import PRIMITIVES
 from workers.simd.graph.unsupported import UnsupportedError
@@ -25,7 +25,8 @@ def test_another_generator_is_not_what_was_compiled(monkeypatch: pytest.MonkeyPa
     """Kernels are kept on disk; the noise's definition stands outside of the compiler's own files."""
     weights_P, keys_P = np.ones(1, np.float32), stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(1))
     before = rollout.make_gradient_sum(50)(weights_P, keys_P)
-    monkeypatch.setattr(noise, "normal_integers", lambda xp, key, at: 3 * normal_integers(xp, key, at))
+    for module in (noise, check):
+        monkeypatch.setattr(module, "normal_integers", lambda xp, key, at: 3 * normal_integers(xp, key, at))
     np.testing.assert_allclose(rollout.make_gradient_sum(50)(weights_P, keys_P), 3 * before, rtol=1e-6)
 
 

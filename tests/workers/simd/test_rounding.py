@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 from es_service.protocol.messages import PolicyShape
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from tests.helpers import spec
-from tests.twins.scalar_graph import evaluate
 from workers.environments import SHIPPED, describe_environment, make_environment
 from workers.policy import initial_parameters
 from workers.simd.backend.emit import emit
@@ -36,6 +35,7 @@ from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.loops import build_loop
 from workers.simd.graph.operations import compute
 from workers.simd.graph.schedule import Region, schedule
+from workers.simd.graph.twin import evaluate
 
 PAIRS, STEPS = 24, 25
 COMPARED = ("fitness", "returns", "descriptor", "steps", "goal_distance")

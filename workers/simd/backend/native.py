@@ -35,7 +35,13 @@ class Native(NamedTuple):
         return found
 
 
-def load_compiled(name: str, text: Callable[[], str], target: Target, folder: Path | None = None) -> Native:
+def load_compiled(
+    name: str,
+    text: Callable[[], str],
+    target: Target,
+    folder: Path | None = None,
+    check: Callable[[Native], object] = lambda native: None,
+) -> Native:
     """Compile LLVM IR, or load the machine code from the cache.
 
     Args:
@@ -43,6 +49,7 @@ def load_compiled(name: str, text: Callable[[], str], target: Target, folder: Pa
         text: function that gives the IR; called only if the code is not in the cache.
         target: processor and instruction set.
         folder: folder of the cache; the user's cache if None.
+        check: function that raises an exception if new code is wrong; such code is not kept.
     """
     folder = folder or cache.cache_folder()
     if folder and not cache.trusted(folder):
@@ -51,6 +58,9 @@ def load_compiled(name: str, text: Callable[[], str], target: Target, folder: Pa
     key = hashlib.sha256(f"{name} {versions}".encode()).hexdigest()
     kept = cache.load(folder, key) if folder else None
     code = kept if kept is not None else compile_object(text(), target)
-    if kept is None and folder:
-        cache.save(folder, key, code)
-    return Native(*load_object(code, target), len(code), kept is not None)
+    native = Native(*load_object(code, target), len(code), kept is not None)
+    if kept is None:
+        check(native)
+        if folder:
+            cache.save(folder, key, code)
+    return native

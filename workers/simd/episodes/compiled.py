@@ -18,12 +18,12 @@ from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from workers.environments import Environment
 from workers.episode import Carry, Episodes
-from workers.simd.backend.native import load_compiled
+from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import Target, host_target
 from workers.simd.backend.words import ALIGNMENT, aligned, filled, pack, require, unpack, words_of
 from workers.simd.episodes.kernel import compile_resets
 from workers.simd.episodes.layout import Network
-from workers.simd.episodes.program import write_episodes
+from workers.simd.episodes.program import EpisodeProgram, write_episodes
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class EpisodeKernel:
     """Shapes and dtypes of a carry."""
     episode_words: int
     """Number of words of an episode's result."""
+    program: EpisodeProgram
     _call: Callable[..., None]
 
     def run(
@@ -68,7 +69,7 @@ class EpisodeKernel:
             reset_keys_L, action_keys_L: stream keys of each lane's reset and action noise.
         """
         lanes = len(reset_keys_L)
-        carries, go = self._begun(weights, unit, mean_O, std_O, noise_keys_P, reset_keys_L, action_keys_L)
+        carries, go = self.started(weights, unit, mean_O, std_O, noise_keys_P, reset_keys_L, action_keys_L)
         go(self.spec.episode_steps)
         # The result of an episode is the last part of a carry.
         found = Episodes(*unpack(carries[:, -self.episode_words :], self.carry.episode, lanes))
@@ -80,7 +81,7 @@ class EpisodeKernel:
 
     def watch(self, weights: np.ndarray, mean_O: np.ndarray, std_O: np.ndarray, reset_key: np.ndarray) -> Carry:
         """Run one evaluation episode step by step; returns its carries until it is done, with leading axis [T]."""
-        carries, go = self._begun(weights, 0.0, mean_O, std_O, None, reset_key[None], reset_key[None])
+        carries, go = self.started(weights, 0.0, mean_O, std_O, None, reset_key[None], reset_key[None])
         words = [carries[0, :, 0].copy()]
         while carries[0, self.alive_word, 0] and len(words) <= self.spec.episode_steps:
             go(1)
@@ -88,7 +89,7 @@ class EpisodeKernel:
         leaves, structure = jax.tree.flatten(self.carry)
         return structure.unflatten(unpack(np.stack(words, axis=1)[None], leaves, len(words)))
 
-    def _begun(
+    def started(
         self,
         weights: np.ndarray,
         unit: float,
@@ -147,6 +148,7 @@ def compile_episodes(
     own_weights: bool = False,
     target: Target | None = None,
     folder: Path | None = None,
+    check: Callable[[EpisodeKernel], object] = lambda kernel: None,
 ) -> EpisodeKernel:
     """Compile the episodes of a run.
 
@@ -156,6 +158,7 @@ def compile_episodes(
         own_weights: evaluation episodes of a policy in each lane, instead of those of the centre.
         target: processor and instruction set; the widest vectors of this machine if None.
         folder: folder of the cache; the user's cache if None.
+        check: function that raises an exception if new code is wrong; see check.py.
 
     Raises:
         UnsupportedError: a step of the environment cannot be compiled.
@@ -163,18 +166,22 @@ def compile_episodes(
     """
     target = target or host_target()
     program = write_episodes(environment, spec, inputs_O, target.width, training=training, own_weights=own_weights)
-    native = load_compiled(program.name, program.text, target, folder)
+    begin = compile_resets(program.steps.begin, target, folder)
     signature = [*[ctypes.c_void_p] * 8, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
-    carry = program.carry
-    return EpisodeKernel(
-        training=training,
-        own_weights=own_weights,
-        spec=spec,
-        inputs_O=inputs_O,
-        network=program.network,
-        begin=compile_resets(program.steps.begin, target, folder),
-        alive_word=program.alive_word,
-        carry=carry,
-        episode_words=sum(map(words_of, carry.episode)),
-        _call=native.function(*signature),
-    )
+
+    def kernel(native: Native) -> EpisodeKernel:
+        return EpisodeKernel(
+            training=training,
+            own_weights=own_weights,
+            spec=spec,
+            inputs_O=inputs_O,
+            network=program.network,
+            begin=begin,
+            alive_word=program.alive_word,
+            carry=program.carry,
+            episode_words=sum(map(words_of, program.carry.episode)),
+            program=program,
+            _call=native.function(*signature),
+        )
+
+    return kernel(load_compiled(program.name, program.text, target, folder, lambda native: check(kernel(native))))

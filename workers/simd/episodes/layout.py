@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +68,20 @@ class Network(NamedTuple):
         weights[: self.vectors] = padded_D[of_vectors[:, None] + np.arange(self.width, dtype=np.uint32)]
         weights.reshape(-1)[self.vectors * self.width :][: len(single)] = padded_D[single]
         return weights
+
+    def pack_own(
+        self, parameters_G_N_D: Sequence[NDArray[np.float32]]
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint64]]:
+        """Policies for kernels with own weights: (their memory, the address of each one's parameters in it).
+
+        The memory must live as long as the addresses are used.
+        """
+        parameters = parameters_G_N_D[0].shape[1]
+        # Rows begin at whole vectors, and a vector that begins in the last row ends in this memory.
+        stride = (parameters // self.width + 2) * self.width
+        rows = aligned((sum(map(len, parameters_G_N_D)), stride)).view(np.float32)
+        np.concatenate(parameters_G_N_D, out=rows[:, :parameters])
+        return rows, rows.ctypes.data + np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.strides[0])
 
 
 def sums_at_once(width: int) -> int:

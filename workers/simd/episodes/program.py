@@ -7,13 +7,13 @@ weights and the observation statistics of the centre, or with `own_weights` each
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr
 
 from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
@@ -27,6 +27,10 @@ from workers.simd.episodes.network import Weights, policy_function, singles_func
 from workers.simd.episodes.noise import definition, fill_function
 from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.graph.graph import Graph
+
+Traced = tuple[Graph, int, list[int]]
+"""A graph, the number of its input words, and the nodes of its outputs."""
 
 
 class EpisodeProgram(NamedTuple):
@@ -42,6 +46,8 @@ class EpisodeProgram(NamedTuple):
     """Complete description of what the IR computes."""
     text: Callable[[], str]
     """Function that makes the LLVM IR. Raises UnsupportedError."""
+    graphs: Callable[[], tuple[Traced, Traced]]
+    """Function that gives the graphs of looking and of moving. Raises UnsupportedError."""
 
 
 def write_episodes(
@@ -76,17 +82,21 @@ def write_episodes(
     alive_word = sum(words_of(aval) for aval in jax.tree.leaves(carry.state))
     words = sum(map(words_of, leaves))
 
+    @functools.cache
+    def graphs() -> tuple[Traced, Traced]:
+        return trace_jaxpr(look), trace_jaxpr(move)
+
     def text() -> str:
-        return _module(look, move, network, len(inputs_O), words, alive_word, weights)
+        return _module(*graphs(), network, len(inputs_O), words, alive_word, weights)
 
     digests = f"{definition()} {jaxpr_digest(look)} {jaxpr_digest(move)}"
     name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {training}{' own' * own_weights}"
-    return EpisodeProgram(steps, carry, alive_word, network, name, text)
+    return EpisodeProgram(steps, carry, alive_word, network, name, text, graphs)
 
 
 def _module(
-    look: ClosedJaxpr,
-    move: ClosedJaxpr,
+    look: Traced,
+    move: Traced,
     network: Network,
     inputs: int,
     words: int,
@@ -103,10 +113,10 @@ def _module(
     """
     width = network.width
     actions = network.outputs
-    graph, _, outputs = trace_jaxpr(look)
+    graph, _, outputs = look
     sources = [("carry", words), ("constants", inputs), ("constants", inputs)]
     look_code = graph_function("look", graph, outputs, sources, "seen", width)
-    graph, _, outputs = trace_jaxpr(move)
+    graph, _, outputs = move
     sources = [("carry", words), ("constants", inputs), ("action", actions), ("action_key", KEY_WORDS)]
     move_code = graph_function("move", graph, outputs, sources, "carry", width)
     policy_code = policy_function(network, weights)

@@ -14,9 +14,10 @@ from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from workers.environments import Environment, make_environment
 from workers.episode import Carry, Episodes
-from workers.simd.backend.native import load_compiled
+from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import WIDTHS, Target, host_target
 from workers.simd.backend.words import aligned, require
+from workers.simd.episodes.check import check_episodes, check_gradient
 from workers.simd.episodes.compiled import EpisodeKernel, compile_episodes
 from workers.simd.episodes.noise import UNROLLED, definition, gradient_module
 from workers.simd.episodes.program import write_episodes
@@ -96,17 +97,12 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Callable[
     """Rollout of explicit policies, with the interface of `workers.rollout.make_policy_rollout`, for any number of
     lanes."""
     kernels = _Kernels(environment, spec, training=False, own_weights=True)
-    parameters = spec.policy.parameters
 
     def rollout(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
         kernel = kernels.fitting(mean_L_O)
-        # Rows begin at whole vectors, and a vector that begins in the last row ends in this memory.
-        stride = (parameters // kernel.network.width + 2) * kernel.network.width
-        rows = aligned((sum(map(len, parameters_G_N_D)), stride)).view(np.float32)
-        np.concatenate(parameters_G_N_D, out=rows[:, :parameters])
-        addresses_L = (rows.ctypes.data + policy_L * rows.strides[0]).astype(np.uint64)
+        rows, addresses_N = kernel.network.pack_own(parameters_G_N_D)
         require(0 <= policy_L.min() <= policy_L.max() < len(rows), "policy_L names rows that are not there")
-        return kernel.run(addresses_L, 0.0, mean_L_O, std_L_O, None, reset_keys_L, reset_keys_L)
+        return kernel.run(addresses_N[policy_L], 0.0, mean_L_O, std_L_O, None, reset_keys_L, reset_keys_L)
 
     return rollout
 
@@ -158,6 +154,7 @@ class _Kernels:
                         inputs_O,
                         training=self._training,
                         own_weights=self._own_weights,
+                        check=check_episodes,
                     )
                 except UnsupportedError as error:  # `why_not` checks the default options only
                     raise UnsupportedError(
@@ -181,20 +178,25 @@ class _Kernels:
 def make_gradient_sum(parameters: int, target: Target | None = None) -> Callable:
     """Sum of weighted noise, with the interface of `workers.rollout.make_gradient_sum`."""
     target = target or host_target()
-    native = load_compiled(f"gradient {definition()}", lambda: gradient_module(target.width), target)
     signature = [*[ctypes.c_void_p] * 2, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64]
-    call = native.function(*signature)
     group = UNROLLED * target.width
     groups = -(-parameters // group)
 
-    def gradient_sum(weights_P: np.ndarray, noise_keys_P: np.ndarray) -> np.ndarray:
-        weights_P, keys_P = np.ascontiguousarray(weights_P, np.float32), np.ascontiguousarray(noise_keys_P)
-        require(keys_P.dtype == np.uint32 and keys_P.shape == (len(weights_P), KEY_WORDS), "a key for each weight")
-        sums = aligned((groups, group)).view(np.float32)
-        call(weights_P.ctypes.data, keys_P.ctypes.data, len(weights_P), sums.ctypes.data, groups)
-        return sums.reshape(-1)[:parameters]
+    def function(native: Native) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        call = native.function(*signature)
 
-    return gradient_sum
+        def gradient_sum(weights_P: np.ndarray, noise_keys_P: np.ndarray) -> np.ndarray:
+            weights_P, keys_P = np.ascontiguousarray(weights_P, np.float32), np.ascontiguousarray(noise_keys_P)
+            require(keys_P.dtype == np.uint32 and keys_P.shape == (len(weights_P), KEY_WORDS), "a key for each weight")
+            sums = aligned((groups, group)).view(np.float32)
+            call(weights_P.ctypes.data, keys_P.ctypes.data, len(weights_P), sums.ctypes.data, groups)
+            return sums.reshape(-1)[:parameters]
+
+        return gradient_sum
+
+    name, text = f"gradient {definition()}", lambda: gradient_module(target.width)
+    checked = lambda native: check_gradient(function(native), parameters)  # noqa: E731
+    return function(load_compiled(name, text, target, check=checked))
 
 
 def always_zero(environment: Environment) -> np.ndarray:

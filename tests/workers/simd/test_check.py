@@ -1,0 +1,102 @@
+"""New machine code is compared with its twin before it is used: right code passes, wrong code is found and not kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
+from tests.helpers import centre, chunk_runner, random_parameters, spec
+from tests.workers.simd.rollouts import targets
+from workers.environments import make_environment
+from workers.simd.backend.function_builder import FunctionBuilder
+from workers.simd.episodes import noise
+from workers.simd.episodes.check import WrongCodeError, check_episodes, require_same
+from workers.simd.episodes.compiled import compile_episodes
+from workers.simd.episodes.rollout import make_gradient_sum
+from workers.simd.graph.operations import OPERATIONS
+
+KINDS = [{"training": True}, {"training": False}, {"training": False, "own_weights": True}]
+
+
+@pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)
+@pytest.mark.parametrize("kind", KINDS, ids=["training", "evaluation", "policies"])
+@pytest.mark.parametrize("hidden", [(), (16,), (33, 48), (144,)], ids=str)
+def test_policies_of_all_shapes_have_the_bits_of_their_twin(hidden, kind, target, tmp_path: Path) -> None:
+    shape = spec(policy=PolicyShape((2, *hidden, 2)))
+    checked = []
+    compile_episodes(
+        make_environment("point_maze", {}),
+        shape,
+        np.arange(2),
+        target=target,
+        folder=tmp_path,
+        check=lambda kernel: checked.append(check_episodes(kernel)),
+        **kind,
+    )
+    assert checked == [None]
+
+
+@pytest.fixture
+def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A worker whose kernels are all new to its machine."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    run = chunk_runner(spec(rollout="simd"))
+    return lambda chunk: run(centre(random_parameters()), chunk)
+
+
+CHUNKS = [TrainingChunk(1, 0), EvaluationChunk(1, 0)]
+
+
+@pytest.mark.parametrize("chunk", CHUNKS, ids=["training", "evaluation"])
+def test_an_instruction_that_computes_something_else_is_found_and_the_code_is_not_kept(
+    worker, chunk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = OPERATIONS["sub"]._replace(llvm="fadd {F} {0}, {1}")
+    with monkeypatch.context() as broken:
+        broken.setitem(OPERATIONS, "sub", wrong)
+        for _ in range(2):  # so nothing is found in the cache
+            with pytest.raises(WrongCodeError, match=r"words of a .* of point_maze differ.*set compute.rollout to xla"):
+                worker(chunk)
+    worker(chunk)
+
+
+@pytest.mark.parametrize("chunk", CHUNKS, ids=["training", "evaluation"])
+def test_a_wrong_sum_of_the_policy_is_found(worker, chunk, monkeypatch: pytest.MonkeyPatch) -> None:
+    right = FunctionBuilder.fma
+    with monkeypatch.context() as broken:
+        broken.setattr(FunctionBuilder, "fma", lambda self, a, b, c: right(self, b, c, a))
+        with pytest.raises(WrongCodeError, match="report this"):
+            worker(chunk)
+    worker(chunk)
+
+
+def test_a_wrong_gradient_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more parameters than the code computes at a time, or of fewer."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    right = FunctionBuilder.fma
+    with monkeypatch.context() as broken:
+        broken.setattr(FunctionBuilder, "fma", lambda self, a, b, c: right(self, a, b, "zeroinitializer"))
+        with pytest.raises(WrongCodeError, match="words of a gradient differ"):
+            make_gradient_sum(50)
+    for target in targets():
+        make_gradient_sum(1000, target)
+
+
+def test_noise_of_the_wrong_pair_is_found(worker, monkeypatch: pytest.MonkeyPatch) -> None:
+    def of_the_first(builder: FunctionBuilder, keys: str) -> list[str]:
+        return noise.load_key(builder, keys, "0")
+
+    monkeypatch.setattr(noise, "keys_of_members", of_the_first)
+    with pytest.raises(WrongCodeError):
+        worker(TrainingChunk(1, 0))
+
+
+def test_one_wrong_bit_is_a_difference_and_two_nan_are_none() -> None:
+    x = np.array([1.0, np.nan, 0.0], np.float32)
+    require_same(x, np.array([1.0, -np.nan, 0.0], np.float32), "numbers")
+    for other in (np.nextafter(x, np.float32(2.0)), np.array([1.0, np.nan, -0.0], np.float32)):
+        with pytest.raises(WrongCodeError, match="of 3 words of numbers differ"):
+            require_same(x, other, "numbers")

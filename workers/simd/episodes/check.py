@@ -1,0 +1,107 @@
+"""A comparison of new machine code with its twin in NumPy, which a worker makes before it uses the code.
+
+Tests compare the code of our machines with the twins. A worker may run on a processor, or with a version of LLVM, that
+we have never seen: there the reset and one step of a few episodes must have the bits that NumPy gives them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from es_service.protocol.messages import WorkerSpec
+from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, stream_keys
+from workers.simd.backend.words import Words
+from workers.simd.episodes import twin
+from workers.simd.episodes.compiled import EpisodeKernel
+from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.graph.operations import compute
+from workers.simd.graph.twin import evaluate
+from workers.simd.graph.unsupported import UnsupportedError
+
+LANES = 16
+UNIT = float(np.float32(0.1 / NORMAL_STD))
+
+
+class WrongCodeError(Exception):
+    """Machine code does not compute what it should; the message says what to do."""
+
+
+def check_episodes(kernel: EpisodeKernel) -> None:
+    """Raise WrongCodeError unless the reset and one step of 16 episodes have the bits of their definition."""
+    spec, inputs_O, rng = kernel.spec, kernel.inputs_O, np.random.default_rng(0)
+    keys_L = stream_keys(0, Domain.EVALUATION_RESET, 0, np.arange(LANES))
+    noise_keys_P = stream_keys(0, Domain.PARAMETER_NOISE, 0, np.arange(LANES // 2)) if kernel.training else None
+    lanes_O = (LANES if kernel.own_weights else 1, spec.policy.widths[0])
+    mean_O, std_O = np.zeros(lanes_O, np.float32), rng.uniform(0.5, 2.0, lanes_O).astype(np.float32)
+    mean_O[:, inputs_O] = rng.normal(0.0, 0.1, (len(mean_O), len(inputs_O)))
+    parameters_L_D = _parameters(spec, rng, LANES if kernel.own_weights else 1)
+    if kernel.own_weights:
+        memory, weights = kernel.network.pack_own([parameters_L_D])
+        weights_of = twin.own(memory[:, : spec.policy.parameters])
+    elif noise_keys_P is not None:
+        weights_of = twin.perturbed(parameters_L_D[0], np.float32(UNIT), noise_keys_P)
+        weights = kernel.network.pack(parameters_L_D[0])
+    else:
+        weights, weights_of = kernel.network.pack(parameters_L_D[0]), twin.shared(parameters_L_D[0], LANES)
+
+    carries, go = kernel.started(weights, UNIT, mean_O, std_O, noise_keys_P, keys_L, keys_L)
+    carry_L = _by_lane(carries)
+    with contextlib.suppress(UnsupportedError):  # then JAX computes the resets
+        begin, _, begun = trace_jaxpr(jax.make_jaxpr(kernel.program.steps.begin)(keys_L[0]))
+        require_same(carry_L, _words(evaluate(begin, begun, keys_L.T)), f"a reset of {spec.environment}")
+    go(1)
+    (look, _, seen), (move, _, after) = kernel.program.graphs()
+    statistics = [np.broadcast_to(x[:, inputs_O], (LANES, len(inputs_O))).T.view(np.uint32) for x in (mean_O, std_O)]
+    x_I_L = np.stack(evaluate(look, seen, np.concatenate([carry_L, *statistics])))
+    action_A_L = twin.policy(spec.policy, inputs_O, x_I_L, weights_of)
+    words = np.concatenate([carry_L, statistics[0], action_A_L.view(np.uint32), keys_L.T])
+    require_same(_by_lane(carries), _words(evaluate(move, after, words)), f"a step of {spec.environment}")
+
+
+def check_gradient(gradient_sum: Callable[..., np.ndarray], parameters: int) -> None:
+    """Raise WrongCodeError unless a gradient sum over a few pairs has the bits of its definition."""
+    keys_P = stream_keys(0, Domain.PARAMETER_NOISE, 0, np.arange(5))
+    weights_P = np.random.default_rng(0).normal(size=5).astype(np.float32)
+    coordinates_D, sums_D = np.arange(parameters, dtype=np.uint32), np.zeros(parameters, np.float32)
+    for weight, key in zip(weights_P, keys_P, strict=True):
+        k_D = normal_integers(np, key, coordinates_D).astype(np.float32)
+        sums_D = compute("fma", [np.full_like(k_D, weight), k_D, sums_D])
+    wanted_D = compute("mul", [sums_D, np.full_like(sums_D, 1.0 / NORMAL_STD)])
+    require_same(gradient_sum(weights_P, keys_P)[:parameters], wanted_D, "a gradient")
+
+
+def require_same(found: np.ndarray, wanted: np.ndarray, what: str) -> None:
+    """Raise WrongCodeError unless two arrays have the same bits; all NaN count as the same.
+
+    Args:
+        what: what the arrays are, for the message.
+    """
+    found, wanted = (np.ascontiguousarray(x).view(np.uint32) for x in (found, wanted))
+    nan = np.isnan(found.view(np.float32)) & np.isnan(wanted.view(np.float32))
+    differing = np.count_nonzero((found != wanted) & ~nan)
+    if differing:
+        raise WrongCodeError(
+            f"simd's machine code for this processor is wrong: {differing:,} of {found.size:,} words of {what} differ "
+            "from their definition. Please report this with the output of es-service doctor; until it is mended, set "
+            "compute.rollout to xla"
+        )
+
+
+def _parameters(spec: WorkerSpec, rng: np.random.Generator, rows: int) -> np.ndarray:
+    """Parameters [rows, D] with which hidden layers neither sleep nor saturate."""
+    scale = 1.0 / np.sqrt(max(spec.policy.widths))
+    return rng.normal(0.0, scale, (rows, spec.policy.parameters)).astype(np.float32)
+
+
+def _by_lane(carries: Words) -> np.ndarray:
+    """Words [word, lane] of carries [block, word, lane]."""
+    return np.concatenate(list(carries), axis=1)[:, :LANES].copy()
+
+
+def _words(values: list[np.ndarray]) -> np.ndarray:
+    """Values of outputs as words; a bool is 0 or 1."""
+    return np.stack([x.astype(np.uint32) if x.dtype == bool else x.view(np.uint32) for x in values])

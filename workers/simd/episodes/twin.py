@@ -1,0 +1,79 @@
+"""The policy in NumPy with the bits of its code: a weight is formed and a sum is rounded as `hidden.py` describes.
+
+Axes: L lanes, D parameters, P pairs, I inputs, A actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.messages import PolicyShape
+from es_service.protocol.noise import normal_integers
+from workers.simd.graph import elementary
+from workers.simd.graph.folding import FoldingGraph
+from workers.simd.graph.operations import compute
+from workers.simd.graph.twin import evaluate
+
+Floats = NDArray[np.float32]
+WeightsOf = Callable[[NDArray[np.intp], bool], Floats]
+"""Function (places in the flat vector of parameters [K], whether they are in the last layer) -> weights [K, L]."""
+
+
+def policy(shape: PolicyShape, inputs_O: NDArray[np.intp], x_I_L: Floats, weights_of: WeightsOf) -> Floats:
+    """Actions [A, L] of each lane.
+
+    Args:
+        inputs_O: inputs of the first layer that are computed; others are always zero.
+        x_I_L: those inputs.
+    """
+    seen, rows, start = x_I_L, inputs_O, 0
+    for number, (inputs, outputs) in enumerate(shape.layers, 1):
+        last = number == len(shape.layers)
+        sums = weights_of(start + inputs * outputs + np.arange(outputs), last)
+        for row, x_L in zip(rows, seen, strict=True):
+            weights = weights_of(start + row * outputs + np.arange(outputs), last)
+            sums = compute("fma", [np.broadcast_to(x_L, sums.shape), weights, sums])
+        seen, rows, start = _tanh(sums), np.arange(outputs), start + (inputs + 1) * outputs
+    return seen
+
+
+def shared(centre_D: Floats, lanes: int) -> WeightsOf:
+    """The centre's weights for all lanes."""
+    return lambda places, last: np.broadcast_to(centre_D[places][:, None], (len(places), lanes))
+
+
+def own(parameters_L_D: Floats) -> WeightsOf:
+    """Weights of each lane's own parameters."""
+    return lambda places, last: parameters_L_D[:, places].T
+
+
+def perturbed(centre_D: Floats, unit: np.float32, noise_keys_P: Any) -> WeightsOf:
+    """The weights of both members of each pair, which are neighbouring lanes."""
+    coordinates_D = np.arange(len(centre_D), dtype=np.uint32)
+    k_P_D = np.stack([normal_integers(np, key, coordinates_D) for key in noise_keys_P])
+    j_P_D = ((k_P_D - 1) >> 1).astype(np.float32)
+
+    def moved(centre: Floats, j: Floats, unit: np.float32) -> Floats:
+        """centre + unit k of k = 2 j + 1."""
+        shifted = compute("add", [centre, np.full_like(centre, unit)])
+        return compute("fma", [j, np.full_like(centre, compute("add", [unit, unit])), shifted])
+
+    def weights_of(places: NDArray[np.intp], last: bool) -> Floats:
+        j_P_K = j_P_D[:, places]
+        centre_P_K = np.broadcast_to(centre_D[places], j_P_K.shape)
+        plus = moved(centre_P_K, j_P_K, unit)
+        doubled = compute("add", [centre_P_K, centre_P_K])
+        minus = moved(centre_P_K, j_P_K, -unit) if last else compute("sub", [doubled, plus])
+        return np.stack([plus, minus], axis=1).reshape(-1, len(places)).T
+
+    return weights_of
+
+
+def _tanh(x: Floats) -> Floats:
+    graph = FoldingGraph()
+    outputs = [elementary.tanh(graph, graph.input("f", 0))]
+    return evaluate(graph, outputs, np.ascontiguousarray(x).view(np.uint32).reshape(1, -1))[0].reshape(x.shape)
