@@ -116,7 +116,7 @@ _ROWS = (
         "policy.action_noise",
         0.0,
         0.0,
-        "literature: the code of MEMES, which adds no noise to actions. uber: the same.",
+        "literature: the code of MEMES, whose settings have no noise of actions. uber: the same.",
         "memes",
     ),
     PresetRow(

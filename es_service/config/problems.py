@@ -7,7 +7,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from es_service.config.yaml_text import show
-from es_service.errors import Problem
+from es_service.errors import ConfigError, Problem
 
 
 def nearest(name: object, candidates: Collection[str]) -> str | None:
@@ -47,3 +47,14 @@ def not_allowed(
 def unfit(field: str, value: Any, what: str, *, suggestion: Any = None, allowed: str | None = None) -> Problem:
     """The problem of a value that does not fit another one; `what` is the whole text after "field: "."""
     return Problem(f"{field}: {what}", field, value, allowed, suggestion)
+
+
+def unknown_name(kind: str, name: str, known: Collection[str], field: str) -> ConfigError:
+    """The error for a name that is not among those of its kind: "the format cvs is unknown; must be ..."."""
+    return ConfigError(
+        f"the {kind} {name} is unknown; must be {one_of(known)}{did_you_mean(name, known)}",
+        field=field,
+        value=name,
+        allowed=one_of(known),
+        suggestion=nearest(name, known),
+    )

@@ -20,12 +20,14 @@ from es_service.config.model import RunConfig, policy_shape
 from es_service.config.tasks import task_of
 from es_service.dispatch.engine import Engine
 from es_service.errors import ConfigError, EvaluationError
+from es_service.logs import logger
 from es_service.loop.checks import valid_members
 from es_service.loop.policies import no_statistics, policy_episodes, policy_work
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.session import initial_policy, make_engine
 
+_LOG = logger(__name__)
 ANY_NUMBER = 2**20
 """Chunks of work at a time, for `workers: auto`: the evaluator cannot know how many policies it will be given."""
 LARGEST = 2**63 - 1
@@ -183,11 +185,16 @@ def evaluator(
         config = load_config(config, overrides, new=False)
     elif overrides:
         config = changed_config(config.model_dump(mode="json"), overrides)
-    made = PolicyEvaluator(config, make_engine(config, at_once=ANY_NUMBER))
+    made = PolicyEvaluator(config, make_engine(config, on_wait=_tell_wait, at_once=ANY_NUMBER))
     try:
         yield made
     finally:
         made.close()
+
+
+def _tell_wait(shortage: str) -> None:
+    if shortage:
+        _LOG.warning("no worker has a place in the cluster; the evaluation waits until there is one. %s", shortage)
 
 
 def _floats(name: str, given: ArrayLike, allowed: str) -> FloatArray:

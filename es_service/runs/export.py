@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from es_service.config.problems import did_you_mean, nearest, one_of
+from es_service.config.problems import unknown_name
 from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
 from es_service.runs.moment import map_places
 from es_service.runs.trackers import TensorBoard, check_trackers, fill
@@ -37,13 +37,7 @@ def export(run: Run, to: str, folder: Path) -> list[Path]:
             finished generation, or not the map that the format needs. StoreError: the folder cannot be written.
     """
     if to not in FORMATS:
-        raise ConfigError(
-            f"the format {to} is unknown; must be {one_of(FORMATS)}{did_you_mean(to, FORMATS)}",
-            field="to",
-            value=to,
-            allowed=one_of(FORMATS),
-            suggestion=nearest(to, FORMATS),
-        )
+        raise unknown_name("format", to, FORMATS, "to")
     if run.generation is None:
         way_out = WayOut("resume", "continue it", str(run.folder))
         raise NotInRunError(f"{run.folder} has no finished generation yet", run=run.folder, ways_out=[way_out])

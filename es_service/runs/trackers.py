@@ -17,7 +17,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Protocol
 
-from es_service.config.problems import did_you_mean, nearest, one_of
+from es_service.config.problems import unknown_name
 from es_service.errors import ConfigError, WayOut
 from es_service.loop.history import Row
 from es_service.runs.view import Run
@@ -54,13 +54,7 @@ def check_trackers(names: Sequence[str]) -> None:
     """Check that trackers exist and that their packages are installed. Raises ConfigError."""
     for name in names:
         if name not in PACKAGES:
-            raise ConfigError(
-                f"the tracker {name} is unknown; must be {one_of(PACKAGES)}{did_you_mean(name, PACKAGES)}",
-                field="log",
-                value=name,
-                allowed=one_of(PACKAGES),
-                suggestion=nearest(name, PACKAGES),
-            )
+            raise unknown_name("tracker", name, PACKAGES, "log")
         found = importlib.util.find_spec(PACKAGES[name])
         if found is None or found.origin is None:  # a folder of the same name, as wandb makes it, is no package
             ways_out = [WayOut("install", "install it", extra=name)]

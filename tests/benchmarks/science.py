@@ -137,7 +137,7 @@ def run_one(method: str, seed: int, env_steps: int, settings: tuple[str, ...], e
     budget = [f"budget.env_steps={env_steps}", f"budget.generations={env_steps // STEPS_AT_LEAST}"]
     config = api.load_config(
         CONFIGS / f"point_maze_{method.split()[0]}.yaml",
-        [*budget, "compute.engine=inline", "compute.workers=1", f"seed={seed}", *METHODS[method], *settings],
+        [*budget, "compute.engine=inline", "compute.workers=1", f"seed={seed}", *METHODS.get(method, ()), *settings],
     )
     return _read(api.run_or_resume(config, folder_of(method, seed, env_steps, settings)).run, method, seed)
 

@@ -307,4 +307,4 @@ def test_copies_cost_hardly_more_with_many_slow_workers():
         assert pending(state) == 0
         return (time.process_time() - started) / events
 
-    assert seconds_per_event(1000) < 3.0 * min(seconds_per_event(100) for _ in range(3))
+    assert min(seconds_per_event(1000) for _ in range(2)) < 3.0 * min(seconds_per_event(100) for _ in range(3))

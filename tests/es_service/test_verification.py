@@ -63,7 +63,7 @@ def engine(worker, monkeypatch):
     def ours(*_, **__):
         yield worker
 
-    monkeypatch.setattr(session, "_engine", ours)
+    monkeypatch.setattr(session, "make_engine", ours)
     monkeypatch.setattr(verification, "inline_engine", ours)
 
 

@@ -28,7 +28,7 @@ from tests.twins import es as twin
 from workers.environments import SHIPPED
 from workers.policy import initial_parameters
 from workers.simd.backend import target
-from workers.simd.episodes import program
+from workers.simd.episodes import compiled
 from workers.simd.episodes import rollout as simd_rollout
 
 
@@ -140,7 +140,7 @@ def test_vectors_of_another_width_give_the_same_run(finished, monkeypatch, isa):
     """What a processor without AVX-512 computes: everything that is kept has the same bits."""
     config, state, store, _, _ = finished
     assert config.compute.rollout == "simd"
-    for module in (simd_rollout, program):
+    for module in (simd_rollout, compiled):
         monkeypatch.setattr(module, "host_target", partial(target.host_target, isa))
     again, other, _, _ = run_in_memory(config)
     assert again.generation == state.generation

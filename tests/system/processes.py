@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from es_service.errors import StoreError
+from es_service.runs import session
 from es_service.store.reader import read_generation
 
 ROOT = Path(__file__).parents[2]
@@ -75,3 +80,9 @@ def is_running(pid: str) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def without_copies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No work item is sent a second time, so that only a deadline notices a worker that hangs."""
+    limits = session.dispatch_limits
+    monkeypatch.setattr(session, "dispatch_limits", lambda *given: replace(limits(*given), late_factor=math.inf))

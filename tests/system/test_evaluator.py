@@ -20,7 +20,7 @@ from es_service.errors import ConfigError, EvaluationError, ServiceError
 from es_service.loop.policies import no_statistics
 from tests.system import cluster
 from tests.system.cluster import Cluster
-from tests.system.processes import children, wait_for
+from tests.system.processes import children, wait_for, without_copies
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::ResourceWarning"),  # Ray leaves files and processes to the garbage collector
@@ -92,7 +92,7 @@ def test_bits_are_the_same_with_threads_and_from_a_run_config(reference):
 def test_workers_that_are_killed_and_stopped_in_mid_evaluation_change_no_bit(
     reference, monkeypatch, engine, transport, pid_of
 ):
-    """One in each of the two evaluations. Only a deadline of our own notices a worker that is stopped."""
+    """One in each of the two evaluations. Without copies, only a deadline of ours notices a worker that is stopped."""
     strikes, send, before = {1: signal.SIGKILL, 2: signal.SIGSTOP}, transport.send, children()
 
     def send_and_strike(self, worker, item_id, attempt, work):
@@ -101,6 +101,7 @@ def test_workers_that_are_killed_and_stopped_in_mid_evaluation_change_no_bit(
             os.kill(pid_of(self, worker), strike)
 
     monkeypatch.setattr(transport, "send", send_and_strike)
+    without_copies(monkeypatch)
     config = CONFIG | {"compute": {"chunk_timeout_s": 1.0, "compile_timeout_s": 20.0}}
     with es_service.evaluator(config, engine=engine, workers=2) as evaluate:
         assert twice(evaluate) == reference
