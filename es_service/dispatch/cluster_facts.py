@@ -17,16 +17,16 @@ from types import ModuleType
 from typing import Any
 
 from es_service.dispatch import node_probe
-from es_service.dispatch.ray_cluster import connect, disconnect
+from es_service.dispatch.ray_cluster import address_here, connect, disconnect
 from es_service.dispatch.ray_faults import error_text
-from es_service.dispatch.ray_ports import HEAD_CALL, NODE_CALL, open_ports, require_answer, uses_tls
+from es_service.dispatch.ray_ports import HEAD_CALL, NODE_CALL, open_ports, require_head, uses_tls
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.sources import Sources
 
 NODE_S = 60.0
 """Longest wait for the facts of all nodes, in seconds; a node first starts a process for the task."""
-NODE_PORTS = ("NodeManagerPort", "ObjectManagerPort", "MetricsExportPort")
-"""Ports of each node, as Ray names them."""
+HTTP_PORTS = {"DashboardAgentListenPort": "agent", "RuntimeEnvAgentPort": "runtime env agent"}
+"""HTTP servers of each node, as Ray names their ports; not that of the metrics, which everybody may read."""
 HEAD = "node:__internal_head__"
 """Resource that only the head has."""
 
@@ -43,8 +43,10 @@ class NodeFacts:
     """`worker_sources` of a shipped task."""
     problem: str = ""
     """Why es-service cannot be imported there; empty if it can."""
+    called: tuple[str, ...] = ()
+    """What was called without a token, such as `dashboard 8265`."""
     open_ports: tuple[str, ...] = ()
-    """What answers without a token, such as `dashboard 8265`."""
+    """What of it answered."""
     public: tuple[str, ...] = ()
     """Public addresses, with ports, on which Ray listens."""
     not_shared: str = ""
@@ -65,6 +67,20 @@ class ClusterFacts:
     """Folder that the nodes should share, if one was given."""
 
 
+@dataclass(frozen=True)
+class _Node:
+    """What Ray says about a node."""
+
+    id: str
+    name: str
+    ports: tuple[int, ...]
+    """Ports on which Ray listens there."""
+    grpc_calls: tuple[tuple[str, str, str], ...]
+    """Name, HOST:PORT and a call of each gRPC server that is called without a token."""
+    http_calls: tuple[tuple[str, str, int], ...]
+    """Name, host and port of each HTTP server that is called without a token."""
+
+
 def cluster_facts(address: str, shared: Path | None = None) -> ClusterFacts:
     """Join a cluster and collect facts about it and about each of its nodes.
 
@@ -77,38 +93,35 @@ def cluster_facts(address: str, shared: Path | None = None) -> ClusterFacts:
         ConfigError: the folder does not exist, or this process cannot write there.
     """
     with _file_in(shared) as file:
-        if address != "auto":
-            require_answer(address)
+        require_head(address_here(address), is_auto=address == "auto")
         try:
             ray = connect(address, gpus=False, cpus=1)
-        except EvaluationError as error:  # with ways out for a run, which do not help here
-            raise EvaluationError(error.sentence, field="cluster", value=address) from error
+        except EvaluationError as error:  # its ways out are those of a run
+            raise EvaluationError(" ".join(error.sentence.split()), field="cluster", value=address) from error
         try:
-            nodes = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}
-            head = ray.get_runtime_context().gcs_address
-            dashboard = _dashboard(ray)
-            answers, silent = _ask(ray, nodes, _port(head), dashboard, file)
+            nodes = _nodes(ray)
+            answers, silent = _ask(ray, nodes, file)
         finally:
             disconnect(ray)
-    answering = _answering(nodes, head)
-    for node, answer in answers.items():
-        if dashboard and answer["dashboard_is_open"]:
-            answering[node].append(f"dashboard {dashboard[1]}")
+    calls = [call for node in nodes for call in node.grpc_calls]
+    is_open = dict(zip(calls, open_ports([call[1:] for call in calls]), strict=True))
     return ClusterFacts(
         driver=NodeFacts("this host", **node_probe.software()),
         nodes=tuple(
             NodeFacts(
-                _name(nodes[node]),
+                node.name,
                 **answer["software"],
-                open_ports=tuple(answering[node]),
+                called=tuple(name for name, *_ in (*node.grpc_calls, *node.http_calls)),
+                open_ports=(*(call[0] for call in node.grpc_calls if is_open[call]), *answer["open"]),
                 public=public_sockets(answer["listening"], answer["addresses"]),
                 not_shared=answer["not_shared"],
             )
-            for node, answer in answers.items()
+            for node in nodes
+            if (answer := answers.get(node.id))
         ),
-        silent={_name(nodes[node]): why for node, why in silent.items()},
+        silent={node.name: silent[node.id] for node in nodes if node.id in silent},
         encrypted=uses_tls(),
-        shared=None if shared is None else str(shared),
+        shared=None if shared is None else os.path.abspath(shared),
     )
 
 
@@ -123,56 +136,60 @@ def public_sockets(listening: Iterable[tuple[str, int]], addresses: Iterable[str
     found = set()
     for address, port in listening:
         bound = ipaddress.ip_address(address)
+        bound = getattr(bound, "ipv4_mapped", None) or bound  # a socket of IPv6 that listens on an address of IPv4
         reached = [one for one in own if one.version <= bound.version] if bound.is_unspecified else [bound]
-        found |= {(str(one), port) for one in reached if (getattr(one, "ipv4_mapped", None) or one).is_global}
+        found |= {(str(one), port) for one in reached if one.is_global}
     return tuple(_joined(host, port) for host, port in sorted(found))
 
 
+def _nodes(ray: ModuleType) -> list[_Node]:
+    """The nodes of the cluster, the head first."""
+    head = ray.get_runtime_context().gcs_address
+    dashboard = _dashboard(ray)
+    found = []
+    for node in ray.nodes():
+        if not node["Alive"]:
+            continue
+        host, port, is_head = node["NodeManagerAddress"], node["NodeManagerPort"], HEAD in node["Resources"]
+        ports = [value for name, value in node.items() if name.endswith("Port")]
+        grpc_calls = [(f"raylet {port}", _joined(host, port), NODE_CALL)]
+        http_calls = [(f"{name} {node[key]}", host, node[key]) for key, name in HTTP_PORTS.items() if node.get(key)]
+        if is_head:
+            head_port = int(head.rpartition(":")[2])
+            ports.append(head_port)
+            grpc_calls.insert(0, (f"head {head_port}", head, HEAD_CALL))
+        if is_head and dashboard:
+            ports.append(dashboard[1])
+            http_calls.append((f"dashboard {dashboard[1]}", *dashboard))
+        name = f"{node['NodeManagerHostname']} {host}"
+        found.append((not is_head, name, _Node(node["NodeID"], name, (*ports,), (*grpc_calls,), (*http_calls,))))
+    return [node for *_, node in sorted(found, key=lambda one: one[:2])]
+
+
 def _ask(
-    ray: ModuleType,
-    nodes: Mapping[str, dict[str, Any]],
-    head_port: int,
-    dashboard: tuple[str, int] | None,
-    file: tuple[str, str] | None,
+    ray: ModuleType, nodes: Iterable[_Node], file: tuple[str, str] | None
 ) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     """Node id -> its facts, for each node that gave them, and node id -> why, for each that did not."""
     affinity = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
     ray.cloudpickle.register_pickle_by_value(node_probe)
     try:
         probe = ray.remote(num_cpus=0, max_retries=0)(node_probe.facts)
-        asked = {}
-        for node_id, node in nodes.items():
-            is_head = HEAD in node["Resources"]
-            ports = [node[name] for name in NODE_PORTS]
-            if is_head:
-                ports += [head_port, *([dashboard[1]] if dashboard else [])]
-            at = probe.options(scheduling_strategy=affinity(node_id, soft=False))
-            asked[at.remote(ports, dashboard if is_head else None, file)] = node_id
+        asked = {
+            probe.options(scheduling_strategy=affinity(node.id, soft=False)).remote(
+                node.ports, node.http_calls, file
+            ): node.id
+            for node in nodes
+        }
     finally:
         ray.cloudpickle.unregister_pickle_by_value(node_probe)
     ready, late = ray.wait(list(asked), num_returns=len(asked), timeout=NODE_S)
-    answers, silent = {}, {asked[ref]: f"no answer within {NODE_S:g} s" for ref in late}
+    answers, silent = {}, {asked[ref]: f"nothing within {NODE_S:g} s" for ref in late}
     for ref in ready:
         try:
             answers[asked[ref]] = ray.get(ref)
         except ray.exceptions.RayError as error:
             silent[asked[ref]] = error_text(error).strip().rpartition("\n")[2]
     return answers, silent
-
-
-def _answering(nodes: Mapping[str, dict[str, Any]], head: str) -> dict[str, list[str]]:
-    """Node id -> which of its gRPC ports answer without a token."""
-    calls = []
-    for node_id, node in nodes.items():
-        if HEAD in node["Resources"]:
-            calls.append((node_id, f"head {_port(head)}", head, HEAD_CALL))
-        port = node["NodeManagerPort"]
-        calls.append((node_id, f"raylet {port}", _joined(node["NodeManagerAddress"], port), NODE_CALL))
-    found: dict[str, list[str]] = {node_id: [] for node_id in nodes}
-    for (node_id, name, *_), is_open in zip(calls, open_ports([call[2:] for call in calls]), strict=True):
-        if is_open:
-            found[node_id].append(name)
-    return found
 
 
 def _dashboard(ray: ModuleType) -> tuple[str, int] | None:
@@ -207,14 +224,6 @@ def _file_in(folder: Path | None) -> Iterator[tuple[str, str] | None]:
         yield str(file), content
     finally:
         file.unlink(missing_ok=True)
-
-
-def _name(node: Mapping[str, Any]) -> str:
-    return f"{node['NodeManagerHostname']} {node['NodeManagerAddress']}"
-
-
-def _port(address: str) -> int:
-    return int(address.rpartition(":")[2])
 
 
 def _joined(host: str, port: int) -> str:

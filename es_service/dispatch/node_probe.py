@@ -10,36 +10,39 @@ import http.client
 import importlib
 import platform
 from collections.abc import Collection
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 HTTP_S = 5.0
-"""Longest wait for an answer of the dashboard, in seconds."""
+"""Longest wait for an answer to a request, in seconds."""
+PATH = "/api/version"
+"""A path that needs a token; a few others, such as that of the dashboard's page, need none."""
 ANY_TASK = "point_maze"
 """A shipped task: the sources of a shipped task are those of every worker."""
 
 
-def facts(ports: Collection[int], dashboard: tuple[str, int] | None, file: tuple[str, str] | None) -> dict[str, Any]:
+def facts(
+    ports: Collection[int], http_calls: Collection[tuple[str, str, int]], file: tuple[str, str] | None
+) -> dict[str, Any]:
     """Facts about the node on which this runs.
 
     Args:
         ports: Ray's ports on this node.
-        dashboard: host and port of the dashboard, if it is on this node.
+        http_calls: name, host and port of each of Ray's HTTP servers on this node.
         file: path and content of a file that the driver has written.
     """
     return {
         "software": software(),
         "listening": listening(ports),
         "addresses": addresses(),
-        "dashboard_is_open": dashboard is not None and is_open(*dashboard),
+        "open": [name for name, host, port in http_calls if is_open(host, port)],
         "not_shared": "" if file is None else why_not_shared(*file),
     }
 
 
 def software() -> dict[str, Any]:
     """Versions by name, hashes of the sources of workers, and why es-service cannot be used here, or ""."""
-    versions = {"ray": metadata.version("ray"), "python": platform.python_version()}
+    versions = {"ray": importlib.import_module("ray").__version__, "python": platform.python_version()}
     sources: dict[str, str] = {}
     problem = ""
     try:
@@ -70,11 +73,11 @@ def addresses() -> list[str]:
 
 
 def is_open(host: str, port: int) -> bool:
-    """Whether a dashboard answers a request that has no token."""
+    """Whether an HTTP server of Ray answers a request that has no token, be it that it does not know the path."""
     connection = http.client.HTTPConnection(host, port, timeout=HTTP_S)
     try:
-        connection.request("GET", "/api/version")
-        return connection.getresponse().status == http.client.OK
+        connection.request("GET", PATH)
+        return connection.getresponse().status not in (http.client.UNAUTHORIZED, http.client.FORBIDDEN)
     except (OSError, http.client.HTTPException):  # nothing answers there
         return False
     finally:
