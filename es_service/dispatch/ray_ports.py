@@ -57,7 +57,7 @@ def require_head(address: str, *, is_auto: bool = False) -> None:
         )
     if code is not None:
         raise EvaluationError(
-            f"what answers at {address} is not the head of a Ray cluster ({code.name}). Give the port "
+            f"the server at {address} does not answer as the head of a Ray cluster does ({code.name}). Give the port "
             "with which its head was started, usually 6379",
             field="cluster",
             value=address,

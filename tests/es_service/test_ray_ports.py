@@ -62,7 +62,7 @@ def test_the_token_of_this_host_is_tried_before_a_cluster_is_joined(head, monkey
 
 def test_a_server_that_is_no_head_is_named(head, monkeypatch):
     monkeypatch.setattr(ray_ports, "HEAD_CALL", ray_ports.NODE_CALL)
-    with pytest.raises(EvaluationError, match=f"what answers at {head} is not the head .*UNIMPLEMENTED"):
+    with pytest.raises(EvaluationError, match=f"the server at {head} does not answer as the head .*UNIMPLEMENTED"):
         require_head(head)
 
 

@@ -1,81 +1,185 @@
-"""`es-service doctor --cluster` on clusters of several hosts, and a run in a cluster with TLS."""
+"""`es-service doctor --cluster` on clusters of several hosts, healthy and with each fault; and a run with TLS."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import signal
 import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
+import ray
 import yaml
 
+from es_service.protocol import machine
 from es_service.store.digest import digest_parts
 from tests.system import cluster
-from tests.system.cluster import Cluster
+from tests.system.cluster import TOKEN, Cluster
 from tests.system.processes import ROOT, wait_for
 from tests.system.test_cluster import CONFIG, inline_digest
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
 PUBLIC = "11.0.0.77"
 """An address that is public, but for the namespace that has it here."""
+SERVERS = "1 head, 2 raylets, 2 agents, 2 runtime env agents, 1 dashboard"
+NOT_ENCRYPTED = "messages between nodes are not encrypted"
+LISTEN = f"""
+import pathlib, socket, sys
+packets = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.ntohs(3))
+packets.settimeout(0.1)
+seen = with_token = 0
+while not pathlib.Path(sys.argv[1]).exists():
+    try:
+        packet, (device, *_) = packets.recvfrom(1 << 16)
+    except TimeoutError:
+        continue
+    if device == "eth0":
+        seen += 1
+        with_token += {TOKEN.encode()!r} in packet
+print(seen, with_token)
+"""
+"""Counts what passes between hosts until a file exists: all packets, and those in which the token can be read."""
 
 
 def doctor(hosts: Cluster, *options: object, code: int, **environment: str) -> str:
     """What the command prints on the head, where its exit code must be this one."""
-    found, printed = hosts.run("head", "es-service", "doctor", "--cluster", *options, timeout=120.0, **environment)
+    found, printed = hosts.run("head", "es-service", "doctor", "--cluster", *options, timeout=300.0, **environment)
     assert found == code, printed
     assert "Traceback" not in printed
     return printed
 
 
-def test_everything_that_is_wrong_with_a_cluster_is_found(tmp_path):
-    """One host is as the driver's. Of another, a file of our code was edited, the shared folder is its own, and one of
-    its addresses is public. Nobody needs a token."""
-    shared, edited = tmp_path / "shared", tmp_path / "policy.py"
-    shared.mkdir()
-    policy = ROOT / "workers/policy.py"
-    edited.write_text(f"{policy.read_text()}# edited\n")
-    other = f"mount --bind {edited} {policy} && mount -t tmpfs tmpfs {shared} && ip address add {PUBLIC}/8 dev eth0"
+def findings(hosts: Cluster, *options: object, code: int) -> dict[str, dict[str, str]]:
+    """What is found, but for what is in order: text of the fault -> finding."""
+    printed = json.loads(doctor(hosts, hosts.address, *options, "--json", code=code))
+    return {one["what"]: one for one in printed if one["level"] != "ok"}
+
+
+def has_dashboard(hosts: Cluster) -> bool:
+    """Whether the dashboard, which takes its time to start, is listening."""
+    return ":8265" in hosts.run("head", "ss", "-Hltn")[1]
+
+
+@contextlib.contextmanager
+def counted(hosts: Cluster, folder: Path):
+    """What LISTEN counts on the head until the end of the block, as a list that is filled then."""
+    stop, counts = folder / "stop", []
+    process = hosts.popen("head", sys.executable, "-c", LISTEN, stop)
+    try:
+        yield counts
+    finally:
+        stop.touch()
+        printed, _ = process.communicate(timeout=60)
+    counts += map(int, printed.split())
+
+
+def test_a_cluster_with_a_token_has_no_finding_until_one_of_its_hosts_has_faults(tmp_path):
+    """Then each fault is found. The token can be read in the traffic, as the guide says."""
+    shared, site = tmp_path / "shared", tmp_path / "site"
+    for folder in (shared, site):
+        folder.mkdir()
+    with Cluster(tmp_path) as hosts:
+        hosts.start("one", 1, PYTHONPATH=f"{ROOT}{os.pathsep}{site}")
+        wait_for(lambda: has_dashboard(hosts))
+        with counted(hosts, tmp_path) as counts:
+            printed = doctor(hosts, "auto", "--shared", shared, code=0)
+        seen, with_token = counts
+        assert 0 < with_token < seen
+        assert list(shared.iterdir()) == []
+        *sound, note = printed.splitlines()
+        assert [line[:6] for line in sound] == ["  ok  "] * 6
+        assert sound[0] == f"  ok  2 of 2 nodes answer: head {hosts.ip(0)}, one {hosts.ip(1)}"
+        assert sound[1].endswith(f": {SERVERS}")
+        assert note.startswith(f"note  {NOT_ENCRYPTED}")
+
+        edited = {
+            Path(machine.__file__): (f'VERSION = "{machine.VERSION}"', 'VERSION = "0.1.0"'),
+            ROOT / "workers/policy.py": ("", "# edited\n"),
+            Path(ray.__file__).with_name("_version.py"): (ray.__version__, "2.0.0"),
+        }
+        mounts = [f"mount -t tmpfs tmpfs {shared}", f"ip address add {PUBLIC}/8 dev eth0"]
+        for file, (old, new) in edited.items():
+            (tmp_path / file.name).write_text(file.read_text().replace(old, new, 1))
+            mounts.append(f"mount --bind {tmp_path / file.name} {file}")
+        (site / "sitecustomize.py").write_text("import platform\nplatform.python_version = lambda: '3.11.99'\n")
+        assert hosts.run("one", "sh", "-ec", "\n".join(mounts)) == (0, "")
+        here = {"es-service": machine.VERSION, "python": sys.version.split()[0], "ray": ray.__version__}
+        versions = f"es-service 0.1.0 (here {here['es-service']}), python 3.11.99 (here {here['python']}), "
+        versions = f"other versions: {versions}ray 2.0.0 (here {here['ray']})"
+
+        def with_new_process():
+            found = findings(hosts, "--shared", shared, code=1)
+            return found if versions in found else None  # a process that Ray started before has the old versions
+
+        found = wait_for(with_new_process)
+        assert found.keys() == {
+            "Ray listens on a public address",
+            versions,
+            "other code than here in es_service/protocol/machine.py, workers/policy.py",
+            f"{shared} is not shared (No such file or directory)",
+            NOT_ENCRYPTED,
+        }
+        assert {one["where"].split(" (")[0] for one in found.values()} == {f"one {hosts.ip(1)}", ""}
+        assert f"{PUBLIC}:" in found["Ray listens on a public address"]["where"]
+
+
+def test_a_cluster_without_a_token_is_found(tmp_path):
     hosts = Cluster(tmp_path)
     hosts.settings = {**hosts.settings, "RAY_AUTH_MODE": "disabled"}
     with hosts:
-        hosts.start("alike", 1)
-        hosts.start("other", 1, setup=other)
-
-        def findings():
-            printed = doctor(hosts, hosts.address, "--shared", shared, "--json", code=1)
-            found = {one["what"]: one for one in json.loads(printed) if one["level"] == "FAIL"}
-            return found if "dashboard" in found["Ray answers without a token"]["where"] else None
-
-        found = wait_for(findings)  # the dashboard takes its time
-        assert found.keys() == {
-            "Ray answers without a token",
-            "Ray listens on a public address",
-            "other code than here in workers/policy.py",
-            f"{shared} is not shared (No such file or directory)",
-        }
+        hosts.start("one", 1)
+        wait_for(lambda: has_dashboard(hosts))
+        found = findings(hosts, code=1)
+        assert found.keys() == {"Ray answers without a token", NOT_ENCRYPTED}
         where = found["Ray answers without a token"]["where"]
-        for name, place in (("head", "head 6379, raylet"), ("head", "dashboard 8265"), ("alike", ""), ("other", "")):
-            assert re.search(rf"{name} 10\.77\.0\.\d \([^)]*{place or 'raylet'}", where), where
-        assert PUBLIC in found.pop("Ray listens on a public address")["where"]
-        found.pop("Ray answers without a token")
-        assert {one["where"] for one in found.values()} == {f"other {hosts.ip(2)}"}
-        assert list(shared.iterdir()) == []
+        node = r"raylet \d+, agent \d+, runtime env agent \d+"
+        assert re.fullmatch(
+            rf"head {hosts.ip(0)} \(head 6379, {node}, dashboard 8265\), one {hosts.ip(1)} \({node}\)", where
+        ), where
 
-        printed = doctor(hosts, "auto", code=1)
-        assert printed.startswith(f"  ok  3 of 3 nodes answered: head {hosts.ip(0)}, ")
-        assert f"FAIL  other {hosts.ip(2)}: other code than here in workers/policy.py; " in printed
-        assert "is not shared" not in printed
 
-        for pid, line in hosts.processes("head").items():
-            if "gcs_server" in line:
-                os.kill(pid, signal.SIGSTOP)
+@pytest.mark.long
+def test_what_does_not_answer_is_found_within_its_time(tmp_path):
+    """A node that is stopped, a host with another Ray, a host that is no node, a head that is stopped."""
+    with Cluster(tmp_path) as hosts:
+        hosts.start("one", 1)
+
+        def stop(node: str, program: str) -> None:
+            (pid,) = [pid for pid, line in hosts.processes(node).items() if line.split()[0].endswith(program)]
+            os.kill(pid, signal.SIGSTOP)
+
+        file = Path(ray.__file__).with_name("_version.py")
+        (tmp_path / "version.py").write_text(file.read_text().replace(ray.__version__, "2.0.0"))
+        other = f"mount --bind {tmp_path / 'version.py'} {file} && es-service doctor --cluster {hosts.address}"
+        code, printed = hosts.run("one", "unshare", "--mount", "sh", "-c", other, timeout=300.0)
+        assert (code, len(printed.splitlines())) == (1, 1), printed
+        assert f"Version mismatch: The cluster was started with: Ray: {ray.__version__} " in printed
+
+        alone = f"mount -t proc proc /proc && es-service doctor --cluster {hosts.address}"
+        inside = ("unshare", "--mount", "--pid", "--fork", "--kill-child", "sh", "-c", alone)
+        code, printed = hosts.run("one", *inside, timeout=300.0)
+        assert (code, len(printed.splitlines())) == (1, 1), printed
+        assert "no node of Ray runs on this host" in printed
+
+        stop("one", "raylet")
+        impatient = "from es_service.dispatch import cluster_facts; cluster_facts.NODE_S = 10.0; "
+        impatient += "from es_service.cli.main import main; main()"
+        code, printed = hosts.run(
+            "head", sys.executable, "-c", impatient, "doctor", "--cluster", hosts.address, timeout=300.0
+        )
+        assert code == 1, printed
+        assert f"FAIL  one {hosts.ip(1)}: the node does not answer a task (nothing within 10 s); " in printed
+        assert f"  ok  1 of 2 nodes answer: head {hosts.ip(0)}\n" in printed
+
+        stop("head", "gcs_server")
         began = time.monotonic()
         printed = doctor(hosts, hosts.address, code=1)
-        assert f"no Ray cluster answers at {hosts.address} within" in printed
+        assert f"no Ray cluster answers at {hosts.address} (the port is open, but gives no answer within 5 s" in printed
         assert time.monotonic() - began < 60
 
 
@@ -91,21 +195,31 @@ def certificates(folder, addresses):
     return dict(entry.split("=", 1) for entry in made.stdout.split("\0") if entry.startswith(("RAY_USE_", "RAY_TLS_")))
 
 
+@pytest.mark.long
 def test_a_run_in_a_cluster_with_tls_has_the_digest_that_it_has_alone(tmp_path):
-    """And a cluster with a token and TLS has no finding."""
+    """Nobody can read the token in the traffic, nobody joins without a certificate, and nothing at all is found."""
     config, run = tmp_path / "config.yaml", tmp_path / "run"
     config.write_text(yaml.safe_dump(CONFIG | {"budget": {"generations": 5}}))
     hosts = Cluster(tmp_path)
     hosts.settings = {**hosts.settings, **certificates(tmp_path, [hosts.ip(0), hosts.ip(1)])}
     assert hosts.settings["RAY_USE_TLS"] == "1"
     with hosts:
-        hosts.start("one", 1)
-        printed = doctor(hosts, hosts.address, code=0)
-        assert printed.startswith(f"  ok  2 of 2 nodes answered: head {hosts.ip(0)}, one {hosts.ip(1)}; ")
-        assert len(printed.splitlines()) == 1, printed
+        with counted(hosts, tmp_path) as counts:
+            hosts.start("one", 1)
+            wait_for(lambda: has_dashboard(hosts))
+            printed = doctor(hosts, hosts.address, code=0)
+            command = ("es-service", "run", config, "--out", run, "--address", hosts.address)
+            code, said = hosts.run("head", *command, timeout=300.0)
+            assert code == 0, said
+        assert [line[:6] for line in printed.splitlines()] == ["  ok  "] * 5, printed
+        assert f": {SERVERS}\n" in printed
+        seen, with_token = counts
+        assert seen > 100
+        assert with_token == 0
         printed = doctor(hosts, hosts.address, code=1, RAY_USE_TLS="0")
-        assert f"no Ray cluster answers at {hosts.address} within" in printed
-        command = ("es-service", "run", config, "--out", run, "--address", hosts.address)
-        code, printed = hosts.run("head", *command, timeout=120.0)
-        assert code == 0, printed
+        assert "if the cluster uses TLS, this host must, too" in printed
+        strangers = tmp_path / "stranger"
+        strangers.mkdir()
+        printed = doctor(hosts, hosts.address, code=1, **certificates(strangers, [hosts.ip(0)]))
+        assert f"no Ray cluster answers at {hosts.address} (" in printed
     assert digest_parts(run) == inline_digest(tmp_path / "inline", CONFIG, 5)
