@@ -60,7 +60,7 @@ def test_nothing_is_found_where_nothing_is_wrong():
 
 def test_nothing_is_in_order_if_no_node_answers():
     facts = replace(SOUND, nodes=(), silent={"one 10.0.0.1": "it ended", "two 10.0.0.2": "it ended"})
-    (found,) = bad(facts)
+    [found] = findings(facts)
     assert (found.level, found.where) == ("FAIL", "one 10.0.0.1, two 10.0.0.2")
 
 
@@ -151,9 +151,11 @@ def test_a_socket_is_public_where_it_listens_on_a_public_address_of_its_host(bou
 
 
 def test_a_node_finds_the_sockets_that_listen_and_its_addresses():
-    with socket.create_server(("127.0.0.1", 0)) as server, socket.socket() as idle:
-        idle.bind(("127.0.0.1", 0))
-        port, other = server.getsockname()[1], idle.getsockname()[1]
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        socket.create_connection(server.getsockname()) as client,
+    ):
+        port, other = server.getsockname()[1], client.getsockname()[1]
         assert node_probe.listening([port, other]) == [("127.0.0.1", port)]
     assert "127.0.0.1" in node_probe.addresses()
 

@@ -85,7 +85,7 @@ def test_a_cluster_with_a_token_has_no_finding_until_one_of_its_hosts_has_faults
         folder.mkdir()
     with Cluster(tmp_path) as hosts:
         hosts.start("one", 1, PYTHONPATH=f"{ROOT}{os.pathsep}{site}")
-        wait_for(lambda: has_dashboard(hosts))
+        wait_for(lambda: has_dashboard(hosts), 120.0)
         with counted(hosts, tmp_path) as counts:
             printed = doctor(hosts, "auto", "--shared", shared, code=0)
         seen, with_token = counts
@@ -116,7 +116,7 @@ def test_a_cluster_with_a_token_has_no_finding_until_one_of_its_hosts_has_faults
             found = findings(hosts, "--shared", shared, code=1)
             return found if versions in found else None  # a process that Ray started before has the old versions
 
-        found = wait_for(with_new_process)
+        found = wait_for(with_new_process, 240.0)
         assert found.keys() == {
             "Ray listens on a public address",
             versions,
@@ -133,7 +133,7 @@ def test_a_cluster_without_a_token_is_found(tmp_path):
     hosts.settings = {**hosts.settings, "RAY_AUTH_MODE": "disabled"}
     with hosts:
         hosts.start("one", 1)
-        wait_for(lambda: has_dashboard(hosts))
+        wait_for(lambda: has_dashboard(hosts), 120.0)
         found = findings(hosts, code=1)
         assert found.keys() == {"Ray answers without a token", NOT_ENCRYPTED}
         where = found["Ray answers without a token"]["where"]
@@ -206,7 +206,7 @@ def test_a_run_in_a_cluster_with_tls_has_the_digest_that_it_has_alone(tmp_path):
     with hosts:
         with counted(hosts, tmp_path) as counts:
             hosts.start("one", 1)
-            wait_for(lambda: has_dashboard(hosts))
+            wait_for(lambda: has_dashboard(hosts), 120.0)
             printed = doctor(hosts, hosts.address, code=0)
             command = ("es-service", "run", config, "--out", run, "--address", hosts.address)
             code, said = hosts.run("head", *command, timeout=300.0)
