@@ -35,7 +35,8 @@ fi
 config=$1 run=$2
 shift 2
 
-# Only those who have the token can use the cluster. Each start of the job has its own token.
+# Ray's ports are open to the whole network of the nodes, and only those who have the token can use them. Each start of
+# the job has its own token, which travels in plain text. The dashboard is open to the first node alone.
 RAY_AUTH_TOKEN=$(od -An -N32 -tx1 /dev/urandom | tr -d ' \n')
 export RAY_AUTH_TOKEN RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0
 export RAY_SYMMETRIC_RUN_CLUSTER_WAIT_TIMEOUT=300    # seconds that the other nodes wait for the first one

@@ -14,10 +14,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
 from es_service.api import load_config
 from es_service.cli.data import print_json
+from es_service.cli.options import print_finding
 from es_service.config.model import worker_spec
 from es_service.config.tasks import TASKS
 from es_service.dispatch.cores import cores
@@ -40,16 +40,14 @@ MIN_FREE_BYTES = 1 << 30
 MIN_MEMORY_BYTES = 2 << 30
 
 
-def examine(console: Console, *, as_json: bool = False) -> bool:
+def examine(*, as_json: bool = False) -> bool:
     """Print every finding, at once or as JSON at the end, and return whether no check failed."""
     found: list[Finding] = []
     for check in (_software, _ray, _machine, _vectors, _disk, _noise, _rollout):
         for level, text in _guarded(check):
             found.append((level, text))
             if not as_json:
-                colour = {"ok": "green", "note": "yellow", "FAIL": "red"}[level]
-                console.print(f"[{colour}]{level:>4}[/]  ", end="")
-                console.print(text, highlight=False, markup=False, soft_wrap=True)
+                print_finding(level, text)
     if as_json:
         print_json([{"level": level, "text": text} for level, text in found])
     return all(level != "FAIL" for level, _ in found)

@@ -193,11 +193,24 @@ app.add_typer(bench, name="bench")
 
 
 @app.command()
-def doctor(as_json: JsonOption = False) -> None:
-    """Check that this machine can run searches, and show what their results depend on."""
+def doctor(
+    cluster: Annotated[
+        str | None,
+        typer.Option("--cluster", metavar="ADDRESS", help="Check this Ray cluster instead: HOST:PORT, or auto."),
+    ] = None,
+    shared: Annotated[
+        Path | None, typer.Option("--shared", help="With --cluster: a folder that all nodes should share.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check that this machine, or a cluster, can run searches, and show what their results depend on."""
     from es_service.cli.doctor import examine
+    from es_service.cli.doctor_cluster import examine_cluster
 
-    raise typer.Exit(0 if examine(console, as_json=as_json) else 1)
+    if cluster is None and shared is not None:
+        raise ConfigError("--shared is for a cluster; give --cluster, too")
+    passed = examine(as_json=as_json) if cluster is None else examine_cluster(cluster, shared, as_json=as_json)
+    raise typer.Exit(0 if passed else 1)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Options that several commands share, the config keys that they set, and the printing of notes and errors."""
+"""Options that several commands share, the config keys that they set, and the printing of notes, findings, errors."""
 
 from __future__ import annotations
 
@@ -107,6 +107,13 @@ def print_note(message: str, style: str | None = None) -> None:
     """Print a line that is not a result to stderr. If stderr is closed, rich raises SystemExit, which is ignored."""
     with contextlib.suppress(SystemExit):
         errors.print(message, style=style, highlight=False, markup=False, soft_wrap=True)
+
+
+def print_finding(level: str, text: str) -> None:
+    """Print a finding of `doctor`, whose level is "ok", "note" or "FAIL", on stdout."""
+    colour = {"ok": "green", "note": "yellow", "FAIL": "red"}[level]
+    console.print(f"[{colour}]{level:>4}[/]  ", end="")
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def print_error(error: ServiceError | str) -> None:

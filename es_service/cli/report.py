@@ -24,7 +24,8 @@ def report(
         typer.Option(
             "--replay",
             metavar="best|I,J|none",
-            help="Replay the best centre (default), a cell's elite, or none; can be repeated.",
+            help="Replay the best centre (default, unless this executes code of a user), a cell's elite, or none; "
+            "can be repeated.",
         ),
     ] = None,
     group_by: Annotated[
@@ -61,7 +62,15 @@ def report(
     def evaluate(name: str) -> str:
         return command("evaluate", folder, *(["--best"] if name == "best" else ["--cell", name]))
 
-    for file in write_report(folder, out, best="best" in wanted, cells=cells, evaluate=evaluate, figures=figures):
+    for file in write_report(
+        folder,
+        out,
+        best="best" in wanted,
+        cells=cells,
+        trusted=replay is not None,
+        evaluate=evaluate,
+        figures=figures,
+    ):
         print(file)
 
 

@@ -91,7 +91,7 @@ def connect(address: str | None, *, gpus: bool, cpus: int) -> ModuleType:
             raise EvaluationError("this process already uses Ray; call ray.shutdown() first", ways_out=ways_out)
         try:
             if address not in (None, "auto"):
-                _knock(address)
+                knock(address)
             ray.init(**options, logging_level=logging.ERROR, log_to_driver=False)
         except SystemExit as stop:  # Ray replaces the handler of SIGTERM by one that exits with the signal's number
             ray.shutdown()
@@ -136,6 +136,26 @@ def disconnect(ray: ModuleType, *, forget: bool = False) -> None:
                 latest.unlink()
 
 
+def address_here(address: str) -> str:
+    """HOST:PORT of a cluster that a process on this host may join; "auto" is resolved as Ray resolves it.
+
+    Raises:
+        EvaluationError: Ray is not installed, or runs on no process of this host. There, `ray.init` would wait for a
+            minute, and then say only that it failed.
+    """
+    with signal_handlers_kept(), environment_kept(SETTINGS):
+        try:
+            from ray._private import services
+        except ImportError as error:
+            raise EvaluationError(f"Ray cannot be imported ({error}); install the package `ray`") from error
+        if not services.find_node_ids():
+            raise EvaluationError(
+                "no node of Ray runs on this host. Do this on a machine of the cluster, or start Ray "
+                "here first, with the address of its head"
+            )
+        return services.canonicalize_bootstrap_address("auto") or address if address == "auto" else address
+
+
 def nodes_of_cluster(address: str) -> list[int]:
     """Cores of each node of a cluster, which is joined for this question only. Raises EvaluationError as `connect`."""
     ray = connect(address, gpus=False, cpus=1)
@@ -143,6 +163,14 @@ def nodes_of_cluster(address: str) -> list[int]:
         return cores_of_nodes(ray)
     finally:
         disconnect(ray)
+
+
+def knock(address: str) -> None:
+    """Raise ValueError if the address is not HOST:PORT, and OSError if nothing listens there."""
+    host, colon, port = address.rpartition(":")
+    if not colon or not port.isdigit():
+        raise ValueError(f"{address!r} is neither HOST:PORT nor auto")
+    socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
 
 
 class Watch:
@@ -194,11 +222,3 @@ def _session_folder(ray: ModuleType) -> Path | None:
 def _let_print(ray: ModuleType, allowed: bool) -> None:
     """Set whether Ray may print to our stdout. It prints a long text for each lost worker, which is reported anyway."""
     ray._private.worker._worker_logs_enabled = allowed
-
-
-def _knock(address: str) -> None:
-    """Raise ValueError if the address is not HOST:PORT, and OSError if nothing listens there."""
-    host, colon, port = address.rpartition(":")
-    if not colon or not port.isdigit():
-        raise ValueError(f"{address!r} is neither HOST:PORT nor auto")
-    socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()

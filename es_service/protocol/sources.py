@@ -39,7 +39,7 @@ def worker_sources(environment: str) -> dict[str, str]:
     Args:
         environment: the value of `task.environment`.
     """
-    return _package_sources(*WORKERS) | (_module_sources(environment) if _is_own(environment) else {})
+    return _package_sources(*WORKERS) | (_module_sources(environment) if is_own(environment) else {})
 
 
 def driver_sources(algorithm: str) -> dict[str, str]:
@@ -48,7 +48,7 @@ def driver_sources(algorithm: str) -> dict[str, str]:
     Args:
         algorithm: the value of `search.algorithm`.
     """
-    return _package_sources(*DRIVER) | (_imported_sources(algorithm) if _is_own(algorithm) else {})
+    return _package_sources(*DRIVER) | (_imported_sources(algorithm) if is_own(algorithm) else {})
 
 
 def other_files(ours: Sources, theirs: Sources) -> list[str]:
@@ -77,7 +77,7 @@ def why_refused(expected: Sources, environment: str) -> str:
     )
 
 
-def _is_own(name: str) -> bool:
+def is_own(name: str) -> bool:
     """Whether a task or an algorithm is the user's, `package.module:name`."""
     return ":" in name and not name.startswith("brax:")
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from es_service.errors import ServiceError
 from es_service.protocol.recordings import Recordings
+from es_service.protocol.sources import is_own
 from es_service.report import floor
 from es_service.report.data import RunData
 from es_service.report.facts import number
@@ -28,24 +29,28 @@ PLAIN_STEP_S = 0.05
 """Seconds of a step in the replay of a task that has no time of its own."""
 
 
-def replay_section(data: RunData, *, best: bool, cells: Sequence[Sequence[int]]) -> Mapping[str, Any]:
+def replay_section(data: RunData, *, best: bool, cells: Sequence[Sequence[int]], trusted: bool) -> Mapping[str, Any]:
     """The section of the page, the data of its script, and the libraries that it needs.
 
     A task that cannot be run on this machine, such as a user's task whose package is missing, has a section that says
     so. Errors about cells are raised: NotInRunError.
+
+    Args:
+        trusted: whether code that the config of the run names may be executed, without which such a run has no replay.
     """
     run = data.standing.run
     for place in cells:
         run.cell(place)
+    names = (run.present_config["task"]["environment"], run.present_config["search"]["algorithm"])
+    if not trusted and (code := [name for name in names if is_own(name)]):
+        return _no_replay(
+            f"A replay would execute {' and '.join(code)}, which the config of this run names. If you trust its "
+            "author, ask for the replay by its name: best, or a cell."
+        )
     try:
         replays, found = record(run, best=best, cells=cells)
     except ServiceError as error:
-        text = f"No episode could be recorded on this machine: {error.sentence}"
-        return {
-            "section": section("Replay", tag("p", text, class_="problem"), id_="replay"),
-            "scripts": {},
-            "libraries": [],
-        }
+        return _no_replay(f"No episode could be recorded on this machine: {error.sentence}")
     solid = bool(found.shapes) and all(one.recording.poses_T_L_7 is not None for one in replays)
     scripts = {"replay": _solid(data, replays, found) if solid else _flat(data, replays)}
     libraries = [asset("three.bundle.js")] if solid else []
@@ -53,6 +58,14 @@ def replay_section(data: RunData, *, best: bool, cells: Sequence[Sequence[int]])
         "section": _section(data, replays, solid=solid),
         "scripts": scripts,
         "libraries": [*libraries, asset("replay.js")],
+    }
+
+
+def _no_replay(text: str) -> Mapping[str, Any]:
+    return {
+        "section": section("Replay", tag("p", text, class_="problem"), id_="replay"),
+        "scripts": {},
+        "libraries": [],
     }
 
 

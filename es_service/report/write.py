@@ -34,6 +34,7 @@ def write_report(
     *,
     best: bool = True,
     cells: Sequence[Sequence[int]] = (),
+    trusted: bool = False,
     evaluate: Evaluate | None = None,
     figures: AnyPath | None = None,
 ) -> list[Path]:
@@ -43,6 +44,7 @@ def write_report(
         out: file to write; None: `report.html` in the run's folder.
         best: whether to record an episode of the best centre for a replay, which takes seconds.
         cells: places of at most eight cells whose elites are to be replayed, too.
+        trusted: whether a replay may execute code that the config of the run names, a task or a search of a user.
         evaluate: what evaluates a policy, as text; None: the Python call.
         figures: folder to write figures into; None: none are written.
 
@@ -62,7 +64,7 @@ def write_report(
         empty_figure()  # a missing matplotlib is reported before episodes are recorded
     data = read_run(folder)
     found = bool(data.history["generation"].size) and (best or bool(cells))
-    replays = replay_section(data, best=best, cells=cells) if found else None
+    replays = replay_section(data, best=best, cells=cells, trusted=trusted) if found else None
     page = write_page(run_page(data, evaluate or python_call(folder), replays), Path(out or folder / REPORT))
     return [page, *(write_figures([data], Path(figures)) if figures is not None else [])]
 

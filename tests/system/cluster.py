@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
@@ -185,6 +186,9 @@ class Machines(Hosts):
 class Cluster(Hosts):
     """Nodes by name; the first is the head, with the dashboard and no CPU for workers. Use as a context manager."""
 
+    settings: Mapping[str, str] = RAY_SETTINGS
+    """Environment variables of every process."""
+
     @property
     def address(self) -> str:
         """Where a driver joins."""
@@ -194,15 +198,15 @@ class Cluster(Hosts):
         """Start the head."""
         self.start("head", 0)
 
-    def start(self, node: str, cpus: int, **environment: str) -> None:
-        """Start a node, and wait for it."""
+    def start(self, node: str, cpus: int, setup: str = "true", **environment: str) -> None:
+        """Start a node after a line of shell, and wait for it."""
         number = len(self.nodes)
         role = (
             ["--head", f"--port={PORT}", "--dashboard-host=127.0.0.1"] if number == 0 else [f"--address={self.address}"]
         )
         ray = [Path(sys.executable).parent / "ray", "start", "--block", f"--node-ip-address={self.ip(number)}"]
         ray += [f"--num-cpus={cpus}", "--object-store-memory=100000000", "--disable-usage-stats", *role]
-        self.add(node, *ray, **environment)
+        self.add(node, *ray, setup=setup, **environment)
         self._wait_until_joined(node)
 
     def worker(self, node: str) -> int:
@@ -216,7 +220,7 @@ class Cluster(Hosts):
             time.sleep(0.1)
 
     def _environment(self, node: str) -> dict[str, str]:
-        return super()._environment(node) | RAY_SETTINGS
+        return {**super()._environment(node), **self.settings}
 
 
 def children_of(pid: int) -> list[int]:

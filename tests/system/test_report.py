@@ -132,7 +132,8 @@ SLALOM = "tests.examples.ant_slalom:AntSlalom"
 @pytest.mark.parametrize("name", ["ant_maze", "ant_trap", "brax:hopper", SLALOM])
 def test_bodies_are_replayed_in_three_dimensions(page, tmp_path, name):
     environment = {"PYTHONPATH": str(ROOT)}
-    page.open(replayed(tmp_path / "run", {"map.enabled": False, "search.algorithm": "es"}, TASKS[name], **environment))
+    settings = {"map.enabled": False, "search.algorithm": "es"}
+    page.open(replayed(tmp_path / "run", settings, TASKS[name], "--replay", "best", **environment))
     page.until("Number(document.getElementById('stage').dataset.triangles) > 500")
     if not page.value("document.getElementById('follow').checked"):
         page.click("#follow")
@@ -161,8 +162,12 @@ def test_without_webgl_the_path_is_shown_from_above(tmp_path):
 
 def test_a_task_that_is_gone_is_reported_without_a_replay(page, tmp_path):
     gone = replace(SHIPPED["point_maze"], name="no_such_package:Task")
-    report = replayed(tmp_path / "run", {}, gone)
-    page.open(report)
+    page.open(replayed(tmp_path / "run", {}, gone))
+    assert "A replay would execute no_such_package:Task, which the config of this run names" in page.text("#replay")
+    (tmp_path / "run/report.html").unlink()
+    code, printed = es("report", tmp_path / "run", "--replay", "best")
+    assert code == 0, printed
+    page.open(tmp_path / "run/report.html")
     assert "No episode could be recorded on this machine" in page.text("#replay")
     assert "no_such_package" in page.text("#replay")
 
