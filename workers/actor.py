@@ -13,15 +13,11 @@ from typing import TYPE_CHECKING
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import Work, WorkerPlace
 from es_service.protocol.process_environment import worker_environment
-from es_service.protocol.sources import why_refused
+from es_service.protocol.sources import OtherCodeError, why_refused
 from workers.xla_cache import xla_cache_settings
 
 if TYPE_CHECKING:  # it imports JAX, whose settings are made here
     from workers.compilable import Compilable
-
-
-class OtherCodeError(Exception):
-    """The driver's code is not that of this host; the message names the host and the files."""
 
 
 class WorkerActor:
