@@ -36,7 +36,7 @@ def training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
 def evaluation_result(episodes: Episodes) -> EpisodesResult:
     """Results of each evaluation episode [E] and the trace of the first."""
     result = _episodes_result(episodes)
-    return replace(result, trace_T_B=np.array(episodes.trace_T_B[0]))
+    return replace(result, trace_T_B=np.asarray(episodes.trace_T_B)[0].copy())
 
 
 def policies_result(episodes: Episodes, traced_L: Any) -> EpisodesResult:

@@ -6,6 +6,7 @@ A worker has no state that a restart would lose: every result is a pure function
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import accumulate
 from typing import Any, NamedTuple, TypeVar
 
@@ -60,31 +61,30 @@ def make_worker(spec: WorkerSpec) -> Compilable:
     """
     kinds = _kinds(spec)
 
-    def compile_for(work: Sequence[Work]) -> None:
-        for group in _groups(work, together=spec.rollout == "simd"):
-            kind = kinds[type(group[0][1])]
-            try:
-                kind.function.compile(*kind.arguments(group))
-            except BaseException as error:
-                error.add_note(f"raised while compiling for {chunk_name(group[0][1])}")
-                raise
+    groups = partial(_groups, together=spec.rollout == "simd")
 
-    def run_group(work: Sequence[Work]) -> list[ChunkResult]:
-        kind = kinds[type(work[0][1])]
+    def compile_group(kind: _Kind, work: Sequence[Work]) -> list[ChunkResult]:
+        kind.function.compile(*kind.arguments(work))
+        return []
+
+    def run_group(kind: _Kind, work: Sequence[Work]) -> list[ChunkResult]:
+        return kind.results(work, kind.function(*kind.arguments(work)))
+
+    def named(
+        function: Callable[[_Kind, Sequence[Work]], list[ChunkResult]], work: Sequence[Work]
+    ) -> list[ChunkResult]:
         try:
-            return kind.results(work, kind.function(*kind.arguments(work)))
+            return function(kinds[type(work[0][1])], work)
         except BaseException as error:
             if len(work) == 1:
                 error.add_note(f"raised in {chunk_name(work[0][1])}")
                 raise
-        return [result for one in work for result in run_group([one])]  # to find the one that raises
+        return [result for one in work for result in named(function, [one])]  # to find the one that raises
 
     def run(work: Sequence[Work]) -> list[ChunkResult]:
-        groups = _groups(work, together=spec.rollout == "simd")
-        results = [result for group in groups for result in run_group(group)]
-        return with_neighbours_added(work, results)
+        return with_neighbours_added(work, [result for group in groups(work) for result in named(run_group, group)])
 
-    return Compilable(run, compile_for)
+    return Compilable(run, lambda work: [named(compile_group, group) for group in groups(work)])
 
 
 def _kinds(spec: WorkerSpec) -> dict[type[Chunk], _Kind]:
