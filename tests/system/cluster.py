@@ -194,15 +194,15 @@ class Cluster(Hosts):
         """Start the head."""
         self.start("head", 0)
 
-    def start(self, node: str, cpus: int, **environment: str) -> None:
-        """Start a node, and wait for it."""
+    def start(self, node: str, cpus: int, setup: str = "true", **environment: str) -> None:
+        """Start a node after a line of shell, and wait for it."""
         number = len(self.nodes)
         role = (
             ["--head", f"--port={PORT}", "--dashboard-host=127.0.0.1"] if number == 0 else [f"--address={self.address}"]
         )
         ray = [Path(sys.executable).parent / "ray", "start", "--block", f"--node-ip-address={self.ip(number)}"]
         ray += [f"--num-cpus={cpus}", "--object-store-memory=100000000", "--disable-usage-stats", *role]
-        self.add(node, *ray, **environment)
+        self.add(node, *ray, setup=setup, **environment)
         self._wait_until_joined(node)
 
     def worker(self, node: str) -> int:
