@@ -58,6 +58,7 @@ if __name__ == "__main__":
     from workers.cores import make_worker_with_cores
 
     run = make_worker_with_cores(spec(rollout="xla", episode_steps=30), 2)
+    run.compile(work())  # in each child
     results = run(work())
     if len(sys.argv) > 1:
         import multiprocessing
