@@ -22,14 +22,17 @@ def read_dispatch_log(folder: Path) -> list[dict[str, Any]]:
 def check_dispatch(folder: Path) -> dict[str, int]:
     """Assert that each chunk was delivered once, by a worker that was there and had it, and generations are contiguous.
 
+    A worker compiles once for each kind of chunks, when it has an item of this kind.
+
     Returns counts: sessions, generations committed, items delivered, chunks handed out again after a fault, chunks sent
-    a second time because a worker was late, workers lost.
+    a second time because a worker was late, workers lost, compilations.
     """
     entries = read_dispatch_log(folder)
     assert entries[0]["is"] == "Session"
-    counts = dict.fromkeys(("sessions", "generations", "delivered", "repeated", "copied", "lost"), 0)
+    counts = dict.fromkeys(("sessions", "generations", "delivered", "repeated", "copied", "lost", "compiled"), 0)
     newest = None
     up: set[int] = set()
+    compiled: set[tuple[int, str]] = set()
     holders: dict[tuple, set[int]] = {}
     waiting: set[tuple] = set()
     answered: tuple | None = None
@@ -41,7 +44,7 @@ def check_dispatch(folder: Path) -> dict[str, int]:
                 if counts["sessions"]:  # a kill may come between a commit and its line here
                     assert entry["after_generation"] in (newest, 0 if newest is None else newest + 1)
                 newest = entry["after_generation"]
-                up, holders, waiting = set(), {}, set()
+                up, compiled, holders, waiting = set(), set(), {}, set()
                 counts["sessions"] += 1
             case "Submit":
                 assert not waiting, f"{waiting} were never delivered"
@@ -61,6 +64,12 @@ def check_dispatch(folder: Path) -> dict[str, int]:
                     assert len(holders[item_id]) == 1, "of an item that one other worker has"
                 counts["copied" if entry["copy"] else "repeated"] += item_id[-1] if item_id in holders else 0
                 holders.setdefault(item_id, set()).add(worker)
+            case "Compiled" if worker in up:
+                assert (worker, entry["kind"]) not in compiled, "compiled twice"
+                assert any(worker in has and item[2] == entry["kind"] for item, has in holders.items())
+                assert entry["seconds"] >= 0.0
+                compiled.add((worker, entry["kind"]))
+                counts["compiled"] += 1
             case "Result":
                 answered = item_id if worker in up and worker in holders.get(item_id, ()) else None
             case "Deliver":

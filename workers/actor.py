@@ -8,17 +8,16 @@ from __future__ import annotations
 import os
 import pickle
 import socket
-from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from es_service.protocol.machine import platform_info, platform_text
-from es_service.protocol.messages import ChunkResult, Work, WorkerPlace
+from es_service.protocol.messages import Work, WorkerPlace
 from es_service.protocol.process_environment import worker_environment
-from es_service.protocol.sources import why_refused
+from es_service.protocol.sources import OtherCodeError, why_refused
 from workers.xla_cache import xla_cache_settings
 
-
-class OtherCodeError(Exception):
-    """The driver's code is not that of this host; the message names the host and the files."""
+if TYPE_CHECKING:  # it imports JAX, whose settings are made here
+    from workers.compilable import Compilable
 
 
 class WorkerActor:
@@ -34,7 +33,7 @@ class WorkerActor:
             cores: number of cores that it may use at a time.
         """
         self._spec, self._index, self._gpus, self._cores = spec, index, gpus, cores
-        self._run_chunks: Callable[[Sequence[Work]], list[ChunkResult]] | None = None
+        self._run_chunks: Compilable | None = None
 
     def __repr__(self) -> str:
         return f"worker-{self._index}@{socket.gethostname()}"
@@ -67,6 +66,14 @@ class WorkerActor:
 
         return platform_text(platform_info() | {"device": jax.devices()[0].device_kind})
 
+    def compile(self, chunks: bytes, *subjects: bytes) -> float:
+        """Compile for chunks without running them; returns the seconds that it took. The arguments are those of `run`.
+
+        The engine calls this before the first call of `run` for each kind of chunk.
+        """
+        assert self._run_chunks is not None, "compile was called before build"
+        return self._run_chunks.seconds_to_compile(_unpacked(chunks, subjects))
+
     def run(self, chunks: bytes, *subjects: bytes) -> bytes:
         """Run chunks; returns the pickled results.
 
@@ -75,6 +82,10 @@ class WorkerActor:
             subjects: each one pickled.
         """
         assert self._run_chunks is not None, "run was called before build"
-        known = [pickle.loads(subject) for subject in subjects]
-        work = [(known[index], chunk) for index, chunk in pickle.loads(chunks)]
-        return pickle.dumps(self._run_chunks(work), pickle.HIGHEST_PROTOCOL)
+        return pickle.dumps(self._run_chunks(_unpacked(chunks, subjects)), pickle.HIGHEST_PROTOCOL)
+
+
+def _unpacked(chunks: bytes, subjects: tuple[bytes, ...]) -> list[Work]:
+    """The chunks of a call with their subjects."""
+    known = [pickle.loads(subject) for subject in subjects]
+    return [(known[index], chunk) for index, chunk in pickle.loads(chunks)]

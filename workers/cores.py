@@ -13,22 +13,32 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from es_service.protocol.gradient_tree import with_neighbours_added
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec
 from es_service.protocol.parent import end_with
+from workers.compilable import Compilable
 from workers.worker import make_worker
 
 PARTS_PER_CORE = 2
 """Parts of a work item for each core, so that a core that finishes early takes over a part of another one."""
 AnyWork = TypeVar("AnyWork")
-RunChunks = Callable[[Sequence[Work]], list[ChunkResult]]
-_run_in_child: RunChunks | None = None
-"""Function of a child process, which `_begin_child` sets."""
 
 
-def make_worker_with_cores(spec: WorkerSpec, cores: int) -> RunChunks:
+class _Child(NamedTuple):
+    """What a child process has."""
+
+    worker: Compilable
+    barrier: Any
+    """Barrier of all children of the worker."""
+
+
+_child: _Child | None = None
+"""Set in a child process, by `_begin_child`."""
+
+
+def make_worker_with_cores(spec: WorkerSpec, cores: int) -> Compilable:
     """`make_worker` for a worker that may use several cores at a time.
 
     The environment must already allow each JAX one thread only. If a child process ends, so does this process, since
@@ -37,25 +47,33 @@ def make_worker_with_cores(spec: WorkerSpec, cores: int) -> RunChunks:
     if cores == 1:
         return make_worker(spec)
     if spec.rollout == "simd":
-        return divided(ThreadPoolExecutor(cores), make_worker(spec), cores)
+        worker, pool = make_worker(spec), ThreadPoolExecutor(cores)
+        return Compilable(lambda work: _divided(pool, worker.run, work, cores), worker.compile)
     context = get_context("spawn")  # a forked JAX would not work
-    pool = ProcessPoolExecutor(cores, context, _begin_child, (spec, os.getpid()))
-    return divided(pool, _run_child, cores)
+    given = (spec, os.getpid(), context.Barrier(cores))
+    pool = ProcessPoolExecutor(cores, context, _begin_child, given)
+    _together(pool, _meet, [()] * cores)  # from now on there is a child for each core
+    return Compilable(
+        lambda work: _divided(pool, _run_child, work, cores),
+        lambda work: _together(pool, _compile_in_child, [(work,)] * cores),
+    )
 
 
-def divided(pool: Executor, run: RunChunks, cores: int) -> RunChunks:
-    """Function that runs the parts of a work item side by side."""
+def _divided(pool: Executor, run: Callable[[Any], Any], work: Sequence[Work], cores: int) -> list[ChunkResult]:
+    """Run the parts of a work item side by side."""
+    results = _together(pool, run, [(part,) for part in parts(work, cores)])
+    return with_neighbours_added(work, [result for part in results for result in part])
 
-    def run_parts(work: Sequence[Work]) -> list[ChunkResult]:
-        try:
-            futures = [pool.submit(run, part) for part in parts(work, cores)]
-            wait(futures)  # also if one has failed, or the others would compete with the next work item
-            return with_neighbours_added(work, [result for future in futures for result in future.result()])
-        except BrokenProcessPool as error:
-            print(f"a child process of this worker has ended: {error}", file=sys.stderr, flush=True)
-            os._exit(1)
 
-    return run_parts
+def _together(pool: Executor, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+    """Results of calls that run side by side, in their order."""
+    try:
+        futures = [pool.submit(function, *given) for given in arguments]
+        wait(futures)  # also if one has failed, or the others would compete with the next work item
+        return [future.result() for future in futures]
+    except BrokenProcessPool as error:
+        print(f"a child process of this worker has ended: {error}", file=sys.stderr, flush=True)
+        os._exit(1)
 
 
 def parts(work: Sequence[AnyWork], cores: int) -> list[Sequence[AnyWork]]:
@@ -68,13 +86,27 @@ def parts(work: Sequence[AnyWork], cores: int) -> list[Sequence[AnyWork]]:
     return [work[start:end] for start, end in zip([0, *ends], ends, strict=False)]
 
 
-def _begin_child(spec: WorkerSpec, parent: int) -> None:
+def _begin_child(spec: WorkerSpec, parent: int, barrier: Any) -> None:
     """Prepare a child process, which ends with its parent."""
-    global _run_in_child
+    global _child
     end_with(parent)
-    _run_in_child = make_worker(spec)
+    _child = _Child(make_worker(spec), barrier)
+
+
+def _meet() -> None:
+    """Wait for the other children, so that each runs one of as many calls as there are children."""
+    assert _child is not None, "the pool initialises each child"
+    _child.barrier.wait()
+
+
+def _compile_in_child(work: Sequence[Work]) -> None:
+    assert _child is not None, "the pool initialises each child"
+    try:
+        _child.worker.compile(work)
+    finally:
+        _meet()
 
 
 def _run_child(work: Sequence[Work]) -> list[ChunkResult]:
-    assert _run_in_child is not None, "the pool initialises each child"
-    return _run_in_child(work)
+    assert _child is not None, "the pool initialises each child"
+    return _child.worker(work)

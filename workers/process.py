@@ -11,15 +11,17 @@ import socket
 import sys
 import threading
 import traceback
-from collections.abc import Callable
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from es_service.protocol.messages import Subject, forget_oldest
 from es_service.protocol.parent import end_with
 from es_service.protocol.sources import why_refused
 from es_service.protocol.wire import framed, receive
 from workers.xla_cache import xla_cache_settings
+
+if TYPE_CHECKING:  # it imports JAX, whose settings are made here
+    from workers.compilable import Compilable
 
 
 def main(descriptor: int, parent: int) -> None:
@@ -29,6 +31,7 @@ def main(descriptor: int, parent: int) -> None:
     worker's socket. A worker receives ("subject", number, Subject) and ("chunks", item, attempt, [(number, Chunk)]);
     `item` names their work item, and `number` the subject of each. It sends ("broken", text), or
     ("up",) and then for each work item ("results", item, attempt, [ChunkResult]) or ("failure", item, attempt, text).
+    Before it computes the first work item of a kind, it compiles for it and sends ("compiled", kind, seconds).
     """
     end_with(parent)
     with socket.socket(fileno=descriptor) as control:
@@ -55,7 +58,7 @@ def _descriptor(control: socket.socket) -> int | None:
     return descriptors[0] if descriptors else None
 
 
-def _make_run_chunks(spec: Any) -> Callable[..., Any] | str:
+def _make_run_chunks(spec: Any) -> Compilable | str:
     """Function that runs chunks, or the reason why there is none: other code, or the traceback of an error."""
     if problem := why_refused(spec.sources, spec.environment):
         return problem
@@ -68,7 +71,7 @@ def _make_run_chunks(spec: Any) -> Callable[..., Any] | str:
         return traceback.format_exc()
 
 
-def _work(descriptor: int, run_chunks: Callable[..., Any] | str) -> None:
+def _work(descriptor: int, run_chunks: Compilable | str) -> None:
     """Run one worker until the parent closes its end. After any other end, the parent sees that and the reason."""
     with socket.socket(fileno=descriptor) as parent:
         try:
@@ -79,13 +82,14 @@ def _work(descriptor: int, run_chunks: Callable[..., Any] | str) -> None:
             traceback.print_exc()
 
 
-def _serve(parent: socket.socket, run_chunks: Callable[..., Any] | str) -> None:
+def _serve(parent: socket.socket, run_chunks: Compilable | str) -> None:
     """Receive chunks and send their results; does not return unless the worker is broken."""
     if isinstance(run_chunks, str):
         parent.sendall(framed(("broken", run_chunks)))
         return
     parent.sendall(framed(("up",)))
     subjects: dict[int, Subject] = {}
+    compiled: set[str] = set()
     while True:
         match receive(parent):
             case ("subject", number, subject):
@@ -93,6 +97,10 @@ def _serve(parent: socket.socket, run_chunks: Callable[..., Any] | str) -> None:
             case ("chunks", item, attempt, chunks):
                 try:
                     work = [(subjects[number], chunk) for number, chunk in chunks]
+                    if (kind := type(work[0][1]).__name__) not in compiled:
+                        seconds = run_chunks.seconds_to_compile(work)
+                        compiled.add(kind)
+                        parent.sendall(framed(("compiled", kind, seconds)))
                     answer = ("results", item, attempt, run_chunks(work))
                 except BaseException:  # also sys.exit in an environment
                     answer = ("failure", item, attempt, traceback.format_exc())

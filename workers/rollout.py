@@ -18,13 +18,14 @@ from jax import lax
 from es_service.protocol.messages import SIGNS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
 from es_service.protocol.policies import POLICY_SLOTS
+from workers.compilable import Compilable, jitted
 from workers.environments import Environment
-from workers.episode import Carry, Episodes, episode_steps
+from workers.episode import Carry, episode_steps
 from workers.policy import act, split_layers
 
 
-def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
-    """Rollout of one training chunk; it is compiled at its first call.
+def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
+    """Rollout of one training chunk.
 
     Returns:
         f(centre_D, unit, mean_O, std_O, noise_keys_P_4, reset_keys_P_S_E_4, action_keys_P_S_E_4) -> Episodes with
@@ -55,36 +56,38 @@ def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Callabl
         by_block = jax.tree.map(lambda x: x.reshape(blocks, block_pairs, *x.shape[1:]), keys)
         return jax.tree.map(lambda x: x.reshape(spec.chunk_pairs, *x.shape[2:]), lax.map(block, by_block))
 
-    return jax.jit(rollout)
+    return jitted(rollout)
 
 
-def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
-    """Rollout of one evaluation chunk, with episodes of the centre without action noise; compiled at its first call.
+def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
+    """Rollout of one evaluation chunk, with episodes of the centre without action noise.
 
     Returns:
         f(centre_D, mean_O, std_O, reset_keys_E_4) -> Episodes with leading axis [E].
     """
-    return jax.jit(_make_episodes(environment, spec, training=False))
+    return jitted(_make_episodes(environment, spec, training=False))
 
 
-def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
-    """Rollout of one policy chunk, with episodes of explicit policies without action noise; compiled at its first call.
+def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
+    """Rollout of one policy chunk, with episodes of explicit policies without action noise.
 
     Returns:
         f(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L_4) -> Episodes with leading axis [L], for at most
         POLICY_SLOTS lanes. The parameters are a list of arrays [N, D]; policy_L is the row of each lane among the rows
         of all. Lanes repeat to fill the chunk, whose shape never changes.
     """
-    episodes = jax.jit(_make_episodes(environment, spec, training=False, own_weights=True))
+    episodes = jitted(_make_episodes(environment, spec, training=False, own_weights=True))
 
-    def rollout(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
-        lanes = len(policy_L)
-        lane_L = np.minimum(np.arange(POLICY_SLOTS), lanes - 1)
+    def filled(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
+        lane_L = np.minimum(np.arange(POLICY_SLOTS), len(policy_L) - 1)
         parameters_L_D = np.concatenate(parameters_G_N_D)[policy_L[lane_L]]
-        found = episodes(parameters_L_D, mean_L_O[lane_L], std_L_O[lane_L], reset_keys_L[lane_L])
-        return jax.tree.map(lambda x: np.asarray(x)[:lanes], found)
+        return parameters_L_D, mean_L_O[lane_L], std_L_O[lane_L], reset_keys_L[lane_L]
 
-    return rollout
+    def rollout(*given):
+        lanes = len(given[-1])
+        return jax.tree.map(lambda x: np.asarray(x)[:lanes], episodes(*filled(*given)))
+
+    return Compilable(rollout, lambda *given: episodes.compile(*filled(*given)))
 
 
 def make_watched_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Carry]:
@@ -109,8 +112,8 @@ def make_watched_rollout(environment: Environment, spec: WorkerSpec) -> Callable
     return jax.jit(rollout)
 
 
-def make_gradient_sum(parameters: int) -> Callable:
-    """Sum of weighted noise of one block of pairs; it is compiled at its first call.
+def make_gradient_sum(parameters: int) -> Compilable:
+    """Sum of weighted noise of one block of pairs.
 
     Returns:
         f(weights_P, noise_keys_P_4) -> sum over pairs of weight x standard normal noise, [D]. Pairs are added one by
@@ -127,7 +130,7 @@ def make_gradient_sum(parameters: int) -> Callable:
         sum_D = lax.fori_loop(0, weights_P.shape[0], add_pair, jnp.zeros(parameters, jnp.float32))
         return sum_D * np.float32(1.0 / NORMAL_STD)
 
-    return jax.jit(gradient_sum)
+    return jitted(gradient_sum)
 
 
 def _make_member_episodes(environment: Environment, spec: WorkerSpec):

@@ -6,9 +6,9 @@ A worker has no state that a restart would lose: every result is a pure function
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from functools import partial
 from itertools import accumulate
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -18,11 +18,9 @@ from es_service.protocol.messages import (
     Centre,
     Chunk,
     ChunkResult,
-    EpisodesResult,
     EvaluationChunk,
     GradientChunk,
     GradientResult,
-    Moments,
     Policies,
     PolicyChunk,
     Subject,
@@ -33,36 +31,75 @@ from es_service.protocol.messages import (
 )
 from es_service.protocol.noise import NORMAL_STD, Domain, Keys, stream_keys
 from es_service.protocol.policies import slots
+from workers.compilable import Compilable
 from workers.environments import make_environment
 from workers.episode import Episodes
+from workers.results import evaluation_result, policies_result, training_result
 
 AnyChunk = TypeVar("AnyChunk", TrainingChunk, EvaluationChunk, GradientChunk)
 POLICY_CHUNKS_TOGETHER = 8
 """Most policy chunks in one call of the kernel: a call costs little then, and the copies of the weights stay small."""
 
 
-def make_worker(spec: WorkerSpec) -> Callable[[Sequence[Work]], list[ChunkResult]]:
-    """Function from the chunks of a work item to their results; what it uses is compiled at its first call.
+class _Kind(NamedTuple):
+    """How the chunks of one kind are computed; a group of them runs together."""
+
+    function: Compilable
+    arguments: Callable[[Any], tuple[Any, ...]]
+    """Function from a group of chunks, with their subjects, to the arguments of `function`."""
+    results: Callable[[Any, Any], list[ChunkResult]]
+    """Function from the group and what `function` has computed to the results of its chunks."""
+
+
+def make_worker(spec: WorkerSpec) -> Compilable:
+    """Function from the chunks of a work item to their results; `compile` compiles what their kind uses.
 
     With simd the episodes of neighbouring chunks around one centre run in one call of the kernel, and so do those of a
     few neighbouring policy chunks, since an episode's bits do not depend on the others. With xla they might, so each
     chunk runs alone. A note on an exception names the chunk that raised it. Gradient blocks are added as far as the
     work item has the neighbours.
     """
+    kinds = _kinds(spec)
+
+    groups = partial(_groups, together=spec.rollout == "simd")
+
+    def compile_group(kind: _Kind, work: Sequence[Work]) -> list[ChunkResult]:
+        kind.function.compile(*kind.arguments(work))
+        return []
+
+    def run_group(kind: _Kind, work: Sequence[Work]) -> list[ChunkResult]:
+        return kind.results(work, kind.function(*kind.arguments(work)))
+
+    def named(
+        function: Callable[[_Kind, Sequence[Work]], list[ChunkResult]], work: Sequence[Work]
+    ) -> list[ChunkResult]:
+        try:
+            return function(kinds[type(work[0][1])], work)
+        except BaseException as error:
+            if len(work) == 1:
+                error.add_note(f"raised in {chunk_name(work[0][1])}")
+                raise
+        return [result for one in work for result in named(function, [one])]  # to find the one that raises
+
+    def run(work: Sequence[Work]) -> list[ChunkResult]:
+        return with_neighbours_added(work, [result for group in groups(work) for result in named(run_group, group)])
+
+    return Compilable(run, lambda work: [named(compile_group, group) for group in groups(work)])
+
+
+def _kinds(spec: WorkerSpec) -> dict[type[Chunk], _Kind]:
+    """How a run's chunks of each kind are computed."""
     environment = make_environment(spec.environment, spec.environment_options)
     if spec.rollout == "simd":
         from workers.simd.episodes import rollout as made_by
     else:
         from workers import rollout as made_by
-    training_rollout = made_by.make_training_rollout(environment, spec)
-    evaluation_rollout = made_by.make_evaluation_rollout(environment, spec)
-    policy_rollout = made_by.make_policy_rollout(environment, spec)
     gradient_sum = made_by.make_gradient_sum(spec.policy.parameters)
 
-    def train(work: Sequence[tuple[Centre, TrainingChunk]]) -> list[ChunkResult]:
+    def training_arguments(work: Sequence[tuple[Centre, TrainingChunk]]) -> tuple[Any, ...]:
         centre, chunks = _around_one(work)
         first, pairs_P = chunks[0], _ids(chunks, spec.chunk_pairs)
-        episodes = training_rollout(
+        return (
             centre.parameters_D,
             np.float32(centre.sigma / NORMAL_STD),
             centre.observation_mean_O,
@@ -70,76 +107,78 @@ def make_worker(spec: WorkerSpec) -> Callable[[Sequence[Work]], list[ChunkResult
             stream_keys(spec.seed, Domain.PARAMETER_NOISE, first.generation, pairs_P, *population_id(first)),
             *episode_keys(spec, first.generation, pairs_P, population_id(first)),
         )
-        return [_training_result(part, centre.observation_mean_O) for part in _split(episodes, spec.chunk_pairs)]
 
-    def evaluate(work: Sequence[tuple[Centre, EvaluationChunk]]) -> list[ChunkResult]:
+    def training_results(work: Sequence[tuple[Centre, TrainingChunk]], episodes: Episodes) -> list[ChunkResult]:
+        shift_O = work[0][0].observation_mean_O
+        return [training_result(part, shift_O) for part in _split(episodes, spec.chunk_pairs)]
+
+    def evaluation_arguments(work: Sequence[tuple[Centre, EvaluationChunk]]) -> tuple[Any, ...]:
         centre, chunks = _around_one(work)
         first, episodes_E = chunks[0], _ids(chunks, EVALUATION_EPISODES_PER_CHUNK)
-        episodes = evaluation_rollout(
+        return (
             centre.parameters_D,
             centre.observation_mean_O,
             centre.observation_std_O,
             stream_keys(spec.seed, Domain.EVALUATION_RESET, first.generation, episodes_E, *population_id(first)),
         )
-        return [_evaluation_result(part) for part in _split(episodes, EVALUATION_EPISODES_PER_CHUNK)]
 
-    def gradient(work: Sequence[tuple[Centre, GradientChunk]]) -> list[ChunkResult]:
+    def evaluation_results(work: Sequence[Work], episodes: Episodes) -> list[ChunkResult]:
+        return [evaluation_result(part) for part in _split(episodes, EVALUATION_EPISODES_PER_CHUNK)]
+
+    def gradient_arguments(work: Sequence[tuple[Centre, GradientChunk]]) -> tuple[Any, ...]:
         _, chunks = _around_one(work)
         first = chunks[0]
         pairs_C_P = _ids(chunks, spec.gradient_block_pairs).reshape(len(chunks), -1)
         keys_C_P = stream_keys(spec.seed, Domain.PARAMETER_NOISE, first.generation, pairs_C_P, *population_id(first))
-        return [
-            GradientResult(np.array(gradient_sum(chunk.weights_P, keys_P)))
-            for chunk, keys_P in zip(chunks, keys_C_P, strict=True)
-        ]
+        return [chunk.weights_P for chunk in chunks], keys_C_P
 
-    def run_policies(work: Sequence[tuple[Policies, PolicyChunk]]) -> list[ChunkResult]:
-        policies, chunk = work[0]
-        together = list({id(one): one for one, _ in work}.values())
-        ends = accumulate(len(one.parameters_N_D) for one in together)
-        first_row = dict(zip(map(id, together), [0, *ends], strict=False))
-        slots_C = [slots(*one) for one in work]
-        row_L = np.concatenate(
-            [first_row[id(one)] + policy_L for (one, _), (policy_L, _) in zip(work, slots_C, strict=True)]
-        )
-        number_L = np.concatenate([one.first + policy_L for (one, _), (policy_L, _) in zip(work, slots_C, strict=True)])
-        episode_L = np.concatenate([episode_L for _, episode_L in slots_C])
-        episodes = policy_rollout(
-            [one.parameters_N_D for one in together],
-            np.concatenate([one.observation_mean_N_O for one in together])[row_L],
-            np.concatenate([one.observation_std_N_O for one in together])[row_L],
-            row_L,
-            stream_keys(policies.seed, Domain.EVALUATION_RESET, chunk.generation, episode_L, number_L, chunk.ask),
-        )
-        results, start = [], 0
-        for (one, _), (_, episode_L) in zip(work, slots_C, strict=True):
-            part = Episodes(*(leaf[start : start + len(episode_L)] for leaf in episodes))
-            results.append(_policies_result(part, episode_L == 0 if one.traces else None))
-            start += len(episode_L)
-        return results
+    def gradient_sums(weights_C_P: Sequence[Any], keys_C_P: Any) -> list[Any]:
+        return [gradient_sum(*block) for block in zip(weights_C_P, keys_C_P, strict=True)]
 
-    functions: dict[type[Chunk], Callable[[Any], list[ChunkResult]]] = {
-        TrainingChunk: train,
-        EvaluationChunk: evaluate,
-        GradientChunk: gradient,
-        PolicyChunk: run_policies,
+    def compile_gradient_sum(weights_C_P: Sequence[Any], keys_C_P: Any) -> None:
+        gradient_sum.compile(weights_C_P[0], keys_C_P[0])
+
+    def gradient_results(work: Sequence[Work], sums_C_D: list[Any]) -> list[ChunkResult]:
+        return [GradientResult(np.array(sum_D)) for sum_D in sums_C_D]
+
+    return {
+        TrainingChunk: _Kind(made_by.make_training_rollout(environment, spec), training_arguments, training_results),
+        EvaluationChunk: _Kind(
+            made_by.make_evaluation_rollout(environment, spec), evaluation_arguments, evaluation_results
+        ),
+        GradientChunk: _Kind(Compilable(gradient_sums, compile_gradient_sum), gradient_arguments, gradient_results),
+        PolicyChunk: _Kind(made_by.make_policy_rollout(environment, spec), _policy_arguments, _policy_results),
     }
 
-    def run_group(work: Sequence[Work]) -> list[ChunkResult]:
-        try:
-            return functions[type(work[0][1])](work)
-        except BaseException as error:
-            if len(work) == 1:
-                error.add_note(f"raised in {chunk_name(work[0][1])}")
-                raise
-        return [result for one in work for result in run_group([one])]  # to find the one that raises
 
-    def run(work: Sequence[Work]) -> list[ChunkResult]:
-        groups = _groups(work, together=spec.rollout == "simd")
-        results = [result for group in groups for result in run_group(group)]
-        return with_neighbours_added(work, results)
+def _policy_arguments(work: Sequence[tuple[Policies, PolicyChunk]]) -> tuple[Any, ...]:
+    policies, chunk = work[0]
+    together = list({id(one): one for one, _ in work}.values())
+    ends = accumulate(len(one.parameters_N_D) for one in together)
+    first_row = dict(zip(map(id, together), [0, *ends], strict=False))
+    slots_C = [slots(*one) for one in work]
+    row_L = np.concatenate(
+        [first_row[id(one)] + policy_L for (one, _), (policy_L, _) in zip(work, slots_C, strict=True)]
+    )
+    number_L = np.concatenate([one.first + policy_L for (one, _), (policy_L, _) in zip(work, slots_C, strict=True)])
+    episode_L = np.concatenate([episode_L for _, episode_L in slots_C])
+    return (
+        [one.parameters_N_D for one in together],
+        np.concatenate([one.observation_mean_N_O for one in together])[row_L],
+        np.concatenate([one.observation_std_N_O for one in together])[row_L],
+        row_L,
+        stream_keys(policies.seed, Domain.EVALUATION_RESET, chunk.generation, episode_L, number_L, chunk.ask),
+    )
 
-    return run
+
+def _policy_results(work: Sequence[tuple[Policies, PolicyChunk]], episodes: Episodes) -> list[ChunkResult]:
+    results, start = [], 0
+    for one, chunk in work:
+        _, episode_L = slots(one, chunk)
+        part = Episodes(*(leaf[start : start + len(episode_L)] for leaf in episodes))
+        results.append(policies_result(part, episode_L == 0 if one.traces else None))
+        start += len(episode_L)
+    return results
 
 
 def _groups(work: Sequence[Work], *, together: bool) -> list[list[Work]]:
@@ -195,68 +234,3 @@ def episode_keys(spec: WorkerSpec, generation: int, pairs_P: Any, population: tu
     episode_E = np.arange(spec.episodes_per_member)
     ids = (pairs_P[:, None, None], sign_S[None, :, None], episode_E, *population)
     return stream_keys(spec.seed, domains, generation, *ids)
-
-
-def _training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
-    """Results of a training chunk's members from their episodes [P, S, E].
-
-    They are means over the episodes, except the least goal distance, which is the minimum, and the steps, which are the
-    sum.
-    """
-    host = Episodes(*map(np.asarray, episodes))
-
-    def mean(x_P_S_E: Any) -> Any:
-        return x_P_S_E.mean(axis=2) if x_P_S_E.shape[2] > 1 else x_P_S_E[:, :, 0].copy()
-
-    distance_P_S_E = host.goal_distance
-    return EpisodesResult(
-        fitness=mean(host.fitness),
-        returns=mean(host.returns),
-        descriptor=mean(host.descriptor),
-        steps=host.steps.sum(axis=2, dtype=np.int32),
-        goal_distance=np.stack([mean(distance_P_S_E[..., 0]), distance_P_S_E[..., 1].min(axis=2)], axis=-1),
-        moments=_moments(host, shift_O),
-    )
-
-
-def _evaluation_result(episodes: Episodes) -> EpisodesResult:
-    """Results of each evaluation episode [E] and the trace of the first."""
-    result = _episodes_result(episodes)
-    return replace(result, trace_T_B=np.array(episodes.trace_T_B[0]))
-
-
-def _policies_result(episodes: Episodes, traced_L: Any) -> EpisodesResult:
-    """Results of each episode of a policy chunk [L], with the traces of those in `traced_L` unless that is None."""
-    result = _episodes_result(episodes)
-    return result if traced_L is None else replace(result, trace_T_B=np.array(episodes.trace_T_B)[traced_L])
-
-
-def _episodes_result(episodes: Episodes) -> EpisodesResult:
-    """Results of single episodes without traces; arrays are copied out of JAX's memory."""
-    host = Episodes(*map(np.array, episodes))
-    return EpisodesResult(
-        fitness=host.fitness,
-        returns=host.returns,
-        descriptor=host.descriptor,
-        steps=host.steps,
-        goal_distance=host.goal_distance,
-        moments=None,
-    )
-
-
-def _moments(host: Episodes, shift_O: Any) -> Moments:
-    """Moments of the observations of all counted steps in valid episodes.
-
-    An episode is invalid if its sums, fitness or descriptor are not finite. All of its observations are left out,
-    because they may have been arbitrarily large before.
-    """
-    size = host.shifted_sum_O.shape[-1]
-    sums, squares = (x.reshape(-1, size).astype(np.float64) for x in (host.shifted_sum_O, host.shifted_square_sum_O))
-    said = (sums, squares, host.fitness.reshape(-1, 1), host.descriptor.reshape(len(sums), -1))
-    valid = np.logical_and.reduce([np.isfinite(x).all(axis=1) for x in said])
-    count = float(host.steps.reshape(-1)[valid].sum())
-    if count == 0.0:
-        return Moments(0.0, np.zeros(size), np.zeros(size))
-    mean_O = sums[valid].sum(axis=0) / count
-    m2_O = np.maximum(squares[valid].sum(axis=0) - count * np.square(mean_O), 0.0)
-    return Moments(count, mean_O + shift_O, m2_O)

@@ -71,10 +71,14 @@ class ComputeConfig(Section):
         30.0,
         description="Shortest deadline of a chunk in seconds; slow chunks make the deadline of later chunks longer.",
     )
+    first_chunk_timeout_s: Positive = Field(
+        120.0,
+        description="Deadline in seconds of a chunk while it is not known how long chunks of its kind take, which is "
+        "until the first one is done; at least chunk_timeout_s. Compilation does not count.",
+    )
     compile_timeout_s: Positive = Field(
         120.0,
-        description="Deadline in seconds of a worker's first chunk of each kind, which includes compilation. If the "
-        "deadline of later chunks is longer, it applies to the first one too.",
+        description="Deadline in seconds for the compilation that a worker does before its first chunk of each kind.",
     )
     max_attempts: Count = Field(4, description="Attempts to compute a chunk before the run stops with its error.")
     place_timeout_s: Positive | None = Field(

@@ -31,7 +31,7 @@ from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import ChunkResult, Work, WorkItemId
 
 _LOG = logger(__name__)
-_RARE = (events.WorkerUp, events.WorkerLost, events.Failure, events.StopWorker)
+_RARE = (events.WorkerUp, events.WorkerLost, events.Compiled, events.Failure, events.StopWorker)
 """Events and commands that `logging` reports at level INFO."""
 POLL_S = 0.1
 """Longest time in seconds until a request to stop is noticed."""
@@ -51,7 +51,14 @@ class Answer:
 
 
 Message = (
-    events.Placed | events.WorkerUp | events.WorkerLost | events.Failure | events.Drain | events.SetWorkers | Answer
+    events.Placed
+    | events.WorkerUp
+    | events.WorkerLost
+    | events.Compiled
+    | events.Failure
+    | events.Drain
+    | events.SetWorkers
+    | Answer
 )
 """Messages of a transport: events of the scheduler, and answers."""
 
@@ -75,7 +82,10 @@ class Transport(Protocol):
         ...
 
     def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
-        """Send chunks and their centres to a worker that is up; it runs them after those that it was sent before."""
+        """Send chunks and their centres to a worker that is up; it runs them after those that it was sent before.
+
+        Before it runs the first chunks of a kind, it compiles for them, and `Compiled` follows.
+        """
         ...
 
     def platforms(self) -> frozenset[str]:

@@ -36,9 +36,11 @@ class Limits:
     that ran the item. It should be above `max_failures_in_a_row`, so that a single broken worker is replaced first."""
     start_deadline_s: float = 120.0
     """Longest time in which a worker must come up, counted again from when it has a place."""
+    compile_deadline_s: float = 600.0
+    """Longest time in which a worker must compile for its first item of a kind."""
     first_deadline_s: float = 600.0
-    """Longest time for a worker's first item of a kind, which includes compiling, and for any item while its usual
-    duration is not known. If the limit for later items is longer, that limit applies."""
+    """Longest time for an item while no duration of its kind is known, without the time of compiling. If
+    `min_deadline_s` is longer, that limit applies."""
     late_factor: float = 2.0
     """A worker is late when its item has taken late_factor x size x median of recent durations of its kind. At the end
     of a phase, its items are then sent to an idle worker too; with infinity, no item ever is."""
@@ -109,6 +111,18 @@ class WorkerLost:
     bystander: bool = False
     """Whether it was lost together with another worker, or before it received its work item; the item is then not
     charged with the loss."""
+    refused: bool = False
+    """Whether its host must not work for this run, and gets no other worker. This is no fault."""
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """A worker has compiled for a kind of work items, and begins to compute its first item of this kind."""
+
+    worker: int
+    kind: str
+    seconds: float
+    """How long compiling took, as the worker measured it."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +168,7 @@ class SetWorkers:
     workers: int
 
 
-Event = Submit | Placed | WorkerUp | WorkerLost | Result | Failure | Tick | Drain | SetWorkers
+Event = Submit | Placed | WorkerUp | WorkerLost | Compiled | Result | Failure | Tick | Drain | SetWorkers
 
 
 # Commands, which an engine must carry out in the order given.

@@ -23,7 +23,7 @@ from typing import IO
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.events import Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
+from es_service.dispatch.events import Compiled, Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
 from es_service.protocol.messages import Subject, Work, WorkerSpec, forget_oldest
 from es_service.protocol.process_environment import child_environment
@@ -212,6 +212,8 @@ class ChildProcesses:
                 match said:
                     case ("up",):
                         self._ready.append(WorkerUp(number))
+                    case ("compiled", kind, seconds):
+                        self._ready.append(Compiled(number, kind, seconds))
                     case ("results", item_id, attempt, results):
                         worker.unanswered -= 1
                         self._ready.append(Answer(number, item_id, attempt, results))

@@ -1,13 +1,18 @@
-"""The calls of Ray actors that have not been answered yet."""
+"""The calls of Ray actors: those that have not been answered yet, and the arguments of those that get chunks."""
 
 from __future__ import annotations
 
+import pickle
 from collections import deque
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
+from es_service.protocol.messages import Subject, Work, forget_oldest
+
+IN_CALL_BYTES = 64 * 2**10
+"""Largest size in bytes of a subject sent with every call; a larger one is stored, and fetched once per node."""
 MANY = 64
 """Number of calls above which all answers that are there are looked for at once, since Ray looks at every call."""
 
@@ -18,9 +23,11 @@ class Call:
 
     worker: int
     what: str
-    """Method that was called: place, build or run."""
+    """Method that was called: place, build, compile or run."""
     item_id: Hashable = None
     attempt: int = 0
+    kind: str = ""
+    """Kind of chunks for which it compiles."""
 
 
 class Calls:
@@ -66,8 +73,40 @@ class Calls:
         return self._ready.popleft() if ready else None
 
     def owed_first(self) -> dict[int, str]:
-        """Worker -> method of its first call: place, build or run."""
+        """Worker -> method of its first call."""
         first: dict[int, str] = {}
         for call in self._calls.values():
             first.setdefault(call.worker, call.what)
         return first
+
+
+class Arguments:
+    """Arguments of calls that get chunks. A large subject is stored once for all calls that share it."""
+
+    def __init__(self, ray: ModuleType) -> None:
+        self._ray = ray
+        self._subjects: dict[int, tuple[Subject, Any]] = {}
+        """By `id`, which the subject in the entry keeps from being reused."""
+
+    def of(self, work: Sequence[Work]) -> tuple[Any, ...]:
+        """The chunks, and their subjects without repetitions, as `WorkerActor.run` takes them."""
+        subjects: dict[int, Any] = {}
+        for subject, _ in work:
+            if id(subject) not in subjects:
+                subjects[id(subject)] = self._packed(subject)
+        index = {key: number for number, key in enumerate(subjects)}
+        chunks = pickle.dumps([(index[id(subject)], chunk) for subject, chunk in work], pickle.HIGHEST_PROTOCOL)
+        return chunks, *subjects.values()
+
+    def forget(self) -> None:
+        """Forget all subjects, so that Ray need not keep them."""
+        self._subjects.clear()
+
+    def _packed(self, subject: Subject) -> Any:
+        """The subject, pickled, or the reference under which Ray has stored that."""
+        if (known := self._subjects.get(id(subject))) is None:
+            pickled = pickle.dumps(subject, pickle.HIGHEST_PROTOCOL)
+            known = subject, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
+            self._subjects[id(subject)] = known
+            forget_oldest(self._subjects, lambda entry: entry[0].nbytes)
+        return known[1]

@@ -20,15 +20,14 @@ from typing import Any
 from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
-from es_service.dispatch.ray_calls import Call, Calls
+from es_service.dispatch.events import Compiled, Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
+from es_service.dispatch.ray_calls import Arguments, Call, Calls
 from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_faults import error_text, fault_reason
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage
-from es_service.protocol.messages import Subject, Work, WorkerPlace, WorkerSpec, forget_oldest
-
-IN_CALL_BYTES = 64 * 2**10
-"""Largest size in bytes of a subject sent with every call; a larger one is stored, and fetched once per node."""
+from es_service.dispatch.ray_refusals import Refusals
+from es_service.protocol.messages import Work, WorkerPlace, WorkerSpec
+from es_service.protocol.sources import OtherCodeError
 
 
 def ray_engine(
@@ -43,6 +42,7 @@ def ray_engine(
     most: int | None = None,
     log: Log = no_log,
     on_wait: Callable[[str], None] = lambda shortage: None,
+    on_refusal: Callable[[str], None] = lambda refusal: None,
 ) -> Engine[Actors]:
     """Engine whose workers are Ray actors, which are starting.
 
@@ -57,6 +57,7 @@ def ray_engine(
         most: use as many cores as there is room for, up to this number and also when the room changes, and ask for
             more if `cpus` is given, see `ASKED_AHEAD`; None: use the number in `limits`.
         on_wait: as in `Engine`; not called in a Ray of our own, which has room.
+        on_refusal: as in `Actors`.
 
     Raises:
         EvaluationError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
@@ -66,7 +67,7 @@ def ray_engine(
     try:
         claim, limits, growth = layout(ray, limits, cpus, gpus, most, ours=address is None)
         watch = None if address is None else Watch(ray, claim)
-        transport = Actors(ray, spec, actor, claim, watch, growth, limits.workers)
+        transport = Actors(ray, spec, actor, claim, watch, growth, limits.workers, on_refusal)
         return Engine(transport, limits, should_stop, log, (lambda shortage: None) if watch is None else on_wait)
     except BaseException:
         disconnect(ray)
@@ -85,6 +86,7 @@ class Actors:
         watch: Watch | None,
         growth: Growth | None,
         workers: int,
+        on_refusal: Callable[[str], None] = lambda refusal: None,
     ) -> None:
         """Make a transport without workers.
 
@@ -92,6 +94,7 @@ class Actors:
             watch: watch of the cluster that was joined; None in a Ray of our own, whose only node is this machine.
             growth: when the room for workers changes, `SetWorkers` follows it; None: no `SetWorkers`.
             workers: number of workers wanted at the start.
+            on_refusal: called once for each host whose code is not the driver's, with what its worker said.
         """
         self._ray = ray
         self._spec, self._claim = pickle.dumps(spec, pickle.HIGHEST_PROTOCOL), claim
@@ -99,12 +102,12 @@ class Actors:
         self._class = ray.remote(**options)(actor)
         self._watch, self._growth, self._wanted = watch, growth, workers
         self._handles: dict[int, Any] = {}
-        self._calls = Calls(ray)
+        self._calls, self._arguments = Calls(ray), Arguments(ray)
         self._places: dict[int, WorkerPlace] = {}
         self._planned: dict[int, str] = {}
         """Worker id -> node, for workers that have no place yet and are to be placed on a certain node."""
         self._platforms: set[str] = set()
-        self._drained: set[int] = set()
+        self._up, self._drained = set[int](), set[int]()
         self._has_lost = False
         self._followed: Membership | None = None
         """The state of the cluster that all workers are known to be in accord with."""
@@ -113,8 +116,9 @@ class Actors:
         self._to_ask: set[int] = set()
         """Workers that must be asked for their place again before the next chunks, because another worker was lost."""
         self._inbox: deque[Message] = deque()
-        self._subjects: dict[int, tuple[Subject, Any]] = {}
-        """By `id`, which the subject in the entry keeps from being reused."""
+        self._compiled: dict[int, set[str]] = {}
+        """Worker id -> kinds of chunks for which it was told to compile."""
+        self._refusals = Refusals(on_refusal)
 
     def places(self) -> dict[int, WorkerPlace]:
         """Worker id -> place, for the workers that have one."""
@@ -123,9 +127,9 @@ class Actors:
     def start(self, worker: int) -> None:
         """Ask Ray for an actor. It is up when it has a place and has built its functions."""
         try:
-            at = self._class.options(scheduling_strategy=self._strategy(worker))
+            at = self._class.options(**self._where(worker))
             handle = at.remote(self._spec, worker, self._claim.gpus, 1 if self._claim.gpus else self._claim.cpus)
-            self._handles[worker] = handle
+            self._handles[worker], self._compiled[worker] = handle, set()
             self._calls[handle.place.remote()] = Call(worker, "place")
             self._calls[handle.build.remote()] = Call(worker, "build")
         except self._ray.exceptions.RayError as error:
@@ -135,17 +139,17 @@ class Actors:
         """Kill an actor and ignore its unanswered calls. Returns "", since its output is in Ray's logs on its node."""
         self._has_lost = True
         self._calls.forget(worker)
-        self._places.pop(worker, None)
-        self._planned.pop(worker, None)
-        handle = self._handles.pop(worker, None)
-        self._to_ask = set(self._handles)
-        if handle is not None:
+        self._up.discard(worker)
+        for known in (self._places, self._planned, self._compiled):
+            known.pop(worker, None)
+        if (handle := self._handles.pop(worker, None)) is not None:
             with contextlib.suppress(self._ray.exceptions.RayError, ValueError):
                 self._ray.kill(handle, no_restart=True)
+        self._to_ask = set(self._handles)
         return ""
 
     def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
-        """Call the actor. A large subject is stored once for all calls that share it.
+        """Call the actor, first to compile if it has no chunks of this kind so far.
 
         The loss of an idle actor shows only when it is called. So after a loss, perhaps of a node, each other actor is
         asked for its place before its next chunks, which are charged with its loss only if it has answered that call.
@@ -153,16 +157,14 @@ class Actors:
         if worker not in self._handles:
             return  # it has just been lost when it was sent other chunks, which `receive` is going to report
         try:
-            subjects: dict[int, Any] = {}
-            for subject, _ in work:
-                if id(subject) not in subjects:
-                    subjects[id(subject)] = self._packed(subject)
-            index = {key: number for number, key in enumerate(subjects)}
-            chunks = pickle.dumps([(index[id(subject)], chunk) for subject, chunk in work], pickle.HIGHEST_PROTOCOL)
+            arguments, kind = self._arguments.of(work), type(work[0][1]).__name__
             if worker in self._to_ask:
                 self._to_ask.discard(worker)
                 self._calls[self._handles[worker].place.remote()] = Call(worker, "place")
-            ref = self._handles[worker].run.remote(chunks, *subjects.values())
+            if kind not in self._compiled[worker]:
+                self._compiled[worker].add(kind)
+                self._calls[self._handles[worker].compile.remote(*arguments)] = Call(worker, "compile", kind=kind)
+            ref = self._handles[worker].run.remote(*arguments)
         except self._ray.exceptions.RayError as error:
             self._lose(worker, fault_reason(error))
             return
@@ -177,18 +179,24 @@ class Actors:
         return tuple(worker for worker, what in self._calls.owed_first().items() if what == "place")
 
     def shortage(self) -> str:
-        """What a worker needs and the cluster has; this waits for the head node."""
-        return shortage(self._ray, self._claim, None if self._watch is None else self._watch.latest())
+        """What a worker needs and the cluster has, and which hosts refuse; this waits for the head node."""
+        nodes = None if self._watch is None else self._refusals.without(self._watch.latest())
+        return shortage(self._ray, self._claim, nodes) + (f". {self._refusals}" if self._refusals else "")
 
     def receive(self, timeout_s: float) -> Message | None:
-        """The next message. Raises EvaluationError if the cluster does not answer any more."""
+        """The next message.
+
+        Raises:
+            EvaluationError: the cluster does not answer any more; or no worker is up, and all nodes with room refuse.
+        """
         if self._watch is not None:
             self._follow(self._watch)
+        if self._refusals and not self._up:
+            self._refusals.check(None if self._watch is None else self._watch.latest())
         if self._inbox:
             return self._inbox.popleft()
         if not self._calls:
             time.sleep(timeout_s)
-            return None
         while self._calls:
             if (ref := self._calls.answered(timeout_s)) is None:
                 break
@@ -205,26 +213,22 @@ class Actors:
         forget = self._watch is None and bool(self._places) and not self._has_lost
         for worker in list(self._handles):
             self.kill(worker)
-        self._subjects.clear()
+        self._arguments.forget()
         disconnect(self._ray, forget=forget)
-
-    def _packed(self, subject: Subject) -> Any:
-        """The subject as an argument of a call: pickled, or the reference under which Ray has stored that."""
-        if (known := self._subjects.get(id(subject))) is None:
-            pickled = pickle.dumps(subject, pickle.HIGHEST_PROTOCOL)
-            known = subject, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
-            self._subjects[id(subject)] = known
-            forget_oldest(self._subjects, lambda entry: entry[0].nbytes)
-        return known[1]
 
     def _message(self, ref: Any) -> Message | None:
         call, errors = self._calls[ref], self._ray.exceptions
         try:
             value = self._ray.get(ref)
         except errors.RayTaskError as error:  # the call raised an exception, and the actor is alive
-            if call.what != "run":
+            if isinstance(error, OtherCodeError):
+                return self._refused(call.worker, str(getattr(error, "cause", error)))
+            if call.what not in ("compile", "run"):
                 return self._lost(call.worker, error_text(error))
             del self._calls[ref]
+            if call.what == "compile":  # the call of `run` behind it raises the same
+                self._compiled[call.worker].discard(call.kind)
+                return None
             return Failure(call.worker, call.item_id, call.attempt, error_text(error))
         except errors.RayError as error:
             where = self._places.get(call.worker)
@@ -232,8 +236,11 @@ class Actors:
         del self._calls[ref]
         if call.what == "run":
             return Answer(call.worker, call.item_id, call.attempt, pickle.loads(value))
+        if call.what == "compile":
+            return Compiled(call.worker, call.kind, value)
         if call.what == "build":
             self._platforms.add(value)
+            self._up.add(call.worker)
             return WorkerUp(call.worker)
         is_known = call.worker in self._places  # then it was asked again, to find out whether it is alive
         self._places[call.worker] = WorkerPlace(*value)
@@ -257,24 +264,34 @@ class Actors:
             self._nodes |= now.alive
             for worker in [worker for worker, place in self._places.items() if place.node in gone]:
                 self._lose(worker, f"{self._places[worker]}: its node died")
-        if self._growth is not None and (wanted := self._growth.wanted(now, self._wanted)) != self._wanted:
+        room = self._refusals.without(now)
+        if self._growth is not None and (wanted := self._growth.wanted(room, self._wanted)) != self._wanted:
             self._wanted = wanted
             self._inbox.append(SetWorkers(wanted))
 
-    def _strategy(self, worker: int) -> Any:
-        """Where Ray should place a worker: with several cores, on the node that is most free. If none is, the worker
-        waits for any node, and an autoscaler sees it; it does not see workers that wait for a certain node."""
+    def _where(self, worker: int) -> dict[str, Any]:
+        """Where Ray should place a worker, as options: with several cores, on the node that is most free. If none is,
+        the worker waits for any node, and an autoscaler sees it; it does not see workers that wait for a certain node.
+        """
+        if self._refusals:
+            return self._refusals.elsewhere()
         free = {} if self._watch is None or self._claim.cpus == 1 else self._watch.latest().free
         if (node := emptiest(free, self._planned.values())) is None:
-            return "SPREAD"
+            return {"scheduling_strategy": "SPREAD"}
         self._planned[worker] = node
         affinity = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
-        return affinity(node, soft=True, _spill_on_unavailable=True)
+        return {"scheduling_strategy": affinity(node, soft=True, _spill_on_unavailable=True)}
+
+    def _refused(self, worker: int, said: str) -> WorkerLost:
+        """Give the node of a worker no others, except those that wait for a place already."""
+        self._refusals.add(self._places[worker].node, said)
+        self._followed = None
+        return self._lost(worker, said, refused=True)
 
     def _lose(self, worker: int, reason: str) -> None:
         self._inbox.append(self._lost(worker, reason))
 
-    def _lost(self, worker: int, reason: str) -> WorkerLost:
-        has_begun = self._calls.owed_first().get(worker) == "run"
+    def _lost(self, worker: int, reason: str, *, refused: bool = False) -> WorkerLost:
+        has_begun = self._calls.owed_first().get(worker) in ("compile", "run")
         self.kill(worker)
-        return WorkerLost(worker, reason, bystander=not has_begun)
+        return WorkerLost(worker, reason, bystander=not has_begun, refused=refused)

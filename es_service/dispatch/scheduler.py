@@ -15,13 +15,13 @@ Rules:
 * Only the item that a worker was running is charged with the loss of the worker. An item that waited behind it keeps
   its attempts, and so does an item sent to a worker that was gone already, if the transport reports this. Thus the loss
   of a machine with many workers is one fault, however many of them are tried before all are known to be gone.
-* The loss of a draining worker is no fault, nor is a missing place: a worker that gets none in time is replaced,
-  because it may have failed before it could report its place, and does not count as lost.
+* The loss of a draining worker is no fault, nor is a refusal, nor a missing place: a worker that gets none in time is
+  replaced, because it may have failed before it could report its place, and does not count as lost.
 * Workers that are lost before they come up count as a failed attempt to start workers. They count as another failed
   attempt only if they were started after the first of them was lost.
 
-assignment.py decides which worker gets which item, and sets the deadlines of items. stragglers.py decides which items
-are sent a second time. scheduler_changes.py keeps the containers of the state consistent.
+assignment.py decides which worker gets which item, and deadlines.py how long it may take. stragglers.py decides which
+items are sent a second time. scheduler_changes.py keeps the containers of the state consistent.
 
 Cost: a step copies the containers of the state, whose copies are cheap (cheap_copies.py), and looks only at the workers
 and items that its event concerns and at those that it stops or assigns. An event takes 20 to 29 microseconds with 10 to
@@ -34,10 +34,12 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable
 
-from es_service.dispatch.assignment import add_duration, assign, begin_first_slot
+from es_service.dispatch.assignment import assign
 from es_service.dispatch.cheap_copies import Sorted, Table
+from es_service.dispatch.deadlines import add_duration, begin_first_slot, missed_deadline, note_compiled, plain
 from es_service.dispatch.events import (
     Command,
+    Compiled,
     Deliver,
     Drain,
     Event,
@@ -99,8 +101,11 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
             if pop_worker(s, s.starting, worker) is not None:
                 put_worker(s, s.up, worker, Worker(s.next_rank))
                 s = s._replace(start_failures=0, next_rank=s.next_rank + 1)
-        case WorkerLost(worker, reason, bystander):
-            s = _lose(s, out, worker, reason, now, fault=worker not in s.draining, charge=not bystander)
+        case WorkerLost(worker, reason, bystander, refused):
+            fault = not refused and worker not in s.draining
+            s = _lose(s, out, worker, reason, now, fault=fault, charge=not bystander)
+        case Compiled():
+            note_compiled(s, event, now)
         case Failure():
             s = _failure(s, out, event, now)
         case Tick(silent):
@@ -139,15 +144,13 @@ def _result(
     index = find_slot(record, item_id, attempt)
     if index is not None:
         item = record.slots[index].item
-        warm, pace = record.warm, record.pace
+        pace = record.pace
         # The duration is not known of an answer out of order, nor of a superseded one, which may have been read late.
         if index == 0 and delivered:
             pace = IN_TIME if record.late_s > -math.inf else LATE
-            if item.kind in warm:  # else it may include compiling
+            if item.kind in record.warm:  # else it may include compiling
                 add_duration(s, item.kind, (now - record.started_s) / item.size)
-        if index == 0 and item.kind not in warm:
-            warm = warm | {item.kind}
-        record = record._replace(slots=without(record.slots, index), warm=warm, pace=pace, failures_in_a_row=0)
+        record = record._replace(slots=without(record.slots, index), pace=pace, failures_in_a_row=0)
         _close_slot(s, out, worker, record, index, now)
     return s
 
@@ -249,32 +252,17 @@ def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int
     """Stop every worker whose deadline has passed; the run fails if no worker was up for too long."""
     for worker in late_workers(s, now):
         if s.failed is None:
-            reason = _missed_deadline(s, worker)
+            reason = missed_deadline(s, worker)
             out.append(StopWorker(worker, reason))
             is_silent = worker in silent
             has_no_place = is_silent and worker in s.starting
             s = _lose(s, out, worker, reason, now, fault=not has_no_place, charge=not is_silent)
     name, limit_s = down_limit(s)
     if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + limit_s:
-        for_s = f"for {_plain(limit_s)} s ({s.limits.name_of(name)})"
+        for_s = f"for {plain(limit_s)} s ({s.limits.name_of(name)})"
         text = f"was up {for_s} while {len(s.items)} work items waited" if s.next_rank else f"got a place {for_s}"
         return _fail(s, out, f"no worker {text}; last loss: {s.last_loss}")
     return s
-
-
-def _missed_deadline(s: SchedulerState, worker: int) -> str:
-    """Text that says what a worker has not done in time."""
-    record = s.up.get(worker) or s.draining.get(worker)
-    if record is None:
-        limit_s = s.limits.start_deadline_s
-        return f"did not come up within {_plain(limit_s)} s ({s.limits.name_of('start_deadline_s')})"
-    limit_s, name = record.deadline_s - record.started_s, s.limits.name_of(record.limit)
-    return f"no answer to work item {record.slots[0].item.id} within {_plain(limit_s)} s ({name})"
-
-
-def _plain(seconds: float) -> str:
-    """A number of seconds with at most three significant digits, or as a whole number from 100 on; no exponent."""
-    return f"{seconds:.0f}" if seconds >= 100.0 else f"{seconds:.3g}"
 
 
 def _drain(s: SchedulerState, out: list[Command], worker: int) -> SchedulerState:

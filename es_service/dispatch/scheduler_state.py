@@ -49,9 +49,9 @@ class Worker(NamedTuple):
     slots: tuple[Slot, ...] = ()
     """Work items that it has not answered yet, in the order in which they were sent; it runs the first."""
     started_s: float = 0.0
-    """Time at which it began the first slot."""
+    """Time at which it began the first slot, or ended compiling for it."""
     deadline_s: float = math.inf
-    """Time by which it must come up, or answer the first slot."""
+    """Time by which it must come up, or have compiled for the first slot, or answer it."""
     late_s: float = math.inf
     """Time from which it is late with the first slot; infinity if the usual duration is not known, and -infinity once
     it is known to be late."""
@@ -61,7 +61,7 @@ class Worker(NamedTuple):
     limit: str = ""
     """Field of `Limits` that determines the deadline for the first slot."""
     warm: frozenset[str] = frozenset()
-    """Kinds of which it has finished a work item, so that it need not compile for them again."""
+    """Kinds for which it has compiled."""
     failures_in_a_row: int = 0
     """Consecutive work items that raised an exception."""
     placed: bool = False
@@ -93,7 +93,7 @@ class SchedulerState(NamedTuple):
     late: Sorted[tuple[int, Hashable]]
     """(place, id) of every work item that may be sent a second time, see stragglers.py."""
     durations_s: dict[str, tuple[float, ...]]
-    """Kind -> recent durations of one chunk, without those that may include compiling."""
+    """Kind -> recent durations of one chunk, without compiling."""
     next_worker: int = 0
     """Id of the next worker to start."""
     next_rank: int = 0

@@ -84,6 +84,7 @@ def predict(
     limits = events.Limits(
         workers=actors,
         cores=cores,
+        compile_deadline_s=NEVER_S,
         first_deadline_s=NEVER_S,
         min_deadline_s=NEVER_S,
         start_deadline_s=NEVER_S,
@@ -92,6 +93,8 @@ def predict(
     state, _ = step(initial_state(limits), events.Tick(), 0.0)
     for worker in range(actors):
         state, _ = step(state, events.WorkerUp(worker), 0.0)
+        for phase in phases:
+            state, _ = step(state, events.Compiled(worker, phase.kind, 0.0), 0.0)
 
     def seconds_of(worker: int, kind: str, chunks: int) -> float:
         return costs.chunk_s[kind] * longest_part(chunks) * slowness(worker)

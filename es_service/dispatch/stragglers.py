@@ -5,8 +5,9 @@ item. The first answer counts, and the other is dropped like any duplicate: an i
 of a gradient is added twice. It never has more than one copy, and none after a loss or a failure, since it may be the
 cause. A copy is no retry; if it makes its worker fail, the item is charged as ever.
 
-A worker is late if its item takes much longer than usual, and slow until it answers an item in time. The items of a
-slow worker, or of a new one, which must compile, are copied as soon as another worker is idle. While a worker is known
+A worker is late if its item takes much longer than usual, not counting the time of compiling, and slow until it answers
+an item in time. The items of a slow worker, or of a new one, which must compile, are copied as soon as another worker
+is idle. While a worker is known
 to be in time, slow and new workers get no copies, so that the workers of a slow node do not copy each other's items.
 When there is none, slow workers get them, and new ones get copies of what a slow worker has.
 
@@ -18,7 +19,7 @@ from __future__ import annotations
 
 import math
 
-from es_service.dispatch.assignment import begin_first_slot
+from es_service.dispatch.deadlines import begin_first_slot
 from es_service.dispatch.events import Assign, Command
 from es_service.dispatch.scheduler_changes import copy_item, put_worker
 from es_service.dispatch.scheduler_state import LATE, SchedulerState, Slot, has_idle_worker_for_copies

@@ -61,6 +61,10 @@ def in_words(files: list[str], most: int = 5) -> str:
     return ", ".join(files[:most]) + (f" and {len(files) - most} others" if len(files) > most else "")
 
 
+class OtherCodeError(Exception):
+    """The driver's code is not that of this host; the message names the host and the files."""
+
+
 def why_refused(expected: Sources, environment: str) -> str:
     """Why this process must not work for a driver, naming the host and the files; empty if its code is the driver's.
 

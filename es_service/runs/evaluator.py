@@ -185,7 +185,7 @@ def evaluator(
         config = load_config(config, overrides, new=False)
     elif overrides:
         config = changed_config(config.model_dump(mode="json"), overrides)
-    made = PolicyEvaluator(config, make_engine(config, on_wait=_tell_wait, at_once=ANY_NUMBER))
+    made = PolicyEvaluator(config, make_engine(config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER))
     try:
         yield made
     finally:

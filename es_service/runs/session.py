@@ -36,7 +36,8 @@ from workers.policy import initial_parameters
 _LOG = logger(__name__)
 LIMIT_NAMES = {
     "start_deadline_s": "half of compute.no_worker_timeout_s",
-    "first_deadline_s": "compute.compile_timeout_s",
+    "compile_deadline_s": "compute.compile_timeout_s",
+    "first_deadline_s": "compute.first_chunk_timeout_s",
     "min_deadline_s": "at least compute.chunk_timeout_s",
     "place_timeout_s": "compute.place_timeout_s",
     "no_worker_timeout_s": "compute.no_worker_timeout_s",
@@ -114,7 +115,7 @@ def work(
         _naming_the_run(store.folder),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
         stop_on_signals() as should_stop,
-        make_engine(config, should_stop, log, tell_wait) as engine,
+        make_engine(config, should_stop, log, tell_wait, tell) as engine,
     ):
 
         def after_generation(row: Mapping[str, Any]) -> None:
@@ -160,7 +161,8 @@ def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
         workers=worker_count(config, most),
         max_attempts=compute.max_attempts,
         start_deadline_s=compute.no_worker_timeout_s / 2,  # so that two attempts fit into it
-        first_deadline_s=compute.compile_timeout_s,
+        compile_deadline_s=compute.compile_timeout_s,
+        first_deadline_s=compute.first_chunk_timeout_s,
         min_deadline_s=compute.chunk_timeout_s,
         place_timeout_s=math.inf if compute.place_timeout_s is None else compute.place_timeout_s,
         no_worker_timeout_s=compute.no_worker_timeout_s,
@@ -173,6 +175,7 @@ def make_engine(
     should_stop: Callable[[], int | None] = lambda: None,
     log: Log = no_log,
     on_wait: Callable[[str], None] = lambda shortage: None,
+    on_refusal: OnNotice = lambda refusal: None,
     *,
     at_once: int | None = None,
 ) -> Engine[Any]:
@@ -180,6 +183,7 @@ def make_engine(
 
     Args:
         should_stop, log, on_wait: as in `Engine`.
+        on_refusal: as in `ray_engine`.
         at_once: number of chunks that can be computed at the same time; None: as in a generation of a run.
     """
     spec, compute = worker_spec(config, task_of(config)), config.compute
@@ -200,6 +204,7 @@ def make_engine(
         most=at_once if compute.workers == "auto" else None,
         log=log,
         on_wait=on_wait,
+        on_refusal=on_refusal,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from es_service.dispatch.events import Command, Event, Limits, StartWorker, Submit, Tick, WorkerUp, WorkItem
+from es_service.dispatch.events import Command, Compiled, Event, Limits, StartWorker, Submit, Tick, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import IN_TIME, SchedulerState, initial_state, next_time
 
@@ -14,6 +14,7 @@ LIMITS = Limits(
     in_flight=2,
     max_attempts=3,
     start_deadline_s=50.0,
+    compile_deadline_s=200.0,
     first_deadline_s=100.0,
     late_factor=math.inf,
     min_deadline_s=10.0,
@@ -40,11 +41,17 @@ def items(item_ids: str) -> Submit:
     return Submit(tuple(WorkItem(item_id, "train" if item_id.islower() else "evaluate") for item_id in item_ids))
 
 
-def ready(workers: int = 2, **changes: object) -> SchedulerState:
+def cold(workers: int = 2, **changes: object) -> SchedulerState:
     """All workers up at time 0."""
     state, commands = step(initial_state(replace(LIMITS, workers=workers, **changes)), Tick(), 0.0)
     assert commands == [StartWorker(worker) for worker in range(workers)]
     return play(state, *((0.0, WorkerUp(worker)) for worker in range(workers)))[0]
+
+
+def ready(workers: int = 2, **changes: object) -> SchedulerState:
+    """All workers up at time 0, when they have compiled for both kinds."""
+    kinds = [(worker, kind) for worker in range(workers) for kind in ("train", "evaluate")]
+    return play(cold(workers, **changes), *((0.0, Compiled(*each, 0.0)) for each in kinds))[0]
 
 
 def check_consistency(state: SchedulerState) -> None:

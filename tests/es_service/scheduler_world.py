@@ -11,6 +11,7 @@ from random import Random
 
 from es_service.dispatch.events import (
     Assign,
+    Compiled,
     Deliver,
     Drain,
     Event,
@@ -33,9 +34,11 @@ from es_service.dispatch.scheduler_state import initial_state, next_deadline, pe
 from tests.es_service.scheduler_play import check_consistency
 
 START_FATES = ("start_dies", "start_hangs", "no_place")
+COMPILE_FATES = ("compile_dies", "compile_hangs", "compile_slow", "compile_raises")
 ITEM_FATES = ("item_dies", "item_hangs", "item_slow", "item_raises", "contradicts")
 FAULTS = (
     *START_FATES,
+    *COMPILE_FATES,
     *ITEM_FATES,
     "dies_idle",
     "duplicates",
@@ -56,6 +59,7 @@ class World:
             in_flight=r.randint(1, 2),
             max_attempts=r.randint(2, 5),
             start_deadline_s=3.0,
+            compile_deadline_s=5.0,
             first_deadline_s=8.0,
             min_deadline_s=2.0,
             deadline_factor=4.0,
@@ -83,6 +87,8 @@ class World:
         self.alive: set[int] = set()
         self.inbox: dict[int, deque[tuple[tuple, int]]] = {}
         self.busy: set[int] = set()
+        self.compiled: set[tuple[int, str]] = set()
+        self.told_compiled: set[tuple[int, str]] = set()
         self.unplaced: set[int] = set()
         self.waits: set[int] = set()
         self.last_word: dict[int, float] = {}
@@ -159,6 +165,29 @@ class World:
             return
         self.busy.add(worker)
         item_id, attempt = self.inbox[worker].popleft()
+        if (worker, item_id[0]) in self.compiled:
+            self.compute(worker, item_id, attempt)
+            return
+        fate = next((fate for fate in COMPILE_FATES if self.happens(fate)), "ok")
+        if fate != "compile_hangs":
+            seconds = self.random.random() + 10.0 * (fate == "compile_slow")
+            self.at(seconds, self.end_compiling, worker, item_id, attempt, fate, seconds)
+
+    def end_compiling(self, worker: int, item_id: tuple, attempt: int, fate: str, seconds: float) -> None:
+        """It compiles again for the next item of this kind if it raised an exception."""
+        if worker not in self.alive and not self.happens("speaks_after_stop"):
+            return
+        if fate == "compile_dies":
+            self.die(worker)
+        elif fate == "compile_raises":
+            self.end(worker, item_id, attempt, "item_raises")
+        else:
+            self.compiled.add((worker, item_id[0]))
+            self.seen["compiled"] += 1
+            self.say(worker, Compiled(worker, item_id[0], seconds))
+            self.compute(worker, item_id, attempt)
+
+    def compute(self, worker: int, item_id: tuple, attempt: int) -> None:
         fate = self.poison.get(item_id) or next((fate for fate in ITEM_FATES if self.happens(fate)), "ok")
         if fate != "item_hangs":
             self.at(self.random.random() + 10.0 * (fate == "item_slow"), self.end, worker, item_id, attempt, fate)
@@ -223,6 +252,8 @@ class World:
                 expected = worker in self.draining
                 self.seen["lost while draining"] += expected
                 self.forget(worker, fault=not expected, charge=not expected)
+            case Compiled(worker, kind) if worker in self.known:
+                self.told_compiled.add((worker, kind))
             case Result(worker, item_id, attempt):
                 if worker in self.known and (item_id, attempt) in self.open[worker]:
                     self.open[worker].remove((item_id, attempt))
@@ -304,6 +335,10 @@ class World:
             has_no_place = isinstance(event, Tick) and worker in event.silent
             self.seen["no place" if has_no_place else "quarantine" if isinstance(event, Failure) else "deadline"] += 1
             assert worker in self.up or self.now >= self.start_due[worker], "it could still have come up in time"
+            if isinstance(event, Tick) and worker in self.up:
+                is_compiling = (worker, self.open[worker][0][0][0]) not in self.told_compiled
+                assert is_compiling == ("did not finish compiling" in reason)
+                self.seen["compiled too long"] += is_compiling
             self.forget(worker, fault=not has_no_place, charge=isinstance(event, Tick))
         self.known.discard(worker)
         self.up.discard(worker)

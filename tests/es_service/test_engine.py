@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from es_service.dispatch import engine as engine_module
 from es_service.dispatch.engine import POLL_S, Answer, Engine, item_sizes
-from es_service.dispatch.events import Failure, Limits, WorkerLost, WorkerUp
+from es_service.dispatch.events import Compiled, Failure, Limits, WorkerLost, WorkerUp
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk, around
 from tests.helpers import centre, random_parameters
@@ -53,7 +53,7 @@ def expected(point, chunk) -> Any:
 
 
 class Scripted:
-    """A Transport in memory. Workers come up at once; the hooks, which tests replace, say what they do after that."""
+    """A Transport in memory. Workers come up and compile at once; the hooks, which tests replace, say what comes."""
 
     def __init__(self) -> None:
         self.inbox: deque = deque()
@@ -61,6 +61,7 @@ class Scripted:
         self.killed: list[int] = []
         self.last_words: dict[int, str] = {}
         self.waits: list[float] = []
+        self.compiled: set[tuple[int, str]] = set()
         self.closed = False
         self.on_send: Callable[[Sent], Any] = lambda sent: self.inbox.append(sent.answer())
         self.on_wait: Callable[[], Any] = lambda: None
@@ -74,6 +75,9 @@ class Scripted:
 
     def send(self, worker, item_id, attempt, work):
         self.sent.append(Sent(worker, item_id, attempt, work))
+        if (worker, item_id.kind) not in self.compiled:
+            self.compiled.add((worker, item_id.kind))
+            self.inbox.append(Compiled(worker, item_id.kind, 0.0))
         self.on_send(self.sent[-1])
 
     def silent(self):

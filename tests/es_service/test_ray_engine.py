@@ -14,11 +14,13 @@ import pytest
 
 from es_service.dispatch import engine as engine_module
 from es_service.dispatch.engine import Answer, Engine
-from es_service.dispatch.events import Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
-from es_service.dispatch.ray_engine import IN_CALL_BYTES, Actors
+from es_service.dispatch.events import Compiled, Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
+from es_service.dispatch.ray_calls import IN_CALL_BYTES
+from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE, Claim, Growth, Membership, emptiest, look
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol.messages import KEPT_CENTRES, TrainingChunk, around
+from es_service.protocol.messages import KEPT_CENTRES, EvaluationChunk, TrainingChunk, around
+from es_service.protocol.sources import OtherCodeError
 from tests.helpers import SPEC, centre, random_parameters
 
 FIRST = centre(random_parameters())
@@ -31,6 +33,14 @@ class RayError(Exception):
 
 class RayTaskError(RayError):
     """As in Ray."""
+
+
+class OtherCodeRayTaskError(RayTaskError, OtherCodeError):
+    """An exception of a worker, as Ray raises it in the driver."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(f"a traceback: {text}")
+        self.cause = OtherCodeError(text)
 
 
 class ActorDiedError(RayError):
@@ -67,17 +77,24 @@ class PretendedRay:
         self.node_of: Callable[[int], str] = lambda number: "node"
         self.calls: list[tuple[Any, ...]] = []
         """Arguments of each call of `run`."""
+        self.compiled: list[tuple[int, str]] = []
+        """(actor, kind of chunks) of each call of `compile`."""
+        self.refusing: set[str] = set()
+        """Nodes whose code is not the driver's."""
         self.stored: list[bytes] = []
         self.strategies: list[Any] = []
         """Where each actor was to be placed: "SPREAD", or (node, options)."""
+        self.selectors: list[Any] = []
+        """The labels that its node must have, or None."""
         affinity = SimpleNamespace(NodeAffinitySchedulingStrategy=lambda node, **options: (node, options))
         self.util = SimpleNamespace(scheduling_strategies=affinity)
 
     def remote(self, **_: Any) -> Callable[[type], Any]:
         return lambda cls: SimpleNamespace(options=self._options)
 
-    def _options(self, scheduling_strategy: Any) -> Any:
+    def _options(self, scheduling_strategy: Any, label_selector: dict[str, str] | None = None) -> Any:
         self.strategies.append(scheduling_strategy)
+        self.selectors.append(label_selector)
         return SimpleNamespace(remote=self._start)
 
     def wait(self, refs: list[Ref], num_returns: int, timeout: float) -> tuple[list[Ref], list[Ref]]:
@@ -115,11 +132,13 @@ class PretendedRay:
 
     def _start(self, spec: bytes, index: int, gpus: float, cores: int) -> Any:
         placed = sum(actor.state in ("alive", "hung") for actor in self.actors)
-        actor = Actor(index, "alive" if placed < self.room else "pending")
+        excluded = self.node_of(index) in str(self.selectors[-1])
+        actor = Actor(index, "alive" if placed < self.room and not excluded else "pending")
         self.actors.append(actor)
         methods = {
             "place": lambda: ("host", actor.number, self.node_of(actor.number)),
             "build": lambda: f"kind {actor.number % 2}",
+            "compile": lambda chunks, *centres: 0.0,
             "run": lambda chunks, *centres: pickle.dumps([f"of {chunk}" for _, chunk in pickle.loads(chunks)]),
         }
         calls = {name: SimpleNamespace(remote=self._caller(actor, name, body)) for name, body in methods.items()}
@@ -131,6 +150,10 @@ class PretendedRay:
             actor.owed.append(ref)
             if name == "run":
                 self.calls.append(arguments)
+            if name == "compile":
+                self.compiled.append((actor.number, type(pickle.loads(arguments[0])[0][1]).__name__))
+            if name == "build" and self.node_of(actor.number) in self.refusing:
+                ref.error = OtherCodeRayTaskError(f"{self.node_of(actor.number)} has other code: a.py")
             if name == "run" and actor.state == "alive":
                 actor.ran += 1
                 self.on_run(actor)
@@ -141,7 +164,7 @@ class PretendedRay:
 
     def _settle(self, actor: Actor, ref: Ref) -> None:
         if not ref.is_ready and actor.state in ("alive", "dead"):
-            ref.error = ActorDiedError("gone") if actor.state == "dead" else None
+            ref.error = ActorDiedError("gone") if actor.state == "dead" else ref.error
             ref.is_ready = True
 
 
@@ -164,8 +187,9 @@ def transport(
     watch: PretendedWatch | None = None,
     growth: Growth | None = None,
     claim: Claim = ONE_CORE,
+    on_refusal: Callable[[str], None] = lambda refusal: None,
 ) -> Actors:
-    return Actors(ray, SPEC, type(None), claim, watch, growth, limits.workers)
+    return Actors(ray, SPEC, type(None), claim, watch, growth, limits.workers, on_refusal)
 
 
 def ray_engine(ray: PretendedRay, limits: Limits, watch: PretendedWatch | None = None) -> Engine[Actors]:
@@ -210,7 +234,7 @@ def test_an_actor_that_waited_for_its_place_says_once_that_it_has_one():
         actors.send(worker, "key", 1, around(FIRST, [CHUNK]))
     assert isinstance(actors.receive(0.0), WorkerLost)
     actors.send(0, "other key", 1, around(FIRST, [CHUNK]))
-    assert [type(actors.receive(0.0)) for _ in range(3)] == [Answer, Answer, type(None)]
+    assert [type(actors.receive(0.0)) for _ in range(4)] == [Compiled, Answer, Answer, type(None)]
 
 
 def test_an_actor_that_is_given_no_place_is_not_lost():
@@ -322,6 +346,80 @@ def test_a_run_asks_for_more_workers_than_there_is_room_for_up_to_its_work():
     assert asks.wanted(Membership({}, {}, frozenset(), frozenset()), 7) == 7
 
 
+def test_an_actor_compiles_once_for_each_kind_and_nothing_else_is_asked_of_it():
+    """Also while several items are sent ahead. If compiling fails, it is asked again with the next item."""
+    ray = PretendedRay()
+    with ray_engine(ray, Limits(2)) as engine:
+        for _ in range(3):
+            engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
+            engine.evaluate(around(FIRST, [EvaluationChunk(2, chunk) for chunk in range(20)]))
+        kinds = ("EvaluationChunk", "TrainingChunk")
+        assert sorted(ray.compiled) == [(actor, kind) for actor in (0, 1) for kind in kinds]
+        calls = [len(actor.owed) for actor in ray.actors]
+        assert sum(calls) == 2 * (2 + len(kinds)) + len(ray.calls), "place and build, compile, run"
+    actors = transport(ray := PretendedRay(), Limits(1))
+    actors.start(0)
+    actors.send(0, "a", 1, around(FIRST, [CHUNK]))
+    actors.send(0, "b", 1, around(FIRST, [CHUNK]))
+    for call in (2, 3):
+        ray.actors[0].owed[call].error = RayTaskError("no")
+    told = [type(actors.receive(0.0)) for _ in range(5)]
+    assert told == [Placed, WorkerUp, Failure, Answer, type(None)]
+    actors.send(0, "a", 2, around(FIRST, [CHUNK]))
+    assert [type(actors.receive(0.0)) for _ in range(3)] == [Compiled, Answer, type(None)]
+
+
+@pytest.mark.parametrize("grows", [False, True])
+def test_a_node_that_refuses_is_told_of_once_and_gets_no_other_worker(grows):
+    """The run goes on with the others, and the refusal is no fault."""
+    ray, watch, told = PretendedRay(room=4), PretendedWatch(), []
+    ray.refusing = {"bad"}
+    ray.node_of = lambda number: "good" if ray.selectors[number] or number % 2 else "bad"
+    watch.now = Membership({"good": 2, "bad": 2}, {"good": 2, "bad": 2}, frozenset(), frozenset({"good", "bad"}))
+    limits = Limits(4 if grows else 6, start_deadline_s=1000.0)
+    actors = transport(ray, limits, watch, Growth(4) if grows else None, on_refusal=told.append)
+    with Engine(actors, limits) as engine:
+        for _ in range(5):
+            chunks = [TrainingChunk(2, chunk) for chunk in range(20)]
+            assert engine.evaluate(around(FIRST, chunks)) == [f"of {chunk}" for chunk in chunks]
+        assert told == ["bad has other code: a.py"]
+        assert engine.counts.lost_workers == 0
+        assert [ray.node_of(actor.number) for actor in ray.actors].count("bad") == (2 if grows else 3)
+        assert ray.selectors[: limits.workers] == [None] * limits.workers
+        later = ray.selectors[limits.workers :]
+        assert len(later) <= 3
+        assert all(selector == {"ray.io/node-id": "!in(bad)"} for selector in later)
+        assert engine.counts.workers == (2 if grows else 6)
+        assert "bad has other code" in actors.shortage()
+
+
+@pytest.mark.parametrize("watched", [False, True])
+def test_a_run_ends_at_once_if_every_node_refuses_but_not_before_its_last_worker_is_gone(watched):
+    """A worker that is up goes on when the code of its host changes; the driver's own Ray has one host."""
+    ray, watch = PretendedRay(), PretendedWatch() if watched else None
+    if watch is not None:
+        watch.now = Membership({"bad": 2, "head": 0}, {}, frozenset(), frozenset({"bad", "head"}))
+    ray.node_of = lambda number: "bad"
+    with Engine(transport(ray, Limits(2), watch), Limits(2, restart_backoff_s=0.0)) as engine:
+        while not all(actor.ran for actor in ray.actors):
+            engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
+        ray.refusing = {"bad"}
+        ray.end(ray.actors[1])
+        for _ in range(3):
+            engine.evaluate(around(FIRST, [TrainingChunk(2, chunk) for chunk in range(20)]))
+        ray.end(ray.actors[0])
+        for actor in ray.actors[2:]:
+            ray.end(actor)
+        with pytest.raises(EvaluationError, match="bad has other code"):
+            engine.evaluate(around(FIRST, [CHUNK]))
+    ray = PretendedRay()
+    ray.node_of, ray.refusing = (lambda number: "bad"), {"bad"}
+    with Engine(transport(ray, Limits(2), watch), Limits(2)) as engine:
+        with pytest.raises(EvaluationError, match="bad has other code"):
+            engine.evaluate(around(FIRST, [CHUNK]))
+        assert all(ray.selectors[2:]), "none of those that replace the first two could get a place there"
+
+
 def test_a_node_that_dies_under_idle_workers_takes_none_of_the_others_along():
     """The newest are on the node that stays. The smaller room is known before any call fails; nor is a node dead that
     was not seen yet, or when no node at all is seen."""
@@ -377,7 +475,7 @@ def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
 
 
 @pytest.mark.parametrize("error", [RayTaskError, ActorDiedError])
-@pytest.mark.parametrize("call", range(3))
+@pytest.mark.parametrize("call", [0, 1, 3])
 def test_what_is_said_of_an_error_has_no_colours(error, call):
     """Neither of one in a place, a build or a run; it is for logs, too."""
     ray = PretendedRay()
@@ -385,7 +483,7 @@ def test_what_is_said_of_an_error_has_no_colours(error, call):
     actors.start(0)
     actors.send(0, "key", 1, around(FIRST, [CHUNK]))
     ray.actors[0].owed[call].error = error("\x1b[36mray::worker-0\x1b[39m: \x1b[1;31mno\x1b[0m")
-    told = [actors.receive(0.0) for _ in range(3)]
+    told = [actors.receive(0.0) for _ in range(4)]
     said = [message.reason for message in told if isinstance(message, WorkerLost)]
     said += [message.message for message in told if isinstance(message, Failure)]
     assert len(said) == 1

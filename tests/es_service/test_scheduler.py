@@ -10,7 +10,9 @@ import pytest
 
 from es_service.dispatch.events import (
     Assign,
+    Compiled,
     Deliver,
+    Drain,
     Fail,
     Failure,
     Result,
@@ -25,7 +27,7 @@ from es_service.dispatch.events import (
 )
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending, usual_chunk_s
-from tests.es_service.scheduler_play import LIMITS, items, play, ready
+from tests.es_service.scheduler_play import LIMITS, cold, items, play, ready
 
 
 def test_tasks_go_out_in_order_to_idle_workers_first():
@@ -102,45 +104,76 @@ def test_a_task_that_kills_its_workers_is_poison_too():
     assert commands == [Fail(message)]
 
 
-def test_deadlines_exempt_compiling_and_follow_the_median_of_their_kind():
-    state, _ = play(ready(1, in_flight=1), (0.0, items("abcdefE")))
-    assert next_deadline(state) == 100.0
-    state, _ = step(state, Result(0, "a", 1), 40.0)
-    assert state.durations_s == {}
-    assert next_deadline(state) == 40.0 + 100.0, "no duration is known yet"
-    state, _ = step(state, Result(0, "b", 1), 44.0)
-    assert next_deadline(state) == 44.0 + 5.0 * 4.0
-    state, _ = step(state, Result(0, "c", 1), 46.0)
-    assert next_deadline(state) == 46.0 + 5.0 * 3.0
-    state, _ = step(state, Result(0, "d", 1), 47.0)
-    assert next_deadline(state) == 47.0 + 5.0 * 2.0
-    state, _ = step(state, Result(0, "e", 1), 48.0)
-    assert next_deadline(state) == 48.0 + 10.0, "never below min_deadline_s"
-    state, _ = step(state, Result(0, "f", 1), 49.0)
-    assert next_deadline(state) == 49.0 + 100.0, "the first item of another kind compiles"
+def test_deadlines_follow_the_median_of_their_kind():
+    state, _ = play(ready(1, in_flight=1), (0.0, items("abcdeE")))
+    assert next_deadline(state) == 100.0, "no duration is known yet"
+    state, _ = step(state, Result(0, "a", 1), 4.0)
+    assert next_deadline(state) == 4.0 + 5.0 * 4.0
+    state, _ = step(state, Result(0, "b", 1), 6.0)
+    assert next_deadline(state) == 6.0 + 5.0 * 3.0
+    state, _ = step(state, Result(0, "c", 1), 7.0)
+    assert next_deadline(state) == 7.0 + 5.0 * 2.0
+    state, _ = step(state, Result(0, "d", 1), 8.0)
+    assert next_deadline(state) == 8.0 + 10.0, "never below min_deadline_s"
+    state, _ = step(state, Result(0, "e", 1), 9.0)
+    assert next_deadline(state) == 9.0 + 100.0, "of another kind, no duration is known"
     assert state.durations_s == {"train": (4.0, 2.0, 1.0, 1.0, 1.0)}
     state, _ = play(ready(1), *((float(n), event) for n in range(40) for event in (items("a"), Result(0, "a", 1))))
     assert len(state.durations_s["train"]) == 31, "a bounded window"
 
 
-def test_what_compiles_may_take_no_less_time_than_what_does_not():
-    """Neither while no duration is known, nor on a worker that is new."""
-    state, _ = play(ready(1, in_flight=1, first_deadline_s=10.0, min_deadline_s=60.0), (0.0, items("abcde")))
+def test_compiling_has_a_time_of_its_own_and_a_first_item_has_a_duration():
+    """Each worker compiles once for each kind; how late the message about it is read makes no difference."""
+    state, _ = play(cold(1), (1.0, items("abE")))
+    assert next_deadline(state) == 1.0 + 200.0
+    state, commands = step(state, Compiled(0, "train", 150.0), 155.0)
+    assert (commands, next_deadline(state)) == ([], 151.0 + 100.0)
+    state, _ = step(state, Result(0, "a", 1), 155.0)
+    assert state.durations_s == {"train": (4.0,)}
+    assert next_deadline(state) == 155.0 + 5.0 * 4.0, "it has compiled for this kind"
+    state, _ = step(state, Result(0, "b", 1), 160.0)
+    assert next_deadline(state) == 160.0 + 200.0, "of another kind"
+    again, commands = step(state, Compiled(0, "train", 3.0), 165.0)
+    assert (commands, again) == ([], state)
+    assert step(state, Compiled(7, "evaluate", 3.0), 165.0) == (state, []), "of a worker that is not known"
+    state, _ = step(state, Compiled(0, "evaluate", 100.0), 165.0)
+    assert state.up[0].started_s == 165.0, "no item begins later than now"
+    state, _ = play(
+        state, (166.0, Result(0, "E", 1)), (166.0, SetWorkers(2)), (166.0, WorkerUp(1)), (167.0, items("cd"))
+    )
+    deadlines_s = {worker: state.up[worker].deadline_s for worker in (0, 1)}
+    assert deadlines_s == {0: 167.0 + 5.0 * 4.5, 1: 167.0 + 200.0}, "a new worker compiles, whatever is known"
+    drained, _ = play(state, (168.0, Drain(1)), (170.0, Compiled(1, "train", 2.5)))
+    assert drained.draining[1].deadline_s == 169.5 + 5.0 * 4.5, "also one that drains"
+
+
+def test_the_message_of_a_missed_deadline_says_what_the_worker_was_doing():
+    """And names the limit. The item of one that hangs while it compiles is charged, like any other."""
+    state, _ = play(cold(1, max_attempts=1), (0.0, items("a")))
+    doing = "did not finish compiling for work item a within 200 s (compile_deadline_s)"
+    failed = f"work item a failed in 1 attempts; the last time worker 0 was lost while running it: {doing}"
+    assert step(state, Tick(), 200.0)[1][:2] == [StopWorker(0, doing), Fail(failed)]
+    state, _ = step(state, Compiled(0, "train", 50.0), 50.0)
+    doing = "no answer to work item a within 100 s of computing (first_deadline_s)"
+    assert StopWorker(0, doing) in step(state, Tick(), 150.0)[1]
+    state, _ = play(state, (60.0, Result(0, "a", 1)), (61.0, items("b")))
+    doing = "no answer to work item b within 50 s of computing (min_deadline_s)"
+    assert StopWorker(0, doing) in step(state, Tick(), 111.0)[1]
+
+
+def test_a_first_item_has_no_less_time_than_later_ones():
+    state, _ = play(ready(1, first_deadline_s=10.0, min_deadline_s=60.0), (0.0, items("a")))
     assert next_deadline(state) == 60.0
-    state, _ = play(state, (50.0, Result(0, "a", 1)), (100.0, Result(0, "b", 1)))
-    assert next_deadline(state) == 100.0 + 5.0 * 50.0
-    state, _ = play(state, (110.0, WorkerLost(0, "killed")), (111.0, WorkerUp(1)))
-    assert next_deadline(state) == 111.0 + 5.0 * 50.0
 
 
 def test_deadlines_and_durations_are_in_proportion_to_the_size_of_an_item():
     sized = Submit(tuple(WorkItem(name, "train", size) for name, size in (("a", 1), ("b", 4), ("c", 3), ("d", 1))))
     state, _ = play(ready(1, in_flight=1), (0.0, sized), (5.0, Result(0, "a", 1)), (17.0, Result(0, "b", 1)))
-    assert usual_chunk_s(state, "train") == 3.0
-    assert next_deadline(state) == 17.0 + 5.0 * 3 * 3.0
+    assert usual_chunk_s(state, "train") == 4.0
+    assert next_deadline(state) == 17.0 + 5.0 * 3 * 4.0
     state, _ = step(state, Result(0, "c", 1), 20.0)
-    assert state.durations_s == {"train": (3.0, 1.0)}
-    assert next_deadline(state) == 20.0 + 5.0 * 1 * 2.0
+    assert state.durations_s == {"train": (5.0, 3.0, 1.0)}
+    assert next_deadline(state) == 20.0 + 5.0 * 1 * 3.0
     assert usual_chunk_s(state, "evaluate") is None
 
 
@@ -149,7 +182,7 @@ def test_deadlines_and_durations_are_in_proportion_to_the_size_of_an_item():
 )
 def test_seconds_are_said_without_an_exponent(limit_s, said):
     state, _ = play(ready(1, first_deadline_s=limit_s, min_deadline_s=0.1), (0.0, items("a")))
-    reason = f"no answer to work item a within {said} s (first_deadline_s)"
+    reason = f"no answer to work item a within {said} s of computing (first_deadline_s)"
     assert step(state, Tick(), limit_s)[1][0] == StopWorker(0, reason)
 
 
@@ -161,13 +194,14 @@ def test_chunks_handed_out_again_are_counted_not_tasks():
 
 def test_the_clock_of_a_prefetched_task_starts_when_the_one_ahead_is_done():
     state, _ = play(ready(1), (0.0, items("abcd")), (10.0, Result(0, "a", 1)), (12.0, Result(0, "b", 1)))
-    assert state.durations_s == {"train": (2.0,)}
-    assert next_deadline(state) == 22.0
-    state, _ = step(state, Result(0, "c", 1), 15.0)
-    assert next_deadline(state) == 15.0 + 12.5
-    assert step(state, Tick(), 27.4) == (state, [])
-    state, commands = step(state, Tick(), 27.5)
-    assert commands == [StopWorker(0, "no answer to work item d within 12.5 s (min_deadline_s)"), StartWorker(1)]
+    assert state.durations_s == {"train": (10.0, 2.0)}
+    assert next_deadline(state) == 12.0 + 5.0 * 6.0
+    state, _ = step(state, Result(0, "c", 1), 14.5)
+    assert next_deadline(state) == 14.5 + 12.5
+    assert step(state, Tick(), 26.9) == (state, [])
+    state, commands = step(state, Tick(), 27.0)
+    reason = "no answer to work item d within 12.5 s of computing (min_deadline_s)"
+    assert commands == [StopWorker(0, reason), StartWorker(1)]
     assert step(state, WorkerUp(1), 28.0)[1] == [Assign(1, "d", 2)]
 
 
@@ -175,8 +209,8 @@ def test_a_result_out_of_order_leaves_the_clock_of_the_running_task_alone():
     state, _ = play(ready(1, in_flight=3), (0.0, items("abc")), (9.0, Result(0, "b", 1)))
     assert next_deadline(state) == 100.0
     state, _ = play(state, (10.0, Result(0, "a", 1)), (12.0, items("de")), (15.0, Result(0, "d", 1)))
-    assert state.durations_s == {}, "how long an answer out of order took is not known"
-    assert play(state, (16.0, Result(0, "c", 1)))[0].durations_s == {"train": (6.0,)}
+    assert state.durations_s == {"train": (10.0,)}, "how long an answer out of order took is not known"
+    assert play(state, (16.0, Result(0, "c", 1)))[0].durations_s == {"train": (10.0, 6.0)}
 
 
 def test_stale_answers_are_dropped_and_counted():

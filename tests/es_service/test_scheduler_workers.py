@@ -131,7 +131,7 @@ def test_a_worker_that_never_comes_up_is_killed_and_replaced():
 
 def test_a_worker_without_a_place_is_started_anew_and_nobody_hears_of_it():
     """However often: then the last that is up is lost, and the run waits for others as long as it should."""
-    patient = initial_state(replace(LIMITS, first_deadline_s=1000.0))
+    patient = initial_state(replace(LIMITS, compile_deadline_s=1000.0))
     state, _ = play(patient, (0.0, Tick()), (1.0, WorkerUp(0)), (1.0, items("a")))
     for number in range(1, 6):
         state, commands = step(state, Tick(silent=(number,)), 50.0 * number)
@@ -145,7 +145,10 @@ def test_a_worker_without_a_place_is_started_anew_and_nobody_hears_of_it():
 def test_what_a_silent_worker_does_not_answer_in_time_is_not_to_blame():
     state, _ = play(ready(1), (0.0, items("a")))
     state, commands = step(state, Tick(silent=(0,)), 100.0)
-    assert commands == [StopWorker(0, "no answer to work item a within 100 s (first_deadline_s)"), StartWorker(1)]
+    assert commands == [
+        StopWorker(0, "no answer to work item a within 100 s of computing (first_deadline_s)"),
+        StartWorker(1),
+    ]
     assert state.lost_workers == 1
     assert step(state, WorkerUp(1), 101.0)[1] == [Assign(1, "a", 1)]
 
@@ -222,7 +225,7 @@ def test_a_drained_worker_finishes_what_it_has_and_is_replaced_without_blame():
     assert play(initial_state(LIMITS), (0.0, Tick()), (1.0, Drain(0)))[1] == [StopWorker(0, "drained"), StartWorker(2)]
     # One that hangs while draining is killed all the same.
     state, commands = play(state, (3.0, WorkerUp(2)), (101.0, Tick()))
-    assert StopWorker(0, "no answer to work item a within 100 s (first_deadline_s)") in commands
+    assert StopWorker(0, "no answer to work item a within 100 s of computing (first_deadline_s)") in commands
 
 
 def test_the_number_of_workers_follows_the_wish():

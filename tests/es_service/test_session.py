@@ -6,7 +6,7 @@ import re
 
 from es_service.api import load_config
 from es_service.config.compute import ComputeConfig
-from es_service.dispatch.events import Result, StopWorker, Submit, Tick, WorkerLost, WorkerUp, WorkItem
+from es_service.dispatch.events import Compiled, Result, StopWorker, Submit, Tick, WorkerLost, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state
 from es_service.runs.session import LIMIT_NAMES, dispatch_limits
@@ -19,6 +19,7 @@ CONFIG = {
         "workers": 1,
         "chunk_timeout_s": 5,
         "compile_timeout_s": 8,
+        "first_chunk_timeout_s": 7,
         "place_timeout_s": 15,
         "no_worker_timeout_s": 20,
     },
@@ -42,11 +43,15 @@ def test_messages_of_deadlines_name_the_keys_that_set_them():
     assert "no worker was up for 20 s (compute.no_worker_timeout_s) while" in gone[-1]
     assert "no worker got a place for 15 s (compute.place_timeout_s)" in messages_after((0.0, work), (15.0, Tick()))[-1]
     assert messages_after((0.0, work), (1.0, WorkerUp(0)), (9.0, Tick()))[0] == (
-        "no answer to work item a within 8 s (compute.compile_timeout_s)"
+        "did not finish compiling for work item a within 8 s (compute.compile_timeout_s)"
     )
-    answers = [(1.0, WorkerUp(0)), (2.0, Result(0, "a", 1)), (2.1, Result(0, "b", 1))]
-    assert messages_after((0.0, work), *answers, (7.1, Tick()))[0] == (
-        "no answer to work item c within 5 s (at least compute.chunk_timeout_s)"
+    compiled = [(1.0, WorkerUp(0)), (7.0, Compiled(0, "train", 6.0))]
+    assert messages_after((0.0, work), *compiled, (14.0, Tick()))[0] == (
+        "no answer to work item a within 7 s of computing (compute.first_chunk_timeout_s)"
+    )
+    answers = [*compiled, (7.1, Result(0, "a", 1)), (7.2, Result(0, "b", 1))]
+    assert messages_after((0.0, work), *answers, (12.2, Tick()))[0] == (
+        "no answer to work item c within 5 s of computing (at least compute.chunk_timeout_s)"
     )
 
 

@@ -17,9 +17,16 @@ from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError
 from es_service.protocol.machine import CODE, is_mixed
 from es_service.protocol.messages import TrainingChunk
-from es_service.protocol.sources import driver_sources, in_words, other_files, why_refused, worker_sources
+from es_service.protocol.sources import (
+    OtherCodeError,
+    driver_sources,
+    in_words,
+    other_files,
+    why_refused,
+    worker_sources,
+)
 from tests.helpers import SPEC, centre, random_parameters
-from workers.actor import OtherCodeError, WorkerActor
+from workers.actor import WorkerActor
 
 ROOT = Path(__file__).parents[2]
 WORKERS, DRIVER = worker_sources("point_maze"), driver_sources("es")

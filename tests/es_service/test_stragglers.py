@@ -14,6 +14,7 @@ from es_service.dispatch import engine as engine_module
 from es_service.dispatch.engine import Answer, Engine
 from es_service.dispatch.events import (
     Assign,
+    Compiled,
     Deliver,
     Drain,
     Fail,
@@ -30,7 +31,7 @@ from es_service.dispatch.events import (
     WorkItem,
 )
 from es_service.dispatch.scheduler import step
-from es_service.dispatch.scheduler_state import IN_TIME, LATE, SchedulerState, next_deadline, pending
+from es_service.dispatch.scheduler_state import IN_TIME, LATE, NEW, SchedulerState, next_deadline, pending
 from es_service.protocol.gradient_tree import tree_sum, with_neighbours_added
 from es_service.protocol.messages import GradientChunk, GradientResult, around
 from tests.es_service.scheduler_play import check_consistency, items, play, ready
@@ -63,7 +64,7 @@ def test_a_late_item_is_sent_to_an_idle_worker_too_and_the_first_answer_counts()
         done, commands = play(done, (12.7, Result(other, "a", 1)))
         assert (commands, done.duplicates) == ([], 1)
         assert (done.copies, done.retries, done.lost_workers) == (1, 0, 0)
-        durations_s = {"train": (1.0, 1.0, 1.0, 2.5 if first == 0 else 0.5)}
+        durations_s = {"train": (1.0, 1.0, 1.0, 1.0, 1.0, 2.5 if first == 0 else 0.5)}
         assert done.durations_s == durations_s, "when the other answer was given is not known"
 
 
@@ -142,6 +143,17 @@ def test_a_slow_worker_gets_a_copy_only_if_no_other_would():
     assert commands == [Assign(0, "c", 1, copy=True)], "now both are slow"
 
 
+def test_compiling_makes_no_worker_late():
+    """Its first item is timed from the end of compiling, and it is then in time or late like any other."""
+    state, _ = play(experienced(1), (10.0, SetWorkers(2)), (10.0, WorkerUp(1)), (11.0, items("ab")))
+    state, _ = play(state, (12.0, Result(0, "a", 1)), (40.0, Tick()))
+    assert (state.up[1].pace, state.copies) == (NEW, 1), "worker 0 is idle, and worker 1 has answered nothing so far"
+    state, _ = play(state, (41.0, Compiled(1, "train", 30.0)))
+    assert state.up[1].late_s == 41.0 + 2.0
+    assert play(state, (42.0, Result(1, "b", 1)))[0].up[1].pace == IN_TIME
+    assert play(state, (43.0, Tick()))[0].up[1].pace == LATE
+
+
 def test_a_worker_that_must_compile_does_not_hold_up_the_others():
     state, _ = play(experienced(2), (10.0, WorkerLost(0, "killed")), (10.0, WorkerUp(2)), (11.0, items("ab")))
     state, commands = play(state, (12.0, Result(1, "a", 1)), (12.0, Tick()))
@@ -192,7 +204,8 @@ def test_a_phase_ends_without_a_worker_that_hangs_and_the_worker_is_replaced_wit
     state, commands = play(state, (13.0, Result(1, "a", 1)))
     assert (commands, pending(state), next_deadline(state)) == ([Deliver("a")], 0, 20.0)
     state, commands = play(state, (14.0, items("cd")), (20.0, Tick()))
-    assert commands[:2] == [StopWorker(0, "no answer to work item a within 10 s (min_deadline_s)"), StartWorker(2)]
+    reason = "no answer to work item a within 10 s of computing (min_deadline_s)"
+    assert commands[:2] == [StopWorker(0, reason), StartWorker(2)]
     assert [state.items[item].faults for item in "cd"] == [0, 0]
 
 

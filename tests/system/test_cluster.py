@@ -24,7 +24,7 @@ from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation
 from tests.dispatch_checker import check_dispatch, read_dispatch_log
 from tests.system import cluster
-from tests.system.cluster import Cluster
+from tests.system.cluster import ROOT, Cluster
 from tests.system.processes import committed, wait_for
 from tests.system.session import SMALL
 
@@ -285,6 +285,40 @@ def test_what_cannot_be_joined_is_named(tmp_path):
         printed = run("--or-resume")
         for version in ("2.1.0", "3.9.1", "2.60"):
             assert version in printed
+
+
+def test_a_node_with_other_code_is_told_of_once_and_left_out(tmp_path):
+    """It gets no worker after the first ones; a run for which there is no other node ends at once."""
+    config, run = tmp_path / "config.yaml", tmp_path / "run"
+    compute = CONFIG["compute"] | {"dispatch_log": True, "worker_resources": {"cpu": 1}, "workers": 4}
+    config.write_text(yaml.safe_dump(CONFIG | {"compute": compute}))
+    ours, other = ROOT / "workers" / "policy.py", tmp_path / "policy.py"
+    other.write_text(f"{ours.read_text()}# a comment\n")
+    with Cluster(tmp_path) as hosts:
+        hosts.start("stale", 2, setup=f"mount --bind {other} {ours}", PYTHONDONTWRITEBYTECODE="1")
+        started = time.monotonic()
+        command = ("es-service", "run", config, "--address", hosts.address, "--out")
+        code, printed = hosts.run("head", *command, tmp_path / "alone", timeout=90.0)
+        assert code == 1
+        assert "stale has other code" in printed
+        assert "workers/policy.py" in printed
+        assert "Traceback" not in printed
+        print(f"every node refuses: the run ends after {time.monotonic() - started:.1f} s")
+        hosts.start("good", 2)
+        driver = hosts.popen("head", *command, run)
+        wait_for(lambda: len(entries(run, "Committed", 0.0)) > 3)
+        since = time.time()
+        wait_for(lambda: len(entries(run, "Committed", since)) > 50)
+        assert not entries(run, "WorkerLost", since)
+        printed = stop_a_little_later(hosts, driver, run)
+    assert printed.count("stale has other code") == 1, printed
+    assert "lost" not in printed, printed
+    refused = entries(run, "WorkerLost", 0.0)
+    assert 1 <= len(refused) <= 4
+    assert all(entry["refused"] for entry in refused)
+    assert {entry["worker"] for entry in refused}.isdisjoint(e["worker"] for e in entries(run, "WorkerUp", 0.0))
+    assert len(entries(run, "WorkerUp", 0.0)) == 2
+    assert digest_parts(run) == inline_digest(tmp_path / "inline", CONFIG, read_generation(run))
 
 
 def test_a_driver_whose_head_dies_says_so_and_goes_on_alone(tmp_path):

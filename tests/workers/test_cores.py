@@ -18,6 +18,7 @@ from tests.helpers import spec
 from tests.system.processes import ROOT
 from tests.workers.test_worker import bits, work
 from workers import cores as module
+from workers.compilable import Compilable
 from workers.cores import make_worker_with_cores, parts
 from workers.worker import make_worker
 
@@ -39,7 +40,7 @@ def test_threads_with_simd_give_the_results_of_one_core(monkeypatch):
         threads[threading.get_ident()] += 1
         return run(part)
 
-    monkeypatch.setattr(module, "make_worker", lambda _: watched)
+    monkeypatch.setattr(module, "make_worker", lambda _: Compilable(watched, run.compile))
     found = make_worker_with_cores(worker_spec, 3)(work())
     assert list(map(bits, found)) == list(map(bits, run(work())))
     assert len(threads) == 3
@@ -57,6 +58,7 @@ if __name__ == "__main__":
     from workers.cores import make_worker_with_cores
 
     run = make_worker_with_cores(spec(rollout="xla", episode_steps=30), 2)
+    run.compile(work())  # in each child
     results = run(work())
     if len(sys.argv) > 1:
         import multiprocessing

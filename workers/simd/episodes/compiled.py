@@ -16,6 +16,7 @@ import numpy as np
 
 from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
+from workers.compilable import Compilable
 from workers.environments import Environment
 from workers.episode import Carry, Episodes
 from workers.simd.backend.native import Native, load_compiled
@@ -37,7 +38,7 @@ class EpisodeKernel:
     inputs_O: np.ndarray
     """Indices of the observations that are computed, as inputs of the policy."""
     network: Network
-    begin: Callable[[np.ndarray], np.ndarray]
+    begin: Compilable
     """Function from reset keys [lane, 4] to words of carries [block, word, lane]."""
     alive_word: int
     """Index of the word of a carry that says whether the episode is alive."""

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service.protocol.noise import KEY_WORDS
+from workers.compilable import Compilable, jitted
 from workers.simd.backend.emit import emit
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import Target, host_target
@@ -135,10 +136,8 @@ def compile_kernel(
     )
 
 
-def compile_resets(
-    begin: Callable[[Any], Any], target: Target, folder: Path | None
-) -> Callable[[np.ndarray], np.ndarray]:
-    """Function from reset keys [lane, 4] to words of carries, compiled by simd if possible and otherwise by JAX.
+def compile_resets(begin: Callable[[Any], Any], target: Target, folder: Path | None) -> Compilable:
+    """Function from reset keys [lane, 4] to words of carries, compiled here by simd if possible and otherwise by JAX.
 
     Resets of Brax's own environments, for example, cannot be compiled by simd. Resets are few compared with steps, but
     the bits of those that JAX compiles may differ between processors.
@@ -147,8 +146,12 @@ def compile_resets(
     try:
         kernel = compile_kernel(begin, key, target=target, folder=folder)
     except UnsupportedError:
-        resets = jax.jit(jax.vmap(begin))
-        return lambda keys_L: pack([np.asarray(leaf) for leaf in jax.tree.leaves(resets(keys_L))], target.width)
+        resets = jitted(jax.vmap(begin))
+
+        def packed(keys_L: np.ndarray) -> np.ndarray:
+            return pack([np.asarray(leaf) for leaf in jax.tree.leaves(resets(keys_L))], target.width)
+
+        return Compilable(packed, resets.compile)
 
     def words(keys_L: np.ndarray) -> np.ndarray:
         keys = pack([keys_L], target.width)
@@ -156,4 +159,4 @@ def compile_resets(
         kernel.run(keys, out)
         return out
 
-    return words
+    return Compilable(words, lambda keys_L: None)

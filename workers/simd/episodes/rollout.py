@@ -12,6 +12,7 @@ import numpy as np
 
 from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
+from workers.compilable import Compilable
 from workers.environments import Environment, make_environment
 from workers.episode import Carry, Episodes
 from workers.simd.backend.native import Native, load_compiled
@@ -61,7 +62,7 @@ def why_not(task: TaskSpec) -> str:
     return ""
 
 
-def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
+def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
     """Rollout of one training chunk, with the interface of `workers.rollout.make_training_rollout`."""
     kernels = _Kernels(environment, spec, training=True)
 
@@ -79,10 +80,13 @@ def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Callabl
             *(np.stack(leaves, axis=1).reshape(*axes, *leaves[0].shape[1:]) for leaves in zip(*by_episode, strict=True))
         )
 
-    return rollout
+    def compile_for(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
+        kernels.fitting(mean_O).begin.compile(reset_keys_P_S_E[:, :, 0].reshape(-1, KEY_WORDS))
+
+    return Compilable(rollout, compile_for)
 
 
-def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
+def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
     """Rollout of one evaluation chunk, with the interface of `workers.rollout.make_evaluation_rollout`."""
     kernels = _Kernels(environment, spec, training=False)
 
@@ -90,10 +94,13 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Calla
         kernel, weights = kernels.for_centre(centre_D, mean_O)
         return kernel.run(weights, 0.0, mean_O, std_O, None, reset_keys_E, reset_keys_E)
 
-    return rollout
+    def compile_for(centre_D, mean_O, std_O, reset_keys_E):
+        kernels.fitting(mean_O).begin.compile(reset_keys_E)
+
+    return Compilable(rollout, compile_for)
 
 
-def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Episodes]:
+def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
     """Rollout of explicit policies, with the interface of `workers.rollout.make_policy_rollout`, for any number of
     lanes."""
     kernels = _Kernels(environment, spec, training=False, own_weights=True)
@@ -104,7 +111,10 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Callable[
         require(0 <= policy_L.min() <= policy_L.max() < len(rows), "policy_L names rows that are not there")
         return kernel.run(addresses_N[policy_L], 0.0, mean_L_O, std_L_O, None, reset_keys_L, reset_keys_L)
 
-    return rollout
+    def compile_for(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
+        kernels.fitting(mean_L_O).begin.compile(reset_keys_L)
+
+    return Compilable(rollout, compile_for)
 
 
 def make_watched_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Carry]:
@@ -175,8 +185,8 @@ class _Kernels:
         return kernel, weights
 
 
-def make_gradient_sum(parameters: int, target: Target | None = None) -> Callable:
-    """Sum of weighted noise, with the interface of `workers.rollout.make_gradient_sum`."""
+def make_gradient_sum(parameters: int, target: Target | None = None) -> Compilable:
+    """Sum of weighted noise, with the interface of `workers.rollout.make_gradient_sum`; it is compiled here."""
     target = target or host_target()
     signature = [*[ctypes.c_void_p] * 2, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64]
     group = UNROLLED * target.width
@@ -196,7 +206,8 @@ def make_gradient_sum(parameters: int, target: Target | None = None) -> Callable
 
     name, text = f"gradient {definition()}", lambda: gradient_module(target.width)
     checked = lambda native: check_gradient(function(native), parameters)  # noqa: E731
-    return function(load_compiled(name, text, target, check=checked))
+    gradient_sum = function(load_compiled(name, text, target, check=checked))
+    return Compilable(gradient_sum, lambda *_: None)
 
 
 def always_zero(environment: Environment) -> np.ndarray:
