@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from es_service.dispatch.engine import Answer, Engine, Message
-from es_service.dispatch.events import Assign, Limits, Result, Submit, Tick, WorkerUp, WorkItem
+from es_service.dispatch.events import Assign, Compiled, Limits, Result, Submit, Tick, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending
 from es_service.protocol.messages import NO_CENTRE, GradientResult, TrainingChunk, Work, WorkItemId, around
@@ -38,7 +38,7 @@ class AnswersAtOnce:
         self._inbox: deque[Message] = deque()
 
     def start(self, worker: int) -> None:
-        self._inbox.append(WorkerUp(worker))
+        self._inbox += [WorkerUp(worker), Compiled(worker, "TrainingChunk", 0.0)]
 
     def kill(self, worker: int) -> str:
         return ""
@@ -80,7 +80,8 @@ def scheduler_seconds(items: int, workers: int) -> tuple[float, float]:
     """Seconds of the scheduler alone: for an item that is submitted, and for one that is answered."""
     state, _ = step(initial_state(limits_of(workers)), Tick(), 0.0)
     for worker in range(workers):
-        state, _ = step(state, WorkerUp(worker), 0.0)
+        for event in (WorkerUp(worker), Compiled(worker, "TrainingChunk", 0.0)):
+            state, _ = step(state, event, 0.0)
     submit, answer = [], []
     for generation in range(GENERATIONS):
         ids = [WorkItemId(generation, index, "TrainingChunk", generation, 0, index, 1) for index in range(items)]

@@ -21,7 +21,10 @@ UNPICKLERS = {
     "workers.recording": "the request of the process that started it",
 }
 """Module that unpickles -> what; each has it from a process of ours or from the cluster, and none from a run folder."""
-PICKLERS = {"es_service.runs.export": "writes the archive of pyribs, which nothing here reads"}
+PICKLERS = {
+    "es_service.runs.export": "writes the archive of pyribs, which nothing here reads",
+    "es_service.dispatch.ray_calls": "chunks and their subjects, which workers unpickle",
+}
 """Module that may import pickle, only to write."""
 SERIALIZERS = ("pickle", "_pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve")
 BUILTINS = {"eval", "exec", "compile", "__import__"}
