@@ -104,7 +104,10 @@ def test_a_worker_killed_or_stopped_in_mid_generation(tmp_path, reference, numbe
     outcome = run(tmp_path / "run", strike, notices.append, chunk_timeout_s=chunk_timeout_s)
     history = outcome.run.history
     what = "a worker" if number == signal.SIGKILL else "2 workers"
-    assert [notice.partition(";")[0] for notice in notices] == [f"generation {g + 1}: lost {what}" for g in after]
+    told = [notice.partition(";")[0] for notice in notices]
+    assert len(told) == len(after)
+    for line, g in zip(told, after, strict=True):  # on a busy machine, it is noticed in the generation after
+        assert line in (f"generation {g + 1}: lost {what}", f"generation {g + 2}: lost {what}")
     assert history["lost_workers"].sum() == len(hit)
     assert digest_parts(tmp_path / "run") == reference
     assert children() == []
