@@ -1,30 +1,53 @@
-"""Number of cores that this process may use, by its CPU affinity and the quota of its container."""
+"""Number of cores that this process may use, by its CPU affinity and the quotas of its control groups."""
 
 from __future__ import annotations
 
 import os
-from pathlib import Path
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
 
 CGROUP = Path("/sys/fs/cgroup")
-"""Path of a container's control group inside the container."""
+"""Folder of the control groups, as this process sees it."""
+MEMBERSHIP = Path("/proc/self/cgroup")
+"""File that names the control groups of this process."""
 
 
 def cores() -> int:
-    """Cores in this process's CPU affinity, or the quota of its container (`docker run --cpus`), rounded up, if that is
-    less."""
-    usable = len(os.sched_getaffinity(0))
-    quota, period = _quota()
-    return min(usable, -(-quota // period)) if quota > 0 and period > 0 else usable
+    """Cores in this process's CPU affinity, or the least quota of its control groups (`docker run --cpus`, `systemd-run
+    -p CPUQuota=`, a Slurm job), rounded up, if that is less.
+
+    The quota of a group also holds for all groups inside it, so the group of the process and all groups around it
+    count, in both versions of control groups. A group without a readable quota has none.
+    """
+    return min([len(os.sched_getaffinity(0)), *_quotas()])
 
 
-def _quota() -> tuple[int, int]:
-    """(microseconds of core time allowed per period, microseconds of a period); without a limit, the first is not
-    positive."""
+def _quotas() -> Iterator[int]:
+    """Cores that each of the groups with a quota allows."""
+    for top, files, inside in _memberships():
+        for group in (inside, *inside.parents):
+            try:
+                texts = [(top / group / file).read_text() for file in files]
+                quota, period = map(int, " ".join(texts).split())
+            except (OSError, ValueError):  # without a limit, the quota of version 2 is "max"
+                continue
+            if quota > 0 and period > 0:  # without a limit, the quota of version 1 is -1
+                yield -(-quota // period)
+
+
+def _memberships() -> Iterator[tuple[Path, tuple[str, ...], PurePosixPath]]:
+    """For each version: the folder of all groups, the files of a group whose texts are its quota and period, and the
+    path of this process's group in that folder."""
+    # Lines of the file are NUMBER:CONTROLLERS:PATH, without controllers for version 2. In a container, the path may be
+    # that of the host, which the container does not see; then its own group is the folder itself.
+    path = {"": "/", "cpu": "/"}
     try:
-        if (version_2 := CGROUP / "cpu.max").exists():
-            quota, period = version_2.read_text().split()
-        else:
-            quota, period = ((CGROUP / "cpu" / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
-        return int(quota), int(period)  # without a limit, the quota is -1 in version 1 and "max" in version 2
-    except (OSError, ValueError):
-        return 0, 0
+        lines = MEMBERSHIP.read_text().splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        controllers, _, group = line.partition(":")[2].partition(":")
+        path |= {controller: group for controller in controllers.split(",") if controller in path}
+    inside = {controller: PurePosixPath(group.lstrip("/")) for controller, group in path.items() if ".." not in group}
+    yield CGROUP, ("cpu.max",), inside.get("", PurePosixPath())
+    yield CGROUP / "cpu", ("cpu.cfs_quota_us", "cpu.cfs_period_us"), inside.get("cpu", PurePosixPath())

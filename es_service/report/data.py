@@ -27,6 +27,7 @@ from es_service.protocol.messages import TaskSpec
 from es_service.runs.standing import Standing, standing_at
 from es_service.runs.view import Run
 from es_service.search.maps.behaviour_map import BehaviourMap
+from es_service.store.columns import as_floats
 from es_service.store.digest import checked_parts, digest_of
 from es_service.store.lock import lock_holder
 from es_service.store.schema import RunMeta
@@ -47,8 +48,7 @@ class RunData:
     history: Columns
     """Columns of the history, [G]; a damaged row is left out."""
     centres: Columns
-    """Columns of the evaluated centres, [N]: `generation`, `ask` (the place among those of its generation), and those
-    of the run."""
+    """Columns of the evaluated centres, [N], in the order of the asks: `generation`, and those of the run."""
     map: BehaviourMap | None
     """None if the run has no map, or if it cannot be read."""
     paths: Mapping[int, NDArray[np.float32]]
@@ -120,7 +120,7 @@ def read_run(folder: Path, *, paths: bool = True, digest: bool = True) -> RunDat
     driver = lock_holder(folder)  # read before the history, so that the last row is not missed
     found = read_sound(folder, kept)
     problems = list(found.problems)
-    row = found.history[-1] if found.history else None
+    row = found.newest
     run = Run(folder)
     run.__dict__["meta"] = found.meta  # it is cached there, and `run.db` itself may be damaged
     best = found.parts.get(BEST)
@@ -128,8 +128,8 @@ def read_run(folder: Path, *, paths: bool = True, digest: bool = True) -> RunDat
         folder=folder,
         meta=found.meta,
         task=task_from_fields(found.meta.task),
-        history=_columns([column.name for column in found.meta.columns], found.history),
-        centres=_centres(found),
+        history=_floats(found.history),
+        centres=_floats(found.evaluations),
         map=_map(found, problems),
         paths=_paths(found),
         best=None if best is None else (int(best["generation"]), float(best["fitness"])),
@@ -140,17 +140,9 @@ def read_run(folder: Path, *, paths: bool = True, digest: bool = True) -> RunDat
     )
 
 
-def _columns(names: list[str], rows: list[dict[str, Any]]) -> dict[str, NDArray[np.float64]]:
-    return {name: np.array([row[name] for row in rows], np.float64) for name in names}
-
-
-def _centres(found: SoundRun) -> dict[str, NDArray[np.float64]]:
-    rows = [
-        {"generation": row["generation"], "ask": ask, **centre}
-        for row, centres in zip(found.history, found.evaluations, strict=True)
-        for ask, centre in enumerate(centres)
-    ]
-    return _columns(["generation", "ask", *(column.name for column in found.meta.evaluation_columns)], rows)
+def _floats(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[np.float64]]:
+    """Columns as floats; `columns` is emptied, so that a long history is in memory once."""
+    return {name: as_floats(columns.pop(name)) for name in list(columns)}
 
 
 def _map(found: SoundRun, problems: list[str]) -> BehaviourMap | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,8 +27,13 @@ RIBS_MARGIN = 2e-6
 """Least distance of exported descriptors from a cell's edge: pyribs adds 1e-6 to a measure before finding its cell."""
 
 
+SUMS = "SHA256SUMS"
+"""File with the SHA-256 of each exported file, in the format of `sha256sum`: `sha256sum -c` finds damaged ones."""
+
+
 def export(run: Run, to: str, folder: Path) -> list[Path]:
     """Write a run into `folder`, which is created if needed, and return the files written. Older files are replaced.
+    Of other formats than that of TensorBoard, the last file, `SHA256SUMS`, has the SHA-256 of the others.
 
     Args:
         to: a key of FORMATS.
@@ -43,20 +49,22 @@ def export(run: Run, to: str, folder: Path) -> list[Path]:
         raise NotInRunError(f"{run.folder} has no finished generation yet", run=run.folder, ways_out=[way_out])
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        return FORMATS[to](run, folder)
+        files = FORMATS[to](run, folder)
+        # Events of TensorBoard have checksums of their own.
+        return files if to == "tensorboard" else [*files, _write_sums(folder, files)]
     except OSError as error:
         raise StoreError(f"cannot write into {folder}: {error.strerror or error}; choose another folder") from error
 
 
-def tables(run: Run) -> dict[str, pd.DataFrame]:
-    """History, evaluated centres, novelty archive and, where there is one, the map, as of one generation."""
+def tables(run: Run) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Names and content of history, evaluated centres, novelty archive and, where there is one, the map, as of one
+    generation. They come one by one, because the first two may be large."""
     moment = run.at(wanted=is_no_elite)
-    found = {
-        "history": run.history_until(moment.generation).reset_index(),
-        "evaluations": run.evaluations_until(moment.generation),
-        "novelty": moment.novelty,
-    }
-    return found | ({"map": moment.map} if run.constants["map.enabled"] else {})
+    yield "history", run.history_until(moment.generation).reset_index()
+    yield "evaluations", run.evaluations_until(moment.generation)
+    yield "novelty", moment.novelty
+    if run.constants["map.enabled"]:
+        yield "map", moment.map
 
 
 def arrays(run: Run) -> dict[str, np.ndarray]:
@@ -164,7 +172,7 @@ def _map_arrays(run: Run, map_: BehaviourMap, elites: dict[int, Elite]) -> dict[
 
 def _csv(run: Run, folder: Path) -> list[Path]:
     written = []
-    for name, table in tables(run).items():
+    for name, table in tables(run):
         written.append(folder / f"{name}.csv")
         table.to_csv(written[-1], index=False, lineterminator="\n")
     return written
@@ -172,7 +180,7 @@ def _csv(run: Run, folder: Path) -> list[Path]:
 
 def _parquet(run: Run, folder: Path) -> list[Path]:
     written = []
-    for name, table in tables(run).items():
+    for name, table in tables(run):
         written.append(folder / f"{name}.parquet")
         try:
             table.to_parquet(written[-1], index=False)
@@ -180,6 +188,20 @@ def _parquet(run: Run, folder: Path) -> list[Path]:
             ways_out = [_install("parquet")]
             raise ConfigError("parquet needs pyarrow", field="to", value="parquet", ways_out=ways_out) from error
     return written
+
+
+def _write_sums(folder: Path, files: list[Path]) -> Path:
+    """Write the SHA-256 of new files into SHA256SUMS, beside those of other files that are still there."""
+    sums, found = folder / SUMS, {}
+    if sums.exists():
+        lines = (line.partition("  ") for line in sums.read_text(encoding="utf-8", errors="replace").splitlines())
+        there = {path.name for path in folder.iterdir()}
+        found = {name: sha256 for sha256, _, name in lines if name in there}
+    for file in files:
+        with file.open("rb") as stream:
+            found[file.name] = hashlib.file_digest(stream, "sha256").hexdigest()
+    sums.write_text("".join(f"{sha256}  {name}\n" for name, sha256 in sorted(found.items())), encoding="utf-8")
+    return sums
 
 
 def _install(extra: str) -> WayOut:

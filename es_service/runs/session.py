@@ -17,7 +17,7 @@ from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log, no_lo
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.errors import EvaluationError, WayOut
+from es_service.errors import EvaluationError, StoreError, WayOut
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.parts import moments_from_arrays
@@ -210,7 +210,15 @@ def make_engine(
 
 def initial_centres(config: RunConfig, start: Part | None) -> tuple[list[FloatArray], Moments]:
     """The initial centres and observation statistics: random centres without statistics, or copies of the policy of
-    `search.init_from` with its statistics, which the run has stored as its start."""
+    `search.init_from` with its statistics, which the run has stored as its start.
+
+    Raises StoreError if the run should have a start and has none.
+    """
+    if start is None and config.search.init_from is not None:
+        raise StoreError(
+            f"the run starts from a policy of {config.search.init_from}, which it has lost; start it again in a new "
+            "folder"
+        )
     task, centres = task_of(config), range(config.search.centres)
     if start is not None:
         return [start["centre_D"] for _ in centres], moments_from_arrays(start)

@@ -32,6 +32,7 @@ from es_service.store.codec import (
     changed_sum,
     encode_part,
     part_sha256,
+    row_dict,
     row_values,
     state_sha256,
     state_sum,
@@ -171,7 +172,8 @@ class _Comparison:
         self._changed |= parts
         self.reached = generation
         stored = reader.read_row(self._run.folder, generation)
-        found = _history_differences(self._run, generation, stored.values, history)
+        values = row_dict(self._run.meta.columns, stored.row)
+        found = _history_differences(self._run, generation, values, history)
         if table_bytes(self._run.meta.evaluation_columns, evaluations) != stored.evaluations:
             found.append("the evaluated centres")
         if state_sha256(self._sum) != stored.state:

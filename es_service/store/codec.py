@@ -186,8 +186,8 @@ def table_bytes(columns: Sequence[Column], rows: Sequence[Mapping[str, int | flo
     return b"".join(row_bytes(tuple(_value(column, row[column.name]) for column in columns)) for row in rows)
 
 
-def table_rows(columns: Sequence[Column], payload: bytes) -> list[dict[str, int | float]]:
-    """The rows that `table_bytes` encoded; NaN stands for no value.
+def table_rows(columns: Sequence[Column], payload: bytes) -> list[Row]:
+    """The rows that `table_bytes` encoded, with values in the order of `columns`.
 
     Raises:
         ValueError: `payload` does not consist of such rows.
@@ -208,7 +208,7 @@ def table_rows(columns: Sequence[Column], payload: bytes) -> list[dict[str, int 
         raise ValueError(f"the evaluated centres are unreadable: {error!r}") from error
     if columns and len(values) % len(columns):
         raise ValueError(f"the evaluated centres have {len(values)} values, which {len(columns)} columns do not fit")
-    return [row_dict(columns, tuple(values[i : i + len(columns)])) for i in range(0, len(values), len(columns) or 1)]
+    return [tuple(values[i : i + len(columns)]) for i in range(0, len(values), len(columns) or 1)]
 
 
 def column_bytes(columns: Sequence[Column]) -> bytes:

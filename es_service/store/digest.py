@@ -21,8 +21,9 @@ from es_service.errors import StoreError, WayOut
 from es_service.loop.parts import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.protocol.machine import is_mixed
 from es_service.store.codec import column_bytes, decode_part, row_bytes
+from es_service.store.connection import reading
 from es_service.store.folder import DATABASE
-from es_service.store.reader import kept_states, platforms, reading, state_payload
+from es_service.store.reader import kept_states, platforms, state_payload
 from es_service.store.schema import RunMeta, history_select
 from es_service.store.verify import verify
 
@@ -67,9 +68,9 @@ def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
         StoreError: the run cannot be read, or is damaged; the message names the damaged data.
     """
     with reading(folder) as (connection, meta):
-        if problems := verify(connection, folder / DATABASE).problems:
+        if damage := verify(connection, folder / DATABASE).damage:
             raise StoreError(
-                f"{folder} is damaged: {'; '.join(problems)}",
+                f"{folder} is damaged: {damage}",
                 run=folder,
                 ways_out=[WayOut("resume", "continue from the newest intact generation", str(folder))],
             )

@@ -15,6 +15,21 @@ Rows = Mapping[str, Mapping[int, str]]
 """Stored state rows: part -> generation -> SHA-256."""
 
 
+def kept_rows(connection: sqlite3.Connection) -> dict[str, dict[int, str]]:
+    """Stored state rows, without their payloads. Those that damage has given values of other types are left out."""
+    kept: dict[str, dict[int, str]] = {}
+    typed = "typeof(part) = 'text' AND typeof(generation) = 'integer' AND typeof(sha256) = 'text'"
+    for part, at, sha256 in connection.execute(f"SELECT part, generation, sha256 FROM state WHERE {typed}"):
+        kept.setdefault(part, {})[at] = sha256
+    return kept
+
+
+def newest_state(connection: sqlite3.Connection) -> int | None:
+    """Newest generation of a state row; None if there is none."""
+    query = "SELECT max(generation) FROM state WHERE typeof(generation) = 'integer'"
+    return connection.execute(query).fetchone()[0]
+
+
 def outdated_rows(
     kept: Rows, replaced: Iterable[str], keep_every: int | None, earlier: Sequence[int]
 ) -> list[tuple[str, int]]:

@@ -8,7 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 from es_service.store.codec import text_sha256
+from es_service.store.schema import Damaged
 
+LIST = "platforms"
+"""Key of the list of the rows' generations in the table `meta`, by which the loss of a row is noticed. Older versions
+neither store nor read it."""
 Execute = Callable[..., sqlite3.Cursor]
 """Runs an SQL statement with its values."""
 
@@ -27,6 +31,36 @@ def record(execute: Execute, generation: int, platform: dict[str, Any]) -> bool:
         row = (generation, text, text_sha256(f"platform {generation}", text))
         execute("INSERT INTO platform (generation, platform, sha256) VALUES (?, ?, ?)", row)
     return differs
+
+
+def store_list(execute: Execute) -> None:
+    """Store the list of all rows, together with the first generation of the newest one.
+
+    Not earlier: an older version of es-service may still compute that generation instead, and deletes the row.
+    """
+    text = json.dumps([at for (at,) in execute("SELECT generation FROM platform ORDER BY generation")])
+    execute("INSERT OR REPLACE INTO meta VALUES (?, ?, ?)", (LIST, text, text_sha256(LIST, text)))
+
+
+def sound_platforms(connection: sqlite3.Connection) -> list[tuple[int, str]]:
+    """Recorded platforms as (first generation, JSON text), in order.
+
+    Raises:
+        Damaged: a record does not match its SHA-256, or is missing.
+    """
+    found: list[tuple[int, str]] = []
+    for at, text, sha256 in connection.execute("SELECT generation, platform, sha256 FROM platform ORDER BY generation"):
+        if text_sha256(f"platform {at}", text) != sha256:
+            raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
+        found.append((at, text))
+    listed = connection.execute("SELECT value FROM meta WHERE key = ?", (LIST,)).fetchone()
+    newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
+    stored = {at for at, _ in found}
+    for at in [] if listed is None or newest is None else json.loads(listed[0]):
+        # The row of a generation that was lost, and is not computed again yet, was deleted with it.
+        if at <= newest and at not in stored:
+            raise Damaged(f"the platform recorded at generation {at} is missing")
+    return found
 
 
 def newest_before(execute: Execute, generation: int) -> dict[str, Any] | None:

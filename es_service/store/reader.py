@@ -5,25 +5,27 @@ Readers never create, change or repair a run. The state and the history rows tha
 
 from __future__ import annotations
 
-import contextlib
 import json
 import sqlite3
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
+from es_service.loop.history import Column
 from es_service.store.beginning import load_start
-from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict, table_rows
-from es_service.store.folder import COPY, DATABASE, explained, is_network_filesystem, require_run_folder
-from es_service.store.kept import whole_states
-from es_service.store.lock import lock_holder
-from es_service.store.schema import Damaged, RunMeta, history_select, load_meta, quoted
-from es_service.store.verify import KeptRows, is_no_damage, row_is_sound, rows_in_force, sound_platforms
+from es_service.store.codec import Row, column_bytes, decode_part, part_sha256, row_dict, table_rows
+from es_service.store.columns import Columns, Table
+from es_service.store.connection import reading
+from es_service.store.kept import kept_rows, newest_state, whole_states
+from es_service.store.platforms import sound_platforms
+from es_service.store.schema import Damaged, RunMeta, history_select
+from es_service.store.verify import KeptRows, row_is_sound, rows_in_force
 
-_BUSY_S = 5.0
+GENERATION = Column("generation", "INTEGER", True, "generation that evaluated the centre")
+"""The column before those of the evaluated centres."""
 EvaluatedCentres = list[dict[str, int | float]]
 """The centres that one generation evaluated, as values by column name; NaN stands for no value."""
 
@@ -31,73 +33,12 @@ EvaluatedCentres = list[dict[str, int | float]]
 class HistoryRow(NamedTuple):
     """A history row whose SHA-256 was checked."""
 
-    values: dict[str, int | float]
+    row: Row
+    """Values in the order of the run's columns."""
     evaluations: bytes
+    """The evaluated centres, encoded by `codec.table_bytes`."""
     state: str
     """`codec.state_sha256` of the state after the generation."""
-
-
-@contextlib.contextmanager
-def reading(folder: Path) -> Iterator[tuple[sqlite3.Connection, RunMeta]]:
-    """Context manager with a read-only connection to the run in `folder`, inside a transaction, and its description.
-
-    All reads in it see the same generation. It should be short, because a writer cannot empty SQLite's log meanwhile.
-
-    Raises:
-        StoreError: the folder is not a run folder, the run was written by a version with another schema, or it cannot
-            be read.
-    """
-    folder = Path(folder)
-    try:
-        connection, meta = _connected(folder)
-    except (sqlite3.Error, Damaged, OSError) as error:
-        raise _unreadable(folder, error) from error
-    with contextlib.closing(connection):
-        try:
-            yield connection, meta
-        except (sqlite3.Error, Damaged) as error:
-            raise _unreadable(folder, error) from error
-
-
-def _connected(folder: Path) -> tuple[sqlite3.Connection, RunMeta]:
-    require_run_folder(folder)
-    if not (folder / DATABASE).exists():
-        way_out = WayOut("resume", f"restore it from {COPY}", str(folder))
-        raise StoreError(f"{folder / DATABASE} is missing", run=folder, ways_out=[way_out])
-    if not is_network_filesystem(folder) or not (folder / COPY).exists():
-        return connected_to(folder / DATABASE)
-    # On a network file system, read the copy while a writer is running.
-    if lock_holder(folder) is None:
-        # This fails if a killed writer left a transaction that must be rolled back, which readers cannot do.
-        with contextlib.suppress(sqlite3.Error):
-            return connected_to(folder / DATABASE)
-    return connected_to(folder / COPY)
-
-
-def connected_to(file: Path) -> tuple[sqlite3.Connection, RunMeta]:
-    """A read-only connection to a database, inside a transaction, and the description of its run.
-
-    Raises Damaged, StoreError or sqlite3.Error if it cannot be read.
-    """
-    uri = f"{file.absolute().as_uri()}?mode=ro"
-    connection = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None)
-    try:
-        connection.execute("BEGIN")
-        # The first read determines the generation that the whole transaction sees.
-        return connection, load_meta(connection, file)
-    except BaseException:
-        connection.close()
-        raise
-
-
-def _unreadable(folder: Path, error: sqlite3.Error | Damaged | OSError) -> StoreError:
-    if not isinstance(error, Damaged) and is_no_damage(error, folder):
-        return explained(error, folder, "reading the run", "try again, or read a copy of the folder")
-    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-    is_database = code != sqlite3.SQLITE_NOTADB and "no such table: meta" not in str(error)
-    what = "cannot be read" if is_database else "is not a run folder"
-    way_out = WayOut("resume", "repair it as far as possible, if it is a run", str(folder))
-    return StoreError(f"{folder} {what}: {error}", run=folder, ways_out=[way_out])
 
 
 def read_meta(folder: Path) -> RunMeta:
@@ -107,15 +48,17 @@ def read_meta(folder: Path) -> RunMeta:
 
 
 def read_generation(folder: Path) -> int | None:
-    """Newest committed generation; None if there is none."""
-    with reading(folder) as (connection, _):
-        return connection.execute("SELECT max(generation) FROM history").fetchone()[0]
+    """Newest committed generation; None if there is none. Raises StoreError if its history row is damaged."""
+    newest = read_newest(folder)
+    return None if newest is None else int(newest["generation"])
 
 
 def read_history(
     folder: Path, since_generation: int | None = None, limit: int | None = None
 ) -> list[dict[str, int | float]]:
     """History rows in order, as values by column name; NaN stands for no value.
+
+    A row takes more than a hundred bytes per value; `read_history_columns` needs eight.
 
     Args:
         since_generation: generation of the first row; None for all rows.
@@ -125,17 +68,36 @@ def read_history(
         StoreError: a row is missing or does not match its SHA-256.
     """
     with reading(folder) as (connection, meta):
-        return [row.values for row in _sound_rows(connection, meta, max(since_generation or 0, 0), limit)]
+        found = _sound_rows(connection, meta, max(since_generation or 0, 0), limit)
+        return [row_dict(meta.columns, one.row) for one in found]
+
+
+def read_history_columns(folder: Path, limit: int | None = None) -> Columns:
+    """The history from generation 0 on, as columns; `limit` and errors as in `read_history`."""
+    with reading(folder) as (connection, meta):
+        table = Table(meta.columns)
+        for one in _sound_rows(connection, meta, 0, limit):
+            table.add(one.row)
+        return table.columns()
 
 
 def read_evaluations(folder: Path, since_generation: int = 0, limit: int | None = None) -> list[EvaluatedCentres]:
     """The centres that each generation evaluated, in the order of the asks; arguments and errors as `read_history`."""
     with reading(folder) as (connection, meta):
-        found = _sound_rows(connection, meta, since_generation, limit)
-        try:
-            return [table_rows(meta.evaluation_columns, row.evaluations) for row in found]
-        except ValueError as error:
-            raise Damaged(str(error)) from error
+        columns = meta.evaluation_columns
+        found = (table_rows(columns, one.evaluations) for one in _sound_rows(connection, meta, since_generation, limit))
+        return [[row_dict(columns, row) for row in rows] for rows in found]
+
+
+def read_evaluation_columns(folder: Path, limit: int | None = None) -> Columns:
+    """The evaluated centres of all generations, as columns, the first of which is `generation`; `limit` (of
+    generations) and errors as in `read_history`."""
+    with reading(folder) as (connection, meta):
+        table = Table((GENERATION, *meta.evaluation_columns))
+        for generation, one in enumerate(_sound_rows(connection, meta, 0, limit)):
+            for row in table_rows(meta.evaluation_columns, one.evaluations):
+                table.add((generation, *row))
+        return table.columns()
 
 
 def read_newest(folder: Path) -> dict[str, int | float] | None:
@@ -146,8 +108,8 @@ def read_newest(folder: Path) -> dict[str, int | float] | None:
     """
     with reading(folder) as (connection, meta):
         newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
-        rows = _sound_rows(connection, meta, newest or 0)
-        return rows[-1].values if rows else None
+        rows = [row_dict(meta.columns, one.row) for one in _sound_rows(connection, meta, newest or 0)]
+        return rows[-1] if rows else None
 
 
 def read_row(folder: Path, generation: int) -> HistoryRow:
@@ -157,9 +119,9 @@ def read_row(folder: Path, generation: int) -> HistoryRow:
         StoreError: the row is missing or does not match its SHA-256.
     """
     with reading(folder) as (connection, meta):
-        if not (rows := _sound_rows(connection, meta, generation, 1)):
-            raise Damaged(f"the history row of generation {generation} is missing")
-        return rows[0]
+        for one in _sound_rows(connection, meta, generation, 1):
+            return one
+        raise Damaged(f"the history row of generation {generation} is missing")
 
 
 def read_start(folder: Path) -> dict[str, NDArray[Any]] | None:
@@ -168,32 +130,25 @@ def read_start(folder: Path) -> dict[str, NDArray[Any]] | None:
         return load_start(connection)
 
 
-def read_totals(folder: Path, names: Sequence[str]) -> list[int | float]:
-    """Sums of columns over the whole history, in the order of `names`. Rows are not checked against their SHA-256."""
-    sums = ", ".join(f"coalesce(sum(history.{quoted(name)}), 0)" for name in names)
-    with reading(folder) as (connection, _):
-        return list(connection.execute(f"SELECT {sums} FROM history").fetchone())
-
-
 def _sound_rows(
     connection: sqlite3.Connection, meta: RunMeta, first: int, limit: int | None = None
-) -> list[HistoryRow]:
+) -> Iterator[HistoryRow]:
     """History rows from generation `first` on. Raises Damaged if a row is missing or does not match its SHA-256."""
     query = history_select(meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation LIMIT ?"
-    columns = column_bytes(meta.columns)
-    rows: list[HistoryRow] = []
+    columns, at = column_bytes(meta.columns), [column.name for column in meta.columns].index("generation")
+    expected = first
     for *values, evaluations, state, sha256 in connection.execute(query, (first, -1 if limit is None else limit)):
         row = tuple(values)
-        named = row_dict(meta.columns, row)
-        if not row_is_sound(columns, row, evaluations, state, sha256) or named["generation"] != first + len(rows):
-            raise Damaged(f"the history row of generation {first + len(rows)} is damaged or missing")
-        rows.append(HistoryRow(named, evaluations, state))
+        if not row_is_sound(columns, row, evaluations, state, sha256) or row[at] != expected:
+            raise Damaged(f"the history row of generation {expected} is damaged or missing")
+        expected += 1
+        yield HistoryRow(row, evaluations, state)
     # Damage can hide the end of a table even from SQLite. The state shows it, since every generation has state rows.
-    newest = connection.execute("SELECT max(generation) FROM state").fetchone()[0]
-    if newest is not None and newest >= first + len(rows) and len(rows) != limit:
-        at = first + len(rows) - 1
-        raise Damaged(f"the history after generation {at} is missing; the state is that of generation {newest}")
-    return rows
+    newest = newest_state(connection)
+    if newest is not None and newest >= expected and expected - first != limit:
+        raise Damaged(
+            f"the history after generation {expected - 1} is missing; the state is that of generation {newest}"
+        )
 
 
 def read_parts(
@@ -213,8 +168,10 @@ def read_parts(
         if newest is None:
             way_out = WayOut("resume", "continue it", str(folder))
             raise StoreError(f"{folder} has no generation yet", run=folder, ways_out=[way_out])
+        if (last := newest_state(connection) or 0) > newest:
+            raise Damaged(f"the history after generation {newest} is missing; the state is that of generation {last}")
         asked = newest if generation is None else generation
-        kept = _kept_rows(connection)
+        kept = kept_rows(connection)
         whole = whole_states(connection, kept)
         if asked not in whole:
             if asked == newest:
@@ -242,26 +199,22 @@ def read_parts(
 def read_kept(folder: Path) -> tuple[KeptRows, list[int]]:
     """Stored state rows (part -> generation -> SHA-256), and the generations whose whole state is stored."""
     with reading(folder) as (connection, _):
-        kept = _kept_rows(connection)
+        kept = kept_rows(connection)
         return kept, whole_states(connection, kept)
 
 
 def kept_states(connection: sqlite3.Connection) -> list[int]:
     """Generations whose whole state is stored: at most the last two, unless the run keeps others."""
-    return whole_states(connection, _kept_rows(connection))
-
-
-def _kept_rows(connection: sqlite3.Connection) -> KeptRows:
-    kept: KeptRows = {}
-    for part, at, sha256 in connection.execute("SELECT part, generation, sha256 FROM state"):
-        kept.setdefault(part, {})[at] = sha256
-    return kept
+    return whole_states(connection, kept_rows(connection))
 
 
 def state_payload(connection: sqlite3.Connection, part: str, generation: int) -> bytes:
-    """The payload of an existing state row."""
+    """The payload of a state row that was found. Raises Damaged if it cannot be found again or holds something else."""
     query = "SELECT payload FROM state WHERE part = ? AND generation = ?"
-    return connection.execute(query, (part, generation)).fetchone()[0]
+    row = connection.execute(query, (part, generation)).fetchone()
+    if row is None or not isinstance(row[0], bytes):
+        raise Damaged(f"the state of {part!r} at generation {generation} is missing")
+    return row[0]
 
 
 def read_platforms(folder: Path) -> list[tuple[int, dict[str, Any]]]:

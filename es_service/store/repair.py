@@ -66,13 +66,13 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str]) 
     if not verdict.problems:
         return verdict
     if verdict.good is None:
-        raise Damaged("; ".join(verdict.problems))
+        raise Damaged(verdict.damage)
     connection.execute("BEGIN IMMEDIATE")
     for table in GENERATION_TABLES:
         connection.execute(f"DELETE FROM {table} WHERE generation > ?", (verdict.good,))
     connection.executemany("DELETE FROM state WHERE part IS ? AND generation IS ?", verdict.bad_rows)
     connection.execute("COMMIT")
-    found = "; ".join(verdict.problems)
+    found = verdict.damage
     if verdict.good == verdict.newest:
         notices.append(
             f"{file}: {found}. The newest generation, {verdict.good}, is intact; the damaged rows were deleted"
@@ -84,7 +84,7 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str]) 
         )
     again = verify(connection, file)
     if again.problems:
-        raise Damaged("; ".join(again.problems))
+        raise Damaged(again.damage)
     return again
 
 
@@ -153,7 +153,7 @@ def make_copy(connection: sqlite3.Connection, folder: Path) -> None:
             target.execute("PRAGMA journal_mode = DELETE")
             verdict = verify(target, temporary, _known_rows(target, folder / COPY))
         if verdict.problems:
-            raise Damaged("; ".join(verdict.problems))
+            raise Damaged(verdict.damage)
         sync_file(temporary)
         os.replace(temporary, folder / COPY)
         sync_folder(folder)

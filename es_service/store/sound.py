@@ -16,12 +16,14 @@ from typing import Any
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
-from es_service.store.codec import column_bytes, decode_part, part_sha256, row_dict, table_rows
+from es_service.store.codec import Row, column_bytes, decode_part, part_sha256, row_dict, table_rows
+from es_service.store.columns import Columns, Table
+from es_service.store.connection import connected_to, reading
 from es_service.store.folder import COPY
-from es_service.store.kept import whole_states
-from es_service.store.reader import EvaluatedCentres, connected_to, platforms, reading, state_payload
+from es_service.store.kept import kept_rows, newest_state, whole_states
+from es_service.store.reader import GENERATION, platforms, state_payload
 from es_service.store.schema import Damaged, RunMeta, history_select
-from es_service.store.verify import KeptRows, row_is_sound, rows_in_force
+from es_service.store.verify import row_is_sound, rows_in_force
 
 Arrays = dict[str, NDArray[Any]]
 Kept = Callable[[str, Arrays], Arrays | None]
@@ -33,10 +35,12 @@ class SoundRun:
     """What could be read of a run in one transaction; every value matches its SHA-256."""
 
     meta: RunMeta
-    history: list[dict[str, int | float]]
-    """Sound history rows in the order of generations, as values by column name; NaN stands for no value."""
-    evaluations: list[EvaluatedCentres]
-    """The centres that each generation of `history` evaluated, in the order of the asks."""
+    history: Columns
+    """Sound history rows in the order of generations."""
+    newest: dict[str, int | float] | None
+    """The last of these rows, as values by column name; NaN stands for no value. None if there is none."""
+    evaluations: Columns
+    """The centres that these generations evaluated, in the order of the asks; the first column is `generation`."""
     platforms: list[tuple[int, dict[str, Any]]]
     """(first generation, platform); each applies until the next one."""
     generation: int | None
@@ -54,14 +58,14 @@ def read_sound(folder: Path, kept: Kept = lambda part, arrays: arrays) -> SoundR
     """
     problems: list[str] = []
     with _any_sound(folder, problems) as (connection, meta):
-        rows, evaluations = _history(connection, meta, problems)
+        history, newest, evaluations = _history(connection, meta, problems)
         found: list[tuple[int, dict[str, Any]]] = []
         with _noted(problems, "the platforms cannot be read"):
             found = platforms(connection)
         generation, parts = None, {}
         with _noted(problems, "the state cannot be read"):
             generation, parts = _state(connection, kept, problems)
-    return SoundRun(meta, rows, evaluations, found, generation, parts, tuple(problems))
+    return SoundRun(meta, history, newest, evaluations, found, generation, parts, tuple(problems))
 
 
 @contextlib.contextmanager
@@ -75,7 +79,7 @@ def _any_sound(folder: Path, problems: list[str]) -> Iterator[tuple[sqlite3.Conn
                 raise
             try:
                 opened = connected_to(folder / COPY)
-            except (sqlite3.Error, Damaged):
+            except (sqlite3.Error, Damaged, UnicodeDecodeError):
                 raise error from None
             stack.enter_context(contextlib.closing(opened[0]))
             problems.append(f"{error.sentence}; shown is its copy {COPY}")
@@ -93,44 +97,50 @@ def _noted(problems: list[str], what: str) -> Iterator[None]:
 
 def _history(
     connection: sqlite3.Connection, meta: RunMeta, problems: list[str]
-) -> tuple[list[dict[str, int | float]], list[EvaluatedCentres]]:
-    """The sound history rows and the centres that were evaluated; a row that is damaged is left out."""
-    columns = column_bytes(meta.columns)
-    rows: list[dict[str, int | float]] = []
-    evaluations: list[EvaluatedCentres] = []
+) -> tuple[Columns, dict[str, int | float] | None, Columns]:
+    """The sound history rows, the last of them, and the centres that were evaluated; a damaged row is left out."""
+    columns, at = column_bytes(meta.columns), [column.name for column in meta.columns].index("generation")
+    history, evaluations = Table(meta.columns), Table((GENERATION, *meta.evaluation_columns))
+    last: Row | None = None
     expected = 0
-    lost: list[int] = []
+    lost: list[range] = []
     with _noted(problems, "the end of the history cannot be read"):
         query = history_select(meta.columns) + " ORDER BY history.generation"
         for *values, centres, state, sha256 in connection.execute(query):
             row = tuple(values)
-            named = row_dict(meta.columns, row)
-            if not row_is_sound(columns, row, centres, state, sha256):
+            # A damaged page can also show rows again.
+            if not row_is_sound(columns, row, centres, state, sha256) or row[at] < expected:
                 continue
-            lost += range(expected, int(named["generation"]))
-            expected = int(named["generation"]) + 1
-            rows.append(named)
-            evaluations.append(table_rows(meta.evaluation_columns, centres))
+            evaluated = table_rows(meta.evaluation_columns, centres)
+            history.add(row)
+            if row[at] > expected:
+                lost.append(range(expected, row[at]))
+            last, expected = row, row[at] + 1
+            for centre in evaluated:
+                evaluations.add((row[at], *centre))
     with _noted(problems, "the number of generations cannot be read"):
-        newest = connection.execute("SELECT max(generation) FROM state").fetchone()[0]
-        lost += range(expected, (-1 if newest is None else newest) + 1)
+        newest = newest_state(connection)
+        if newest is not None and newest >= expected:
+            lost.append(range(expected, newest + 1))
     if lost:
         problems.append(f"the history rows of generations {_spans(lost)} are damaged or missing")
-    return rows, evaluations
+    named = None if last is None else row_dict(meta.columns, last)
+    return history.columns(), named, evaluations.columns()
 
 
 def _state(connection: sqlite3.Connection, kept: Kept, problems: list[str]) -> tuple[int | None, dict[str, Arrays]]:
     """The newest generation whose whole state is stored, and its parts; the newest parts there are if none is."""
-    stored: KeptRows = {}
-    for part, at, sha256 in connection.execute("SELECT part, generation, sha256 FROM state"):
-        stored.setdefault(part, {})[at] = sha256
-    if not stored:
+    stored = kept_rows(connection)
+    found = (newest_state(connection), connection.execute("SELECT max(generation) FROM history").fetchone()[0])
+    if (newest := max((at for at in found if at is not None), default=None)) is None:
         return None, {}
     whole = whole_states(connection, stored)
-    newest = max(at for rows in stored.values() for at in rows)
     generation = max(whole, default=newest)
-    if generation not in whole:
-        problems.append("the state of the newest generation is incomplete")
+    if newest not in whole:
+        problems.append(
+            f"the state of generation {newest} is incomplete"
+            + (f"; that of generation {generation} is shown" if whole else "")
+        )
     parts: dict[str, Arrays] = {}
     damaged = []
     for part, (at, sha256) in sorted(rows_in_force(stored, generation).items()):
@@ -139,7 +149,7 @@ def _state(connection: sqlite3.Connection, kept: Kept, problems: list[str]) -> t
             if part_sha256(part, at, payload) != sha256:
                 raise ValueError(part)
             arrays = kept(part, decode_part(payload))
-        except (sqlite3.Error, ValueError, TypeError):
+        except (sqlite3.Error, Damaged, ValueError):
             damaged.append(part)
             continue
         if arrays is not None:
@@ -150,13 +160,7 @@ def _state(connection: sqlite3.Connection, kept: Kept, problems: list[str]) -> t
     return generation, parts
 
 
-def _spans(numbers: list[int]) -> str:
+def _spans(spans: list[range]) -> str:
     """Increasing numbers as text, such as "3, 7 to 9"; at most five spans."""
-    spans: list[list[int]] = []
-    for number in numbers:
-        if spans and number == spans[-1][1] + 1:
-            spans[-1][1] = number
-        else:
-            spans.append([number, number])
-    shown = [str(first) if first == last else f"{first} to {last}" for first, last in spans[:5]]
+    shown = [str(span[0]) if len(span) == 1 else f"{span[0]} to {span[-1]}" for span in spans[:5]]
     return ", ".join(shown) + (" and others" if len(spans) > 5 else "")

@@ -14,9 +14,9 @@ from es_service.store.codec import (
     row_sha256,
     state_sha256,
     state_sum,
-    text_sha256,
 )
 from es_service.store.folder import is_disk_full
+from es_service.store.platforms import sound_platforms
 from es_service.store.schema import Damaged, RunMeta, history_select, load_meta, table_statements
 
 _NOT_DAMAGE = {
@@ -30,6 +30,8 @@ _NOT_DAMAGE = {
     sqlite3.SQLITE_INTERRUPT,
 }
 """SQLite errors that do not mean that the file is damaged, so the file must not be replaced because of them."""
+MOST_NAMED = 8
+"""Most problems that a message names."""
 KeptRows = dict[str, dict[int, str]]
 """Stored state rows: part -> generation -> SHA-256."""
 
@@ -49,6 +51,12 @@ class Verdict:
     """Damaged state rows as (part, generation), which must be deleted."""
     problems: tuple[str, ...] = field(default=())
     """All problems found, as messages for the user."""
+
+    @property
+    def damage(self) -> str:
+        """The problems in one message, which names the first few if there are many."""
+        more = [f"and {len(self.problems) - MOST_NAMED} more problems"] if len(self.problems) > MOST_NAMED else []
+        return "; ".join([*self.problems[:MOST_NAMED], *more])
 
 
 def is_no_damage(error: BaseException, folder: Path) -> bool:
@@ -105,21 +113,22 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
     if tables != table_statements(meta.columns):
         raise Damaged("its tables are not those of a run")
     sound_platforms(connection)
+    if connection.execute("SELECT min(generation) < 0 FROM history").fetchone()[0]:
+        raise Damaged("it has a history row of a negative generation")
 
     problems: list[str] = []
-    states = _history(connection, meta, first, problems)
+    count, sound, states = _history(connection, meta, first, problems)
     kept, bad_rows = _state(connection, problems)
-    sound_history = next((index for index, state in enumerate(states) if state is None), len(states))
-    newest = len(states) - 1 if states else None
-    unfinished = sorted((part, at) for part, rows in kept.items() for at in rows if at >= len(states))
+    newest = count - 1 if count else None
+    unfinished = sorted((part, at) for part, rows in kept.items() for at in rows if at >= count)
     problems += [f"state of {part!r} at generation {at} has no history row" for part, at in unfinished]
     good = None
     if newest is not None:
         # The states of older generations are not stored.
         for generation in (newest, newest - 1):
-            in_force = rows_in_force(kept, generation) if 0 <= generation < sound_history else {}
+            in_force = rows_in_force(kept, generation) if 0 <= generation < sound else {}
             # A fork has the whole history of its parent, but only the newest of the parent's states.
-            if in_force and states[generation] == state_sha256(state_sum(in_force)):
+            if in_force and states.get(generation) == state_sha256(state_sum(in_force)):
                 good = generation
                 break
         else:
@@ -129,24 +138,29 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
     return Verdict(meta, newest, good, kept, tuple(bad_rows), tuple(problems))
 
 
-def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems: list[str]) -> list[str | None]:
-    """The `state_sha256` of each generation; None if its history row is damaged, "" for generations before `first`."""
+def _history(
+    connection: sqlite3.Connection, meta: RunMeta, first: int, problems: list[str]
+) -> tuple[int, int, dict[int, str]]:
+    """The number of history rows, the number of those before the first damaged one, and the `state_sha256` of the last
+    two generations. The rows of generations before `first` are taken for sound."""
     columns = column_bytes(meta.columns)
     at = [column.name for column in meta.columns].index("generation")
-    states: list[str | None] = [""] * first
+    states: dict[int, str] = {}
+    count, bad = first, []
     query = history_select(meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation"
     for *values, evaluations, state, sha256 in connection.execute(query, (first,)):
         row = tuple(values)
-        generation = len(states)
+        generation, count = count, count + 1
+        if row[at] == generation and row_is_sound(columns, row, evaluations, state, sha256):
+            states[generation] = state
+            states.pop(generation - 2, None)
+            continue
+        bad.append(generation)
         if row[at] != generation:
             problems.append(f"history row of generation {generation} is missing")
-            states.append(None)
             break
-        sound = row_is_sound(columns, row, evaluations, state, sha256)
-        if not sound:
-            problems.append(f"history row of generation {generation} does not match its SHA-256")
-        states.append(state if sound else None)
-    return states
+        problems.append(f"history row of generation {generation} does not match its SHA-256")
+    return count, min([*bad, count]), states
 
 
 def row_is_sound(columns: bytes, row: tuple, evaluations: object, state: object, sha256: object) -> bool:
@@ -155,20 +169,6 @@ def row_is_sound(columns: bytes, row: tuple, evaluations: object, state: object,
         return isinstance(evaluations, bytes) and row_sha256(columns, row, evaluations, str(state)) == sha256
     except ValueError:
         return False
-
-
-def sound_platforms(connection: sqlite3.Connection) -> list[tuple[int, str]]:
-    """Recorded platforms as (first generation, JSON text), in order.
-
-    Raises:
-        Damaged: a record does not match its SHA-256.
-    """
-    found: list[tuple[int, str]] = []
-    for at, text, sha256 in connection.execute("SELECT generation, platform, sha256 FROM platform ORDER BY generation"):
-        if text_sha256(f"platform {at}", text) != sha256:
-            raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
-        found.append((at, text))
-    return found
 
 
 def _state(connection: sqlite3.Connection, problems: list[str]) -> tuple[KeptRows, list[tuple[str, int]]]:

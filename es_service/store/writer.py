@@ -36,7 +36,7 @@ from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.kept import earlier_states, outdated_rows
 from es_service.store.lock import RunLock, acquire_lock
-from es_service.store.platforms import newest_before, record
+from es_service.store.platforms import newest_before, record, store_list
 from es_service.store.repair import open_sound
 from es_service.store.schema import PAGE_BYTES, RunMeta, history_insert, history_select
 from es_service.store.upkeep import Upkeep
@@ -73,7 +73,7 @@ class RunStore:
         self.notices = []
         self.lock = lock
         self._hook = hook
-        self._closed = False
+        self._closed = self._recorded = False
         self._connection, verdict = open_sound(folder, self.notices)
         self.meta = verdict.meta
         self.generation = verdict.good
@@ -208,7 +208,10 @@ class RunStore:
                 execute("INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)", row)
             self._hook("mid_transaction")
             execute(self._insert_history, history_values)
+            if self._recorded:
+                store_list(execute)
             self._hook("before_commit")
+        self._recorded = False
         self.generation, self._state_sum = generation, total
         for part, at in outdated:
             del self._kept[part][at]
@@ -232,12 +235,7 @@ class RunStore:
         """Record the platform of a generation that is not stored yet, and of those after it.
 
         This replaces the records of `generation` and later. Nothing is recorded if the platform is the same as before.
-
-        Args:
-            platform: package versions and CPU kind, as values that JSON can represent.
-
-        Returns:
-            Whether the platform differs from that of the generations before, or is the first.
+        Returns whether it differs from that of the generations before, or is the first.
 
         Raises:
             StoreError: `generation` is already stored.
@@ -247,6 +245,7 @@ class RunStore:
                 f"{self.folder}: generation {generation} is already stored, so its platform cannot be changed"
             )
         with self._transaction("recording the platform") as execute:
+            self._recorded = True
             return record(execute, generation, platform)
 
     def platform_before(self, generation: int) -> dict[str, Any] | None:

@@ -1,13 +1,15 @@
-"""What is exported while a driver works."""
+"""What is exported while a driver works, and how damaged exports are found."""
 
 from __future__ import annotations
+
+import subprocess
 
 import numpy as np
 import pytest
 
 from es_service import api
 from es_service.runs import session
-from es_service.runs.export import arrays, tables
+from es_service.runs.export import arrays, export, tables
 from es_service.store import reader
 from tests.benchmarks.science import in_this_process
 
@@ -43,11 +45,11 @@ def test_an_export_is_of_one_generation_although_one_more_is_stored_before_each_
     same = api.run(api.load_config(CONFIG), tmp_path / "same").run
     expected = {}
     for generation in range(FIRST, LAST):
-        expected[generation] = tables(same) | arrays(same)
+        expected[generation] = dict(tables(same)) | arrays(same)
         go_on(same)
-    for name in ("read_parts", "read_history"):
+    for name in ("read_parts", "read_history_columns"):
         monkeypatch.setattr(reader, name, after_a_generation(run, getattr(reader, name)))
-    found_tables, found_arrays = tables(run), arrays(run)
+    found_tables, found_arrays = dict(tables(run)), arrays(run)
     assert FIRST + 2 < run.generation < LAST
     at = found_tables["history"]["generation"].iloc[-1]
     assert found_tables["history"]["centre_fitness_mean"].equals(expected[at]["history"]["centre_fitness_mean"])
@@ -57,3 +59,26 @@ def test_an_export_is_of_one_generation_although_one_more_is_stored_before_each_
         all(np.array_equal(array, of_one[name], equal_nan=True) for name, array in found_arrays.items())
         for of_one in expected.values()
     )
+
+
+def failed(folder):
+    """Files of which sha256sum says that they have changed or are missing."""
+    done = subprocess.run(["sha256sum", "-c", "SHA256SUMS"], cwd=folder, capture_output=True, text=True, check=False)
+    return {line.partition(":")[0] for line in done.stdout.splitlines() if not line.endswith(": OK")}
+
+
+def test_a_damaged_export_is_found_by_sha256sum(run, tmp_path):
+    """NumPy reads an array of a damaged npz file without a word if its header has become that of a shorter one."""
+    files = {file.name for to in ("csv", "npz", "parquet") for file in export(run, to, tmp_path / "export")}
+    assert "policies.npz" in files
+    assert "SHA256SUMS" in files
+    assert failed(tmp_path / "export") == set()
+    for name in files - {"SHA256SUMS"}:
+        content = (tmp_path / "export" / name).read_bytes()
+        (tmp_path / "export" / name).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+        assert failed(tmp_path / "export") == {name}
+        (tmp_path / "export" / name).write_bytes(content)
+    (tmp_path / "export" / "map.csv").unlink()
+    (tmp_path / "export" / "SHA256SUMS").write_bytes((tmp_path / "export" / "SHA256SUMS").read_bytes() + b"\xff\0  x\n")
+    export(run, "npz", tmp_path / "export")
+    assert failed(tmp_path / "export") == set(), "what is gone or no file is left out"

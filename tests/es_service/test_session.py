@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 from es_service.api import load_config
 from es_service.config.compute import ComputeConfig
 from es_service.dispatch.events import Compiled, Result, StopWorker, Submit, Tick, WorkerLost, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state
-from es_service.runs.session import LIMIT_NAMES, dispatch_limits
+from es_service.errors import StoreError
+from es_service.runs.session import LIMIT_NAMES, dispatch_limits, initial_centres
 
 CONFIG = {
     "task": {"environment": "point_maze"},
@@ -59,3 +62,10 @@ def test_keys_that_messages_name_exist():
     for name in LIMIT_NAMES.values():
         (item_id,) = re.findall(r"compute\.(\w+)", name)
         assert item_id in ComputeConfig.model_fields
+
+
+def test_a_run_that_has_lost_its_start_does_not_start_anywhere_else(tmp_path):
+    search = {"algorithm": "es", "init_from": str(tmp_path)}
+    config = load_config(CONFIG | {"search": search}, new=False)
+    with pytest.raises(StoreError, match="which it has lost"):
+        initial_centres(config, None)

@@ -22,6 +22,7 @@ from es_service.errors import ConfigError
 from es_service.runs.standing import Standing, look, more, state
 from es_service.store import reader
 from es_service.store.lock import acquire_lock
+from tests.run_examples import write_run
 from tests.system.session import SMALL
 
 
@@ -43,10 +44,20 @@ def test_of_a_long_history_only_the_newest_row_is_read(run, console, monkeypatch
 
     sound_rows = reader._sound_rows
     monkeypatch.setattr(reader, "_sound_rows", no_more_than_one)
+    monkeypatch.setattr(status, "FAULTS_OF", 1)
     print_status(console, run)
     follow_status(console, run)
     print_summary(console, run, "")
     assert "\ngeneration 5 " in capsys.readouterr().out
+
+
+def test_the_faults_of_the_newest_generations_are_counted(console, tmp_path, monkeypatch, capsys):
+    run = api.open_run(write_run(tmp_path / "run", generations=20))  # its only faults are those of generation 5
+    counted = "\nfaults handled     1 workers replaced, 2 chunks sent again"
+    for most, expected in ((1000, [f"{counted}\n"]), (16, [f"{counted} in the last 16 generations\n"]), (15, [])):
+        monkeypatch.setattr(status, "FAULTS_OF", most)
+        print_status(console, run)
+        assert re.findall("\nfaults .*\n", capsys.readouterr().out) == expected
 
 
 @pytest.mark.parametrize(

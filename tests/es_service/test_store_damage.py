@@ -10,9 +10,16 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
+from es_service.store import writer as store
 from es_service.store.codec import encode_part
-from es_service.store.digest import digest_parts
-from es_service.store.reader import read_evaluations, read_generation, read_history, read_parts, read_platforms
+from es_service.store.digest import checked_parts, digest_parts
+from es_service.store.reader import (
+    read_evaluations,
+    read_generation,
+    read_history,
+    read_parts,
+    read_platforms,
+)
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     advance,
@@ -182,6 +189,98 @@ def test_another_platform_or_meta_is_noticed(tmp_path):
     behind_the_stores_back(tmp_path / "run", "UPDATE meta SET value = replace(value, '0', '1') WHERE key = 'run'")
     with pytest.raises(StoreError, match="record 'run' in its table meta does not match"):
         read_history(tmp_path / "run")
+
+
+def test_a_platform_that_vanished_is_noticed(tmp_path):
+    """It would take with it that a run is mixed."""
+    for first in (0, 2):
+        folder = tmp_path / str(first)
+        with create(folder) as run:
+            run.record_platform(0, {"cpu": "a"})
+            advance(run, 1)
+            run.record_platform(2, {"cpu": "b"})
+        with RunStore.open(folder) as run:
+            assert run.notices == []
+            run.record_platform(2, {"cpu": "c"})
+            advance(run, 3)
+        assert read_platforms(folder) == [(0, {"cpu": "a"}), (2, {"cpu": "c"})]
+        behind_the_stores_back(folder, f"DELETE FROM platform WHERE generation = {first}")
+        for use in (RunStore.open, read_platforms):
+            with pytest.raises(StoreError, match=f"platform recorded at generation {first} is missing"):
+                use(folder)
+
+
+def test_a_platform_is_lost_together_with_its_only_generation(tmp_path):
+    folder = tmp_path / "run"
+    with create(folder) as run:
+        run.record_platform(0, {"cpu": "a"})
+        advance(run, 4)
+    with RunStore.open(folder) as run:
+        run.record_platform(5, {"cpu": "b"})
+        advance(run, 5)
+    behind_the_stores_back(folder, "DELETE FROM state WHERE generation = 5")
+    with RunStore.open(folder) as run:
+        assert run.generation == 4
+        assert read_platforms(folder) == [(0, {"cpu": "a"})]
+        run.record_platform(5, {"cpu": "a"})
+        advance(run, 6)
+    assert read_platforms(folder) == [(0, {"cpu": "a"})]
+
+
+def test_platforms_that_an_older_version_recorded_or_replaced_are_read(tmp_path, monkeypatch):
+    """Older versions store no list of the platforms, and leave that of a newer version as it is."""
+    folder, platforms = tmp_path / "run", []
+
+    def work(generation, cpu, last):
+        with RunStore.open(folder) as run:
+            run.record_platform(generation, {"cpu": cpu})
+            advance(run, last)
+            assert run.notices == []
+        platforms.append(read_platforms(folder))
+
+    create(folder).close()
+    with monkeypatch.context() as older:
+        older.setattr(store, "store_list", lambda execute: None)
+        work(0, "a", 1)
+    work(2, "a", 2)
+    work(3, "b", 2)  # killed before it has finished a generation
+    with monkeypatch.context() as older:
+        older.setattr(store, "store_list", lambda execute: None)
+        work(3, "a", 4)
+        work(5, "c", 5)
+    work(6, "d", 6)
+    assert [[at for at, _ in found] for found in platforms] == [[0], [0], [0, 3], [0], [0, 5], [0, 5, 6]]
+    behind_the_stores_back(folder, "DELETE FROM platform WHERE generation = 5")
+    with pytest.raises(StoreError, match="platform recorded at generation 5 is missing"):
+        read_platforms(folder)
+
+
+def test_the_newest_generation_is_read_from_its_sound_row(tmp_path):
+    folder = finished(tmp_path / "run", 6)
+    behind_the_stores_back(folder, "UPDATE history SET env_steps = 1 WHERE generation = 2")
+    assert read_generation(folder) == 5
+    behind_the_stores_back(folder, "UPDATE history SET env_steps = 1 WHERE generation = 5")
+    with pytest.raises(StoreError, match="history row of generation 5"):
+        read_generation(folder)
+
+
+def test_a_row_of_a_negative_generation_is_noticed(tmp_path):
+    """Readers begin at generation 0, but the digest would include it."""
+    folder = finished(tmp_path / "run", 3)
+    copied = (
+        "SELECT -1, env_steps, centre_fitness_mean, goal_distance, seconds_rollout, evaluations, state_sha256, sha256"
+    )
+    behind_the_stores_back(folder, f"INSERT INTO history {copied} FROM history WHERE generation = 0")
+    for use in (RunStore.open, checked_parts):
+        with pytest.raises(StoreError, match="history row of a negative generation"):
+            use(folder)
+
+
+def test_many_problems_are_not_all_named(tmp_path):
+    folder = finished(tmp_path / "run", 30)
+    behind_the_stores_back(folder, "UPDATE history SET env_steps = 1 WHERE generation < 20")
+    with pytest.raises(StoreError, match=r"generation 7 does not match its SHA-256; and 13 more problems\."):
+        RunStore.open(folder)
 
 
 @pytest.mark.parametrize(("position", "complaint"), [(18, "unknown file format"), (39, "quick_check"), (0, "SQLite")])

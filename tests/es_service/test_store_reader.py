@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from es_service.errors import StoreError
-from es_service.store import reader as store_reader
+from es_service.store import connection as store_connection
 from es_service.store import schema as store_schema
 from es_service.store.reader import (
     read_generation,
@@ -20,7 +20,6 @@ from es_service.store.reader import (
     read_newest,
     read_parts,
     read_platforms,
-    read_totals,
 )
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
@@ -40,7 +39,6 @@ def test_readers_follow_a_writer(tmp_path):
     with create(folder) as run:
         assert read_history(folder) == []
         assert read_newest(folder) is None
-        assert read_totals(folder, ["env_steps"]) == [0]
         with pytest.raises(StoreError, match="no generation yet"):
             read_parts(folder)
         for generation in range(5):
@@ -50,10 +48,6 @@ def test_readers_follow_a_writer(tmp_path):
             assert [row["generation"] for row in read_history(folder, 3)] == list(range(3, generation + 1))
             assert [row["generation"] for row in read_history(folder, 1, limit=2)] == [1, 2][:generation]
             assert read_newest(folder) == pytest.approx(read_history(folder)[-1], nan_ok=True)
-            rows = read_history(folder)
-            assert read_totals(folder, ["env_steps", "seconds_rollout"]) == [
-                sum(row[name] for row in rows) for name in ("env_steps", "seconds_rollout")
-            ]
             assert_same_state(read_parts(folder)[1], state_at(generation))
 
 
@@ -111,7 +105,7 @@ def test_a_log_that_cannot_be_opened_is_no_damage(tmp_path):
 
 
 def test_a_database_that_somebody_locks_is_no_damage(tmp_path, monkeypatch):
-    monkeypatch.setattr(store_reader, "_BUSY_S", 0.0)
+    monkeypatch.setattr(store_connection, "_BUSY_S", 0.0)
     folder = finished(tmp_path / "run", 3)
     with contextlib.closing(sqlite3.connect(folder / "run.db", isolation_level=None)) as connection:
         connection.execute("BEGIN EXCLUSIVE")

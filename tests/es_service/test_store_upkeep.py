@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from es_service.errors import StoreError
+from es_service.store import connection as store_connection
 from es_service.store import folder as run_folder
-from es_service.store import reader as store_reader
 from es_service.store import repair as store_repair
 from es_service.store import upkeep as store_upkeep
 from es_service.store import verify as store_verify
@@ -90,7 +90,7 @@ def test_a_reader_that_holds_on_does_not_fail_the_end(tmp_path, monkeypatch):
     monkeypatch.setattr(store_upkeep, "_CLOSE_PATIENCE_MS", 50)
     folder = tmp_path / "run"
     run = create(folder, generations=3)
-    with store_reader.reading(folder) as (connection, _):
+    with store_connection.reading(folder) as (connection, _):
         assert connection.execute("SELECT count(*) FROM history").fetchone() == (3,)
         run.close()
     assert_same_history(read_history(folder), 3)
@@ -172,7 +172,7 @@ def test_a_copy_that_cannot_be_made_is_a_notice(tmp_path, monkeypatch):
 
 @pytest.fixture
 def on_network(monkeypatch):
-    for module in (store, store_reader):
+    for module in (store, store_connection):
         monkeypatch.setattr(module, "is_network_filesystem", lambda path: True)
 
 

@@ -10,9 +10,10 @@ from es_service.cli.commands import command, settings, way_command
 from es_service.cli.tables.progress import plain_line
 from es_service.runs.standing import Standing, is_waiting, look, more, population_size, state, way_on
 from es_service.runs.view import Run
-from es_service.store.reader import read_totals
 
 FOLLOW_INTERVAL_S = 1.0
+FAULTS_OF = 1000
+"""Newest generations whose faults are counted; a report shows those of all."""
 
 
 def print_status(console: Console, run: Run) -> None:
@@ -80,10 +81,13 @@ def _progress(standing: Standing) -> dict[str, str]:
     if "map_cells" in last:
         filled["map"] = f"{last['map_cells']:,} cells, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
-    lost, retries = read_totals(standing.run.folder, ("lost_workers", "retries"))
+    rows = standing.run.history_rows(last["generation"] - FAULTS_OF + 1)
+    # A fork may have no numbers (NaN) for the generations of its parent.
+    lost, retries = (sum(row[name] for row in rows if row[name] > 0) for name in ("lost_workers", "retries"))
     faults = {}
     if lost or retries:
-        faults["faults handled"] = f"{lost} workers replaced, {retries} chunks sent again"
+        where = f" in the last {FAULTS_OF:,} generations" if last["generation"] >= FAULTS_OF else ""
+        faults["faults handled"] = f"{lost} workers replaced, {retries} chunks sent again{where}"
     of = {key: f" of {limit:,}" for key, limit in limits.items()}
     target = f" (target: {limits['target_fitness']:g})" if "target_fitness" in limits else ""
     return {

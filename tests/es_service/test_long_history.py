@@ -1,0 +1,109 @@
+"""The memory that the history of a long run takes: eight bytes a value, and less than a gigabyte in all."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from es_service import open_run
+from es_service.loop.parts import BLOCK_PREFIX, archive_to_parts
+from es_service.report.data import read_run
+from es_service.runs.export import tables
+from es_service.search.novelty import archive_of
+from es_service.store import reader
+from es_service.store.beginning import Beginning
+from es_service.store.writer import RunStore
+from tests.run_examples import write_run
+from tests.system.processes import ROOT
+
+MILLION = 1_000_000
+MOST_BYTES = 10**9
+
+
+def long_run(folder: Path, generations: int) -> Path:
+    """A run with the rows of a short one again and again, and with its last state."""
+    short = write_run(folder / "short", generations=20)
+    rows, centres = reader.read_history(short), reader.read_evaluations(short)
+    newest, parts = reader.read_parts(short)
+    count = np.arange(generations)
+    archive = archive_of(np.random.default_rng(0).uniform(-1, 1, (generations, 2)), count, 0 * count)
+    parts = {name: part for name, part in parts.items() if not name.startswith(BLOCK_PREFIX)}
+
+    def history() -> Iterator[dict[str, Any]]:
+        for generation in range(generations):
+            yield rows[generation % newest] | {"generation": generation}
+
+    beginning = Beginning(
+        history=history(),
+        parts=parts | archive_to_parts(archive, 0),
+        newest=generations - 1,
+        evaluations=(centres[generation % newest] for generation in range(generations)),
+    )
+    config = (short / "config.yaml").read_text()
+    RunStore.create(folder / "long", config, reader.read_meta(short), beginning).close()
+    return folder / "long"
+
+
+@pytest.mark.parametrize("read", ["history", "evaluations", "export", "report"])
+def test_a_generation_takes_about_eight_bytes_a_value(tmp_path, read):
+    def peak(generations: int) -> int:
+        folder = long_run(tmp_path / str(generations), generations)
+        tracemalloc.start()
+        match read:
+            case "report":
+                read_run(folder, paths=False)
+            case "export":
+                for _ in tables(open_run(folder)):
+                    pass
+            case _:
+                getattr(open_run(folder), read)
+        found = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return found
+
+    peak(10)  # imports
+    small, large = 1000, 5000
+    meta = reader.read_meta(long_run(tmp_path / "run", 10))
+    values = len(meta.columns) * (read != "evaluations") + len(meta.evaluation_columns) * (read != "history")
+    assert peak(large) - peak(small) < 2 * 8 * values * (large - small)
+
+
+@pytest.fixture(scope="module")
+def of_a_million(tmp_path_factory):
+    return long_run(tmp_path_factory.mktemp("long"), MILLION)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize(
+    "work",
+    [
+        "assert len(run.history) == len(run.evaluations)",
+        "export(run, 'csv', out)",
+        "export(run, 'parquet', out)",
+        "export(run, 'npz', out)",
+        "write_report(run.folder, out / 'report.html', best=False)",
+        "run.digest()",
+    ],
+)
+def test_a_million_generations_stay_below_a_gigabyte(tmp_path, of_a_million, work):
+    program = f"""
+from pathlib import Path
+from es_service import open_run, write_report
+from es_service.runs.export import export
+run, out = open_run({str(of_a_million)!r}), Path({str(tmp_path)!r})
+{work}
+print(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0])
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    kibibytes = int(done.stdout.split()[-1])
+    print(f"\n{work}: {kibibytes * 1024 / 1e6:.0f} MB at most")
+    assert kibibytes * 1024 < MOST_BYTES

@@ -1,0 +1,63 @@
+"""Commands for runs that are damaged at random; `es_service/test_store_fuzz.py` does the same with Python's readers."""
+
+from __future__ import annotations
+
+import random
+import shutil
+
+import pytest
+
+from tests.es_service.mutations import damage_bytes, damage_rows
+from tests.system.command_line import command, digest
+
+READS = (
+    ("status",),
+    ("status", "--json"),
+    ("digest",),
+    ("evaluate", "--episodes", "1", "--workers", "1"),
+    ("export", "--to", "npz"),
+    ("report", "--replay", "none"),
+)
+
+
+def printed(folder, words):
+    """What a command prints; None if it says that it cannot."""
+    result = command(words[0], folder, *words[1:])
+    if result.returncode == 0:
+        return result.stdout
+    assert result.returncode in (1, 2)
+    assert "cannot" in result.stderr or '"problem"' in result.stdout or "damaged" in result.stderr, result
+    return None
+
+
+@pytest.fixture(scope="module")
+def example(mapped, tmp_path_factory):
+    """A run and its copy, the folder in which copies of both are damaged, and what commands print of it before."""
+    place = tmp_path_factory.mktemp("damaged")
+    original, folder = place / "original", place / "run"
+    for copy in (original, folder):
+        shutil.copytree(mapped.folder, copy)
+        shutil.copyfile(copy / "run.db", copy / "run.db.copy")
+    return original, folder, {words: printed(folder, words) for words in READS}
+
+
+def examine(example, number):
+    rng, (original, folder, expected) = random.Random(number), example
+    shutil.rmtree(folder)
+    shutil.copytree(original, folder)
+    print(number, rng.choice((damage_bytes, damage_rows))(folder / "run.db", rng))
+    for words in READS:
+        assert printed(folder, words) in (None, expected[words]), words
+    if command("resume", folder).returncode == 0:
+        assert digest(folder) == expected["digest",].strip()
+
+
+@pytest.mark.slow
+def test_no_command_shows_a_traceback_or_another_run(example):
+    examine(example, 0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", range(1, 40))
+def test_no_command_shows_a_traceback_or_another_run_for_long(example, number):
+    examine(example, number)
