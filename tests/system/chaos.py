@@ -188,16 +188,12 @@ def _kill_driver(world: World, host: str, rng: Random) -> str:
 
 
 def _stop(world: World, host: str, rng: Random) -> str:
-    """Stop a worker, a raylet, all of a node, or the driver."""
-    victim = rng.choice(["a worker", "the raylet", "everything", "the driver"])
-    if victim == "the driver":
-        world.signal([world.driver()], signal.SIGSTOP)
-        return "the driver stopped"
-    if victim == "everything":
-        world.signal(world.pids(host, ""), signal.SIGSTOP)
-    else:
-        world.signal(world.pids(host, "WorkerActor" if victim == "a worker" else "/raylet/raylet "), signal.SIGSTOP)
-    return f"{victim} on {host} stopped"
+    """Stop a worker, a raylet, all of a node, the driver, or what the head node consists of."""
+    where, name = rng.choice(
+        [(host, "WorkerActor"), (host, "/raylet/raylet "), (host, ""), (HEAD, "es-service run"), (HEAD, "gcs_server")]
+    )
+    world.signal(world.pids(where, name), signal.SIGSTOP)
+    return f"{name or 'everything'} on {where} stopped"
 
 
 def _go_on(world: World, host: str) -> None:

@@ -7,7 +7,6 @@ folder. A driver that ends without being allowed to is an error.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -15,13 +14,14 @@ import struct
 import subprocess
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Self
 
 import yaml
 
 from es_service.dispatch.dispatch_log import FILE
+from tests.system.chaos_tally import Tally
 from tests.system.cluster import PORT, RAY_SETTINGS, Machines, children_of, join, ray_start
 
 HEAD, NODES = "head", ("one", "two", "three")
@@ -40,60 +40,12 @@ AGAIN_S = 2.0
 """Least time between two starts of the same thing."""
 
 
-@dataclass
-class Tally:
-    """What the dispatch log tells, as far as it has been read."""
+@dataclass(frozen=True)
+class End:
+    """How a driver ended."""
 
-    commits: int = 0
-    sessions: int = 0
-    lost: int = 0
-    repeated: int = 0
-    """Episodes that were begun again after a loss, or because their generation was lost with its driver."""
-    copied: int = 0
-    """Episodes that were sent a second time because a worker was late."""
-    at: int = 0
-    """Bytes that have been read."""
-    up: set[int] = field(default_factory=set)
-    """Workers that are up."""
-    begun: dict[tuple, int] = field(default_factory=dict)
-    """Work item -> its episodes, for all of the generation that is being computed."""
-
-    def read(self, path: Path, episodes_per_chunk: int) -> None:
-        """Read the whole lines that have been added."""
-        if not path.exists():
-            return
-        with path.open("rb") as file:
-            file.seek(self.at)
-            lines, newline, _ = file.read().rpartition(b"\n")
-        self.at += len(lines) + len(newline)
-        for line in lines.split(b"\n"):
-            try:
-                self._count(json.loads(line), episodes_per_chunk)
-            except ValueError:  # cut short by a kill or a full disk
-                continue
-
-    def _count(self, entry: dict[str, Any], episodes_per_chunk: int) -> None:
-        match entry["is"]:
-            case "Session":
-                self.sessions += 1
-                self.repeated += sum(self.begun.values())
-                self.begun, self.up = {}, set()
-            case "WorkerUp":
-                self.up.add(entry["worker"])
-            case "WorkerLost" | "StopWorker":
-                self.lost += entry["is"] == "WorkerLost"
-                self.up.discard(entry["worker"])
-            case "Assign":
-                item_id = tuple(entry["item_id"])
-                episodes = 0 if item_id[2] == "GradientChunk" else item_id[-1] * episodes_per_chunk
-                if entry["copy"]:
-                    self.copied += episodes
-                elif item_id in self.begun:
-                    self.repeated += episodes
-                self.begun[item_id] = episodes
-            case "Committed":
-                self.commits += 1
-                self.begun = {}
+    code: int
+    printed: str
 
 
 class World(Machines):
@@ -112,8 +64,8 @@ class World(Machines):
         self.tally = Tally()
         self.may_end = False
         """Whether the driver may end now by an error of its own."""
-        self.ends: list[str] = []
-        """How each driver but the last ended: its exit code, and the last line that it printed."""
+        self.ends: list[End] = []
+        """Of each driver but the last."""
         self._config, self._clock = config, clock
         self._started: dict[str, subprocess.Popen[bytes]] = {}
         """Host -> its Ray, and "driver" -> the driver."""
@@ -127,6 +79,7 @@ class World(Machines):
             command = ["cc", "-shared", "-fPIC", "-O2", "-o", self.log_folder / "wall_clock.so", CLOCK, "-ldl"]
             subprocess.run(command, check=True)
         _mount(self.disk, RUN_DISK)
+        self._on_sigterm = signal.signal(signal.SIGTERM, signal.default_int_handler)  # else nothing would be undone
         try:
             return super().__enter__()
         except BaseException:
@@ -134,6 +87,7 @@ class World(Machines):
             raise
 
     def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGTERM, self._on_sigterm)
         try:
             super().__exit__()
         finally:
@@ -296,9 +250,10 @@ class World(Machines):
             return
         ended = self._started.pop("driver")
         printed = sorted(self.log_folder.glob("driver.*.log"))[-1].read_text(errors="replace")
-        self.ends.append(f"{ended.returncode}: {(printed.strip() or '(nothing)').splitlines()[-1]}")
-        assert "Traceback" not in printed, printed
-        assert self.may_end, f"the driver ended with {ended.returncode}: {printed[-3000:]}"
+        self.ends.append(End(ended.returncode, printed))
+        by_itself = ended.returncode == 1 and "error: " in printed and "Traceback" not in printed
+        assert self.may_end, self.ends[-1]
+        assert by_itself or ended.returncode == -signal.SIGKILL, self.ends[-1]
 
     def _environment(self, node: str) -> dict[str, str]:
         environment = super()._environment(node) | RAY_SETTINGS | HEALTH

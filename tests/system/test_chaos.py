@@ -3,7 +3,6 @@
 `ES_CHAOS_SEED=7 pytest tests/system/test_chaos.py -s` plays another plan, and prints the table of costs.
 """
 
-import json
 import os
 import statistics
 from itertools import pairwise
@@ -55,7 +54,8 @@ def test_faults_at_random_change_nothing(tmp_path, seconds, kinds):
         costs = chaos.play(world, SEED, seconds, possible, min(kinds, len(possible)))
         assert world.stop() == 143, world.state()
     run = world.run_folder
-    print(json.dumps(world.ends, indent=1))
+    for end in world.ends:
+        print(f"a driver ended with {end.code}: {(end.printed.strip() or 'nothing').splitlines()[-1]}")
     print(chaos.table(costs, usual_generation_s(run)))
 
     counts = check_dispatch(run)
