@@ -8,6 +8,7 @@ folder. A driver that ends without being allowed to is an error.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import struct
@@ -76,8 +77,7 @@ class World(Machines):
         self.disk.mkdir()
         (self.log_folder / "config.yaml").write_text(yaml.safe_dump(self._config))
         if self._clock:
-            command = ["cc", "-shared", "-fPIC", "-O2", "-o", self.log_folder / "wall_clock.so", CLOCK, "-ldl"]
-            subprocess.run(command, check=True)
+            build_clock(self.log_folder)
         _mount(self.disk, RUN_DISK)
         self._on_sigterm = signal.signal(signal.SIGTERM, signal.default_int_handler)  # else nothing would be undone
         try:
@@ -174,9 +174,7 @@ class World(Machines):
 
     def move_clock(self, host: str, seconds: int) -> None:
         """Set by how much the wall clock of a host is wrong."""
-        file = os.open(self.log_folder / f"clock.{host}", os.O_WRONLY | os.O_CREAT)  # mapped, so it stays the same
-        os.pwrite(file, struct.pack("q", seconds), 0)
-        os.close(file)
+        set_clock(self.log_folder / f"clock.{host}", seconds)
 
     def fill_memory(self, host: str, share: float) -> None:
         """Set how much memory of a host seems to be in use, from 0 to 1: what Ray's memory monitor reads there."""
@@ -251,18 +249,33 @@ class World(Machines):
         ended = self._started.pop("driver")
         printed = sorted(self.log_folder.glob("driver.*.log"))[-1].read_text(errors="replace")
         self.ends.append(End(ended.returncode, printed))
-        by_itself = ended.returncode == 1 and "error: " in printed and "Traceback" not in printed
+        by_itself = ended.returncode == 1 and "\nerror: " in printed and not re.search("Traceback|StackTrace", printed)
         assert self.may_end, self.ends[-1]
         assert by_itself or ended.returncode == -signal.SIGKILL, self.ends[-1]
 
     def _environment(self, node: str) -> dict[str, str]:
         environment = super()._environment(node) | RAY_SETTINGS | HEALTH
         if self._clock:
-            environment |= {
-                "LD_PRELOAD": f"{self.log_folder / 'wall_clock.so'}",
-                "ES_TEST_CLOCK": f"{self.log_folder / f'clock.{node}'}",
-            }
+            environment |= with_clock(self.log_folder, f"clock.{node}")
         return environment | ({} if node == HEAD else {"XDG_CACHE_HOME": "/tmp/ray/cache"})
+
+
+def build_clock(folder: Path) -> None:
+    """Compile the library that moves wall clocks into a folder."""
+    library = folder / "wall_clock.so"
+    subprocess.run(["cc", "-shared", "-fPIC", "-O2", "-Wall", "-Werror", "-o", library, CLOCK, "-ldl"], check=True)
+
+
+def with_clock(folder: Path, name: str) -> dict[str, str]:
+    """Environment of processes whose wall clock is wrong by what a file in the folder says."""
+    return {"LD_PRELOAD": str(folder / "wall_clock.so"), "ES_TEST_CLOCK": str(folder / name)}
+
+
+def set_clock(path: Path, seconds: int) -> None:
+    """Write such a file, in place, since the processes have mapped it."""
+    file = os.open(path, os.O_WRONLY | os.O_CREAT)
+    os.pwrite(file, struct.pack("q", seconds), 0)
+    os.close(file)
 
 
 def _mount(folder: Path, size: str) -> None:
@@ -270,4 +283,5 @@ def _mount(folder: Path, size: str) -> None:
 
 
 def _unmount(folder: Path) -> None:
-    subprocess.run(["umount", folder], check=True)
+    if folder.is_mount():
+        subprocess.run(["umount", folder], check=True)
