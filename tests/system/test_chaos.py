@@ -86,7 +86,7 @@ def test_a_wall_clock_is_moved_while_a_process_runs_and_its_waits_stay_as_long(t
 @pytest.mark.usefixtures("can_have")
 def test_a_link_is_slow_as_long_as_it_is_limited(tmp_path):
     """64 KiB at 256 kbit/s, of which 16 kB pass at once, take a second and a half."""
-    limit = f'ip link set lo up && tc qdisc add dev lo root {" ".join(chaos.SLOW)} && exec "$@"'
+    limit = f'ip link set lo mtu 1500 up && tc qdisc add dev lo root {" ".join(chaos.SLOW)} && exec "$@"'
     command = ["unshare", "--net", "sh", "-c", limit, "sh", sys.executable, "-c", SEND]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     assert float(ran.stdout) > 1.0
