@@ -109,7 +109,7 @@ class World(Machines):
     def tend(self) -> None:
         """Start what has ended."""
         self.tally.read(self.run_folder / FILE, 2 * self._config["compute"]["chunk_pairs"])
-        if self._has_ended("driver"):
+        if "driver" in self._started and self._has_ended("driver"):
             self._note_end()
         if self._has_ended(HEAD):
             for host in (HEAD, *NODES):
@@ -120,7 +120,7 @@ class World(Machines):
                 if self._has_ended(host):
                     self.clear(host)
                     self._start_ray(host, 1, *join(f"{self.ip(0)}:{PORT}"))
-            if self._has_ended("driver"):
+            if "driver" not in self._started:
                 words = ("es-service", "run", self.log_folder / "config.yaml", "--or-resume", "--out", self.run_folder)
                 self._start("driver", HEAD, *words, "--address", f"{self.ip(0)}:{PORT}")
 
@@ -243,9 +243,7 @@ class World(Machines):
         return subprocess.Popen(words, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
 
     def _note_end(self) -> None:
-        """Note how a driver ended, once."""
-        if "driver" not in self._started:
-            return
+        """Note how the driver ended, so that another one is started."""
         ended = self._started.pop("driver")
         printed = sorted(self.log_folder.glob("driver.*.log"))[-1].read_text(errors="replace")
         self.ends.append(End(ended.returncode, printed))
