@@ -214,7 +214,15 @@ def _slow(world: World, host: str, rng: Random) -> str:
 def _move_clock(world: World, host: str, rng: Random) -> str:
     seconds = rng.choice([-1, 1]) * rng.choice([5, 3600, 86400])
     world.move_clock(host, seconds)
-    return f"the wall clock of {host} moved by {seconds} s"
+    return f"the wall clock of {'the driver' if host == HEAD else host} moved by {seconds} s"
+
+
+def _set_clock_right(world: World, host: str) -> None:
+    """Ray's timers follow the wall clock: until a raylet's clock has reached again where it was, or for five minutes,
+    it reports no free CPU. So an operator must start it again."""
+    world.move_clock(host, 0)
+    if host != HEAD:
+        world.clear(host)
 
 
 def _fill_run(world: World, host: str, rng: Random) -> str:
@@ -251,7 +259,7 @@ FAULTS = {
     "driver killed": Fault(_kill_driver, hosts=(HEAD,), ends_driver=True),
     "link cut": Fault(_cut, lambda world, host: world.link(host, "up"), (HEAD, *NODES), (1.0, 15.0)),
     "link slow": Fault(_slow, lambda world, host: world.shape(host), (HEAD, *NODES), (2.0, 6.0)),
-    "clock moved": Fault(_move_clock, lambda world, host: world.move_clock(host, 0), (HEAD, *NODES), (1.0, 4.0)),
+    "clock moved": Fault(_move_clock, _set_clock_right, (HEAD, *NODES), (1.0, 4.0)),
     "run's disk full": Fault(
         _fill_run, lambda world, host: (world.disk / "ballast").unlink(), (HEAD,), (1.0, 5.0), ends_driver=True
     ),

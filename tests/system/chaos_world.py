@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import Any, Self
 
 import yaml
 
@@ -100,7 +100,7 @@ class World(Machines):
     def begin(self) -> None:
         """Make the hosts, start the cluster and submit the run."""
         for host in (HEAD, *NODES):
-            self.move_clock(host, 0)
+            set_clock(self.log_folder / f"clock.{host}", 0)
             self.fill_memory(host, 0.0)
             memory = self.log_folder / f"memory.{host}"
             self.boot(host, setup=f"mount -o remount,{NODE_DISK} /tmp/ray && mount --bind {memory} /sys/fs/cgroup")
@@ -122,7 +122,8 @@ class World(Machines):
                     self._start_ray(host, 1, *join(f"{self.ip(0)}:{PORT}"))
             if "driver" not in self._started:
                 words = ("es-service", "run", self.log_folder / "config.yaml", "--or-resume", "--out", self.run_folder)
-                self._start("driver", HEAD, *words, "--address", f"{self.ip(0)}:{PORT}")
+                clock = with_clock(self.log_folder, f"clock.{HEAD}") if self._clock else {}
+                self._start("driver", HEAD, *words, "--address", f"{self.ip(0)}:{PORT}", **clock)
 
     def wait(self, what: Callable[[], Any], timeout_s: float = 240.0) -> None:
         """Tend until something is true."""
@@ -173,7 +174,7 @@ class World(Machines):
         self.signal(self.processes(host), signal.SIGCONT)
 
     def move_clock(self, host: str, seconds: int) -> None:
-        """Set by how much the wall clock of a host is wrong."""
+        """Set by how much a wall clock is wrong: that of a node's host, or on the head that of the driver alone."""
         set_clock(self.log_folder / f"clock.{host}", seconds)
 
     def fill_memory(self, host: str, share: float) -> None:
@@ -231,16 +232,14 @@ class World(Machines):
         clean = ("sh", "-c", 'rm -rf /tmp/ray/session*; exec "$@"', "sh")
         self._start(host, host, *clean, *ray_start(self.ip(self.nodes.index(host)), cpus, *role))
 
-    def _start(self, name: str, host: str, *command: object) -> None:
+    def _start(self, name: str, host: str, *command: object, **environment: str) -> None:
         self._number += 1
         self._tried_s[name] = time.monotonic()
         with (self.log_folder / f"{name}.{self._number:04}.log").open("wb") as log:
-            self._started[name] = self._popen(host, log, *command)
-
-    def _popen(self, host: str, log: IO[bytes], *command: object) -> subprocess.Popen[bytes]:
-        words = [*self.enter(host), *map(str, command)]
-        environment = self._environment(host)
-        return subprocess.Popen(words, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+            words, environment = [*self.enter(host), *map(str, command)], self._environment(host) | environment
+            self._started[name] = subprocess.Popen(
+                words, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log
+            )
 
     def _note_end(self) -> None:
         """Note how the driver ended, so that another one is started."""
@@ -255,9 +254,10 @@ class World(Machines):
 
     def _environment(self, node: str) -> dict[str, str]:
         environment = super()._environment(node) | RAY_SETTINGS | HEALTH
-        if self._clock:
-            environment |= with_clock(self.log_folder, f"clock.{node}")
-        return environment | ({} if node == HEAD else {"XDG_CACHE_HOME": "/tmp/ray/cache"})
+        if node == HEAD:
+            return environment
+        clock = with_clock(self.log_folder, f"clock.{node}") if self._clock else {}
+        return environment | clock | {"XDG_CACHE_HOME": "/tmp/ray/cache"}
 
 
 def build_clock(folder: Path) -> None:
