@@ -78,24 +78,23 @@ class World(Machines):
         (self.log_folder / "config.yaml").write_text(yaml.safe_dump(self._config))
         if self._clock:
             build_clock(self.log_folder)
-        _mount(self.disk, RUN_DISK)
         self._on_sigterm = signal.signal(signal.SIGTERM, signal.default_int_handler)  # else nothing would be undone
         try:
+            subprocess.run(["mount", "-t", "tmpfs", "-o", RUN_DISK, "tmpfs", self.disk], check=True)
             return super().__enter__()
         except BaseException:
-            _unmount(self.disk)
+            self._unmount()
             raise
 
     def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGTERM, self._on_sigterm)
         try:
             super().__exit__()
-        finally:
             for started in self._started.values():
                 started.wait()
             if self.run_folder.exists():
                 self.run_folder = shutil.copytree(self.run_folder, self.log_folder / "run")
-            _unmount(self.disk)
+        finally:
+            self._unmount()
 
     def begin(self) -> None:
         """Make the hosts, start the cluster and submit the run."""
@@ -206,6 +205,12 @@ class World(Machines):
             lines.append(f"{name}: exit code {started.poll()}, after {self._tried_s[name]:.0f}:\n{log}")
         return "\n".join(lines)
 
+    def _unmount(self) -> None:
+        """Undo the rest of what `__enter__` did; once is enough."""
+        if self.disk.is_mount():
+            subprocess.run(["umount", self.disk], check=True)
+        signal.signal(signal.SIGTERM, self._on_sigterm)
+
     def _programs(self, host: str) -> dict[int, str]:
         """Those of `processes` that are not the host itself."""
         entry = self._entries[host].pid
@@ -276,12 +281,3 @@ def set_clock(path: Path, seconds: int) -> None:
     file = os.open(path, os.O_WRONLY | os.O_CREAT)
     os.pwrite(file, struct.pack("q", seconds), 0)
     os.close(file)
-
-
-def _mount(folder: Path, size: str) -> None:
-    subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", folder], check=True)
-
-
-def _unmount(folder: Path) -> None:
-    if folder.is_mount():
-        subprocess.run(["umount", folder], check=True)

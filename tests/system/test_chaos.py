@@ -23,7 +23,7 @@ from tests.system.session import SMALL
 from tests.system.test_cluster import inline_digest
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
-SEED = int(os.environ.get("ES_CHAOS_SEED", "0"))
+SEED = int(os.environ.get("ES_CHAOS_SEED", "11"))
 CONFIG = SMALL | {
     "search": {"algorithm": "me_es", "pairs": 64, "evaluation_episodes": 16, "block_generations": 5},
     "budget": {"generations": 1_000_000},
