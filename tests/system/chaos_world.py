@@ -208,7 +208,7 @@ class World(Machines):
     def _unmount(self) -> None:
         """Undo the rest of what `__enter__` did; once is enough."""
         if self.disk.is_mount():
-            subprocess.run(["umount", self.disk], check=True)
+            subprocess.run(["umount", "--lazy", self.disk], check=True)
         signal.signal(signal.SIGTERM, self._on_sigterm)
 
     def _programs(self, host: str) -> dict[int, str]:
