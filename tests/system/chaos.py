@@ -13,6 +13,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from random import Random
 
 from tests.system.chaos_world import HEAD, NODES, World
@@ -58,7 +59,7 @@ class Cost:
     strike: Strike
     what: str
     seconds: float
-    """From the fault to the second generation after it was undone."""
+    """From the fault to the second generation after it was undone, or until all workers were there again."""
     commits: int
     """Generations that were committed in this time."""
     repeated: int
@@ -67,8 +68,8 @@ class Cost:
     sessions: int
 
 
-DONE_AGAIN = ("lost", "repeated", "copied", "sessions")
-"""What is counted besides the time."""
+COUNTED = ("lost", "repeated", "copied", "sessions")
+"""What a fault costs besides time, as the tally counts it."""
 
 
 def plan(seed: int, kinds: list[str]) -> Iterator[Strike]:
@@ -105,7 +106,7 @@ def play(world: World, seed: int, seconds: float, kinds: list[str], least: int) 
         if not strike.early:
             world.wait(lambda: len(world.tally.up) == len(NODES))
         took_s, now = time.monotonic() - began, vars(world.tally)
-        spent = {name: now[name] - getattr(before, name) for name in ("commits", *DONE_AGAIN)}
+        spent = {name: now[name] - getattr(before, name) for name in ("commits", *COUNTED)}
         costs.append(Cost(strike, what, took_s, **spent))
     raise AssertionError("the plan has no end")
 
@@ -125,7 +126,7 @@ def table(costs: list[Cost], usual_s: float) -> str:
         of_kind = [cost for cost in costs if cost.strike.kind == kind]
         if of_kind:
             lost = [max(0.0, cost.seconds - cost.commits * usual_s) for cost in of_kind]
-            sums = [sum(getattr(cost, name) for cost in of_kind) for name in DONE_AGAIN]
+            sums = [sum(getattr(cost, name) for cost in of_kind) for name in COUNTED]
             cells = [kind, len(of_kind), f"{sum(lost) / len(lost):.1f}", f"{max(lost):.1f}", *sums]
             lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
@@ -235,7 +236,7 @@ def _fill_node(world: World, host: str, rng: Random) -> str:
     return f"the disk for temporary files of {host} filled"
 
 
-def _fill(ballast) -> None:
+def _fill(ballast: Path) -> None:
     with ballast.open("wb", buffering=0) as file:
         for size in (2**20, 2**12, 1):
             try:

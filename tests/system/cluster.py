@@ -217,18 +217,8 @@ class Cluster(Hosts):
 
 def ray_start(ip: str, cpus: int, *role: str) -> list[str]:
     """Command that is a node for as long as it runs, with an object store that is large enough for any test."""
-    ray = str(Path(sys.executable).parent / "ray")
-    store = "--object-store-memory=100000000"
-    return [
-        ray,
-        "start",
-        "--block",
-        f"--node-ip-address={ip}",
-        f"--num-cpus={cpus}",
-        store,
-        "--disable-usage-stats",
-        *role,
-    ]
+    here = [f"--node-ip-address={ip}", f"--num-cpus={cpus}", "--object-store-memory=100000000"]
+    return [str(Path(sys.executable).parent / "ray"), "start", "--block", "--disable-usage-stats", *here, *role]
 
 
 def join(address: str) -> list[str]:
