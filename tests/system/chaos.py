@@ -6,7 +6,6 @@ which depend on the machine.
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
 import subprocess
@@ -151,7 +150,7 @@ def _kill(name: str, number: int = signal.SIGKILL) -> Inject:
 
     def inject(world: World, host: str, rng: Random) -> str:
         where, pid = _find(world, host, name)
-        os.kill(pid, number)
+        world.signal([pid], number)
         return f"{signal.Signals(number).name} to {name} on {where}"
 
     return inject
@@ -184,7 +183,7 @@ def _lose_head(world: World, host: str, rng: Random) -> str:
 
 
 def _kill_driver(world: World, host: str, rng: Random) -> str:
-    os.kill(world.driver(), signal.SIGKILL)
+    world.signal([world.driver()], signal.SIGKILL)
     return "SIGKILL to the driver"
 
 

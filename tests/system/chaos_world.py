@@ -124,7 +124,7 @@ class World(Machines):
                 clock = with_clock(self.log_folder, f"clock.{HEAD}") if self._clock else {}
                 self._start("driver", HEAD, *words, "--address", f"{self.ip(0)}:{PORT}", **clock)
 
-    def wait(self, what: Callable[[], Any], timeout_s: float = 240.0) -> None:
+    def wait(self, what: Callable[[], Any], timeout_s: float = 400.0) -> None:
         """Tend until something is true."""
         until = time.monotonic() + timeout_s
         while not what():
@@ -253,7 +253,8 @@ class World(Machines):
         self.ends.append(End(ended.returncode, printed))
         # Ray itself ends a driver that asks a head node for something in the instant in which that is lost.
         by_ray = "WrongClusterID" in printed
-        by_itself = ended.returncode == 1 and "\nerror: " in printed and not re.search("Traceback|StackTrace", printed)
+        says_why = re.search("^error: ", printed, re.MULTILINE) and not re.search("Traceback|StackTrace", printed)
+        by_itself = ended.returncode == 1 and says_why
         assert self.may_end, self.ends[-1]
         assert by_itself or by_ray or ended.returncode == -signal.SIGKILL, self.ends[-1]
 

@@ -34,6 +34,7 @@ CONFIG = SMALL | {
         "chunk_timeout_s": 4.0,
         "compile_timeout_s": 30.0,
         "max_attempts": 20,
+        "no_worker_timeout_s": 180.0,
         "dispatch_log": True,
     },
 }
