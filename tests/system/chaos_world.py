@@ -39,6 +39,8 @@ HEALTH = {
 """A node without an answer for some ten seconds counts as dead; with Ray's own settings it is a minute."""
 AGAIN_S = 2.0
 """Least time between two starts of the same thing."""
+KILLED = (-signal.SIGKILL, 128 + signal.SIGKILL)
+"""Exit codes of a driver that was killed, by versions of nsenter."""
 
 
 @dataclass(frozen=True)
@@ -256,7 +258,7 @@ class World(Machines):
         says_why = re.search("^error: ", printed, re.MULTILINE) and not re.search("Traceback|StackTrace", printed)
         by_itself = ended.returncode == 1 and says_why
         assert self.may_end, self.ends[-1]
-        assert by_itself or by_ray or ended.returncode == -signal.SIGKILL, self.ends[-1]
+        assert by_itself or by_ray or ended.returncode in KILLED, self.ends[-1]
 
     def _environment(self, node: str) -> dict[str, str]:
         environment = super()._environment(node) | RAY_SETTINGS | HEALTH
