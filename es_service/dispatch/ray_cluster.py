@@ -20,7 +20,7 @@ from types import ModuleType
 from typing import Any
 
 from es_service.config.compute import ENGINE_IMPLIES
-from es_service.dispatch.ray_nodes import Claim, Membership, cores_of_nodes, look
+from es_service.dispatch.ray_nodes import OTHER_CLUSTER, Claim, Membership, cores_of_nodes, look
 from es_service.dispatch.ray_side_effects import environment_kept, signal_handlers_kept
 from es_service.errors import EvaluationError, Interrupted, WayOut
 from es_service.logs import logger
@@ -180,11 +180,19 @@ class Watch:
         self._ray, self._claim = ray, claim
         self._latest = look(ray, claim)
         self._answered_s = self._asked_s = time.monotonic()
+        self._is_replaced = False
         self._end = threading.Event()
         threading.Thread(target=self._run, daemon=True, name="cluster-watch").start()
 
     def latest(self) -> Membership:
-        """The latest answer. Raises EvaluationError if there was none for more than SILENCE_S seconds."""
+        """The latest answer. Raises EvaluationError if there was none for more than SILENCE_S seconds, or if another
+        cluster answers at the same address."""
+        if self._is_replaced:
+            raise EvaluationError(
+                "the Ray cluster has ended, and another one was started at its address. Resume the run there, or on "
+                "this machine alone",
+                ways_out=[WITHOUT_RAY],
+            )
         now = time.monotonic()
         if now - self._asked_s > PAUSE_S:  # this process was stopped or busy, so the cluster may have answered
             self._answered_s = now
@@ -204,9 +212,11 @@ class Watch:
 
     def _run(self) -> None:
         while not self._end.wait(MEMBERSHIP_S):
-            with contextlib.suppress(Exception):  # any exception means that there is no answer
+            try:
                 self._latest = look(self._ray, self._claim)
                 self._answered_s = time.monotonic()
+            except Exception as error:  # of any class; it means that there is no answer
+                self._is_replaced = OTHER_CLUSTER in str(error)
 
 
 def _session_folder(ray: ModuleType) -> Path | None:

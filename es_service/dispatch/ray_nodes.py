@@ -24,6 +24,10 @@ class Claim:
 
 
 ONE_CORE = Claim()
+HEAD_S = 2
+"""Seconds in which a head node must answer a question for itself."""
+OTHER_CLUSTER = "WrongClusterID"
+"""Part of Ray's message when the head node that answers is that of another cluster, started at the same address."""
 ASKED_AHEAD = 32
 """Most workers for which a cluster has no room, and for which a run with `workers: auto` still asks. An autoscaler sees
 them as demand and starts nodes for them. Each of them is an actor that Ray must keep."""
@@ -121,7 +125,8 @@ def cores_of_nodes(ray: ModuleType) -> list[int]:
 
 
 def look(ray: ModuleType, claim: Claim) -> Membership:
-    """The nodes of the cluster now. This blocks until the head node answers."""
+    """The nodes of the cluster now. Raises an exception of Ray if its head node does not answer."""
+    ask_head(ray)
     leaving = frozenset(_draining(ray))
     alive = {node["NodeID"]: node["Resources"] for node in ray.nodes() if node["Alive"]}
     rooms = {node: _room(resources, claim) for node, resources in alive.items() if node not in leaving}
@@ -149,6 +154,8 @@ def shortage(ray: ModuleType, claim: Claim, nodes: Membership | None) -> str:
     Args:
         nodes: those of the cluster that was joined; None: a Ray of our own, which has room.
     """
+    if nodes is not None and not _answers(ray):
+        return f"Each worker needs {claim}; the head node of the cluster does not answer"
     if nodes is None:
         advice = "The processes of the workers do not start or are very slow"
     elif nodes.room:
@@ -164,6 +171,24 @@ def demand(ray: ModuleType, claim: Claim) -> str:
         f"Each worker needs {claim}; the cluster has {_resources(ray.cluster_resources())} in total and "
         f"{_resources(ray.available_resources())} free"
     )
+
+
+def ask_head(ray: ModuleType) -> None:
+    """Raise an exception of Ray if the head node of the cluster does not answer, or if another cluster's does.
+
+    Without this, Ray's questions about nodes wait for a head node, and end this process when that of another cluster
+    answers. Ray has no public function for this. If a version of Ray lacks this one, they are asked without it.
+    """
+    with contextlib.suppress(AttributeError):
+        ray._private.worker.global_worker.gcs_client.check_alive([], timeout=HEAD_S)
+
+
+def _answers(ray: ModuleType) -> bool:
+    try:
+        ask_head(ray)
+    except Exception:  # of several classes
+        return False
+    return True
 
 
 def _room(resources: dict[str, float], claim: Claim) -> int:

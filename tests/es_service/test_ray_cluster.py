@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +13,7 @@ from test.support import catch_unraisable_exception
 
 from es_service.dispatch import ray_cluster, ray_nodes, ray_side_effects
 from es_service.errors import EvaluationError, Interrupted
+from tests.system.processes import wait_for
 
 
 def test_variables_that_nobody_changed_are_never_touched(monkeypatch):
@@ -102,3 +104,56 @@ def test_nodes_without_cores_and_dead_ones_do_not_count():
     nodes = [({"CPU": 8.0}, True), ({}, True), ({"CPU": 0.0}, True), ({"CPU": 4.0}, False)]
     ray = SimpleNamespace(nodes=lambda: [{"Resources": has, "Alive": alive} for has, alive in nodes])
     assert ray_nodes.cores_of_nodes(ray) == [8]
+
+
+class Head:
+    """What Ray knows of a head node, which fails with `error`, if there is one; it counts what it is asked then."""
+
+    def __init__(self) -> None:
+        self.error: Exception | None = None
+        self.asked = 0
+        client = SimpleNamespace(check_alive=self._check)
+        draining = SimpleNamespace(get_draining_nodes=self._ask)
+        state = SimpleNamespace(state=draining, available_resources_per_node=self._ask)
+        worker = SimpleNamespace(global_worker=SimpleNamespace(gcs_client=client))
+        self._private = SimpleNamespace(worker=worker, state=state)
+        self.nodes = self.cluster_resources = self.available_resources = self._ask
+
+    def _check(self, nodes: list[bytes], timeout: float) -> list[bool]:
+        if self.error is not None:
+            raise self.error
+        return []
+
+    def _ask(self) -> dict:
+        self.asked += self.error is not None
+        return {}
+
+
+def test_a_cluster_that_was_replaced_by_another_at_its_address_is_named_at_once(monkeypatch):
+    """Ray waits for a head node where it is asked for nodes, and ends the process if that is a new one."""
+    monkeypatch.setattr(ray_cluster, "MEMBERSHIP_S", 0.001)
+    monkeypatch.setattr(ray_cluster, "SILENCE_S", 60.0)
+    head = Head()
+    watch = ray_cluster.Watch(head, ray_nodes.ONE_CORE)  # pyright: ignore[reportArgumentType]
+    try:
+        nodes = watch.latest()
+        head.error = RuntimeError("timed out while waiting for GCS")
+        time.sleep(0.1)
+        head.asked = 0  # it may have been lost in the middle of a look
+        time.sleep(0.1)
+        assert watch.latest() == nodes
+        assert "the head node of the cluster does not answer" in ray_nodes.shortage(head, ray_nodes.ONE_CORE, nodes)
+        head.error = RuntimeError("RPC error: WrongClusterID: Perhaps the client is accessing GCS after a restart")
+        wait_for(lambda: says(watch, "another one was started at its address"))
+        assert head.asked == 0
+    finally:
+        watch.close()
+
+
+def says(watch: ray_cluster.Watch, text: str) -> bool:
+    """Whether a watch has an error with this text."""
+    try:
+        watch.latest()
+    except EvaluationError as error:
+        return text in str(error)
+    return False

@@ -201,12 +201,8 @@ class Cluster(Hosts):
     def start(self, node: str, cpus: int, setup: str = "true", **environment: str) -> None:
         """Start a node after a line of shell, and wait for it."""
         number = len(self.nodes)
-        role = (
-            ["--head", f"--port={PORT}", "--dashboard-host=127.0.0.1"] if number == 0 else [f"--address={self.address}"]
-        )
-        ray = [Path(sys.executable).parent / "ray", "start", "--block", f"--node-ip-address={self.ip(number)}"]
-        ray += [f"--num-cpus={cpus}", "--object-store-memory=100000000", "--disable-usage-stats", *role]
-        self.add(node, *ray, setup=setup, **environment)
+        role = ["--head", f"--port={PORT}", "--dashboard-host=127.0.0.1"] if number == 0 else join(self.address)
+        self.add(node, *ray_start(self.ip(number), cpus, *role), setup=setup, **environment)
         self._wait_until_joined(node)
 
     def worker(self, node: str) -> int:
@@ -221,6 +217,17 @@ class Cluster(Hosts):
 
     def _environment(self, node: str) -> dict[str, str]:
         return {**super()._environment(node), **self.settings}
+
+
+def ray_start(ip: str, cpus: int, *role: str) -> list[str]:
+    """Command that is a node for as long as it runs, with an object store that is large enough for any test."""
+    here = [f"--node-ip-address={ip}", f"--num-cpus={cpus}", "--object-store-memory=100000000"]
+    return [str(Path(sys.executable).parent / "ray"), "start", "--block", "--disable-usage-stats", *here, *role]
+
+
+def join(address: str) -> list[str]:
+    """Options of a node that joins the head at an address."""
+    return [f"--address={address}"]
 
 
 def children_of(pid: int) -> list[int]:
