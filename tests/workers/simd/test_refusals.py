@@ -78,6 +78,31 @@ def test_what_the_compiler_refuses_after_tracing_is_refused_beforehand():
             worker(point, chunk)
 
 
+class Plate(Heat):
+    """a plate whose heat spreads once in a step: all of its new values are kept until all old ones have been read"""
+
+    size = 130
+
+    def reset(self, key: Any) -> Any:
+        return jnp.zeros((self.size, self.size))
+
+    def step(self, state: Any, action: Any) -> tuple[Any, Any, Any]:
+        state = 0.9 * state + 0.1 * jnp.roll(state, 1, 0) + action[0]
+        return state, state[0, 0], False
+
+
+class SmallPlate(Plate):
+    """a plate that fits"""
+
+    size = 30
+
+
+def test_a_function_that_needs_more_values_at_a_time_than_the_stack_holds_is_refused():
+    why = rollout.why_not(describe_environment(f"{__name__}:Plate"))
+    assert why == "17,035 values are needed at the same time; simd supports at most 16,384"
+    assert rollout.why_not(describe_environment(f"{__name__}:SmallPlate")) == ""
+
+
 def test_a_step_without_a_text_of_its_own_is_refused_beforehand(monkeypatch: pytest.MonkeyPatch):
     """Kernels are kept under what they compute, so what has no such name is not compiled either."""
 

@@ -17,6 +17,8 @@ from workers.simd.graph.unsupported import UnsupportedError, refusing
 
 MOST_SLOTS = 8192
 """Most vectors in the memory of a block, half a MiB; this memory is on the stack."""
+MOST_LIVE = 16384
+"""Most values that may be needed at the same time, of which the stack holds what registers cannot: one MiB."""
 
 
 def emit(graph: Graph, outputs: Sequence[int], inputs: int, width: int) -> str:
@@ -52,7 +54,7 @@ def graph_function(
             words are read before any is written.
 
     Raises:
-        UnsupportedError: loops carry more values than fit on the stack.
+        UnsupportedError: more values are needed at the same time, or carried by loops, than fit on the stack.
     """
     pointers = list(dict.fromkeys([*(pointer for pointer, _ in sources), out]))
     builder = FunctionBuilder(name, [f"ptr noalias %{pointer}" for pointer in pointers], width)
@@ -66,6 +68,8 @@ def graph_function(
     stored = [writer.in_memory(node) for node in outputs]
     for word, (llvm_type, value) in enumerate(stored):
         builder.store(llvm_type, value, f"%{out}", word)
+    if (live := builder.most_live()) > MOST_LIVE:
+        raise UnsupportedError(f"{live:,} values are needed at the same time; simd supports at most {MOST_LIVE:,}")
     return builder
 
 

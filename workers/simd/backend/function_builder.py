@@ -9,6 +9,7 @@ lane do not depend on the width of the vectors.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 
 MXCSR = 0x9FC0
@@ -38,6 +39,8 @@ declare void @llvm.x86.sse.ldmxcsr(ptr)
 attributes #0 = {{ nounwind "prefer-vector-width"="512" "min-legal-vector-width"="{bits}" }}
 """
 
+VALUE = re.compile(r"%v\d+")
+"""The name of a value that an instruction has made."""
 Values = list[str]
 """Names of values in LLVM IR."""
 
@@ -178,6 +181,20 @@ class FunctionBuilder:
         body()
         self.do(f"br label %{label}_after")
         self.label(f"{label}_after")
+
+    def most_live(self) -> int:
+        """Most values that are needed at the same time, in the order of the instructions.
+
+        Those that do not fit into registers are on the stack.
+        """
+        last = {name: number for number, line in enumerate(self.lines) for name in VALUE.findall(line)}
+        live = most = 0
+        for number, line in enumerate(self.lines):
+            made = line.lstrip().partition(" = ")[0]
+            live += made in last
+            most = max(most, live)
+            live -= sum(last[name] == number for name in set(VALUE.findall(line)))
+        return most
 
     def text(self) -> str:
         """LLVM IR of the finished function."""
