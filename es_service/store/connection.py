@@ -47,9 +47,12 @@ def _connected(folder: Path) -> tuple[sqlite3.Connection, RunMeta]:
         return connected_to(folder / DATABASE)
     # On a network file system, read the copy while a writer is running.
     if lock_holder(folder) is None:
-        # This fails if a killed writer left a transaction that must be rolled back, which readers cannot do.
-        with contextlib.suppress(sqlite3.Error):
+        try:
             return connected_to(folder / DATABASE)
+        except sqlite3.Error as error:
+            # A killed writer may have left a transaction that must be rolled back, which readers cannot do.
+            if not is_no_damage(error, folder):
+                raise
     return connected_to(folder / COPY)
 
 

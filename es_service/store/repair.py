@@ -169,7 +169,8 @@ def _known_rows(connection: sqlite3.Connection, former: Path) -> int:
     """
     if not former.exists():
         return 0
-    with suppress(sqlite3.Error):  # the former copy may be damaged, or may be another file
+    # The former copy may be damaged, also the statements that SQLite's messages quote, or may be another file.
+    with suppress(sqlite3.Error, UnicodeDecodeError):
         columns = load_meta(connection, former).columns
         connection.execute("ATTACH ? AS former", (str(former),))
         try:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 import subprocess
 
 import numpy as np
 import pytest
 
 from es_service import api
+from es_service.errors import StoreError
 from es_service.runs import session
 from es_service.runs.export import arrays, export, tables
 from es_service.store import reader
@@ -59,6 +62,14 @@ def test_an_export_is_of_one_generation_although_one_more_is_stored_before_each_
         all(np.array_equal(array, of_one[name], equal_nan=True) for name, array in found_arrays.items())
         for of_one in expected.values()
     )
+
+
+def test_a_run_that_lost_its_newest_history_row_is_not_exported_as_of_the_generation_before(run, tmp_path):
+    with contextlib.closing(sqlite3.connect(run.folder / "run.db")) as connection, connection:
+        connection.execute("DELETE FROM history WHERE generation = ?", (run.generation,))
+    for use in (lambda: export(run, "csv", tmp_path), lambda: list(tables(run)), lambda: arrays(run)):
+        with pytest.raises(StoreError, match=f"the history after generation {FIRST - 1} is missing"):
+            use()
 
 
 def failed(folder):

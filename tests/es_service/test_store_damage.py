@@ -12,6 +12,7 @@ import pytest
 from es_service.errors import StoreError
 from es_service.store import writer as store
 from es_service.store.codec import encode_part
+from es_service.store.connection import connected_to
 from es_service.store.digest import checked_parts, digest_parts
 from es_service.store.reader import (
     read_evaluations,
@@ -20,6 +21,7 @@ from es_service.store.reader import (
     read_parts,
     read_platforms,
 )
+from es_service.store.sound import read_sound
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     advance,
@@ -168,6 +170,24 @@ def test_a_history_row_that_vanished_is_noticed(tmp_path):
             use(folder)
 
 
+def test_the_newest_history_row_that_vanished_is_noticed(tmp_path):
+    """Without it, the rest looks like a run that ended one generation earlier."""
+    folder = finished(tmp_path / "run", 6)
+    behind_the_stores_back(folder, "DELETE FROM history WHERE generation = 5")
+    for read in (read_generation, read_history, read_evaluations, read_parts):
+        with pytest.raises(
+            StoreError, match="history after generation 4 is missing; the state is that of generation 5"
+        ):
+            read(folder)
+    with pytest.raises(StoreError, match="at generation 5 has no history row"):
+        checked_parts(folder)
+    assert "history rows of generations 5 are damaged or missing" in read_sound(folder).problems[0]
+    with RunStore.open(folder) as run:
+        assert "at generation 5 has no history row" in run.notices[0]
+        advance(run, 5)
+    assert_sound(folder, 5)
+
+
 def test_other_tables_and_columns_are_noticed(tmp_path):
     for statement in ("ALTER TABLE history RENAME COLUMN goal_distance TO other", "CREATE TABLE other (a)"):
         folder = finished(tmp_path / statement[:5], 3)
@@ -176,6 +196,19 @@ def test_other_tables_and_columns_are_noticed(tmp_path):
             RunStore.open(folder)
     with pytest.raises(StoreError, match="no such column"):
         read_history(tmp_path / "ALTER")
+
+
+def test_table_statements_that_are_not_utf_8_are_noticed(tmp_path):
+    """SQLite's messages quote them, and Python cannot decode such a message."""
+    folder = finished(tmp_path / "run", 3)
+    flip_bit(folder / "run.db", position_of(folder / "run.db", b"BLE meta"), bit=7)
+    for _ in ("without a copy", "with a copy that is damaged, too"):
+        for use in (RunStore.open, read_history, read_parts, checked_parts, read_sound):
+            with pytest.raises(StoreError, match=r"can(not)? be (read|used)"):
+                use(folder)
+        with pytest.raises(UnicodeDecodeError):
+            connected_to(folder / "run.db")
+        shutil.copy(folder / "run.db", folder / "run.db.copy")
 
 
 def test_another_platform_or_meta_is_noticed(tmp_path):

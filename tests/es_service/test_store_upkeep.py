@@ -25,6 +25,8 @@ from tests.es_service.store_examples import (
     copy_at_every_commit,
     create,
     finished,
+    flip_bit,
+    position_of,
     state_at,
     without_root_rights,
 )
@@ -116,7 +118,7 @@ def test_the_copy_is_a_verified_single_file_refreshed_when_it_is_time(tmp_path, 
         assert any("missing" in notice and "generation 4" in notice for notice in run.notices)
 
 
-@pytest.mark.parametrize("former", ["sound", "text", "another run", "missing"])
+@pytest.mark.parametrize("former", ["sound", "text", "another run", "not UTF-8", "missing"])
 def test_a_copy_checks_only_rows_that_the_former_one_has_not(tmp_path, monkeypatch, former):
     """Each time all of a long run would keep its driver from its workers. Damage is noticed: test_store_damage."""
     checked: list[int] = []
@@ -133,6 +135,8 @@ def test_a_copy_checks_only_rows_that_the_former_one_has_not(tmp_path, monkeypat
             copy.write_text("no database" * 1000)
         elif former == "another run":
             shutil.copy(finished(tmp_path / "other", 20, seed=1) / "run.db", copy)
+        elif former == "not UTF-8":  # which SQLite quotes in its message
+            flip_bit(copy, position_of(copy, b"BLE meta"), bit=7)
         elif former == "missing":
             copy.unlink()
         monkeypatch.setattr(store_verify, "row_is_sound", counted)
@@ -195,6 +199,22 @@ def test_on_a_network_there_is_no_wal_and_readers_read_the_copy(tmp_path):
     (folder / "run.db").unlink()
     with RunStore.open(folder) as run:
         assert run.generation == 5
+
+
+@pytest.mark.usefixtures("on_network")
+def test_on_a_network_the_copy_does_not_stand_in_for_a_damaged_run(tmp_path):
+    """It may be of an earlier generation."""
+    folder = tmp_path / "run"
+    with create(folder, generations=3) as run:
+        run.upkeep.copy_interval_s = 1000.0
+        advance(run, 5)
+    assert read_generation(folder) == 5
+    for position in (0, position_of(folder / "run.db", b"CREATE TABLE meta")):
+        flip_bit(folder / "run.db", position, bit=1)
+        for read in (read_generation, read_history, read_parts):
+            with pytest.raises(StoreError, match=r"not a (database|run folder)|malformed"):
+                read(folder)
+        flip_bit(folder / "run.db", position, bit=1)
 
 
 MOUNTS = r"""
