@@ -40,7 +40,7 @@ def check_episodes(kernel: EpisodeKernel) -> None:
     mean_O[:, inputs_O] = rng.normal(0.0, 0.1, (len(mean_O), len(inputs_O)))
     parameters_L_D = _parameters(spec, rng, LANES if kernel.own_weights else 1)
     if kernel.own_weights:
-        memory, weights = kernel.network.pack_own([parameters_L_D])
+        memory, weights = kernel.network.pack_own([parameters_L_D], spec.policy.parameters)
         weights_of = twin.own(memory[:, : spec.policy.parameters])
     elif noise_keys_P is not None:
         weights_of = twin.perturbed(parameters_L_D[0], np.float32(UNIT), noise_keys_P)

@@ -70,13 +70,12 @@ class Network(NamedTuple):
         return weights
 
     def pack_own(
-        self, parameters_G_N_D: Sequence[NDArray[np.float32]]
+        self, parameters_G_N_D: Sequence[NDArray[np.float32]], parameters: int
     ) -> tuple[NDArray[np.float32], NDArray[np.uint64]]:
         """Policies for kernels with own weights: (their memory, the address of each one's parameters in it).
 
-        The memory must live as long as the addresses are used.
+        The memory must live as long as the addresses are used. Raises ValueError for another number of parameters.
         """
-        parameters = parameters_G_N_D[0].shape[1]
         # Rows begin at whole vectors, and a vector that begins in the last row ends in this memory.
         stride = (parameters // self.width + 2) * self.width
         rows = aligned((sum(map(len, parameters_G_N_D)), stride)).view(np.float32)

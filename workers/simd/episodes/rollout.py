@@ -107,7 +107,7 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
 
     def rollout(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
         kernel = kernels.fitting(mean_L_O)
-        rows, addresses_N = kernel.network.pack_own(parameters_G_N_D)
+        rows, addresses_N = kernel.network.pack_own(parameters_G_N_D, spec.policy.parameters)
         require(0 <= policy_L.min() <= policy_L.max() < len(rows), "policy_L names rows that are not there")
         return kernel.run(addresses_N[policy_L], 0.0, mean_L_O, std_L_O, None, reset_keys_L, reset_keys_L)
 
