@@ -48,18 +48,18 @@ def make_worker_with_cores(spec: WorkerSpec, cores: int) -> Compilable:
         return make_worker(spec)
     if spec.rollout == "simd":
         worker, pool = make_worker(spec), ThreadPoolExecutor(cores)
-        return Compilable(lambda work: _divided(pool, worker.run, work, cores), worker.compile)
+        return Compilable(lambda work: divided(pool, worker.run, work, cores), worker.compile)
     context = get_context("spawn")  # a forked JAX would not work
     given = (spec, os.getpid(), context.Barrier(cores))
     pool = ProcessPoolExecutor(cores, context, _begin_child, given)
     _together(pool, _meet, [()] * cores)  # from now on there is a child for each core
     return Compilable(
-        lambda work: _divided(pool, _run_child, work, cores),
+        lambda work: divided(pool, _run_child, work, cores),
         lambda work: _together(pool, _compile_in_child, [(work,)] * cores),
     )
 
 
-def _divided(pool: Executor, run: Callable[[Any], Any], work: Sequence[Work], cores: int) -> list[ChunkResult]:
+def divided(pool: Executor, run: Callable[[Any], Any], work: Sequence[Work], cores: int) -> list[ChunkResult]:
     """Run the parts of a work item side by side."""
     results = _together(pool, run, [(part,) for part in parts(work, cores)])
     return with_neighbours_added(work, [result for part in results for result in part])

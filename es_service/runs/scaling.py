@@ -180,6 +180,10 @@ class EchoActor:
         """As `WorkerActor.build`."""
         return platform_text({})
 
+    def compile(self, chunks: bytes, *centres: bytes) -> float:
+        """As `WorkerActor.compile`."""
+        return 0.0
+
     def run(self, chunks: bytes, *centres: bytes) -> bytes:
         """As `WorkerActor.run`."""
         until = time.perf_counter() + SPIN_S

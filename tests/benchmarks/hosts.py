@@ -40,6 +40,7 @@ from es_service.protocol.messages import (
 )
 from tests.system.cluster import Cluster, missing
 from workers.actor import WorkerActor
+from workers.compilable import Compilable
 from workers.cores import divided
 
 HOSTS, CORES = 4, 16
@@ -60,7 +61,8 @@ class SleepingActor(WorkerActor):
 
     def build(self) -> str:
         """As `WorkerActor.build`."""
-        self._run_chunks = divided(ThreadPoolExecutor(self._cores), sleep, self._cores)
+        pool = ThreadPoolExecutor(self._cores)
+        self._run_chunks = Compilable(lambda work: divided(pool, sleep, work, self._cores), lambda work: None)
         return platform_text({})
 
 
