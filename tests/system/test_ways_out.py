@@ -46,7 +46,7 @@ def test_a_folder_with_spaces_is_one_word_of_every_command(tmp_path, capsys):
     printed = capsys.readouterr().out
     commands = [line for line in printed.splitlines() if line.startswith("  ")]
     assert [shlex.split(line)[1:3] for line in commands] == [
-        [verb, str(folder)] for verb in ("status", "evaluate", "digest", "resume", "fork")
+        [verb, str(folder)] for verb in ("status", "report", "evaluate", "digest", "resume", "fork")
     ]
     assert words_after(printed.splitlines()[-1], "resume") == [str(folder), "--set", "budget.generations=2"]
     refused = error_message(refused_changes(folder, [("seed", 0, 1)]))
