@@ -175,7 +175,7 @@ window.addEventListener("DOMContentLoaded", () => {
   let exact = 0;
   const tick = (now) => {
     if (!playing) return;
-    exact += (now - last) / 1000 / data.step_s * Number(byId("speed").value);
+    exact += Math.max(0, now - last) / 1000 / data.step_s * Number(byId("speed").value);  // the time of a frame may be before the click
     last = now;
     step = Math.min(Math.floor(exact), episodes[current].steps);
     show();
