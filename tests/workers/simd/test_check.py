@@ -33,7 +33,7 @@ def test_policies_of_all_shapes_have_the_bits_of_their_twin(hidden, kind, target
         np.arange(2),
         target=target,
         folder=tmp_path,
-        check=lambda kernel: checked.append(check_episodes(kernel)),
+        check=lambda kernel, program: checked.append(check_episodes(kernel, program)),
         **kind,
     )
     assert checked == [None]

@@ -17,6 +17,7 @@ from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, strea
 from workers.simd.backend.words import Words
 from workers.simd.episodes import twin
 from workers.simd.episodes.compiled import EpisodeKernel
+from workers.simd.episodes.program import EpisodeProgram
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.operations import compute
 from workers.simd.graph.twin import evaluate
@@ -30,7 +31,7 @@ class WrongCodeError(Exception):
     """Machine code does not compute what it should; the message says what to do."""
 
 
-def check_episodes(kernel: EpisodeKernel) -> None:
+def check_episodes(kernel: EpisodeKernel, program: EpisodeProgram) -> None:
     """Raise WrongCodeError unless the reset and one step of 16 episodes have the bits of their definition."""
     spec, inputs_O, rng = kernel.spec, kernel.inputs_O, np.random.default_rng(0)
     keys_L = stream_keys(0, Domain.EVALUATION_RESET, 0, np.arange(LANES))
@@ -51,10 +52,10 @@ def check_episodes(kernel: EpisodeKernel) -> None:
     carries, go = kernel.started(weights, UNIT, mean_O, std_O, noise_keys_P, keys_L, keys_L)
     carry_L = _by_lane(carries)
     with contextlib.suppress(UnsupportedError):  # then JAX computes the resets
-        begin, _, begun = trace_jaxpr(jax.make_jaxpr(kernel.program.steps.begin)(keys_L[0]))
+        begin, _, begun = trace_jaxpr(jax.make_jaxpr(program.steps.begin)(keys_L[0]))
         require_same(carry_L, _words(evaluate(begin, begun, keys_L.T)), f"a reset of {spec.environment}")
     go(1)
-    (look, _, seen), (move, _, after) = kernel.program.graphs()
+    (look, _, seen), (move, _, after) = program.graphs()
     statistics = [np.broadcast_to(x[:, inputs_O], (LANES, len(inputs_O))).T.view(np.uint32) for x in (mean_O, std_O)]
     x_I_L = np.stack(evaluate(look, seen, np.concatenate([carry_L, *statistics])))
     action_A_L = twin.policy(spec.policy, inputs_O, x_I_L, weights_of)

@@ -46,7 +46,6 @@ class EpisodeKernel:
     """Shapes and dtypes of a carry."""
     episode_words: int
     """Number of words of an episode's result."""
-    program: EpisodeProgram
     _call: Callable[..., None]
 
     def run(
@@ -149,7 +148,7 @@ def compile_episodes(
     own_weights: bool = False,
     target: Target | None = None,
     folder: Path | None = None,
-    check: Callable[[EpisodeKernel], object] = lambda kernel: None,
+    check: Callable[[EpisodeKernel, EpisodeProgram], object] = lambda kernel, program: None,
 ) -> EpisodeKernel:
     """Compile the episodes of a run.
 
@@ -181,8 +180,9 @@ def compile_episodes(
             alive_word=program.alive_word,
             carry=program.carry,
             episode_words=sum(map(words_of, program.carry.episode)),
-            program=program,
             _call=native.function(*signature),
         )
 
-    return kernel(load_compiled(program.name, program.text, target, folder, lambda native: check(kernel(native))))
+    return kernel(
+        load_compiled(program.name, program.text, target, folder, lambda native: check(kernel(native), program))
+    )
