@@ -159,8 +159,7 @@ def browser() -> Iterator[Page]:
     """Context manager with an empty page of a browser for which no name of a host exists."""
     to_read, to_write = os.pipe()
     from_read, from_write = os.pipe()
-    # Processes of the browser may still write there when it has ended.
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+    with tempfile.TemporaryDirectory() as profile:
         # The protocol's pipes are the file descriptors 3 and 4 of the browser; bash moves them there.
         options = (
             "--remote-debugging-pipe --no-sandbox --headless --disable-gpu-sandbox --enable-unsafe-swiftshader "
