@@ -113,7 +113,7 @@ def measure(task: str) -> dict[str, float]:
     acted[:] = rng.uniform(-1, 1, acted.shape)
     alive = np.ones(width, np.int32)
     centre = network.pack(initial_parameters(spec.policy, "unit_columns", 0))
-    noise = aligned((-(-network.noise_bytes // 4),)).view(np.int8)
+    noise = aligned((network.block_bytes // 4,)).view(np.int8)
     unit = float(np.float32(0.02 / NORMAL_STD))
 
     parts = {}

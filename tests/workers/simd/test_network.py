@@ -17,6 +17,8 @@ from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import WIDTHS, Target
 from workers.simd.backend.words import aligned
+from workers.simd.episodes import layout
+from workers.simd.episodes.hidden import keep_function
 from workers.simd.episodes.layout import Network, plan
 from workers.simd.episodes.network import policy_function
 from workers.simd.episodes.noise import fill_function
@@ -33,19 +35,24 @@ def run(
     arguments = ["x", "alive", "centre", "keys", "places", "noise", "hidden", "action"]
     builder = FunctionBuilder("inside", [*(f"ptr noalias %{name}" for name in arguments), "float %unit"], network.width)
     fill = fill_function(network.vectors, len(network.places) - network.vectors, network.width)
+    keep = [keep_function(network)] * (noisy and network.keeps_weights)
     if noisy:
         builder.do("call void @fill(ptr %keys, ptr %places, ptr %noise)")
+    if keep:
+        builder.do("call void @keep(ptr %centre, ptr %noise, float %unit)")
     given = "ptr %noise, float %unit, " if noisy else ""
     builder.do(f"call void @policy(ptr %x, ptr %alive, ptr %centre, {given}ptr %hidden, ptr %action)")
-    functions = [fill, policy_function(network, "perturbed" if noisy else "shared"), builder]
-    native = load_compiled(f"policy {network.places.tolist()} {noisy}", lambda: module(functions), target, folder)
+    functions = [fill, *keep, policy_function(network, "perturbed" if noisy else "shared"), builder]
+    native = load_compiled(
+        f"policy {network.places.tolist()} {noisy} {bool(keep)}", lambda: module(functions), target, folder
+    )
     lanes = aligned((network.inputs if not network.hidden else network.hidden[0].inputs, network.width))
     lanes.view(np.float32)[:] = x.T
     hidden = aligned((max(1, network.hidden_vectors), network.width)).view(np.float32)
     hidden[:] = UNTOUCHED
     action = aligned((network.outputs, network.width))
     given_keys = keys if noisy else np.zeros((1, 4), np.uint32)
-    noise = np.zeros(network.noise_bytes, np.int8)
+    noise = aligned((network.block_bytes // 4,)).view(np.int8)
     arrays = (lanes, alive, network.pack(centre_D), given_keys, network.places, noise, hidden, action)
     call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * len(arrays), ctypes.c_float)(native.address)
     call(*(array.ctypes.data for array in arrays), SIGMA / NORMAL_STD)
@@ -92,26 +99,42 @@ def test_actions_are_those_of_members_with_their_own_weights(
     np.testing.assert_allclose(found, actions_of(shape, centre_D.astype(float), x), atol=3e-6)
 
 
+@pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)
+def test_weights_made_once_per_episode_give_the_bits_of_those_made_in_each_step(
+    target: Target, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    shape = PolicyShape((5, 64, 17, 3))
+    network = plan(shape, np.arange(5), target.width)
+    centre_D, x = random_parameters(4, shape.parameters, 0.5), random_parameters(5, 5 * target.width, 1.0)
+    keys = stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(target.width // 2))
+    given = network, target, tmp_path, centre_D, x.reshape(-1, 5), np.ones(target.width, np.int32), keys
+    assert network.keeps_weights
+    kept, _ = run(*given)
+    monkeypatch.setattr(layout, "KEPT_BYTES", 0)
+    assert not network.keeps_weights
+    made, _ = run(*given)
+    np.testing.assert_array_equal(kept, made)
+
+
 @pytest.mark.parametrize("noisy", [True, False])
-def test_the_dead_cost_nothing(noisy: bool, tmp_path: Path):
-    """Hidden layers of four neighbours all dead are not computed, and the others' actions are what they were."""
-    target = next(iter(targets()))
+@pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)
+def test_the_dead_cost_nothing(noisy: bool, target: Target, tmp_path: Path):
+    """Hidden layers of eight neighbours all dead are not computed, and the others' actions are what they were."""
     shape = PolicyShape((3, 64, 64, 2))
-    network = plan(shape, np.arange(3), target.width)
+    network, group = plan(shape, np.arange(3), target.width), min(8, target.width)
     centre_D, x = random_parameters(4, shape.parameters, 0.5), np.ones((target.width, 3), np.float32)
     keys = stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(target.width // 2)) if noisy else None
     alive = np.ones(target.width, np.int32)
     everyone, _ = run(network, target, tmp_path, centre_D, x, alive, keys)
-    alive[4:] = 0
-    alive[target.width - 1] = 1  # who keeps its neighbours company
-    found, room = run(network, target, tmp_path, centre_D, x, alive, keys)
-    np.testing.assert_array_equal(found[:4], everyone[:4])
-    np.testing.assert_array_equal(found[-1], everyone[-1])
-    # That of the first is used again, for what the last one sees.
-    second_layer = room[room.size // 2 :].reshape(target.width, -1)
-    assert (second_layer[4:-4] == UNTOUCHED).all()
-    assert (second_layer[:4] != UNTOUCHED).any(axis=1).all()
-    assert (second_layer[-4:] != UNTOUCHED).any(axis=1).all()
+    alive[-group:] = 0
+    for last_one in (0, 1):  # who keeps its neighbours company
+        alive[-1] = last_one
+        found, room = run(network, target, tmp_path, centre_D, x, alive, keys)
+        np.testing.assert_array_equal(found[alive == 1], everyone[alive == 1])
+        # That of the first is used again, for what the last one sees.
+        second_layer = room[room.size // 2 :].reshape(target.width, -1)
+        assert (second_layer[:-group] != UNTOUCHED).any(axis=1).all()
+        assert (second_layer[-group:] != UNTOUCHED).any(axis=1).tolist() == [bool(last_one)] * group
 
 
 @pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)

@@ -125,7 +125,7 @@ class EpisodeKernel:
         if noise_keys_P is not None:
             pairs = width // 2
             keys = filled(noise_keys_P, blocks * pairs)
-            noise = np.empty(self.network.noise_bytes, np.int8)
+            noise = aligned((self.network.block_bytes // 4,)).view(np.int8)
         arrays = (carries, actions, constants, weights, keys, self.network.places, noise, room)
         require(
             [array.dtype.char for array in arrays] == list("IIILIIbI" if self.own_weights else "IIIfIIbI")

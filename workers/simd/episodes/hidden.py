@@ -5,7 +5,8 @@ bias, whatever the width and wherever the weights are from:
 
 shared: from the centre, for all members.
 perturbed: the weights of + are (centre + unit) + 2 unit j, and those of - are 2 centre minus that weight, its mirror
-    image up to a rounding. The members of a pair share the bytes j of their noise k = 2 j + 1.
+    image up to a rounding. The members of a pair share the bytes j of their noise k = 2 j + 1. The weights of + are
+    computed in each step or, if the network is small (`Network.keeps_weights`), once per episode by `keep_function`.
 own: from the parameters of each member.
 """
 
@@ -66,7 +67,7 @@ def perturbed(builder: FunctionBuilder, network: Network, layer: Layer, x: View,
     floats = builder.llvm_types["f"]
     pairs = min(builder.width // 2, max(1, sums_at_once(builder.width) // (2 * layer.tile)))
     assert builder.width % (2 * pairs) == 0
-    unit, twice = units(builder)
+    kept = builder.at("%noise", network.kept_at, "i8")
 
     def tile(first: str, number: str) -> Values:
         weights = builder.index((number, (layer.inputs + 1) * layer.tile), (layer.first, 1))
@@ -75,14 +76,17 @@ def perturbed(builder: FunctionBuilder, network: Network, layer: Layer, x: View,
         def member_weights(row: str | int, v: int) -> list[tuple[str, str]]:
             """Weights (of +, of -) of each pair for input `row` and vector `v` of the tile."""
             at = builder.index((weights, 1), (row, layer.tile), (v, 1))
+            places = [
+                builder.index((first_pair, network.vectors), (pair * network.vectors, 1), (at, 1))
+                for pair in range(pairs)
+            ]
             centre = builder.load(floats, "%centre", at)
-            moved, doubled = (builder.value(f"fadd {floats} {centre}, {one}") for one in (unit, centre))
-            found = []
-            for pair in range(pairs):
-                place = builder.index((first_pair, network.vectors), (pair * network.vectors, 1), (at, 1))
-                plus = builder.fma(noise_of_weights(builder, "%noise", place), twice, moved)
-                found.append((plus, builder.value(f"fsub {floats} {doubled}, {plus}")))
-            return found
+            doubled = builder.value(f"fadd {floats} {centre}, {centre}")
+            if network.keeps_weights:
+                of_plus = [builder.load(floats, kept, place) for place in places]
+            else:
+                of_plus = _weights_of_plus(builder, centre, places)
+            return [(plus, builder.value(f"fsub {floats} {doubled}, {plus}")) for plus in of_plus]
 
         def add(row: str, sums: Values) -> Values:
             seen = [_seen(builder, x, first, member, row) for member in range(2 * pairs)]
@@ -105,6 +109,31 @@ def perturbed(builder: FunctionBuilder, network: Network, layer: Layer, x: View,
         return []
 
     _by_members(builder, layer, 2 * pairs, tile)
+
+
+def keep_function(network: Network) -> FunctionBuilder:
+    """Function `void keep(ptr centre, ptr noise, float unit)`, which writes the weights of a block's + members behind
+    their noise."""
+    builder = FunctionBuilder("keep", ["ptr noalias %centre", "ptr noalias %noise", "float %unit"], network.width)
+    floats = builder.llvm_types["f"]
+    kept = builder.at("%noise", network.kept_at, "i8")
+
+    def vector(at: str, _: Values) -> Values:
+        centre = builder.load(floats, "%centre", at)
+        places = [builder.index((at, 1), (pair * network.vectors, 1)) for pair in range(network.width // 2)]
+        for place, plus in zip(places, _weights_of_plus(builder, centre, places), strict=True):
+            builder.store(floats, plus, kept, place)
+        return []
+
+    builder.loop(network.vectors, vector)
+    return builder
+
+
+def _weights_of_plus(builder: FunctionBuilder, centre: str, places: Sequence[str]) -> Values:
+    """Vectors of weights of + members, from a vector of the centre's weights and the places of the pairs' noise."""
+    unit, twice = units(builder)
+    moved = builder.value(f"fadd {builder.llvm_types['f']} {centre}, {unit}")
+    return [builder.fma(noise_of_weights(builder, "%noise", place), twice, moved) for place in places]
 
 
 def own(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:

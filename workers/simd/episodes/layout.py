@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.messages import PolicyShape
-from workers.simd.backend.words import aligned
+from workers.simd.backend.words import ALIGNMENT, aligned
+
+KEPT_BYTES = 1 << 18
+"""Most bytes of the weights that are kept for a block of members; they are read in each step and must stay in L2."""
 
 
 class Layer(NamedTuple):
@@ -58,7 +61,27 @@ class Network(NamedTuple):
     @property
     def noise_bytes(self) -> int:
         """Number of bytes of the noise of a block of members."""
-        return self.width // 2 * self.vectors * self.width + (len(self.places) - self.vectors) * self.width
+        return self._pair_weights + (len(self.places) - self.vectors) * self.width
+
+    @property
+    def keeps_weights(self) -> bool:
+        """Whether the hidden layers' weights of a block's + members are made once per episode, and not in each step."""
+        return 0 < 4 * self._pair_weights <= KEPT_BYTES
+
+    @property
+    def kept_at(self) -> int:
+        """Byte of the noise's memory at which these weights begin, as float32 [pair, vector, lane]."""
+        return -(-self.noise_bytes // ALIGNMENT) * ALIGNMENT
+
+    @property
+    def block_bytes(self) -> int:
+        """Number of bytes of the noise of a block of members and of the weights that are kept."""
+        return self.kept_at + 4 * self._pair_weights * self.keeps_weights
+
+    @property
+    def _pair_weights(self) -> int:
+        """Number of weights in vectors of a block's pairs, one for each pair."""
+        return self.width // 2 * self.vectors * self.width
 
     def pack(self, parameters_D: NDArray[np.float32]) -> NDArray[np.float32]:
         """Array [rows, width] of the vectors of weights, followed by the single weights."""
@@ -100,11 +123,13 @@ def plan(shape: PolicyShape, inputs_O: NDArray[np.intp], width: int) -> Network:
         width: lanes of a vector.
     """
     layers, places, coordinate = [], [], 0
-    most = sums_at_once(width) // 4  # tiles are powers of 2, so that the number of members that fit divides the width
+    # With noise, four pairs are computed at a time. They share what is made of the centre, so few vectors of many pairs
+    # cost less than many vectors of few. Tiles are powers of 2, so that the members that fit divide the width.
+    most = sums_at_once(width) // 8
     rows, (*hidden, (inputs, outputs)) = inputs_O.tolist(), shape.layers
     for given, wanted in hidden:
         vectors = -(-wanted // width)
-        tile = max(size for size in (1, 2, 4) if size <= most and vectors % size == 0)
+        tile = max(size for size in (1, 2) if size <= most and vectors % size == 0)
         layers.append(Layer(len(rows), wanted, vectors // tile, tile, len(places)))
         for first in range(0, vectors, tile):
             for row in [*rows, given]:

@@ -22,6 +22,7 @@ from workers.episode import Carry, EpisodeSteps, episode_steps
 from workers.simd.backend.emit import graph_function
 from workers.simd.backend.function_builder import FunctionBuilder, Values, module
 from workers.simd.backend.words import words_of
+from workers.simd.episodes.hidden import keep_function
 from workers.simd.episodes.layout import Network, plan
 from workers.simd.episodes.network import Weights, policy_function, singles_function
 from workers.simd.episodes.noise import definition, fill_function
@@ -121,7 +122,8 @@ def _module(
     move_code = graph_function("move", graph, outputs, sources, "carry", width)
     policy_code = policy_function(network, weights)
     fill_code = fill_function(network.vectors, len(network.places) - network.vectors, width)
-    before = {"perturbed": [fill_code], "own": [singles_function(network)], "shared": []}[weights]
+    keep_code = [keep_function(network)] * network.keeps_weights
+    before = {"perturbed": [fill_code, *keep_code], "own": [singles_function(network)], "shared": []}[weights]
     own, noisy = weights == "own", weights == "perturbed"
 
     pointers = ["carries", "action_keys", "constants", "centre", "keys", "places", "noise", "room"]
@@ -144,6 +146,8 @@ def _module(
         if noisy:
             keys = builder.at("%keys", builder.index((number, KEY_WORDS * width // 2)), "i32")
             builder.do(f"call void @fill(ptr {keys}, ptr %places, ptr %noise)")
+            if network.keeps_weights:
+                builder.do("call void @keep(ptr %centre, ptr %noise, float %unit)")
 
         def step(_: str, __: Values) -> Values:
             builder.do(f"call void @look(ptr {carry}, ptr {constants}, ptr {seen})")
