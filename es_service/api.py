@@ -21,7 +21,7 @@ from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.logs import in_run
 from es_service.loop.budget import REACHED, limits_of, raised
-from es_service.loop.history import evaluated_columns, history_columns
+from es_service.loop.history import Column, evaluated_columns, history_columns
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
@@ -158,7 +158,7 @@ def _go_on(
                 value=config.task.environment,
                 run=folder,
             )
-        if store.meta.columns != history_columns(task, config.map.enabled):
+        if (store.meta.columns, store.meta.evaluation_columns) != _columns(config, task):
             raise StoreError(
                 f"{folder} was written by a version of es-service with other history columns; continue it with that "
                 "version",
@@ -238,6 +238,11 @@ def default_folder(config: RunConfig, which: str = "") -> Path:
     return next(RUNS_FOLDER / name for name in names if not (RUNS_FOLDER / name).exists())
 
 
+def _columns(config: RunConfig, task: TaskSpec) -> tuple[tuple[Column, ...], tuple[Column, ...]]:
+    """The columns of a run's history, and those of its evaluated centres."""
+    return history_columns(task, config.map.enabled), evaluated_columns(task, config.map.enabled)
+
+
 def _create_and_work(
     config: RunConfig,
     out: str | os.PathLike[str] | None,
@@ -249,14 +254,15 @@ def _create_and_work(
 ) -> Outcome:
     folder = Path(out) if out is not None else default_folder(config)
     task = task_of(config)
+    columns, evaluation_columns = _columns(config, task)
     meta = RunMeta(
         run_id=uuid4().hex,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         config=config.model_dump(mode="json"),
         constants=config.constants(),
         task=asdict(task),
-        columns=history_columns(task, config.map.enabled),
-        evaluation_columns=evaluated_columns(task, config.map.enabled),
+        columns=columns,
+        evaluation_columns=evaluation_columns,
         parent=parent,
     )
     with RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=hook) as store, in_run(meta.run_id):

@@ -105,7 +105,8 @@ def _row(task: TaskSpec, g: int, fitness_G: np.ndarray, descriptor_B: np.ndarray
         for kind in ("fitness", "return")
         for name, offset in (("min", -20.0), ("q25", -9.0), ("median", -6.0), ("q75", -3.0), ("max", 2.0))
     }
-    goal = {"goal_distance": 1.0 / (1 + g), "goal_distance_min": 0.5 / (1 + g)} if task.has_goal else {}
+    distances = {"goal_distance": 1.0, "goal_distance_way": 0.75, "goal_distance_min": 0.5}
+    goal = {name: value / (1 + g) for name, value in distances.items()} if task.has_goal else {}
     of_map = {}
     if map_ is not None:
         share = (g + 1) / fitness_G.size
@@ -153,9 +154,10 @@ def _row(task: TaskSpec, g: int, fitness_G: np.ndarray, descriptor_B: np.ndarray
                 "cell": of_map.get("cell"),
                 "fitness_mean": fitness,
                 "fitness_std": 1.0,
+                "fitness_max": fitness + 2.0,
                 "return_mean": fitness,
                 **place,
-                "goal_distance": goal.get("goal_distance"),
+                **goal,
                 "novelty": 1.0 / (1 + g) if g else None,
                 "update_norm": 1.0 if g else None,
                 "env_steps": 1000,

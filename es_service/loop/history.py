@@ -54,6 +54,11 @@ _GOAL = (
     Column("goal_distance", "REAL", True, "mean distance to the goal at the end of the evaluation episodes"),
     Column("goal_distance_min", "REAL", True, "least distance to the goal along any evaluation episode"),
 )
+_GOAL_OF_CENTRE = (
+    Column("goal_distance", "REAL", True, "mean distance to the goal at the end"),
+    Column("goal_distance_way", "REAL", True, "mean over the episodes of the least distance along each"),
+    Column("goal_distance_min", "REAL", True, "least distance along any of the episodes"),
+)
 _CELL = (
     "cell of the map that the new centre entered; none if it did not. A number: those of a grid run along its last "
     "dimension first, so that of 20 by 20 cells 90 is 4,10; the map's table has both"
@@ -118,9 +123,10 @@ def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
         ),
         Column("fitness_mean", "REAL", True, "mean fitness over its evaluation episodes"),
         Column("fitness_std", "REAL", True, "standard deviation of the same episodes (population formula)"),
+        Column("fitness_max", "REAL", True, "highest fitness of one of the same episodes"),
         Column("return_mean", "REAL", True, "mean return over the same episodes"),
         *(Column(name, "REAL", True, "mean descriptor over the same episodes") for name in task.descriptor_names),
-        *((Column("goal_distance", "REAL", True, "mean distance to the goal at the end"),) if task.has_goal else ()),
+        *(_GOAL_OF_CENTRE if task.has_goal else ()),
         Column("novelty", "REAL", True, "novelty of its mean descriptor in the archive before the generation"),
         Column("update_norm", "REAL", True, "Euclidean norm of its step in this generation"),
         Column("env_steps", "INTEGER", True, "environment steps of its population and of its evaluation"),
@@ -148,9 +154,10 @@ def evaluated_row(
         **({} if map_ is None else {"start_cell": start_cell, "cell": map_.cell_of(generation, centre)}),
         "fitness_mean": whole["centre_fitness_mean"],
         "fitness_std": whole["centre_fitness_std"],
+        "fitness_max": float(evaluation.fitness.max()),
         "return_mean": whole["centre_return_mean"],
         **{name: whole[f"centre_{name}"] for name in task.descriptor_names},
-        **({"goal_distance": whole["goal_distance"]} if task.has_goal else {}),
+        **_goal_of_centre(evaluation, task),
         "novelty": novelty,
         "update_norm": update_norm,
         "env_steps": env_steps,
@@ -206,10 +213,20 @@ def evaluation_columns(evaluation: EpisodesResult, task: TaskSpec) -> HistoryRow
         **{f"centre_{name}": value for name, value in zip(task.descriptor_names, mean_B, strict=True)},
         **{f"centre_{name}_std": value for name, value in zip(task.descriptor_names, std_B, strict=True)},
     }
-    if task.has_goal:
-        columns["goal_distance"] = float(evaluation.goal_distance[:, 0].mean(dtype=np.float64))
-        columns["goal_distance_min"] = float(evaluation.goal_distance[:, 1].min())
-    return columns
+    goal = _goal_of_centre(evaluation, task)
+    return columns | {name: goal[name] for name in goal if name != "goal_distance_way"}
+
+
+def _goal_of_centre(evaluation: EpisodesResult, task: TaskSpec) -> HistoryRow:
+    """Distances of the evaluation episodes to the goal; empty for a task without one."""
+    if not task.has_goal:
+        return {}
+    end_E, least_E = evaluation.goal_distance.T
+    return {
+        "goal_distance": float(end_E.mean(dtype=np.float64)),
+        "goal_distance_way": float(least_E.mean(dtype=np.float64)),
+        "goal_distance_min": float(least_E.min()),
+    }
 
 
 def map_columns(
