@@ -1,0 +1,182 @@
+"""The tables of the benchmark paper (Chalumeau et al. 2022), as far as evolution strategies can fill them.
+
+    python -m tests.benchmarks.paper                                  # what BUDGET names: a day on two cores
+    python -m tests.benchmarks.paper --task point_maze --seeds 0:2 --env-steps 1_000_000
+    python -m tests.benchmarks.paper --config my.yaml --seeds 100:101 --env-steps 100_000_000 --set search.sigma=0.05
+
+Each run is one of configs/paper with a seed. A finished one becomes a row of results/paper_runs.csv, which is not
+computed again unless more steps are asked for; one that is interrupted is listed with the steps that it has, and goes
+on from there if its folder is still in runs/paper. There are as many runs at a time as cores, each in one process.
+In the end the tables of tests/benchmarks/README.md are written from the csv. The third form is a trial: it prints its
+rows, and adds them to results/paper_trials.csv.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import subprocess
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from es_service import api
+from es_service.cli.sweep import seeds_of
+from es_service.dispatch.cores import cores
+from es_service.errors import Interrupted
+from es_service.protocol.machine import cpu_kind
+from es_service.protocol.process_environment import worker_environment
+from es_service.runs import session
+from tests.benchmarks import paper_tables
+from tests.benchmarks.paper_readings import readings
+from tests.benchmarks.science import in_this_process
+
+ROOT = Path(__file__).parents[2]
+CONFIGS = ROOT / "configs" / "paper"
+RUNS = ROOT / "runs" / "paper"
+TRIALS = Path(__file__).parent / "results" / "paper_trials.csv"
+FIRST, OTHERS = range(5), range(1)
+BUDGET = {
+    **{("point_maze", method): (100_000_000, FIRST) for method in paper_tables.METHODS},
+    **{
+        (task, method): (100_000_000, FIRST if method in ("nsra_es", "me_es", "memes") else OTHERS)
+        for task in ("ant_maze", "ant_trap")
+        for method in paper_tables.METHODS
+    },
+}
+"""(task, method) -> environment steps and seeds of the tables."""
+
+
+class Wanted(NamedTuple):
+    """A run that is to have at least so many steps."""
+
+    config: Path
+    seed: int
+    env_steps: int
+    settings: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        return "_".join([self.config.stem, str(self.seed), *self.settings]).replace("/", "_")
+
+
+def run_one(wanted: Wanted) -> dict[str, Any]:
+    """One run from its config, or from where it was interrupted -> its row."""
+    session.make_engine = in_this_process
+    limits = (f"budget.env_steps={wanted.env_steps}", "budget.generations=null", f"seed={wanted.seed}")
+    chosen = ("compute.engine=inline", "compute.workers=1", *wanted.settings, *limits)
+    config, folder = api.load_config(wanted.config, chosen), RUNS / wanted.name
+    try:
+        api.run_or_resume(config, folder)
+    except Interrupted:
+        if (api.open_run(folder).generation or 0) < 1:
+            raise
+    run = api.open_run(folder)
+    task, history = run.config["task"]["environment"], run.history
+    last = history.iloc[-1]
+    return {
+        "task": task,
+        "method": run.config["search"]["algorithm"],
+        "seed": wanted.seed,
+        **({} if wanted.config.parent == CONFIGS else {"settings": " ".join([wanted.config.stem, *wanted.settings])}),
+        "env_steps": int(last.env_steps),
+        "finished": bool(last.env_steps >= wanted.env_steps),
+        "generations": int(history.index[-1]),
+        "seconds": round(float(last.wall_clock_s)),
+        **readings(task, run.evaluations, history),
+        "cells": int(last.map_cells),
+        "cpu": cpu_kind(),
+        "digest": run.digest()[:16],
+        "commit": commit(),
+    }
+
+
+def commit() -> str:
+    """The commit whose files compute, marked if they differ from it."""
+    git = ("git", "-C", str(ROOT))
+    head = subprocess.run([*git, "rev-parse", "--short=10", "HEAD"], check=True, capture_output=True, text=True).stdout
+    files = ("es_service", "workers", "configs")
+    changed = subprocess.run([*git, "status", "--porcelain", "--", *files], check=True, capture_output=True).stdout
+    return head.strip() + ("+" if changed else "")
+
+
+def missing(wanted: list[Wanted], table: pd.DataFrame) -> list[Wanted]:
+    """Those without a row that has as many steps; the longest first, so that the cores end together."""
+    known = {(f"{row.task}_{row.method}", row.seed): row.env_steps for row in table.itertuples()}
+    left = [one for one in wanted if known.get((one.config.stem, one.seed), 0) < one.env_steps]
+    return sorted(left, key=lambda one: (-one.env_steps, one.config.stem.startswith("point"), one.seed))
+
+
+def compute(wanted: list[Wanted], keep: Any) -> None:
+    """Compute runs, one per core at a time, and `keep` each row as soon as it is there."""
+    RUNS.mkdir(parents=True, exist_ok=True)
+    cleaned = worker_environment(os.environ)
+    os.environ.clear()
+    os.environ.update(cleaned)  # the processes below import JAX with it
+    with ProcessPoolExecutor(cores(), mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
+        pending = {pool.submit(run_one, one): one for one in wanted}
+
+        def stop(*_: object) -> None:
+            for future in pending:
+                future.cancel()
+
+        signal.signal(signal.SIGINT, stop)  # Ctrl-C reaches the runs, too, which end after their generation
+        for future in as_completed(pending):
+            if future.cancelled() or isinstance(future.exception(), Interrupted):
+                continue
+            row = future.result()
+            print(json.dumps(row), flush=True)
+            keep(row)
+            if row["finished"]:
+                shutil.rmtree(RUNS / pending[future].name)
+
+
+def keep_row(row: dict[str, Any]) -> None:
+    """Put the row of a run into the csv, in the place of an older one, and write the tables."""
+    table = paper_tables.read()
+    is_old = (table.task == row["task"]) & (table.method == row["method"]) & (table.seed == row["seed"])
+    paper_tables.write(pd.concat([table[~is_old], pd.DataFrame([row])]))
+
+
+def keep_trial(row: dict[str, Any]) -> None:
+    """Add the row of a trial to their table."""
+    pd.DataFrame([row]).to_csv(TRIALS, mode="a", header=not TRIALS.exists(), index=False, lineterminator="\n")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", nargs="+", default=list(paper_tables.TASKS), choices=paper_tables.TASKS)
+    parser.add_argument("--method", nargs="+", default=list(paper_tables.METHODS), choices=paper_tables.METHODS)
+    parser.add_argument("--seeds", metavar="A:B", help="in the place of those of the tables")
+    parser.add_argument("--env-steps", type=lambda text: int(float(text.replace("_", ""))))
+    parser.add_argument("--config", type=Path, help="a trial: a config of your own, which needs --seeds, --env-steps")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="settings of a trial")
+    arguments = parser.parse_args()
+    seeds = None if arguments.seeds is None else seeds_of(arguments.seeds)
+    if arguments.config is not None:
+        if seeds is None or arguments.env_steps is None:
+            parser.error("--config needs --seeds and --env-steps")
+        settings = tuple(arguments.set)
+        compute([Wanted(arguments.config, seed, arguments.env_steps, settings) for seed in seeds], keep_trial)
+        return
+    if arguments.set:
+        parser.error("--set needs --config")
+    wanted = [
+        Wanted(CONFIGS / f"{task}_{method}.yaml", seed, arguments.env_steps or BUDGET[task, method][0])
+        for task in arguments.task
+        for method in arguments.method
+        for seed in (BUDGET[task, method][1] if seeds is None else seeds)
+    ]
+    compute(missing(wanted, paper_tables.read()), keep_row)
+    paper_tables.write(paper_tables.read())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""The paper's measures: how they are read from a run, by hand, and that the guide has the tables of the csv."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from tests.benchmarks import paper_tables
+from tests.benchmarks.paper_readings import measured, readings
+
+
+def run_of(steps: list[int], centres: list[list[tuple[float, float]]]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """(evaluations, history) of a run whose generations evaluated these (mean, single) values, of fitness and, with
+    the sign changed, of distances."""
+    rows = [(generation, *values) for generation, found in enumerate(centres) for values in found]
+    table = pd.DataFrame(rows, columns=["generation", "fitness_mean", "fitness_max"])
+    table["goal_distance_way"], table["goal_distance_min"] = -table["fitness_mean"], -table["fitness_max"]
+    return table, pd.DataFrame({"env_steps": steps}).rename_axis("generation")
+
+
+def test_both_readings_are_the_best_over_all_centres_so_far():
+    evaluations, history = run_of([10, 20, 30], [[(1.0, 5.0), (2.0, 3.0)], [(np.nan, np.inf)], [(4.0, 4.5)]])
+    found = measured("ant_trap", evaluations, history)
+    assert found["centre"].tolist() == [2.0, 2.0, 4.0]
+    assert found["single"].tolist() == [5.0, 5.0, 5.0]
+
+
+def test_a_reading_is_that_of_the_last_generation_by_then_and_none_if_the_run_is_shorter():
+    steps = [500_000, 999_000, 1_001_000, 9_850_000]
+    found = readings(
+        "point_maze", *run_of(steps, [[(-100.0, -90.0)], [(-50.0, -40.0)], [(-30.0, -25.0)], [(-24.0, -20.0)]])
+    )
+    assert (found["centre_1e6"], found["single_1e6"]) == (-50.0, -40.0)
+    assert (found["centre_1e7"], found["single_1e7"]) == (-24.0, -20.0)
+    assert found["centre_1e8"] is None
+    assert "steps_to_goal_centre" not in found
+
+
+def test_the_goal_is_reached_by_the_first_episode_that_comes_within_a_metre():
+    values = [[(-60.0, -50.0)], [(-9.0, -1.01), (-8.0, -0.99)], [(-1.0, -0.5)]]
+    found = readings("ant_maze", *run_of([10, 20, 30], values))
+    assert (found["steps_to_goal_single"], found["steps_to_goal_centre"]) == (20, 30)
+    assert readings("ant_maze", *run_of([10], [[(-60.0, -50.0)]]))["steps_to_goal_single"] is None
+
+
+def test_the_guide_has_the_tables_of_the_runs():
+    text = paper_tables.GUIDE.read_text()
+    between = text.split(paper_tables.BEGIN)[1].split(paper_tables.END)[0]
+    assert between.strip() == paper_tables.text(paper_tables.read()).strip()
+
+
+def test_a_table_has_a_row_for_each_method_with_median_and_quartiles_and_names_what_is_not_finished():
+    runs = pd.DataFrame(
+        {
+            "task": "ant_trap",
+            "method": ["memes"] * 3 + ["ars"],
+            "seed": [0, 1, 2, 0],
+            "env_steps": [100_000_000, 100_000_000, 40_000_000, 100_000_000],
+            "finished": [True, True, False, True],
+            **{
+                f"{name}_{at}": [1000.0, 1200.0, np.nan, 900.0]
+                for name in ("centre", "single")
+                for at in ("1e6", "1e8")
+            },
+            **{f"{name}_{at}": np.nan for name in ("centre", "single") for at in ("1e7", "1e9")},
+        }
+    )
+    text = paper_tables.text(runs)
+    assert "| MEMES | 0, 1, 2 | **1,100** (1,050 to 1,150, 2 runs) | **1,100**" in text
+    assert "| ARS | 0 | **900** | **900**" in text
+    assert "Not finished: MEMES seed 2 (40 M)." in text
+    assert "QD-PG 1540 ± 46" in text
+    assert "1e7" not in text
