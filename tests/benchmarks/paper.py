@@ -19,7 +19,8 @@ import os
 import shutil
 import signal
 import subprocess
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -114,28 +115,32 @@ def missing(wanted: list[Wanted], table: pd.DataFrame) -> list[Wanted]:
     return sorted(left, key=lambda one: (-one.env_steps, one.config.stem.startswith("point"), one.seed))
 
 
-def compute(wanted: list[Wanted], keep: Any) -> None:
+def compute(wanted: list[Wanted], keep: Callable[[dict[str, Any]], None]) -> None:
     """Compute runs, one per core at a time, and `keep` each row as soon as it is there."""
     RUNS.mkdir(parents=True, exist_ok=True)
     cleaned = worker_environment(os.environ)
     os.environ.clear()
     os.environ.update(cleaned)  # the processes below import JAX with it
+    left, running, stopped = list(wanted), dict[Future, Wanted](), False
+
+    def stop(*_: object) -> None:
+        nonlocal stopped
+        stopped = True
+
+    signal.signal(signal.SIGINT, stop)  # Ctrl-C reaches the runs, too, which end after their generation
     with ProcessPoolExecutor(cores(), mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
-        pending = {pool.submit(run_one, one): one for one in wanted}
-
-        def stop(*_: object) -> None:
-            for future in pending:
-                future.cancel()
-
-        signal.signal(signal.SIGINT, stop)  # Ctrl-C reaches the runs, too, which end after their generation
-        for future in as_completed(pending):
-            if future.cancelled() or isinstance(future.exception(), Interrupted):
-                continue
-            row = future.result()
-            print(json.dumps(row), flush=True)
-            keep(row)
-            if row["finished"]:
-                shutil.rmtree(RUNS / pending[future].name)
+        while running or (left and not stopped):
+            while left and not stopped and len(running) < cores():  # the pool gets no run that would have to wait
+                running[pool.submit(run_one, left[0])] = left.pop(0)
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                one = running.pop(future)
+                if isinstance(future.exception(), Interrupted):
+                    continue
+                row = future.result()
+                print(json.dumps(row), flush=True)
+                keep(row)
+                if row["finished"]:
+                    shutil.rmtree(RUNS / one.name)
 
 
 def keep_row(row: dict[str, Any]) -> None:

@@ -49,6 +49,9 @@ PAPER = {
 PAPER_STEPS_TO_GOAL = {"QD-PG": "8.4e7", "ME-ES": "2.4e10", "NSRA-ES": "2.1e10", "NSR-ES": "never", "CEM-RL": "never"}
 """The paper's environment steps to the goal of AntMaze."""
 
+WHOLE = ("env_steps", "generations", "seconds", "cells", "steps_to_goal_centre", "steps_to_goal_single")
+"""Columns of whole numbers."""
+
 
 def read() -> pd.DataFrame:
     """The table of runs; without rows if there is none yet."""
@@ -64,8 +67,8 @@ def write(table: pd.DataFrame) -> None:
     ]
     table = table.assign(_task=places[0], _method=places[1]).sort_values(["_task", "_method", "seed"])
     table = table.drop(columns=["_task", "_method"])
-    for name in [column for column in table if column.startswith("steps_to_goal")]:
-        table[name] = table[name].astype("Int64")
+    for name in table.columns.intersection(WHOLE):  # NaN, where a run has no such number, would make them floats
+        table[name] = pd.to_numeric(table[name]).astype("Int64")
     table.to_csv(RUNS_CSV, index=False, lineterminator="\n")
     before, rest = GUIDE.read_text().split(BEGIN)
     GUIDE.write_text(f"{before}{BEGIN}\n\n{text(read())}\n{END}{rest.split(END)[1]}")
