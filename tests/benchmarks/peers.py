@@ -77,7 +77,7 @@ def _physics(integrator: str) -> Comparison:
 COMPARISONS = (
     _rollouts("ant_maze", "antmaze", ANT_STEPS, 256, (8, 32, 128)),
     _rollouts("ant_trap", "anttrap", ANT_STEPS, 256, (8, 32, 128)),
-    _rollouts("point_maze", "pointmaze", 200, 64, (16, 64, 256)),
+    _rollouts("point_maze", "pointmaze", 200, 64, (4, 16, 64)),
     _me_es(64, 400),
     _me_es(512, 50),
     _physics("RK4"),
