@@ -1,0 +1,241 @@
+"""How fast are QDax, MuJoCo and evosax on the same cores, by turns with es-service?
+
+    python -m tests.benchmarks.peers --build                # once: an environment for each of them, below runs/peers
+    python -m tests.benchmarks.peers --rounds 5             # half an hour on two cores, on which nothing else computes
+
+Each measurement has a process of its own. Before the rounds, QDax's rollouts choose the batch with which they are
+fastest (round 0). Every measurement is a row of results/peers.csv; printed are medians, and how many times as fast
+es-service is. `peers_theirs` measures the others, by their public interfaces; `peers_environments` has their pins.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from es_service import api
+from es_service.cli.bench_rollouts import bench_rollouts
+from es_service.config.model import worker_spec
+from es_service.config.tasks import task_of
+from es_service.dispatch.cores import cores
+from es_service.dispatch.events import Limits
+from es_service.dispatch.inline_engine import inline_engine
+from es_service.protocol.machine import cpu_kind, platform_info
+from es_service.protocol.process_environment import same_imports
+from tests.benchmarks.peers_environments import NAMED, THEIRS, asked, build, python_of, their_versions
+from tests.benchmarks.rollouts_per_second import ANT_STEPS, config_of, measure
+from tests.helpers import centre
+from workers.environments.ant import STEP_S, SUBSTEPS
+from workers.policy import initial_parameters
+
+ROOT = Path(__file__).parents[2]
+RESULTS = Path(__file__).parent / "results" / "peers.csv"
+OURS = "es-service"
+
+
+class Comparison(NamedTuple):
+    """What one of the others and es-service do, and the column that is compared."""
+
+    what: str
+    program: str
+    theirs: Mapping[str, Any]
+    ours: Mapping[str, Any]
+    column: str
+    batches: tuple[int, ...] = ()
+    """Sizes of which theirs takes the fastest."""
+
+
+def _rollouts(task: str, theirs: str, steps: int, hidden: int, batches: tuple[int, ...]) -> Comparison:
+    request = {"kind": "qdax rollouts", "task": theirs, "steps": steps, "hidden": hidden}
+    ours = {"kind": "rollouts", "task": task}
+    return Comparison(f"{task}: rollouts", "qdax", request, ours, "env_steps_per_second", batches)
+
+
+def _me_es(pairs: int, generations: int) -> Comparison:
+    sizes = {"pairs": pairs, "generations": generations}
+    theirs = {"kind": "qdax me_es", "cells": [20, 20], **sizes}
+    ours = {"kind": "search", "algorithm": "me_es", "whole": True, **sizes}
+    return Comparison(f"point_maze: ME-ES, {pairs} pairs", "qdax", theirs, ours, "ms_per_generation")
+
+
+def _physics(integrator: str) -> Comparison:
+    theirs = {"kind": "mujoco ant", "integrator": integrator, "cores": cores(), "batch": 64, "control_steps": 200}
+    what = f"ant: physics, {integrator} of MuJoCo"
+    return Comparison(what, "mujoco", theirs, {"kind": "physics"}, "simulated_s_per_second")
+
+
+COMPARISONS = (
+    _rollouts("ant_maze", "antmaze", ANT_STEPS, 256, (8, 32, 128)),
+    _rollouts("ant_trap", "anttrap", ANT_STEPS, 256, (8, 32, 128)),
+    _rollouts("point_maze", "pointmaze", 200, 64, (4, 16, 64)),
+    _me_es(64, 400),
+    _me_es(512, 50),
+    _physics("RK4"),
+    _physics("EULER"),
+    Comparison(
+        "point_maze: ES without episodes, 64 pairs",
+        "evosax",
+        {"kind": "evosax es", "pairs": 64, "parameters": 4482, "generations": 200},
+        {"kind": "search", "algorithm": "es", "pairs": 64, "generations": 400, "whole": False},
+        "ms_per_generation",
+    ),
+)
+COLUMNS = (
+    *("round", "program", "what", "env_steps_per_second", "simulated_s_per_second", "physics_steps_per_second"),
+    *("ms_per_generation", "settings", "cpu", "versions"),
+)
+RATES = COLUMNS[3:7]
+
+
+def our_rollouts(task: str, seconds: float) -> dict[str, Any]:
+    """Environment steps per second of whole populations, with all cores; what is compiled is so before."""
+    config = config_of(task)
+    spec = replace(worker_spec(config, task_of(config)), rollout="simd")
+    start_D = initial_parameters(spec.policy, "unit_columns", 0)
+    point = centre(start_D, sigma=0.02, observation_size=spec.policy.widths[0])
+    with inline_engine(spec, Limits(cores())) as engine:
+        chunks = config.search.pairs // spec.chunk_pairs
+        measure(engine, point, chunks, 0.1)  # compiles
+        rate = measure(engine, point, chunks, seconds)
+    ant = task != "point_maze"
+    return {
+        "env_steps_per_second": rate,
+        "physics_steps_per_second": rate * SUBSTEPS if ant else None,
+        "simulated_s_per_second": rate * STEP_S if ant else None,
+        "settings": f"{cores()} workers, {config.search.pairs} pairs",
+    }
+
+
+def our_physics(seconds: float) -> dict[str, Any]:
+    """Steps per second of Brax's ant without a policy, whose control step is as long as that of the mazes' ants."""
+    rows = bench_rollouts(["brax:ant"], policies=[False], rollouts=["simd"], batches=[64], seconds=seconds)
+    rate = next(row["steps_per_second"] for row in rows if row["cores"] == cores())
+    return {
+        "env_steps_per_second": rate,
+        "physics_steps_per_second": rate * SUBSTEPS,
+        "simulated_s_per_second": rate * STEP_S,
+        "settings": f"{cores()} processes, batch 64, spring, steps of {STEP_S / SUBSTEPS} s",
+    }
+
+
+def our_search(algorithm: str, pairs: int, generations: int, whole: bool) -> dict[str, Any]:
+    """Milliseconds per generation of a run on PointMaze, one evaluation episode; the first ten do not count.
+
+    Args:
+        whole: everything between two generations by the clock, the store too; else only the gradient and the driver.
+    """
+    config = api.load_config(
+        {
+            "task": {"environment": "point_maze"},
+            "policy": {"hidden": [64, 64]},
+            "search": {"algorithm": algorithm, "pairs": pairs, "evaluation_episodes": 1},
+            "budget": {"generations": 10 + generations},
+            "compute": {"workers": cores(), "engine": "inline"},
+        }
+    )
+    ends: list[float] = []
+    with tempfile.TemporaryDirectory() as folder:
+        run = api.run(config, Path(folder) / "run", on_generation=lambda row: ends.append(time.perf_counter())).run
+        history = run.history
+    counted = history.iloc[10:]
+    taken = ends[-1] - ends[9]
+    if not whole:
+        seconds = counted["seconds_gradient"] + counted["seconds_driver"]
+        return {"ms_per_generation": 1000 * float(seconds.mean()), "settings": "gradient and driver"}
+    return {
+        "env_steps_per_second": float(counted["env_steps"].iloc[-1] - history["env_steps"].iloc[9]) / taken,
+        "ms_per_generation": 1000 * taken / generations,
+        "settings": f"{pairs} pairs, {generations} generations, {cores()} workers",
+    }
+
+
+KINDS = {"rollouts": our_rollouts, "physics": our_physics, "search": our_search}
+
+
+def take_turns(folder: Path, rounds: int, seconds: float, chosen: Sequence[Comparison], to: Path) -> list[dict]:
+    """Rows of all measurements, written to a table after each."""
+    named = {name: their_versions(folder, name) for name in dict.fromkeys(one.program for one in chosen)}
+    theirs = {name: ", ".join(f"{key} {found[key]}" for key in NAMED[name]) for name, found in named.items()}
+    ours = f"{OURS} {platform_info()['es-service']}, jax {platform_info()['jax']}"
+    rows: list[dict[str, Any]] = []
+
+    def measured(number: int, comparison: Comparison, program: str, request: Mapping[str, Any]) -> dict[str, Any]:
+        if program == OURS:
+            found = asked([sys.executable, "-m", "tests.benchmarks.peers", "--measure"], request, **same_imports())
+        else:
+            found = asked([python_of(folder, program), "-I", THEIRS], request)
+        versions = ours if program == OURS else theirs[program]
+        row = {"round": number, "program": program, "what": comparison.what, **found}
+        rows.append(row | {"cpu": cpu_kind(), "versions": versions})
+        pd.DataFrame(rows, columns=list(COLUMNS)).to_csv(to, index=False, float_format="%.6g", lineterminator="\n")
+        print(json.dumps(row), flush=True)
+        return row
+
+    def timed(request: Mapping[str, Any]) -> dict[str, Any]:
+        return {**request} if "generations" in request else {**request, "seconds": seconds}
+
+    requests = []
+    for one in chosen:
+        request = timed(one.theirs)
+        if one.batches:
+            tried = [request | {"batch": batch} for batch in one.batches]
+            request = max(tried, key=lambda asking: measured(0, one, one.program, asking)["env_steps_per_second"])
+        requests.append((one, request))
+    for number in range(1, rounds + 1):
+        for one, request in requests:
+            sides = [(one.program, request), (OURS, timed(one.ours))]
+            for program, asking in sides if number % 2 else sides[::-1]:
+                measured(number, one, program, asking)
+    return rows
+
+
+def summary(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Medians over the rounds, and by the column that is compared how many times as fast es-service is."""
+    table = pd.DataFrame(rows, columns=list(COLUMNS)).query("round > 0")
+    median = table.assign(ours=table["program"] == OURS).groupby(["what", "ours"])[list(RATES)].median()
+    lines = [f"{'what':<44}{'column':<26}{'theirs':>14}{'ours':>14}{'times as fast':>15}"]
+    for one in COMPARISONS:
+        for column in RATES if one.what in median.index else ():
+            theirs, ours = median[column][one.what, False], median[column][one.what, True]
+            ratio = theirs / ours if column == "ms_per_generation" else ours / theirs
+            times = f"{ratio:.2f}" if column == one.column else ""
+            if not np.isnan([theirs, ours]).any():
+                lines.append(f"{one.what:<44}{column:<26}{theirs:>14,.1f}{ours:>14,.1f}{times:>15}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--build", action="store_true", help="make the environments, and measure nothing")
+    parser.add_argument("--environments", type=Path, default=ROOT / "runs" / "peers", help="folder of the environments")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=5.0, help="length of a measurement that has no other length")
+    parser.add_argument("--only", default="", help="compare only what has this text in its name")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the table that is written")
+    parser.add_argument("--measure", type=json.loads, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    folder = arguments.environments.absolute()
+    if arguments.measure:
+        print(json.dumps(KINDS[arguments.measure.pop("kind")](**arguments.measure)))
+    elif arguments.build:
+        build(folder)
+    else:
+        chosen = [one for one in COMPARISONS if arguments.only in one.what]
+        if not chosen:
+            names = "; ".join(one.what for one in COMPARISONS)
+            parser.error(f"--only {arguments.only!r}: no comparison has this in its name; there are: {names}")
+        print(summary(take_turns(folder, arguments.rounds, arguments.seconds, chosen, arguments.results)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+"""One measurement of another program, by its public interface, in an environment of its own; `peers` starts it.
+
+    ENVIRONMENT/bin/python -I tests/benchmarks/peers_theirs.py '{"kind": "evosax es", "pairs": 64, ...}'
+
+Prints one line of JSON. This file imports nothing of es-service, and what it measures only where it is measured, since
+each program has its own environment.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+NEEDED = {
+    "qdax": ("qdax.tasks.brax_envs", "qdax.core.map_elites", "qdax.core.emitters.mees_emitter"),
+    "mujoco": ("mujoco.rollout", "gymnasium"),
+    "evosax": ("evosax.algorithms",),
+}
+"""Modules without which an environment is not the one of its program."""
+FRAME_SKIP = 5
+"""Physics steps of a control step of gymnasium's ant (`MujocoEnv(frame_skip=5)`)."""
+
+
+def versions(program: str, packages: Sequence[str]) -> dict[str, str]:
+    """Versions of packages; raises ImportError if the program cannot be used."""
+    for module in NEEDED[program]:
+        importlib.import_module(module)
+    return {package: metadata.version(package) for package in packages}
+
+
+def per_second(call: Callable[[], object], units: int, seconds: float) -> float:
+    """Units per second of a call that makes so many, again and again for about `seconds`; the first call, which
+    compiles, does not count."""
+    call()
+    calls, start = 0, time.perf_counter()
+    while time.perf_counter() - start < seconds or not calls:
+        call()
+        calls += 1
+    return calls * units / (time.perf_counter() - start)
+
+
+def _qdax_task(task: str, steps: int, hidden: int) -> tuple[Any, Any, Callable]:
+    """Environment, policy network and scoring function, whose episodes begin with a reset of their own."""
+    import jax
+    from qdax.tasks.brax_envs import create_default_brax_task_components
+
+    environment, network, score, _ = create_default_brax_task_components(
+        task, jax.random.PRNGKey(0), steps, (hidden, hidden), deterministic=False
+    )
+    return environment, network, score
+
+
+def qdax_rollouts(task: str, steps: int, hidden: int, batch: int, seconds: float) -> dict[str, Any]:
+    """Environment steps per second of QDax's scoring function: `batch` policies, one episode each.
+
+    Transitions are not returned, so that XLA need not keep them.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    environment, network, score = _qdax_task(task, steps, hidden)
+    keys = jax.random.split(jax.random.PRNGKey(1), batch)
+    policies = jax.vmap(network.init, in_axes=(0, None))(keys, jnp.zeros(environment.observation_size))
+    scored = jax.jit(lambda policies, key: score(policies, key)[:2])
+    rate = per_second(lambda: jax.block_until_ready(scored(policies, keys[0])), batch * steps, seconds)
+    system = getattr(environment.unwrapped, "sys", None)  # PointMaze has none: it is no physics
+    return {
+        "env_steps_per_second": rate,
+        "simulated_s_per_second": rate * float(system.config.dt) if system else None,
+        "settings": f"batch {batch}",
+    }
+
+
+def qdax_me_es(pairs: int, generations: int, cells: Sequence[int]) -> dict[str, Any]:
+    """Milliseconds per generation of ME-ES on PointMaze, all of whose generations are one compiled loop.
+
+    A first loop of as many generations does not count.
+    """
+    import jax
+    import jax.numpy as jnp
+    from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroids
+    from qdax.core.emitters.mees_emitter import MEESConfig, MEESEmitter
+    from qdax.core.map_elites import MAPElites
+
+    steps = 200
+    environment, network, score = _qdax_task("pointmaze", steps, 64)
+    emitter = MEESEmitter(MEESConfig(sample_number=2 * pairs), 2 * generations, score, num_descriptors=2)
+    search = MAPElites(score, emitter, lambda repertoire: {"best": repertoire.fitnesses.max()})
+    first = jax.vmap(network.init, in_axes=(0, None))(
+        jax.random.split(jax.random.PRNGKey(1), 1), jnp.zeros(environment.observation_size)
+    )
+    centroids = compute_euclidean_centroids(tuple(cells), -1.0, 1.0)
+    carry = search.init(first, centroids, jax.random.PRNGKey(2))
+    loop = jax.jit(lambda carry: jax.lax.scan(search.scan_update, carry, (), length=generations)[0])
+    carry = jax.block_until_ready(loop(carry))
+    start = time.perf_counter()
+    jax.block_until_ready(loop(carry))
+    taken = time.perf_counter() - start
+    return {
+        "env_steps_per_second": generations * (2 * pairs + 1) * steps / taken,
+        "ms_per_generation": 1000 * taken / generations,
+        "settings": f"{2 * pairs} samples, {generations} generations",
+    }
+
+
+def mujoco_ant(integrator: str, cores: int, batch: int, control_steps: int, seconds: float) -> dict[str, Any]:
+    """Steps per second of gymnasium's ant with random actions, each held for a control step, `cores` threads.
+
+    The model's own integrator is RK4, which evaluates the dynamics four times in a step.
+    """
+    import gymnasium
+    import mujoco
+    import numpy as np
+    from mujoco.rollout import rollout
+
+    path = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "ant.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+    random = np.random.default_rng(0)
+    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    starts = np.zeros((batch, mujoco.mj_stateSize(model, kind)))
+    data = mujoco.MjData(model)
+    for start in starts:
+        mujoco.mj_resetData(model, data)
+        data.qpos += random.uniform(-0.1, 0.1, model.nq)
+        mujoco.mj_getState(model, data, start, kind)
+    controls = random.uniform(-1, 1, (batch, control_steps, model.nu)).repeat(FRAME_SKIP, axis=1)
+    threads = [mujoco.MjData(model) for _ in range(cores)]
+    rate = per_second(
+        lambda: rollout(model, threads, starts, controls, persistent_pool=True), batch * control_steps, seconds
+    )
+    return {
+        "env_steps_per_second": rate,
+        "physics_steps_per_second": rate * FRAME_SKIP,
+        "simulated_s_per_second": rate * FRAME_SKIP * model.opt.timestep,
+        "settings": f"{cores} threads, batch {batch}, steps of {model.opt.timestep} s",
+    }
+
+
+def evosax_es(pairs: int, parameters: int, generations: int) -> dict[str, Any]:
+    """Milliseconds per generation of OpenAI-ES's `ask` and `tell` in one compiled loop, for a fitness that costs
+    nothing."""
+    import jax
+    import jax.numpy as jnp
+    from evosax.algorithms import Open_ES
+
+    search = Open_ES(population_size=2 * pairs, solution=jnp.zeros(parameters))
+    params = search.default_params
+
+    def generation(state: Any, key: Any) -> tuple[Any, None]:
+        ask, tell = jax.random.split(key)
+        population, state = search.ask(ask, state, params)
+        return search.tell(tell, population, population[:, 0], state, params)[0], None
+
+    keys = jax.random.split(jax.random.PRNGKey(1), generations)
+    state = search.init(keys[0], jnp.zeros(parameters), params)
+    loop = jax.jit(lambda state: jax.lax.scan(generation, state, keys)[0])
+    rate = per_second(lambda: jax.block_until_ready(loop(state)), generations, 1.0)
+    return {"ms_per_generation": 1000 / rate, "settings": f"{2 * pairs} members, {parameters} parameters"}
+
+
+KINDS: Mapping[str, Callable[..., dict[str, Any]]] = {
+    "qdax rollouts": qdax_rollouts,
+    "qdax me_es": qdax_me_es,
+    "mujoco ant": mujoco_ant,
+    "evosax es": evosax_es,
+    "versions": versions,
+}
+
+
+def main() -> None:
+    asked = json.loads(sys.argv[1])
+    print(json.dumps(KINDS[asked.pop("kind")](**asked)))
+
+
+if __name__ == "__main__":
+    main()
