@@ -151,8 +151,9 @@ def keep_row(row: dict[str, Any]) -> None:
 
 
 def keep_trial(row: dict[str, Any]) -> None:
-    """Add the row of a trial to their table."""
-    pd.DataFrame([row]).to_csv(TRIALS, mode="a", header=not TRIALS.exists(), index=False, lineterminator="\n")
+    """Add the row of a trial to their table, whose first rows have other columns."""
+    before = [pd.read_csv(TRIALS)] if TRIALS.exists() else []
+    pd.concat([*before, pd.DataFrame([row])]).to_csv(TRIALS, index=False, lineterminator="\n")
 
 
 def main() -> None:
