@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -83,3 +87,14 @@ class MemoryStore:
         self.generation = generation
         self.parts |= parts
         self.rows.append(dict(history))
+
+
+def stop(pid: int) -> None:
+    """Stop a process, and return once each of its threads stands still. Until then, others than the one that receives
+    the signal go on, and may answer."""
+    os.kill(pid, signal.SIGSTOP)
+    states = [Path(f"/proc/{pid}/task/{thread}/stat") for thread in os.listdir(f"/proc/{pid}/task")]
+    until = time.monotonic() + 30.0
+    while any(state.read_text().rpartition(")")[2].split()[0] != "T" for state in states):
+        assert time.monotonic() < until, f"process {pid} does not stop"
+        time.sleep(0.01)

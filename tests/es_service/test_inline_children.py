@@ -16,7 +16,7 @@ from es_service.dispatch.events import Limits, StartWorker, Submit
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError
 from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk, around
-from tests.helpers import SPEC, DirectEvaluator, centre, random_parameters, spec
+from tests.helpers import SPEC, DirectEvaluator, centre, random_parameters, spec, stop
 
 FIRST = centre(random_parameters(0))
 CHUNKS = [TrainingChunk(3, chunk_id) for chunk_id in range(8)]
@@ -75,7 +75,7 @@ def test_a_child_stopped_in_mid_message_blocks_nobody():
         with pytest.raises(AssertionError):
             assert_same(engine.evaluate(around(other, chunks)), result)
         (victim,) = engine.transport.process_ids().values()
-        os.kill(victim, signal.SIGSTOP)
+        stop(victim)
         assert_same(engine.evaluate(around(one, chunks)), result)
         assert engine.counts.lost_workers == 1
         assert victim not in engine.transport.process_ids().values()
