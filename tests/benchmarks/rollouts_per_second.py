@@ -42,9 +42,9 @@ ANT_PAIRS, ANT_STEPS = 64, 500
 
 
 def measure(engine: Evaluator, point: Any, chunks: int, seconds: float) -> float:
-    """Steps per second over whole populations for about `seconds`."""
+    """Steps per second over whole populations, at least one, for about `seconds`."""
     steps, start = 0, time.perf_counter()
-    while time.perf_counter() - start < seconds:
+    while not steps or time.perf_counter() - start < seconds:
         results = engine.evaluate(around(point, [TrainingChunk(point.generation, chunk) for chunk in range(chunks)]))
         steps += sum(int(result.steps.sum()) for result in results if isinstance(result, EpisodesResult))
     return steps / (time.perf_counter() - start)
@@ -91,7 +91,7 @@ def compare_policies(task: str, seconds: float) -> dict[str, Any]:
         rates: dict[str, list[float]] = {"perturbed": [], "explicit": []}
         with inline_engine(spec, Limits(workers)) as engine:
             for length in (0.0, *[seconds] * ROUNDS):  # the first compiles
-                rates["perturbed"].append(measure(engine, point, chunks, length or 1e-9))
+                rates["perturbed"].append(measure(engine, point, chunks, length))
                 rates["explicit"].append(measure_policies(engine, policies_N_D, size, length))
         rate = {kind: statistics.median(found[1:]) for kind, found in rates.items()}
         row |= {f"{kind}_{workers}": round(found) for kind, found in rate.items()}
