@@ -18,6 +18,7 @@ from es_service.dispatch.inline_engine import ChildProcesses
 from es_service.dispatch.ray_engine import Actors
 from es_service.errors import ConfigError, EvaluationError, ServiceError
 from es_service.loop.policies import no_statistics
+from tests.helpers import stop
 from tests.system import cluster
 from tests.system.cluster import Cluster
 from tests.system.processes import children, wait_for, without_copies
@@ -96,8 +97,11 @@ def test_workers_that_are_killed_and_stopped_in_mid_evaluation_change_no_bit(
     strikes, send, before = {1: signal.SIGKILL, 2: signal.SIGSTOP}, transport.send, children()
 
     def send_and_strike(self, worker, item_id, attempt, work):
+        strike = strikes.pop(item_id.phase, None)
+        if strike == signal.SIGSTOP:
+            stop(pid_of(self, worker))  # or it might have answered before it is struck
         send(self, worker, item_id, attempt, work)
-        if (strike := strikes.pop(item_id.phase, None)) is not None:
+        if strike == signal.SIGKILL:
             os.kill(pid_of(self, worker), strike)
 
     monkeypatch.setattr(transport, "send", send_and_strike)
