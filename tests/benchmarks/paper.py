@@ -1,6 +1,6 @@
 """The tables of the benchmark paper (Chalumeau et al. 2022), as far as evolution strategies can fill them.
 
-    python -m tests.benchmarks.paper                                  # what BUDGET names: a day on two cores
+    python -m tests.benchmarks.paper                                  # what BUDGET names: some hours on two cores
     python -m tests.benchmarks.paper --task point_maze --seeds 0:2 --env-steps 1_000_000
     python -m tests.benchmarks.paper --config my.yaml --seeds 100:101 --env-steps 100_000_000 --set search.sigma=0.05
 
@@ -74,6 +74,7 @@ def run_one(wanted: Wanted) -> dict[str, Any]:
     limits = (f"budget.env_steps={wanted.env_steps}", "budget.generations=null", f"seed={wanted.seed}")
     chosen = ("compute.engine=inline", "compute.workers=1", *wanted.settings, *limits)
     config, folder = api.load_config(wanted.config, chosen), RUNS / wanted.name
+    code = commit()  # a commit that is made meanwhile is not the one that computes
     try:
         api.run_or_resume(config, folder)
     except Interrupted:
@@ -95,7 +96,7 @@ def run_one(wanted: Wanted) -> dict[str, Any]:
         "cells": int(last.map_cells),
         "cpu": cpu_kind(),
         "digest": run.digest()[:16],
-        "commit": commit(),
+        "commit": code,
     }
 
 
@@ -131,7 +132,8 @@ def compute(wanted: list[Wanted], keep: Callable[[dict[str, Any]], None]) -> Non
     with ProcessPoolExecutor(cores(), mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         while running or (left and not stopped):
             while left and not stopped and len(running) < cores():  # the pool gets no run that would have to wait
-                running[pool.submit(run_one, left[0])] = left.pop(0)
+                one = left.pop(0)
+                running[pool.submit(run_one, one)] = one
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 one = running.pop(future)
                 if isinstance(future.exception(), Interrupted):

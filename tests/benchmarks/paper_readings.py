@@ -26,6 +26,16 @@ GOAL_M = 1.0
 """AntMaze: an episode reaches the goal if it comes so near, in metres."""
 
 
+def power(steps: int) -> str:
+    """1000000 -> 1e6."""
+    return f"{steps:.0e}".replace("e+0", "e")
+
+
+def column(reading: str, at: int) -> str:
+    """Name of the column of a reading, such as centre_1e6."""
+    return f"{reading}_{power(at)}"
+
+
 def measured(task: str, evaluations: pd.DataFrame, history: pd.DataFrame) -> pd.DataFrame:
     """Both readings after each generation.
 
@@ -58,9 +68,7 @@ def readings(task: str, evaluations: pd.DataFrame, history: pd.DataFrame) -> dic
         until = found[steps <= at]
         is_there = len(until) and steps.iloc[-1] >= 0.98 * at
         for name in READINGS:
-            columns[f"{name}_{at:.0e}".replace("e+0", "e")] = (
-                round(float(until[name].iloc[-1]), 2) if is_there else None
-            )
+            columns[column(name, at)] = round(float(until[name].iloc[-1]), 2) if is_there else None
     if task in DISTANCE_TASKS:
         for name in READINGS:
             there = steps[found[name] >= -GOAL_M]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from tests.benchmarks.paper_readings import AT, READINGS
+from tests.benchmarks.paper_readings import AT, READINGS, column, power
 
 RUNS_CSV = Path(__file__).parent / "results" / "paper_runs.csv"
 GUIDE = Path(__file__).parent / "README.md"
@@ -81,8 +81,8 @@ def text(table: pd.DataFrame) -> str:
 
 def _of_task(runs: pd.DataFrame, task: str) -> str:
     title, paper_steps = TASKS[task]
-    at_columns = [at for at in AT if runs[_column("centre", at)].notna().any()]
-    head = ["method", "seeds", *(f"{name}, {_power(at)}" for at in at_columns for name in READINGS)]
+    at_columns = [at for at in AT if runs[column("centre", at)].notna().any()]
+    head = ["method", "seeds", *(f"{name}, {power(at)}" for at in at_columns for name in READINGS)]
     with_goal = task == "ant_maze"
     head += ["steps to the goal, single, of each seed"] * with_goal
     lines = [f"**{title}.**", "", _line(head), _line(["---"] * len(head))]
@@ -90,7 +90,7 @@ def _of_task(runs: pd.DataFrame, task: str) -> str:
         of_method = runs[runs.method == method]
         if len(of_method):
             cells = [name, ", ".join(map(str, of_method.seed))]
-            cells += [_quartiles(of_method[_column(reading, at)]) for at in at_columns for reading in READINGS]
+            cells += [_quartiles(of_method[column(reading, at)]) for at in at_columns for reading in READINGS]
             if with_goal:
                 steps = pd.to_numeric(of_method["steps_to_goal_single"]).tolist()
                 cells.append(", ".join("never" if np.isnan(one) else f"{one / 1e6:,.0f} M" for one in steps))
@@ -103,7 +103,7 @@ def _of_task(runs: pd.DataFrame, task: str) -> str:
         lines += ["", f"Not finished: {which}."]
     values = {name: row[list(TASKS).index(task)] for name, row in PAPER.items()}
     beside = [f"{name} {value}" + _to_goal(name, with_goal) for name, value in values.items() if value]
-    lines += ["", f"In the paper, after {_power(paper_steps)} unless said: {', '.join(beside)}.", ""]
+    lines += ["", f"In the paper, after {power(paper_steps)} unless said: {', '.join(beside)}.", ""]
     return "\n".join(lines)
 
 
@@ -123,15 +123,6 @@ def _quartiles(values: pd.Series) -> str:
 
 def _to_goal(name: str, with_goal: bool) -> str:
     return f" (the goal: {PAPER_STEPS_TO_GOAL[name]})" if with_goal and name in PAPER_STEPS_TO_GOAL else ""
-
-
-def _column(reading: str, at: int) -> str:
-    return f"{reading}_{_power(at)}"
-
-
-def _power(steps: int) -> str:
-    """1000000 -> 1e6."""
-    return f"{steps:.0e}".replace("e+0", "e")
 
 
 def _line(cells: list[str]) -> str:
