@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import signal
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 
-from tests.benchmarks import paper_tables
+from tests.benchmarks import paper, paper_tables
 from tests.benchmarks.paper_readings import measured, readings
 
 
@@ -71,3 +75,27 @@ def test_a_table_has_a_row_for_each_method_with_median_and_quartiles_and_names_w
     assert "Not finished: MEMES seed 2 (40 M)." in text
     assert "QD-PG 1540 ± 46" in text
     assert "1e7" not in text
+
+
+def test_each_wanted_run_is_made_once_and_only_the_folder_of_a_finished_one_goes(monkeypatch, tmp_path):
+    """With threads in the place of processes, and runs that only make their folder; odd seeds do not finish."""
+
+    def run_one(one):
+        (tmp_path / one.name).mkdir()
+        return {"seed": one.seed, "finished": one.seed % 2 == 0}
+
+    monkeypatch.setattr(paper, "RUNS", tmp_path)
+    monkeypatch.setattr(paper, "run_one", run_one)
+    monkeypatch.setattr(paper, "worker_environment", dict)
+    monkeypatch.setattr(paper, "ProcessPoolExecutor", lambda workers, **_: ThreadPoolExecutor(workers))
+    wanted, before, rows = (
+        [paper.Wanted(Path("c.yaml"), seed, 1) for seed in range(5)],
+        signal.getsignal(signal.SIGINT),
+        [],
+    )
+    try:
+        paper.compute(wanted, rows.append)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert sorted(row["seed"] for row in rows) == list(range(5))
+    assert sorted(folder.name for folder in tmp_path.iterdir()) == ["c_1", "c_3"]
