@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.protocol.noise import Domain, stream_keys
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from tests.workers.simd.rollouts import targets
 from workers.environments import make_environment
 from workers.simd.backend.function_builder import FunctionBuilder
 from workers.simd.episodes import noise
-from workers.simd.episodes.check import WrongCodeError, check_episodes, require_same
+from workers.simd.episodes.check import WrongCodeError, check_episodes, check_resets, require_same
 from workers.simd.episodes.compiled import compile_episodes
+from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.episodes.rollout import make_gradient_sum
 from workers.simd.graph.operations import OPERATIONS
 
@@ -61,6 +64,21 @@ def test_an_instruction_that_computes_something_else_is_found_and_the_code_is_no
             with pytest.raises(WrongCodeError, match=r"words of a .* of point_maze differ.*set compute.rollout to xla"):
                 worker(chunk)
     worker(chunk)
+
+
+def test_a_wrong_reset_is_found_before_its_code_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Resets have code of their own, which the episodes of other policies use, too."""
+    begin, key = make_environment("point_maze", {}).reset, stream_keys(0, Domain.EVALUATION_RESET, 0, np.arange(1))[0]
+
+    def compiled():
+        return compile_kernel(begin, key, folder=tmp_path, check=partial(check_resets, environment="point_maze"))
+
+    with monkeypatch.context() as broken:
+        broken.setitem(OPERATIONS, "ixor", OPERATIONS["ixor"]._replace(llvm="or {I} {0}, {1}"))
+        with pytest.raises(WrongCodeError, match="words of a reset of point_maze differ"):
+            compiled()
+    assert not compiled().facts.cached
+    assert compiled().facts.cached
 
 
 @pytest.mark.parametrize("chunk", CHUNKS, ids=["training", "evaluation"])

@@ -22,7 +22,7 @@ from workers.episode import Carry, Episodes
 from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import Target, host_target
 from workers.simd.backend.words import ALIGNMENT, aligned, filled, pack, require, unpack, words_of
-from workers.simd.episodes.kernel import compile_resets
+from workers.simd.episodes.kernel import Check, compile_resets, no_check
 from workers.simd.episodes.layout import Network
 from workers.simd.episodes.program import EpisodeProgram, write_episodes
 
@@ -149,6 +149,7 @@ def compile_episodes(
     target: Target | None = None,
     folder: Path | None = None,
     check: Callable[[EpisodeKernel, EpisodeProgram], object] = lambda kernel, program: None,
+    check_resets: Check = no_check,
 ) -> EpisodeKernel:
     """Compile the episodes of a run.
 
@@ -158,7 +159,7 @@ def compile_episodes(
         own_weights: evaluation episodes of a policy in each lane, instead of those of the centre.
         target: processor and instruction set; the widest vectors of this machine if None.
         folder: folder of the cache; the user's cache if None.
-        check: function that raises an exception if new code is wrong; see check.py.
+        check, check_resets: functions that raise an exception if new code is wrong; see check.py.
 
     Raises:
         UnsupportedError: a step of the environment cannot be compiled.
@@ -166,7 +167,7 @@ def compile_episodes(
     """
     target = target or host_target()
     program = write_episodes(environment, spec, inputs_O, target.width, training=training, own_weights=own_weights)
-    begin = compile_resets(program.steps.begin, target, folder)
+    begin = compile_resets(program.steps.begin, target, folder, check_resets)
     signature = [*[ctypes.c_void_p] * 8, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
 
     def kernel(native: Native) -> EpisodeKernel:

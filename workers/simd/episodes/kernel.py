@@ -16,12 +16,12 @@ import numpy as np
 from es_service.protocol.noise import KEY_WORDS
 from workers.compilable import Compilable, jitted
 from workers.simd.backend.emit import emit
-from workers.simd.backend.native import load_compiled
+from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import Target, host_target
 from workers.simd.backend.words import ALIGNMENT, Words, aligned, pack, require, unpack, words_of
 from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
-from workers.simd.graph.graph import live
+from workers.simd.graph.graph import Graph, live
 from workers.simd.graph.operations import OPERATIONS
 from workers.simd.graph.unsupported import UnsupportedError
 
@@ -96,8 +96,20 @@ class Kernel:
         return jax.tree.unflatten(self.out_tree, unpack(out, self.out_avals, lanes))
 
 
+Check = Callable[[Kernel, Graph, list[int]], object]
+"""Function of a kernel, its graph and the outputs of the graph, which raises an exception if the code is wrong."""
+
+
+def no_check(kernel: Kernel, graph: Graph, outputs: list[int]) -> None:
+    """Trust the code."""
+
+
 def compile_kernel(
-    function: Callable[..., Any], *arguments: Any, target: Target | None = None, folder: Path | None = None
+    function: Callable[..., Any],
+    *arguments: Any,
+    target: Target | None = None,
+    folder: Path | None = None,
+    check: Check = no_check,
 ) -> Kernel:
     """Compile a pure JAX function of one environment.
 
@@ -106,6 +118,7 @@ def compile_kernel(
         arguments: pytrees of arrays or ShapeDtypeStructs, without the axis of lanes.
         target: processor and instruction set; the widest vectors of this machine if None.
         folder: folder of the cache; the user's cache if None.
+        check: check of new code, which is not kept if it is wrong; see check.py.
 
     Raises:
         UnsupportedError: the function contains something that cannot be compiled.
@@ -115,28 +128,33 @@ def compile_kernel(
     started = time.perf_counter()
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     jaxpr_s = time.perf_counter() - started
-    computed = 0
+    leaves, out_tree = jax.tree.flatten(shape)
+    traced: list[tuple[Graph, list[int]]] = []  # empty if the code was cached
 
     def text() -> str:
-        nonlocal computed
         graph, inputs, outputs = trace_jaxpr(closed)
-        computed = sum(graph.keys[node][0] in OPERATIONS for node in live(graph, outputs))
+        traced.append((graph, outputs))
         return emit(graph, outputs, inputs, target.width)
 
-    native = load_compiled(jaxpr_digest(closed), text, target, folder)
-    leaves, out_tree = jax.tree.flatten(shape)
-    return Kernel(
-        target=target,
-        in_tree=jax.tree.structure(arguments),
-        in_avals=tuple(variable.aval for variable in closed.jaxpr.invars),
-        out_tree=out_tree,
-        out_avals=tuple(leaves),
-        facts=Facts(jaxpr_s, computed, native.code_bytes, native.cached),
-        _function=native.function(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64),
-    )
+    def kernel(native: Native) -> Kernel:
+        computed = sum(graph.keys[node][0] in OPERATIONS for graph, outputs in traced for node in live(graph, outputs))
+        return Kernel(
+            target=target,
+            in_tree=jax.tree.structure(arguments),
+            in_avals=tuple(variable.aval for variable in closed.jaxpr.invars),
+            out_tree=out_tree,
+            out_avals=tuple(leaves),
+            facts=Facts(jaxpr_s, computed, native.code_bytes, native.cached),
+            _function=native.function(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64),
+        )
+
+    name = jaxpr_digest(closed)
+    return kernel(load_compiled(name, text, target, folder, lambda native: check(kernel(native), *traced[0])))
 
 
-def compile_resets(begin: Callable[[Any], Any], target: Target, folder: Path | None) -> Compilable:
+def compile_resets(
+    begin: Callable[[Any], Any], target: Target, folder: Path | None, check: Check = no_check
+) -> Compilable:
     """Function from reset keys [lane, 4] to words of carries, compiled here by simd if possible and otherwise by JAX.
 
     Resets of Brax's own environments, for example, cannot be compiled by simd. Resets are few compared with steps, but
@@ -144,7 +162,7 @@ def compile_resets(begin: Callable[[Any], Any], target: Target, folder: Path | N
     """
     key = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
     try:
-        kernel = compile_kernel(begin, key, target=target, folder=folder)
+        kernel = compile_kernel(begin, key, target=target, folder=folder, check=check)
     except UnsupportedError:
         resets = jitted(jax.vmap(begin))
 

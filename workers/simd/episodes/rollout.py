@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import threading
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from workers.episode import Carry, Episodes
 from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import WIDTHS, Target, host_target
 from workers.simd.backend.words import aligned, require
-from workers.simd.episodes.check import check_episodes, check_gradient
+from workers.simd.episodes.check import check_episodes, check_gradient, check_resets
 from workers.simd.episodes.compiled import EpisodeKernel, compile_episodes
 from workers.simd.episodes.noise import UNROLLED, definition, gradient_module
 from workers.simd.episodes.program import write_episodes
@@ -165,6 +166,7 @@ class _Kernels:
                         training=self._training,
                         own_weights=self._own_weights,
                         check=check_episodes,
+                        check_resets=partial(check_resets, environment=self._spec.environment),
                     )
                 except UnsupportedError as error:  # `why_not` checks the default options only
                     raise UnsupportedError(
