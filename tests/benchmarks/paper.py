@@ -7,7 +7,8 @@
 Each run is one of configs/paper with a seed. A finished one becomes a row of results/paper_runs.csv, which is not
 computed again unless more steps are asked for; one that is interrupted is listed with the steps that it has, and goes
 on from there if its folder is still in runs/paper. There are as many runs at a time as cores, each in one process.
-In the end the tables of tests/benchmarks/README.md are written from the csv. The third form is a trial: it prints its
+Its curve is in results/paper_curves.csv. The tables of tests/benchmarks/README.md and the picture of the curves are
+made from these two files, also if no run is missing. The third form is a trial: it prints its
 rows, and adds them to results/paper_trials.csv.
 """
 
@@ -34,14 +35,15 @@ from es_service.errors import Interrupted
 from es_service.protocol.machine import cpu_kind
 from es_service.protocol.process_environment import worker_environment
 from es_service.runs import session
-from tests.benchmarks import paper_tables
-from tests.benchmarks.paper_readings import readings
+from tests.benchmarks import paper_picture, paper_tables
+from tests.benchmarks.paper_readings import curve, readings
 from tests.benchmarks.science import in_this_process
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = ROOT / "configs" / "paper"
 RUNS = ROOT / "runs" / "paper"
 TRIALS = Path(__file__).parent / "results" / "paper_trials.csv"
+PICTURE = TRIALS.with_name("paper.png")
 FIRST, OTHERS = range(5), range(1)
 BUDGET = {
     **{("point_maze", method): (100_000_000, FIRST) for method in paper_tables.METHODS},
@@ -50,6 +52,7 @@ BUDGET = {
         for task in ("ant_maze", "ant_trap")
         for method in paper_tables.METHODS
     },
+    **{(task, "map_elites"): (1_000_000_000, FIRST) for task in ("ant_maze", "ant_trap")},  # the best method
 }
 """(task, method) -> environment steps and seeds of the tables."""
 
@@ -68,8 +71,15 @@ class Wanted(NamedTuple):
         return "_".join([self.config.stem, str(self.seed), *self.settings]).replace("/", "_")
 
 
-def run_one(wanted: Wanted) -> dict[str, Any]:
-    """One run from its config, or from where it was interrupted -> its row."""
+class Computed(NamedTuple):
+    """What is kept of a run: its row in the table, and its curve."""
+
+    row: dict[str, Any]
+    curve: pd.DataFrame
+
+
+def run_one(wanted: Wanted) -> Computed:
+    """One run from its config, or from where it was interrupted."""
     session.make_engine = in_this_process
     limits = (f"budget.env_steps={wanted.env_steps}", "budget.generations=null", f"seed={wanted.seed}")
     chosen = ("compute.engine=inline", "compute.workers=1", *wanted.settings, *limits)
@@ -82,8 +92,8 @@ def run_one(wanted: Wanted) -> dict[str, Any]:
             raise
     run = api.open_run(folder)
     task, history = run.config["task"]["environment"], run.history
-    last = history.iloc[-1]
-    return {
+    last, measured = history.iloc[-1], (task, run.evaluations, history)
+    row = {
         "task": task,
         "method": run.config["search"]["algorithm"],
         "seed": wanted.seed,
@@ -92,12 +102,13 @@ def run_one(wanted: Wanted) -> dict[str, Any]:
         "finished": bool(last.env_steps >= wanted.env_steps),
         "generations": int(history.index[-1]),
         "seconds": round(float(last.wall_clock_s)),
-        **readings(task, run.evaluations, history),
+        **readings(*measured),
         "cells": int(last.map_cells),
         "cpu": cpu_kind(),
         "digest": run.digest()[:16],
         "commit": code,
     }
+    return Computed(row, curve(*measured))
 
 
 def commit() -> str:
@@ -116,8 +127,8 @@ def missing(wanted: list[Wanted], table: pd.DataFrame) -> list[Wanted]:
     return sorted(left, key=lambda one: (-one.env_steps, one.config.stem.startswith("point"), one.seed))
 
 
-def compute(wanted: list[Wanted], keep: Callable[[dict[str, Any]], None]) -> None:
-    """Compute runs, one per core at a time, and `keep` each row as soon as it is there."""
+def compute(wanted: list[Wanted], keep: Callable[[Computed], None]) -> None:
+    """Compute runs, one per core at a time, and `keep` what is kept of each as soon as it is there."""
     RUNS.mkdir(parents=True, exist_ok=True)
     cleaned = worker_environment(os.environ)
     os.environ.clear()
@@ -138,24 +149,24 @@ def compute(wanted: list[Wanted], keep: Callable[[dict[str, Any]], None]) -> Non
                 one = running.pop(future)
                 if isinstance(future.exception(), Interrupted):
                     continue
-                row = future.result()
-                print(json.dumps(row), flush=True)
-                keep(row)
-                if row["finished"]:
+                computed = future.result()
+                print(json.dumps(computed.row), flush=True)
+                keep(computed)
+                if computed.row["finished"]:
                     shutil.rmtree(RUNS / one.name)
 
 
-def keep_row(row: dict[str, Any]) -> None:
-    """Put the row of a run into the csv, in the place of an older one, and write the tables."""
-    table = paper_tables.read()
-    is_old = (table.task == row["task"]) & (table.method == row["method"]) & (table.seed == row["seed"])
-    paper_tables.write(pd.concat([table[~is_old], pd.DataFrame([row])]))
+def keep_run(run: Computed) -> None:
+    """Put a run's row and its curve into the csv files, in the place of older ones, and write the tables."""
+    of_run = {key: run.row[key] for key in paper_tables.RUN}
+    paper_tables.write(paper_tables.with_run(paper_tables.read(), of_run, pd.DataFrame([run.row])))
+    paper_tables.write_curves(paper_tables.with_run(paper_tables.read_curves(), of_run, run.curve.assign(**of_run)))
 
 
-def keep_trial(row: dict[str, Any]) -> None:
+def keep_trial(run: Computed) -> None:
     """Add the row of a trial to their table, whose first rows have other columns."""
     before = [pd.read_csv(TRIALS)] if TRIALS.exists() else []
-    pd.concat([*before, pd.DataFrame([row])]).to_csv(TRIALS, index=False, lineterminator="\n")
+    pd.concat([*before, pd.DataFrame([run.row])]).to_csv(TRIALS, index=False, lineterminator="\n")
 
 
 def main() -> None:
@@ -182,8 +193,9 @@ def main() -> None:
         for method in arguments.method
         for seed in (BUDGET[task, method][1] if seeds is None else seeds)
     ]
-    compute(missing(wanted, paper_tables.read()), keep_row)
+    compute(missing(wanted, paper_tables.read()), keep_run)
     paper_tables.write(paper_tables.read())
+    paper_picture.draw(paper_tables.read_curves(), PICTURE)
 
 
 if __name__ == "__main__":

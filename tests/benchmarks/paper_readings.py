@@ -20,6 +20,8 @@ import pandas as pd
 READINGS = ("centre", "single")
 AT = (1_000_000, 10_000_000, 100_000_000, 1_000_000_000)
 """Environment steps after which a run is read."""
+CURVE_AT = tuple(round(10 ** (eighth / 8)) for eighth in range(5 * 8, 9 * 8 + 1))
+"""Environment steps of the points of a curve: eight in each decade, from 1e5 to 1e9."""
 DISTANCE_TASKS = frozenset({"ant_maze"})
 """Tasks whose measure is the minimum distance to the goal."""
 GOAL_M = 1.0
@@ -62,15 +64,27 @@ def readings(task: str, evaluations: pd.DataFrame, history: pd.DataFrame) -> dic
     them, since a run ends within a generation of its limit.
     """
     found = measured(task, evaluations, history)
-    steps = found["env_steps"]
-    columns: dict[str, Any] = {}
-    for at in AT:
-        until = found[steps <= at]
-        is_there = len(until) and steps.iloc[-1] >= 0.98 * at
-        for name in READINGS:
-            columns[column(name, at)] = round(float(until[name].iloc[-1]), 2) if is_there else None
+    steps, rows = found["env_steps"], read_at(found, AT)
+    columns: dict[str, Any] = {
+        column(name, at): None if np.isnan(rows.at[at, name]) else rows.at[at, name] for at in AT for name in READINGS
+    }
     if task in DISTANCE_TASKS:
         for name in READINGS:
             there = steps[found[name] >= -GOAL_M]
             columns[f"steps_to_goal_{name}"] = int(there.iloc[0]) if len(there) else None
     return columns
+
+
+def curve(task: str, evaluations: pd.DataFrame, history: pd.DataFrame) -> pd.DataFrame:
+    """env_steps, centre and single of a run at the points of `CURVE_AT` that it has reached."""
+    found = read_at(measured(task, evaluations, history), CURVE_AT)
+    return found.dropna(subset=list(READINGS)).rename_axis("env_steps").reset_index()
+
+
+def read_at(found: pd.DataFrame, points: tuple[int, ...]) -> pd.DataFrame:
+    """What was `measured`, read after so many steps as each point has; NaN where the run is too short."""
+    steps = found["env_steps"].to_numpy()
+    last = np.searchsorted(steps, points, side="right") - 1
+    is_there = (last >= 0) & (steps[-1] >= 0.98 * np.array(points))
+    rows = found[list(READINGS)].iloc[np.maximum(last, 0)].astype(float).round(2)
+    return rows.set_axis(pd.Index(points)).where(pd.Series(is_there, index=points), axis=0)

@@ -1,4 +1,4 @@
-"""The tables of the guide about the paper's measures, written from results/paper_runs.csv."""
+"""The tables of the guide about the paper's measures, written from results/paper_runs.csv; and the runs' curves."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ import pandas as pd
 from tests.benchmarks.paper_readings import AT, READINGS, column, power
 
 RUNS_CSV = Path(__file__).parent / "results" / "paper_runs.csv"
+CURVES_CSV = RUNS_CSV.with_name("paper_curves.csv")
+RUN = ("task", "method", "seed")
+"""Columns that name a run."""
 GUIDE = Path(__file__).parent / "README.md"
 BEGIN, END = (
     "<!-- begin of the paper's tables: python -m tests.benchmarks.paper -->",
@@ -55,23 +58,42 @@ WHOLE = ("env_steps", "generations", "seconds", "cells", "steps_to_goal_centre",
 
 def read() -> pd.DataFrame:
     """The table of runs; without rows if there is none yet."""
-    return pd.read_csv(RUNS_CSV) if RUNS_CSV.exists() else pd.DataFrame(columns=["task", "method", "seed", "env_steps"])
+    return pd.read_csv(RUNS_CSV) if RUNS_CSV.exists() else pd.DataFrame(columns=[*RUN, "env_steps"])
+
+
+def read_curves() -> pd.DataFrame:
+    """The curves of the runs: task, method, seed, env_steps, centre, single; without rows if there are none yet."""
+    columns = [*RUN, "env_steps", *READINGS]
+    return pd.read_csv(CURVES_CSV)[columns] if CURVES_CSV.exists() else pd.DataFrame(columns=columns)
+
+
+def with_run(table: pd.DataFrame, run: dict[str, object], rows: pd.DataFrame) -> pd.DataFrame:
+    """The table with these rows of a run, in the place of those that it has."""
+    is_old = np.logical_and.reduce([table[key] == value for key, value in run.items()])
+    return pd.concat([table[~is_old], rows]) if (~is_old).any() else rows
 
 
 def write(table: pd.DataFrame) -> None:
-    """Write the table of runs, in the order of the tasks, methods and seeds, and the guide's tables."""
-    order = [list(TASKS), list(METHODS)]
-    places = [
-        table[key].map({name: at for at, name in enumerate(names)})
-        for key, names in zip(("task", "method"), order, strict=True)
-    ]
-    table = table.assign(_task=places[0], _method=places[1]).sort_values(["_task", "_method", "seed"])
-    table = table.drop(columns=["_task", "_method"])
+    """Write the table of runs and the guide's tables."""
+    table = in_order(table)
     for name in table.columns.intersection(WHOLE):  # NaN, where a run has no such number, would make them floats
         table[name] = pd.to_numeric(table[name]).astype("Int64")
     table.to_csv(RUNS_CSV, index=False, lineterminator="\n")
     before, rest = GUIDE.read_text().split(BEGIN)
     GUIDE.write_text(f"{before}{BEGIN}\n\n{text(read())}\n{END}{rest.split(END)[1]}")
+
+
+def write_curves(table: pd.DataFrame) -> None:
+    """Write the curves of the runs."""
+    in_order(table)[[*RUN, "env_steps", *READINGS]].to_csv(CURVES_CSV, index=False, lineterminator="\n")
+
+
+def in_order(table: pd.DataFrame) -> pd.DataFrame:
+    """The rows in the order of the tasks, methods, seeds and steps."""
+    places = {name: at for names in (TASKS, METHODS) for at, name in enumerate(names)}
+    return table.sort_values(
+        [*RUN, "env_steps"], key=lambda column: column.map(places) if column.name in ("task", "method") else column
+    )
 
 
 def text(table: pd.DataFrame) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from tests.benchmarks import paper, paper_tables
-from tests.benchmarks.paper_readings import measured, readings
+from tests.benchmarks.paper_readings import CURVE_AT, curve, measured, readings
 
 
 def run_of(steps: list[int], centres: list[list[tuple[float, float]]]) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -38,6 +38,25 @@ def test_a_reading_is_that_of_the_last_generation_by_then_and_none_if_the_run_is
     assert (found["centre_1e7"], found["single_1e7"]) == (-24.0, -20.0)
     assert found["centre_1e8"] is None
     assert "steps_to_goal_centre" not in found
+
+
+def test_a_curve_has_the_same_values_as_the_readings_at_the_points_that_the_run_has_reached():
+    run = run_of([90_000, 900_000, 5_000_000, 10_000_001], [[(value, value + 1.0)] for value in (1.0, 2.0, 3.0, 4.0)])
+    found = curve("ant_trap", *run).set_index("env_steps")
+    assert found.index.tolist() == [at for at in CURVE_AT if at <= 10_000_000]
+    assert (found["centre"][100_000], found["centre"][1_000_000], found["single"][10_000_000]) == (1.0, 2.0, 4.0)
+    assert found["centre"][10_000_000] == readings("ant_trap", *run)["centre_1e7"]
+    assert curve("ant_trap", *run_of([200_000, 400_000], [[(1.0, 1.0)], [(2.0, 2.0)]]))["env_steps"].min() > 200_000
+
+
+def test_a_run_takes_the_place_of_its_old_rows_only():
+    runs = [("ant_trap", "me_es", 1), ("ant_trap", "me_es", 0), ("ant_maze", "me_es", 1), ("point_maze", "ars", 1)]
+    table = pd.DataFrame([(*run, 10, 1.0) for run in runs], columns=[*paper_tables.RUN, "env_steps", "centre"])
+    run = {"task": "ant_trap", "method": "me_es", "seed": 1}
+    found = paper_tables.with_run(table, run, pd.DataFrame([{**run, "env_steps": 20, "centre": 2.0}]))
+    assert found["centre"].sum() == 5.0
+    ordered = paper_tables.in_order(found)
+    assert ordered[list(paper_tables.RUN)].agg(tuple, axis=1).tolist() == [runs[3], runs[2], runs[1], runs[0]]
 
 
 def test_the_goal_is_reached_by_the_first_episode_that_comes_within_a_metre():
@@ -82,7 +101,7 @@ def test_each_wanted_run_is_made_once_and_only_the_folder_of_a_finished_one_goes
 
     def run_one(one):
         (tmp_path / one.name).mkdir()
-        return {"seed": one.seed, "finished": one.seed % 2 == 0}
+        return paper.Computed({"seed": one.seed, "finished": one.seed % 2 == 0}, pd.DataFrame())
 
     monkeypatch.setattr(paper, "RUNS", tmp_path)
     monkeypatch.setattr(paper, "run_one", run_one)
@@ -97,5 +116,5 @@ def test_each_wanted_run_is_made_once_and_only_the_folder_of_a_finished_one_goes
         paper.compute(wanted, rows.append)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert sorted(row["seed"] for row in rows) == list(range(5))
+    assert sorted(computed.row["seed"] for computed in rows) == list(range(5))
     assert sorted(folder.name for folder in tmp_path.iterdir()) == ["c_1", "c_3"]
