@@ -3,8 +3,8 @@
     python -m tests.benchmarks.ant_trials [--workers 2]       # a run per core at a time
     python -m tests.benchmarks.ant_trials --config ant_maze_me_es --set search.sigma=0.1 --seed 101
 
-Those of TRIALS, in their order, with seed 100, or what is asked for; a finished one becomes a row of
-results/ant_maze_trials.csv, and one that has a row is not repeated. What is interrupted begins again.
+Those of TRIALS, in their order, with seed 100, or what is asked for, beside the usual settings. A finished one becomes
+a row of results/ant_maze_trials.csv, and one that has a row is not repeated. What is interrupted begins again.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import pandas as pd
 from es_service import api
 from es_service.protocol.process_environment import worker_environment
 from es_service.runs import session
-from tests.benchmarks.ants import summary
+from tests.benchmarks.ants import USUAL, summary
 from tests.benchmarks.science import CONFIGS, in_this_process
 
 TABLE = Path(__file__).parent / "results" / "ant_maze_trials.csv"
@@ -31,7 +31,7 @@ RUNS = Path(__file__).parents[2] / "runs" / "ant_trials"
 ENV_STEPS = 150_000_000
 SEED = 100
 TRIALS: tuple[tuple[str, tuple[str, ...]], ...] = (
-    ("ant_maze_me_es", ()),  # sigma 0.02, learning rate 0.01, as shipped
+    ("ant_maze_me_es", ()),  # sigma 0.02, learning rate 0.01
     ("ant_maze_me_es", ("search.sigma=0.05", "search.learning_rate=0.03")),
     ("ant_maze_me_es", ("search.sigma=0.02", "search.learning_rate=0.03")),
     # Larger steps were worse, so what follows has the usual ones, or smaller ones.
@@ -66,7 +66,7 @@ def run_one(config: str, seed: int, settings: tuple[str, ...]) -> dict[str, Any]
     folder = RUNS / "_".join([config, str(seed), *settings])
     shutil.rmtree(folder, ignore_errors=True)
     budget = (f"budget.env_steps={ENV_STEPS}", "budget.generations=null", f"seed={seed}")
-    chosen = ("compute.engine=inline", "compute.workers=1", *budget, *settings)
+    chosen = ("compute.engine=inline", "compute.workers=1", *budget, *USUAL, *settings)
     run = api.run(api.load_config(CONFIGS / f"{config}.yaml", chosen), folder).run
     row = summary(config, run)
     shutil.rmtree(folder)

@@ -1,7 +1,7 @@
 """What did long runs find on AntMaze and AntTrap? Summaries of run folders, as curves, tables and a picture.
 
     es-service run configs/ant_maze_me_es.yaml --out RUN --set budget.env_steps=1_000_000_000 \\
-        --set budget.generations=null       # the config would stop at 2000
+        --set budget.generations=null       # and a --set for each of USUAL
     python -m tests.benchmarks.ants RUN [RUN ...] --to FOLDER
 
 Writes into the folder ants.csv, a row per run, ants_curves.csv, up to 60 rows per run, and ants.png: where all
@@ -28,6 +28,11 @@ from es_service.protocol.machine import cpu_kind
 from es_service.runs.view import Run
 from workers.environments import SHIPPED
 
+USUAL = (
+    *("policy.hidden=[256,256]", "search.pairs=64", "search.evaluation_episodes=30"),
+    *("search.sigma=0.02", "search.learning_rate=0.01", "search.l2=0.005"),
+)
+"""The usual settings, which the configs of AntMaze had until version 0.10; the long runs and their trials have them."""
 POINTS = 60
 """Of a curve."""
 NEAR_GOAL_M = 5.0

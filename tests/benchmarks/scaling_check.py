@@ -17,11 +17,12 @@ from statistics import mean
 from es_service import api
 from es_service.config.model import RunConfig
 from es_service.runs.scaling import bench_scaling
+from tests.benchmarks.ants import USUAL
 
 CONFIGS = {
     "point_maze_me_es.yaml": ([], 300),
     "ant_trap_me_es.yaml": (["search.pairs=256"], 9),
-    "ant_maze_me_es.yaml": (["search.pairs=128"], 6),
+    "ant_maze_me_es.yaml": ([*USUAL, "search.pairs=128"], 6),
 }
 """Shipped config -> (changes, generations). The ants have fewer pairs, so that a run takes less than a minute."""
 WORKERS = (1, 2)
