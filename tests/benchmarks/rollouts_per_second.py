@@ -1,11 +1,15 @@
 """How many environment steps a second do the workers make, policy and noise in the loop; simd beside xla, two workers
 beside one?
 
-    python -m tests.benchmarks.rollouts_per_second [--tasks ant_maze ...] [--seconds 5] [--threads | --policies]
+    python -m tests.benchmarks.rollouts_per_second [--tasks ant_maze ...] [--seconds 5] [--rounds 5]
 
 Rounds alternate, so that all see the same machine; the ratios count. Policies are the paper's (64x64, ants 256x256)
 with weights of their own per member, action noise and statistics; the inline engine, 4,096 pairs of whole PointMaze
-episodes, 64 pairs of ants for 500 steps. xla's batch is its best: a block of pairs whose weights stay in cache.
+episodes, 64 pairs of ants for 500 steps. xla's batch is its best: a block of pairs whose weights stay in cache. Caches
+of compiled code are empty at first: the first engine of each kind shows how long a worker needs from its start to its
+first episodes, the second one how long with compiled code on disk.
+
+`--threads` makes the workers of simd threads of one process.
 
 `--policies` compares, with simd, as many explicit policies, whose parameters are sent to the workers in every call,
 with the perturbed ones, whose parameters the workers make.
@@ -16,7 +20,9 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import os
 import statistics
+import tempfile
 import time
 from contextlib import ExitStack
 from dataclasses import replace
@@ -36,7 +42,7 @@ from es_service.protocol.messages import EpisodesResult, TrainingChunk, around
 from tests.helpers import centre
 from workers.policy import initial_parameters
 
-ROUNDS = 3
+ROUNDS = 5
 PAIRS = {"point_maze": 4096}
 ANT_PAIRS, ANT_STEPS = 64, 500
 
@@ -77,7 +83,7 @@ def config_of(task: str) -> RunConfig:
     )
 
 
-def compare_policies(task: str, seconds: float) -> dict[str, Any]:
+def compare_policies(task: str, seconds: float, rounds: int) -> dict[str, Any]:
     """A row: medians of the rounds of perturbed and of explicit policies, and the ratio of the medians."""
     config = config_of(task)
     spec = replace(worker_spec(config, task_of(config)), rollout="simd")
@@ -90,7 +96,7 @@ def compare_policies(task: str, seconds: float) -> dict[str, Any]:
     for workers in (1, 2):
         rates: dict[str, list[float]] = {"perturbed": [], "explicit": []}
         with inline_engine(spec, Limits(workers)) as engine:
-            for length in (0.0, *[seconds] * ROUNDS):  # the first compiles
+            for length in (0.0, *[seconds] * rounds):  # the first compiles
                 rates["perturbed"].append(measure(engine, point, chunks, length))
                 rates["explicit"].append(measure_policies(engine, policies_N_D, size, length))
         rate = {kind: statistics.median(found[1:]) for kind, found in rates.items()}
@@ -99,22 +105,25 @@ def compare_policies(task: str, seconds: float) -> dict[str, Any]:
     return row
 
 
-def compare(task: str, seconds: float, *, threads: bool) -> dict[str, Any]:
-    """A row: medians of the rounds, ratios of medians."""
+def compare(task: str, seconds: float, rounds: int, *, threads: bool) -> dict[str, Any]:
+    """A row: medians of the rounds, ratios of medians, and the least and greatest ratio of a round."""
     config = config_of(task)
     spec = worker_spec(config, task_of(config))
     chunks = config.search.pairs // spec.chunk_pairs
     size = spec.policy.widths[0]
     point = centre(initial_parameters(spec.policy, "unit_columns", 0), sigma=0.02, observation_size=size)
     rates: dict[tuple[str, int], list[float]] = {}
+    ready_s: dict[str, list[float]] = {"xla": [], "simd": []}
     with ExitStack() as stack:
         engines = {}
         for rollout, workers in itertools.product(("xla", "simd"), (1, 2)):
             used = threads and rollout == "simd"
-            made = inline_engine(replace(spec, rollout=rollout), Limits(workers), threads=used)
+            made, start = inline_engine(replace(spec, rollout=rollout), Limits(workers), threads=used), time.monotonic()
             engine = engines[rollout, workers] = stack.enter_context(made)
-            measure(engine, point, chunks, 0.0)  # compiles
-        for _ in range(ROUNDS):
+            measure(engine, point, 1, 0.0)
+            ready_s[rollout].append(round(time.monotonic() - start, 1))
+            measure(engine, point, chunks, 0.0)  # now every worker has compiled
+        for _ in range(rounds):
             for kind, engine in engines.items():
                 rates.setdefault(kind, []).append(measure(engine, point, chunks, seconds))
         memory = {
@@ -122,28 +131,34 @@ def compare(task: str, seconds: float, *, threads: bool) -> dict[str, Any]:
             for rollout in ("xla", "simd")
         }
     rate = {kind: statistics.median(found) for kind, found in rates.items()}
+    ratios = {n: [s / x for s, x in zip(rates["simd", n], rates["xla", n], strict=True)] for n in (1, 2)}
     return {
         "task": task,
         **{f"{rollout}_{workers}": round(found) for (rollout, workers), found in rate.items()},
         "simd_over_xla": [round(rate["simd", workers] / rate["xla", workers], 1) for workers in (1, 2)],
+        "of_rounds": [[round(pick(ratios[workers]), 1) for pick in (min, max)] for workers in (1, 2)],
         "two_over_one": {rollout: round(rate[rollout, 2] / rate[rollout, 1], 2) for rollout in ("xla", "simd")},
+        "ready_s": ready_s,
         "worker_peak_mib": {rollout: round(mib) for rollout, mib in memory.items()},
     }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--tasks", nargs="+", default=["point_maze", "ant_maze", "ant_trap"])
+    parser.add_argument("--tasks", nargs="+", default=["point_maze", "ant_maze", "ant_trap", "brax:ant"])
     parser.add_argument("--seconds", type=float, default=5.0, help="length of each round")
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
     parser.add_argument("--threads", action="store_true", help="workers of simd are threads of one process")
     parser.add_argument("--policies", action="store_true", help="explicit policies beside perturbed ones, with simd")
     arguments = parser.parse_args()
-    for task in arguments.tasks:
-        if arguments.policies:
-            row = compare_policies(task, arguments.seconds)
-        else:
-            row = compare(task, arguments.seconds, threads=arguments.threads)
-        print(json.dumps(row), flush=True)
+    with tempfile.TemporaryDirectory() as empty:
+        os.environ["XDG_CACHE_HOME"] = empty
+        for task in arguments.tasks:
+            if arguments.policies:
+                row = compare_policies(task, arguments.seconds, arguments.rounds)
+            else:
+                row = compare(task, arguments.seconds, arguments.rounds, threads=arguments.threads)
+            print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":
