@@ -49,7 +49,8 @@ def draw(curves: pd.DataFrame, path: Path) -> None:
         axes.set_xlabel("environment steps")
     lines = {line.get_label(): line for axes in grid.flat for line in axes.get_lines() if line.get_label()[0] != "_"}
     names = [name for name in METHODS.values() if name in lines]
-    figure.legend([lines[name] for name in names], names, loc="outside lower center", ncols=len(names), frameon=False)
+    columns = min(len(names), 3 * len(tasks))
+    figure.legend([lines[name] for name in names], names, loc="outside lower center", ncols=columns, frameon=False)
     figure.savefig(path, dpi=110, metadata={"Software": None})
     plt.close(figure)
 
