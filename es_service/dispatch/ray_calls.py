@@ -14,7 +14,7 @@ from es_service.protocol.messages import Subject, Work, forget_oldest
 IN_CALL_BYTES = 64 * 2**10
 """Largest size in bytes of a subject sent with every call; a larger one is stored, and fetched once per node."""
 MANY = 64
-"""Number of calls above which all answers that are there are looked for at once, since Ray looks at every call."""
+"""Number of workers above which all answers that are there are looked for at once, since Ray looks at every call."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,8 @@ class Calls:
     def __init__(self, ray: ModuleType) -> None:
         self._ray = ray
         self._calls: dict[Any, Call] = {}
-        self._owed: dict[int, dict[Any, Call]] = {}
-        """Worker -> its calls, oldest first."""
         self._ready: deque[Any] = deque()
-        """References whose answers are there. Those that are not among the calls any more do not count."""
+        """References whose answers are there. Those of a worker that was killed meanwhile do not count."""
 
     def __len__(self) -> int:
         return len(self._calls)
@@ -49,43 +47,42 @@ class Calls:
 
     def __setitem__(self, ref: Any, call: Call) -> None:
         self._calls[ref] = call
-        self._owed.setdefault(call.worker, {})[ref] = call
 
     def __delitem__(self, ref: Any) -> None:
-        owed = self._owed[self._calls.pop(ref).worker]
-        del owed[ref]
+        del self._calls[ref]
 
     def forget(self, worker: int) -> None:
         """Remove the calls of a worker."""
-        for ref in self._owed.pop(worker, ()):
-            del self._calls[ref]
+        self._calls = {ref: call for ref, call in self._calls.items() if call.worker != worker}
 
     def answered(self, timeout_s: float) -> Any | None:
         """Reference to an answer that is there, which the caller removes; None if none comes within `timeout_s`.
 
         The answers of one worker come in the order of its calls. An actor computes them in this order, but each answer
-        travels alone and may overtake an older one, whose reference is then the next: it is there within milliseconds.
+        travels alone and may overtake an older one, so only the oldest call of each worker is waited for.
         """
-        if (ref := self._oldest_ready()) is not None or not self._calls:
-            return ref
-        refs = list(self._calls)
+        while self._ready:
+            if (ref := self._ready.popleft()) in self._calls:
+                return ref
+        if not self._calls:
+            return None
+        refs = list(self._oldest().values())
         ready, _ = self._ray.wait(refs, num_returns=1, timeout=timeout_s)
         if ready and len(refs) > MANY:
             ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0.0)
         self._ready.extend(ready)
-        return self._oldest_ready()
+        return self._ready.popleft() if ready else None
 
     def owed_first(self) -> dict[int, str]:
-        """Worker -> method of its first call."""
-        return {worker: next(iter(owed.values())).what for worker, owed in self._owed.items() if owed}
+        """Worker -> method of its oldest call."""
+        return {worker: self._calls[ref].what for worker, ref in self._oldest().items()}
 
-    def _oldest_ready(self) -> Any | None:
-        """The oldest call of the next worker with an answer."""
-        while self._ready:
-            if (call := self._calls.get(self._ready[0])) is not None:
-                return next(iter(self._owed[call.worker]))
-            self._ready.popleft()
-        return None
+    def _oldest(self) -> dict[int, Any]:
+        """Worker -> reference to the answer of its oldest call."""
+        oldest: dict[int, Any] = {}
+        for ref, call in self._calls.items():
+            oldest.setdefault(call.worker, ref)
+        return oldest
 
 
 class Arguments:

@@ -36,21 +36,21 @@ def read(calls: Calls) -> list[Call]:
     return found
 
 
-@pytest.mark.parametrize("workers", [2, MANY])
+@pytest.mark.parametrize("workers", [2, MANY + 1])
 def test_answers_of_a_worker_come_in_the_order_of_its_calls_and_none_of_one_that_was_forgotten(workers):
-    """Also if some are there before older ones, as a node's refusal once was before the name of the node."""
+    """An answer that is there before an older one waits for it, as a node's refusal did not for the node's name."""
     ray = Waits()
     calls = calls_of(ray, workers, 3)
+    ray.answered = {f"{worker} {number}" for worker in range(workers) for number in (2, 1)}
     assert calls.answered(0.0) is None
-    ray.answered = {f"{worker} {number}" for worker in range(workers) for number in (2, 1)} | {"1 0"}
+    ray.answered |= {f"{worker} 0" for worker in range(workers)}
     first = calls.answered(0.0)
     assert first is not None
-    assert calls[first] == Call(1, "run", 0, 1)
+    assert calls[first] == Call(0, "run", 0, 1)
     calls.forget(1)
     assert calls.owed_first() == {worker: "run" for worker in range(workers) if worker != 1}
     found = read(calls)
-    assert {call.worker for call in found} == set(range(workers)) - {1}
-    assert all([c.item_id for c in found if c.worker == w] == [0, 1, 2] for w in range(workers) if w != 1)
+    assert all([c.item_id for c in found if c.worker == w] == [0, 1, 2] * (w != 1) for w in range(workers))
     assert len(calls) == 0
     assert calls.owed_first() == {}
 
