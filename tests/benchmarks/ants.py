@@ -32,7 +32,7 @@ USUAL = (
     *("policy.hidden=[256,256]", "search.pairs=64", "search.evaluation_episodes=30"),
     *("search.sigma=0.02", "search.learning_rate=0.01", "search.l2=0.005"),
 )
-"""The usual settings, which the configs of AntMaze had until version 0.10; the long runs and their trials have them."""
+"""The usual settings, which the long runs and their trials have, and before version 0.10.0 the configs of AntMaze."""
 POINTS = 60
 """Of a curve."""
 NEAR_GOAL_M = 5.0

@@ -1,15 +1,15 @@
 """The tables of the benchmark paper (Chalumeau et al. 2022), as far as evolution strategies can fill them.
 
-    python -m tests.benchmarks.paper                                  # what BUDGET names: some hours on two cores
+    python -m tests.benchmarks.paper                                  # all that is missing: a night on two cores
     python -m tests.benchmarks.paper --task point_maze --seeds 0:2 --env-steps 1_000_000
     python -m tests.benchmarks.paper --config my.yaml --seeds 100:101 --env-steps 100_000_000 --set search.sigma=0.05
 
-Each run is one of configs/paper with a seed. A finished one becomes a row of results/paper_runs.csv, which is not
-computed again unless more steps are asked for; one that is interrupted is listed with the steps that it has, and goes
-on from there if its folder is still in runs/paper. There are as many runs at a time as cores, each in one process.
-Its curve is in results/paper_curves.csv. The tables of tests/benchmarks/README.md and the picture of the curves are
-made from these two files, also if no run is missing. The third form is a trial: it prints its
-rows, and adds them to results/paper_trials.csv.
+Each run is one of configs/paper with a seed, and has the environment steps that its file names. There are as many runs
+at a time as cores, each in one process. A finished one becomes a row of results/paper_runs.csv and a curve in
+results/paper_curves.csv, and is not computed again unless more steps are asked for; one that is interrupted is listed
+with the steps that it has, and goes on from there if its folder is still in runs/paper. The tables of
+tests/benchmarks/README.md and the picture of the curves are made from these two files, also if no run is missing. The
+third form is a trial: it prints its rows, and adds them to results/paper_trials.csv.
 """
 
 from __future__ import annotations
@@ -44,17 +44,8 @@ CONFIGS = ROOT / "configs" / "paper"
 RUNS = ROOT / "runs" / "paper"
 TRIALS = Path(__file__).parent / "results" / "paper_trials.csv"
 PICTURE = TRIALS.with_name("paper.png")
-FIRST, OTHERS = range(5), range(1)
-BUDGET = {
-    **{("point_maze", method): (100_000_000, FIRST) for method in paper_tables.METHODS},
-    **{
-        (task, method): (100_000_000, FIRST if method in ("nsra_es", "me_es", "memes") else OTHERS)
-        for task in ("ant_maze", "ant_trap")
-        for method in paper_tables.METHODS
-    },
-    **{(task, "map_elites"): (1_000_000_000, FIRST) for task in ("ant_maze", "ant_trap")},  # the best method
-}
-"""(task, method) -> environment steps and seeds of the tables."""
+ONE_ANT = frozenset({"es", "ns_es", "nsr_es", "ars"})
+"""Methods with one seed on AntMaze and on AntTrap; all others have five."""
 
 
 class Wanted(NamedTuple):
@@ -120,9 +111,16 @@ def commit() -> str:
     return head.strip() + ("+" if changed else "")
 
 
-def missing(wanted: list[Wanted], table: pd.DataFrame) -> list[Wanted]:
-    """Those without a row that has as many steps; the longest first, so that the cores end together."""
-    known = {(f"{row.task}_{row.method}", row.seed): row.env_steps for row in table.itertuples()}
+def seeds_of_table(task: str, method: str) -> range:
+    """Seeds of a row of the tables."""
+    return range(1 if task != "point_maze" and method in ONE_ANT else 5)
+
+
+def missing(wanted: list[Wanted], table: pd.DataFrame, curves: pd.DataFrame) -> list[Wanted]:
+    """Those without a curve, or a row that has as many steps; the longest first, so that the cores end together."""
+    drawn = {(f"{row.task}_{row.method}", row.seed) for row in curves[list(paper_tables.RUN)].itertuples()}
+    steps = {(f"{row.task}_{row.method}", row.seed): row.env_steps for row in table.itertuples()}
+    known = {run: steps[run] for run in steps.keys() & drawn}
     left = [one for one in wanted if known.get((one.config.stem, one.seed), 0) < one.env_steps]
     return sorted(left, key=lambda one: (-one.env_steps, one.config.stem.startswith("point"), one.seed))
 
@@ -157,10 +155,10 @@ def compute(wanted: list[Wanted], keep: Callable[[Computed], None]) -> None:
 
 
 def keep_run(run: Computed) -> None:
-    """Put a run's row and its curve into the csv files, in the place of older ones, and write the tables."""
+    """Put a run's curve and its row into the csv files, in the place of older ones, and write the tables."""
     of_run = {key: run.row[key] for key in paper_tables.RUN}
-    paper_tables.write(paper_tables.with_run(paper_tables.read(), of_run, pd.DataFrame([run.row])))
     paper_tables.write_curves(paper_tables.with_run(paper_tables.read_curves(), of_run, run.curve.assign(**of_run)))
+    paper_tables.write(paper_tables.with_run(paper_tables.read(), of_run, pd.DataFrame([run.row])))
 
 
 def keep_trial(run: Computed) -> None:
@@ -188,12 +186,13 @@ def main() -> None:
     if arguments.set:
         parser.error("--set needs --config")
     wanted = [
-        Wanted(CONFIGS / f"{task}_{method}.yaml", seed, arguments.env_steps or BUDGET[task, method][0])
+        Wanted(config, seed, arguments.env_steps or api.load_config(config).budget.env_steps)
         for task in arguments.task
         for method in arguments.method
-        for seed in (BUDGET[task, method][1] if seeds is None else seeds)
+        for config in [CONFIGS / f"{task}_{method}.yaml"]
+        for seed in seeds or seeds_of_table(task, method)
     ]
-    compute(missing(wanted, paper_tables.read()), keep_run)
+    compute(missing(wanted, paper_tables.read(), paper_tables.read_curves()), keep_run)
     paper_tables.write(paper_tables.read())
     paper_picture.draw(paper_tables.read_curves(), PICTURE)
 

@@ -11,7 +11,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import pandas as pd
 
-from tests.benchmarks.paper_readings import READINGS
+from tests.benchmarks.paper_readings import READINGS, power
 from tests.benchmarks.paper_tables import METHODS, PAPER, TASKS
 
 COLOURS = {
@@ -25,7 +25,7 @@ COLOURS = {
     "ars": "#8bb8c9",
 }
 LIMITS = {"point_maze": (-205, -10), "ant_maze": (-62, 3), "ant_trap": (900, 1700)}
-"""Of the measures shown; an ant that stands still has 1,000 in AntTrap."""
+"""Limits of the vertical axis for each task; an ant that stands still has 1,000 in AntTrap."""
 LANDMARKS = {"point_maze": ("QD-PG", "SAC"), "ant_maze": ("QD-PG", "PGA-ME", "SAC"), "ant_trap": ("QD-PG", "SAC")}
 """Methods of the paper whose values are shown."""
 
@@ -41,9 +41,7 @@ def draw(curves: pd.DataFrame, path: Path) -> None:
     for row, reading in enumerate(reversed(READINGS)):
         for axes, task in zip(grid[row], tasks, strict=True):
             _panel(axes, curves[curves.task == task], task, reading)
-            axes.set_title(
-                TASKS[task][0].replace(": ", "\n").replace(", negative", "") if row == 0 else "", fontsize=11
-            )
+            axes.set_title(TASKS[task][0].replace(": ", "\n") if row == 0 else "", fontsize=11)
         grid[row, 0].set_ylabel({"centre": "mean of a centre's episodes", "single": "one episode"}[reading])
     for axes in grid[-1]:
         axes.set_xlabel("environment steps")
@@ -68,7 +66,7 @@ def _panel(axes: Any, curves: pd.DataFrame, task: str, reading: str) -> None:
         value = float(text.split()[0])
         axes.axhline(value, color="black", linewidth=0.8, linestyle=":")
         axes.annotate(
-            f"{name} in the paper, {value:g}",
+            f"{name} in the paper after {power(TASKS[task][1])}: {value:g}",
             (0.01, value),
             xycoords=("axes fraction", "data"),
             va="bottom",

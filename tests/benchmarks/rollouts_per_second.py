@@ -117,8 +117,8 @@ def compare(task: str, seconds: float, rounds: int, *, threads: bool) -> dict[st
     with ExitStack() as stack:
         engines = {}
         for rollout, workers in itertools.product(("xla", "simd"), (1, 2)):
-            used = threads and rollout == "simd"
-            made, start = inline_engine(replace(spec, rollout=rollout), Limits(workers), threads=used), time.monotonic()
+            start, used = time.monotonic(), threads and rollout == "simd"
+            made = inline_engine(replace(spec, rollout=rollout), Limits(workers), threads=used)
             engine = engines[rollout, workers] = stack.enter_context(made)
             measure(engine, point, 1, 0.0)
             ready_s[rollout].append(round(time.monotonic() - start, 1))
@@ -136,7 +136,9 @@ def compare(task: str, seconds: float, rounds: int, *, threads: bool) -> dict[st
         "task": task,
         **{f"{rollout}_{workers}": round(found) for (rollout, workers), found in rate.items()},
         "simd_over_xla": [round(rate["simd", workers] / rate["xla", workers], 1) for workers in (1, 2)],
-        "of_rounds": [[round(pick(ratios[workers]), 1) for pick in (min, max)] for workers in (1, 2)],
+        "simd_over_xla_least_and_greatest": [
+            [round(pick(ratios[workers]), 1) for pick in (min, max)] for workers in (1, 2)
+        ],
         "two_over_one": {rollout: round(rate[rollout, 2] / rate[rollout, 1], 2) for rollout in ("xla", "simd")},
         "ready_s": ready_s,
         "worker_peak_mib": {rollout: round(mib) for rollout, mib in memory.items()},

@@ -96,6 +96,14 @@ def test_a_table_has_a_row_for_each_method_with_median_and_quartiles_and_names_w
     assert "1e7" not in text
 
 
+def test_a_run_is_missing_without_a_curve_or_without_as_many_steps():
+    rows = [("ant_trap", "me_es", 0, 100), ("ant_trap", "me_es", 1, 99), ("ant_trap", "me_es", 2, 100)]
+    table = pd.DataFrame(rows, columns=[*paper_tables.RUN, "env_steps"])
+    wanted = [paper.Wanted(Path("ant_trap_me_es.yaml"), seed, 100) for seed in range(4)]
+    left = paper.missing(wanted, table, table[table.seed != 2])
+    assert [one.seed for one in left] == [1, 2, 3]
+
+
 def test_each_wanted_run_is_made_once_and_only_the_folder_of_a_finished_one_goes(monkeypatch, tmp_path):
     """With threads in the place of processes, and runs that only make their folder; odd seeds do not finish."""
 

@@ -54,14 +54,20 @@ CHUNKS = [TrainingChunk(1, 0), EvaluationChunk(1, 0)]
 
 
 @pytest.mark.parametrize("chunk", CHUNKS, ids=["training", "evaluation"])
+@pytest.mark.parametrize(
+    ("operation", "llvm", "what"),
+    [("ixor", "or {I} {0}, {1}", "a reset"), ("sqrt", "llvm.fabs.{N}", "a step")],
+    ids=["reset", "step"],
+)
 def test_an_instruction_that_computes_something_else_is_found_and_the_code_is_not_kept(
-    worker, chunk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    worker, chunk, operation, llvm, what, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wrong = OPERATIONS["sub"]._replace(llvm="fadd {F} {0}, {1}")
+    wrong = OPERATIONS[operation]._replace(llvm=llvm)
     with monkeypatch.context() as broken:
-        broken.setitem(OPERATIONS, "sub", wrong)
+        broken.setitem(OPERATIONS, operation, wrong)
         for _ in range(2):  # so nothing is found in the cache
-            with pytest.raises(WrongCodeError, match=r"words of a .* of point_maze differ.*set compute.rollout to xla"):
+            message = rf"words of {what} of point_maze differ.*set compute.rollout to xla"
+            with pytest.raises(WrongCodeError, match=message):
                 worker(chunk)
     worker(chunk)
 
