@@ -33,9 +33,9 @@ def training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
     )
 
 
-def evaluation_result(episodes: Episodes) -> EpisodesResult:
-    """Results of each evaluation episode [E] and the trace of the first."""
-    result = _episodes_result(episodes)
+def evaluation_result(episodes: Episodes, wanted: int) -> EpisodesResult:
+    """Results of each of the first `wanted` evaluation episodes and the trace of the first."""
+    result = _episodes_result(Episodes(*(np.asarray(leaf)[:wanted] for leaf in episodes)))
     return replace(result, trace_T_B=np.asarray(episodes.trace_T_B)[0].copy())
 
 

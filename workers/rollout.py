@@ -63,9 +63,15 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compi
     """Rollout of one evaluation chunk, with episodes of the centre without action noise.
 
     Returns:
-        f(centre_D, mean_O, std_O, reset_keys_E_4) -> Episodes with leading axis [E].
+        f(centre_D, mean_O, std_O, reset_keys_E_4, wanted_E) -> Episodes with leading axis [E]. Those that are not
+        wanted need not be computed, and their results may be anything; here all are, since a program that stopped
+        earlier could have other bits.
     """
-    return jitted(_make_episodes(environment, spec, training=False))
+    episodes = jitted(_make_episodes(environment, spec, training=False))
+    return Compilable(
+        lambda centre_D, mean_O, std_O, reset_keys_E, wanted_E: episodes(centre_D, mean_O, std_O, reset_keys_E),
+        lambda centre_D, mean_O, std_O, reset_keys_E, wanted_E: episodes.compile(centre_D, mean_O, std_O, reset_keys_E),
+    )
 
 
 def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:

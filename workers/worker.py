@@ -120,10 +120,12 @@ def _kinds(spec: WorkerSpec) -> dict[type[Chunk], _Kind]:
             centre.observation_mean_O,
             centre.observation_std_O,
             stream_keys(spec.seed, Domain.EVALUATION_RESET, first.generation, episodes_E, *population_id(first)),
+            np.concatenate([np.arange(EVALUATION_EPISODES_PER_CHUNK) < chunk.episodes for chunk in chunks]),
         )
 
-    def evaluation_results(work: Sequence[Work], episodes: Episodes) -> list[ChunkResult]:
-        return [evaluation_result(part) for part in _split(episodes, EVALUATION_EPISODES_PER_CHUNK)]
+    def evaluation_results(work: Sequence[tuple[Centre, EvaluationChunk]], episodes: Episodes) -> list[ChunkResult]:
+        parts = _split(episodes, EVALUATION_EPISODES_PER_CHUNK)
+        return [evaluation_result(part, chunk.episodes) for part, (_, chunk) in zip(parts, work, strict=True)]
 
     def gradient_arguments(work: Sequence[tuple[Centre, GradientChunk]]) -> tuple[Any, ...]:
         _, chunks = _around_one(work)

@@ -25,7 +25,6 @@ from es_service.protocol.messages import (
     NO_CENTRE,
     Centre,
     EpisodesResult,
-    EvaluationChunk,
     FloatArray,
     GradientChunk,
     GradientResult,
@@ -33,6 +32,7 @@ from es_service.protocol.messages import (
     TrainingChunk,
     Work,
     around,
+    evaluation_chunks,
 )
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, CentreState, SearchState, read_only
 from es_service.search.maps.behaviour_map import Elite, make_elite
@@ -92,7 +92,7 @@ def evaluate_centres(
     *,
     resets: Literal["by_ask", "by_chunk", "same"] = "by_ask",
 ) -> list[EpisodesResult]:
-    """Roll out each unperturbed centre: results with axis [E]. Episodes beyond the wanted number are discarded.
+    """Roll out each unperturbed centre: results with axis [E].
 
     Args:
         resets: which random streams the episodes start from. Each centre has its own, addressed by its ask or, in
@@ -102,7 +102,7 @@ def evaluate_centres(
     asked = []
     for index, centre in enumerate(centres):
         first, ask = index * count if resets == "by_chunk" else 0, index if resets == "by_ask" else 0
-        asked.append(around(centre, [EvaluationChunk(centre.generation, first + i, ask) for i in range(count)]))
+        asked.append(around(centre, evaluation_chunks(centre.generation, episodes, first=first, ask=ask)))
     return [_concatenate(results, episodes) for results in _evaluate(EpisodesResult, evaluator, asked)]
 
 

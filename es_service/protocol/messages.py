@@ -167,12 +167,14 @@ class TrainingChunk:
 
 @dataclass(frozen=True)
 class EvaluationChunk:
-    """Request to roll out 16 episodes of the centre itself without action noise, from episode `16 * chunk_id` on."""
+    """Request to roll out episodes of the centre itself without action noise, from episode `16 * chunk_id` on."""
 
     generation: int
     chunk_id: int
     ask: int = 0
     """As for training. Each centre that is evaluated in a generation has resets of its own."""
+    episodes: int = EVALUATION_EPISODES_PER_CHUNK
+    """Number of episodes that are wanted, the first of the chunk's 16. The shape that is compiled has all of them."""
 
 
 @dataclass(frozen=True)
@@ -186,6 +188,13 @@ class GradientChunk:
     the population."""
     ask: int = 0
     """As for training."""
+
+
+def evaluation_chunks(generation: int, episodes: int, *, first: int = 0, ask: int = 0) -> list[EvaluationChunk]:
+    """The chunks of a centre's evaluation, with ids from `first` on."""
+    size = EVALUATION_EPISODES_PER_CHUNK
+    starts = range(0, episodes, size)
+    return [EvaluationChunk(generation, first + i, ask, min(size, episodes - start)) for i, start in enumerate(starts)]
 
 
 Chunk = TrainingChunk | EvaluationChunk | GradientChunk | PolicyChunk

@@ -35,12 +35,12 @@ from es_service.protocol.messages import (
     Chunk,
     ChunkResult,
     EpisodesResult,
-    EvaluationChunk,
     GradientChunk,
     TrainingChunk,
     Work,
     WorkerPlace,
     WorkerSpec,
+    evaluation_chunks,
 )
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, SearchState
@@ -85,7 +85,7 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
     zeros_O = np.zeros(task.observation_size, np.float32)
     centres = [Centre(1, parameters, config.search.sigma, zeros_O, zeros_O + 1.0) for _ in range(populations(config))]
     phases = _phases(config)
-    works = [_work(phase, centres, spec) for phase in phases]
+    works = [_work(phase, centres, spec, config.search.evaluation_episodes) for phase in phases]
     chunk_s, answers = _chunk_costs(spec, works)
     message_s, way_s = _message_costs([work[0] for work in works], answers)
     costs = Costs(chunk_s, message_s, way_s, _driver_cost(config, answers))
@@ -114,18 +114,23 @@ def _phases(config: RunConfig) -> list[Phase]:
     ]
 
 
-def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec) -> list[Work]:
+def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec, evaluation_episodes: int) -> list[Work]:
     """The chunks of a phase, in the order of the populations."""
     ids = range(phase.chunks // len(centres))
     weights_P = np.ones(spec.gradient_block_pairs, np.float32)
     if phase.name == "gradient":
         return [(NO_CENTRE, GradientChunk(1, i, weights_P, ask)) for ask in range(len(centres)) for i in ids]
-    kind = TrainingChunk if phase.name == "rollout" else EvaluationChunk
-    return [(centre, kind(1, i, ask)) for ask, centre in enumerate(centres) for i in ids]
+    if phase.name == "rollout":
+        return [(centre, TrainingChunk(1, i, ask)) for ask, centre in enumerate(centres) for i in ids]
+    return [
+        (centre, chunk)
+        for ask, centre in enumerate(centres)
+        for chunk in evaluation_chunks(1, evaluation_episodes, ask=ask)
+    ]
 
 
 def _steps(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float:
-    """Environment steps of a generation; surplus episodes of evaluations do not count."""
+    """Environment steps of a generation."""
     episodes = {
         "TrainingChunk": 2 * config.search.pairs,  # the steps of a member are those of all of its episodes
         "EvaluationChunk": config.search.evaluation_episodes,

@@ -30,6 +30,15 @@ def test_messages_survive_pickling_and_are_small(chunk):
         assert isinstance(value, np.ndarray | messages.Moments | int | None), name
 
 
+def test_an_evaluation_asks_for_no_more_episodes_than_are_wanted():
+    for episodes, sizes in ((2, [2]), (16, [16]), (35, [16, 16, 3])):
+        chunks = messages.evaluation_chunks(7, episodes, first=4, ask=1)
+        assert [chunk.episodes for chunk in chunks] == sizes
+        assert [(chunk.generation, chunk.chunk_id, chunk.ask) for chunk in chunks] == [
+            (7, 4 + i, 1) for i in range(len(sizes))
+        ]
+
+
 @pytest.mark.parametrize("kind", ERRORS, ids=lambda k: k.__name__)
 def test_errors_survive_pickling(kind):
     if kind is errors.Interrupted:

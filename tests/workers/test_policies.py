@@ -93,7 +93,7 @@ def test_policies_of_an_ant_whose_inputs_that_are_always_zero_are_left_out_have_
     of_centre = rollout.make_evaluation_rollout(environment, worker_spec)
     few = of_policies([policies[:4], policies[4:]], mean_L, std_L, np.arange(17), keys_L)
     for lane in range(17):
-        alone = of_centre(policies[lane], mean_L[0], std_L[0], keys_L[lane : lane + 1])
+        alone = of_centre(policies[lane], mean_L[0], std_L[0], keys_L[lane : lane + 1], np.ones(1, bool))
         jax.tree.map(lambda x, y, lane=lane: np.testing.assert_array_equal(x[lane], y[0]), few, alone)
     mean_L = mean_L.copy()
     mean_L[3] = 1.0  # the zeros count for one policy, so all run with all inputs

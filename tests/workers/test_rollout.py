@@ -91,6 +91,16 @@ def test_evaluation_chunk_equals_numpy_episodes_and_has_no_noise(spec):
         np.testing.assert_allclose(result.descriptor[e], end, atol=1e-3)
 
 
+def test_an_evaluation_of_fewer_episodes_has_the_bits_of_the_first_ones(spec):
+    parameters_D = random_parameters(2)
+    whole, few = (run(EvaluationChunk(4, 1, episodes=count), spec(), parameters_D) for count in (16, 3))
+    assert isinstance(whole, EpisodesResult)
+    assert isinstance(few, EpisodesResult)
+    for name in ("fitness", "returns", "descriptor", "steps", "goal_distance"):
+        np.testing.assert_array_equal(getattr(few, name), getattr(whole, name)[:3])
+    np.testing.assert_array_equal(few.trace_T_B, whole.trace_T_B)
+
+
 def test_gradient_chunk_is_the_weighted_sum_of_the_rollout_s_noise(spec):
     weights = np.random.default_rng(0).normal(size=8).astype(np.float32)
     result = run(GradientChunk(1, 3, weights), spec(), random_parameters())

@@ -20,7 +20,7 @@ def work():
         *[(first, TrainingChunk(1, chunk)) for chunk in (2, 0, 1)],
         *[(second, TrainingChunk(1, chunk, ask=1)) for chunk in (0, 1)],
         (first, TrainingChunk(2, 0)),
-        *[(first, EvaluationChunk(1, chunk)) for chunk in (0, 1)],
+        *[(first, EvaluationChunk(1, chunk, episodes=episodes)) for chunk, episodes in ((0, 16), (1, 3))],
         *[(second, EvaluationChunk(1, chunk, ask=1)) for chunk in (1, 0)],
         *[(first, GradientChunk(1, chunk, weights[chunk])) for chunk in (0, 1)],
         *[(second, GradientChunk(1, chunk, weights[2 + chunk], ask=1)) for chunk in (0, 1)],

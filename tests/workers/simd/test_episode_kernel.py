@@ -36,6 +36,20 @@ def test_arrays_of_other_sizes_are_refused(training: bool) -> None:
             run(*sizes)
 
 
+def test_only_the_episodes_that_are_wanted_are_run() -> None:
+    kernel = compile_episodes(make_environment("point_maze", {}), SPEC, np.arange(2), training=False)
+    weights, lanes = kernel.network.pack(random_parameters()), 2 * kernel.network.width + 3
+    keys_L = stream_keys(1, Domain.EVALUATION_RESET, 0, np.arange(lanes))
+    wanted_L = np.isin(np.arange(lanes), (1, kernel.network.width, lanes - 1))
+    given = (weights, 0.0, np.zeros(2, np.float32), np.ones(2, np.float32), None, keys_L, keys_L)
+    every, some = kernel.run(*given), kernel.run(*given, wanted_L)
+    assert not some.steps[~wanted_L].any()
+    for found, whole in zip(some, every, strict=True):
+        np.testing.assert_array_equal(found[wanted_L], whole[wanted_L])
+    with pytest.raises(ValueError, match="a bool for each lane"):
+        kernel.run(*given, wanted_L[1:])
+
+
 def test_memory_is_protected_without_assertions_too() -> None:
     """`python -O` removes assertions: arrays must stay alive during a call, and wrong ones must still be refused."""
     program = """

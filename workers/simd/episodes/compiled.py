@@ -57,6 +57,7 @@ class EpisodeKernel:
         noise_keys_P: np.ndarray | None,
         reset_keys_L: np.ndarray,
         action_keys_L: np.ndarray,
+        wanted_L: np.ndarray | None = None,
     ) -> Episodes:
         """Run the episodes of all lanes, [L]; returns NumPy arrays.
 
@@ -67,9 +68,15 @@ class EpisodeKernel:
             mean_O, std_O: observation statistics; with own weights those of each lane, [L, O].
             noise_keys_P: keys of the pairs' noise; None for evaluations.
             reset_keys_L, action_keys_L: stream keys of each lane's reset and action noise.
+            wanted_L: lanes whose episodes are run, all if None; a block of lanes ends when these are done. The others
+                stay at their reset.
         """
         lanes = len(reset_keys_L)
         carries, go = self.started(weights, unit, mean_O, std_O, noise_keys_P, reset_keys_L, action_keys_L)
+        if wanted_L is not None:
+            require(wanted_L.shape == (lanes,) and wanted_L.dtype == bool, "wanted_L must have a bool for each lane")
+            lane_L = np.flatnonzero(~wanted_L)
+            carries[lane_L // self.network.width, self.alive_word, lane_L % self.network.width] = 0
         go(self.spec.episode_steps)
         # The result of an episode is the last part of a carry.
         found = Episodes(*unpack(carries[:, -self.episode_words :], self.carry.episode, lanes))

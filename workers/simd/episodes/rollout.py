@@ -91,11 +91,11 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compi
     """Rollout of one evaluation chunk, with the interface of `workers.rollout.make_evaluation_rollout`."""
     kernels = _Kernels(environment, spec, training=False)
 
-    def rollout(centre_D, mean_O, std_O, reset_keys_E):
+    def rollout(centre_D, mean_O, std_O, reset_keys_E, wanted_E):
         kernel, weights = kernels.for_centre(centre_D, mean_O)
-        return kernel.run(weights, 0.0, mean_O, std_O, None, reset_keys_E, reset_keys_E)
+        return kernel.run(weights, 0.0, mean_O, std_O, None, reset_keys_E, reset_keys_E, wanted_E)
 
-    def compile_for(centre_D, mean_O, std_O, reset_keys_E):
+    def compile_for(centre_D, mean_O, std_O, reset_keys_E, wanted_E):
         kernels.fitting(mean_O).begin.compile(reset_keys_E)
 
     return Compilable(rollout, compile_for)
