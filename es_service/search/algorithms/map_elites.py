@@ -54,10 +54,11 @@ def map_elites(config: RunConfig) -> Algorithm:
             key = stream_keys(config.seed, Domain.VARIATION, generation, number)
             return variation(x_D, y_D, key, search.iso_sigma, search.line_sigma)
 
-        # The workers wait meanwhile, so each core makes some; small policies are made sooner by one thread.
-        threads = len(os.sched_getaffinity(0)) if state.centres[0].centre_D.size >= LARGE else 1
-        with ThreadPoolExecutor(threads) as pool:
-            return (PolicyAsk(np.stack(list(pool.map(varied, range(search.batch))))),)
+        numbers = range(search.batch)
+        if state.centres[0].centre_D.size < LARGE:
+            return (PolicyAsk(np.stack([varied(number) for number in numbers])),)
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:  # the workers wait meanwhile
+            return (PolicyAsk(np.stack(list(pool.map(varied, numbers)))),)
 
     def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
         if evaluations[0].generation == 0:
