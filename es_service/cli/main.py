@@ -19,6 +19,7 @@ import typer
 from es_service import api
 from es_service.cli.bench import bench
 from es_service.cli.commands import command
+from es_service.cli.data import print_json
 from es_service.cli.jobs import job_commands
 from es_service.cli.options import (
     AddressOption,
@@ -163,10 +164,11 @@ def evaluate(
     seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the episodes.")] = 0,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Also write the rows to this CSV file.")] = None,
+    as_json: JsonOption = False,
     log_level: LogLevelOption = None,
 ) -> None:
     """Evaluate policies of a run on fresh episodes, and print the results beside the stored values."""
-    from es_service.cli.tables.evaluations import csv_file, print_evaluations
+    from es_service.cli.tables.evaluations import csv_file, print_evaluations, row_of
     from es_service.runs import evaluation
 
     if every and cell:
@@ -181,7 +183,14 @@ def evaluate(
     )
     with csv_file(out, print_note) as write:
         results = evaluation.evaluate(found, chosen, episodes, workers, seed)
-        print_evaluations(console, found, results, write, every=every)
+        if not as_json:
+            print_evaluations(console, found, results, write, every=every)
+            return
+        rows = []
+        for fresh in results:
+            rows.append(row_of(fresh, found.descriptor_names))
+            write(rows[-1])
+    print_json(rows)
 
 
 app.command()(sweep)

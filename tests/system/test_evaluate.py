@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 
 import pandas as pd
 import pytest
@@ -29,7 +30,10 @@ def test_evaluate_puts_fresh_values_beside_stored_ones(tmp_path, mapped):
         f"{len(mapped.map)} elites: the mean descriptor of {len(mapped.map)} still lies in their cell" in result.stdout
     )
     one = ",".join(map(str, mapped.map[["cell_x", "cell_y"]].iloc[0]))
-    assert command("evaluate", mapped.folder, "--cell", one).returncode == 0
+    result = command("evaluate", mapped.folder, "--cell", one, "--episodes", 5, "--json")
+    assert result.returncode == 0, result.stderr
+    [found] = json.loads(result.stdout)
+    assert {name: str(value) for name, value in found.items()} == rows[2]
     for wrong, message in (
         ("99,0", "is not in the map"),
         ("a", "whole numbers"),

@@ -80,7 +80,7 @@ def print_evaluations(console: Console, run: Run, results: Iterable[Fresh], writ
     _line(console, f"{'policy':<10} {'generation':>10} {'stored':>10} {'fresh':>10} {'± s.e.':>8}  descriptor (± std)")
     for fresh in results:
         found.append(fresh)
-        row = _row(fresh, names)
+        row = row_of(fresh, names)
         write(row)
         where = ", ".join(f"{name} {row[name]:.3g} ± {row[f'{name}_std']:.2g}" for name in names)
         one = fresh.candidate
@@ -93,7 +93,8 @@ def print_evaluations(console: Console, run: Run, results: Iterable[Fresh], writ
         _line(console, _about_elites(run, [fresh for fresh in found if fresh.candidate.cell is not None]))
 
 
-def _row(fresh: Fresh, names: list[str]) -> dict[str, Any]:
+def row_of(fresh: Fresh, names: list[str]) -> dict[str, Any]:
+    """The row of a policy, of which `names` are the descriptor's dimensions."""
     one = fresh.candidate
     return {
         "policy": one.name,
