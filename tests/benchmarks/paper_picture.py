@@ -63,5 +63,6 @@ def _panel(axes: Any, curves: pd.DataFrame, task: str, reading: str) -> None:
             xycoords=("axes fraction", "data"),
             va="bottom",
             fontsize=8,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1},
         )
     axes.spines[["top", "right"]].set_visible(False)

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from tests.benchmarks import paper, paper_tables
-from tests.benchmarks.paper_readings import CURVE_AT, curve, measured, readings
+from tests.benchmarks.paper_readings import AT, CURVE_AT, READINGS, column, curve, measured, readings
 
 
 def run_of(steps: list[int], centres: list[list[tuple[float, float]]]) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -72,6 +72,20 @@ def test_the_guide_has_the_tables_of_the_runs():
     assert between.strip() == paper_tables.text(paper_tables.read()).strip()
 
 
+def test_every_run_of_the_tables_has_a_curve_with_the_values_of_its_row():
+    key, table, curves = list(paper_tables.RUN), paper_tables.read(), paper_tables.read_curves()
+    assert set(curves[key].agg(tuple, axis=1)) == set(table[key].agg(tuple, axis=1))
+    assert not curves.duplicated([*key, "env_steps"]).any()
+    for row in table.to_dict("records"):
+        of_run = curves[(curves[key] == [row[name] for name in key]).all(axis=1)].set_index("env_steps")
+        assert of_run.index.max() <= row["env_steps"] / 0.98
+        for at in AT:
+            for name in READINGS:
+                value = row[column(name, at)]
+                assert (at in of_run.index) == (not np.isnan(value)), (row["task"], row["method"], row["seed"], at)
+                assert np.isnan(value) or of_run[name][at] == value
+
+
 def test_a_table_has_a_row_for_each_method_with_median_and_quartiles_and_names_what_is_not_finished():
     runs = pd.DataFrame(
         {
@@ -92,7 +106,7 @@ def test_a_table_has_a_row_for_each_method_with_median_and_quartiles_and_names_w
     assert "| MEMES | 0, 1, 2 | **1,100** (1,050 to 1,150, 2 runs) | **1,100**" in text
     assert "| ARS | 0 | **900** | **900**" in text
     assert "Not finished: MEMES seed 2 (40 M)." in text
-    assert "QD-PG 1540 ± 46" in text
+    assert "In the paper, with other physics of the ant, after 1e8 unless said: QD-PG 1540 ± 46" in text
     assert "1e7" not in text
 
 
