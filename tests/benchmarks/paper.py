@@ -34,9 +34,10 @@ from es_service.dispatch.cores import cores
 from es_service.errors import Interrupted
 from es_service.protocol.machine import cpu_kind
 from es_service.protocol.process_environment import worker_environment
-from es_service.runs import session
+from es_service.runs import evaluation, session
+from es_service.runs.view import Run
 from tests.benchmarks import paper_picture, paper_tables
-from tests.benchmarks.paper_readings import curve, readings
+from tests.benchmarks.paper_readings import DISTANCE_TASKS, curve, readings
 from tests.benchmarks.science import in_this_process
 
 ROOT = Path(__file__).parents[2]
@@ -44,6 +45,7 @@ CONFIGS = ROOT / "configs" / "paper"
 RUNS = ROOT / "runs" / "paper"
 TRIALS = Path(__file__).parent / "results" / "paper_trials.csv"
 PICTURE = TRIALS.with_name("paper.png")
+FRESH_EPISODES = 1_000
 ONE_ANT = frozenset({"es", "ns_es", "nsr_es", "ars"})
 """Methods with one seed on AntMaze and on AntTrap; all others have five."""
 
@@ -94,12 +96,25 @@ def run_one(wanted: Wanted) -> Computed:
         "generations": int(history.index[-1]),
         "seconds": round(float(last.wall_clock_s)),
         **readings(*measured),
+        "fresh": fresh_fitness(run),
         "cells": int(last.map_cells),
         "cpu": cpu_kind(),
         "digest": run.digest()[:16],
         "commit": code,
     }
     return Computed(row, curve(*measured))
+
+
+def fresh_fitness(run: Run) -> float | None:
+    """Mean fitness of the run's best centre in fresh episodes, which did not choose it; None for a measure of distance.
+
+    The best centre is that of the reading `centre`: the one with the highest mean over its evaluation episodes.
+    """
+    if run.config["task"]["environment"] in DISTANCE_TASKS:
+        return None
+    chosen = evaluation.candidates(run, best=True, centre=False, cells=(), every=False)
+    [found] = evaluation.evaluate(run, chosen, FRESH_EPISODES, workers=1)
+    return round(found.mean, 2)
 
 
 def commit() -> str:

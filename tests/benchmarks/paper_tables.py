@@ -106,6 +106,8 @@ def _of_task(runs: pd.DataFrame, task: str) -> str:
     at_columns = [at for at in AT if runs[column("centre", at)].notna().any()]
     head = ["method", "seeds", *(f"{name}, {power(at)}" for at in at_columns for name in READINGS)]
     with_goal = task == "ant_maze"
+    with_fresh = bool(runs["fresh"].notna().any())
+    head += ["best centre, fresh episodes"] * with_fresh
     head += ["steps to the goal, single, of each seed"] * with_goal
     lines = [f"**{title}.**", "", _line(head), _line(["---"] * len(head))]
     for method, name in METHODS.items():
@@ -113,6 +115,8 @@ def _of_task(runs: pd.DataFrame, task: str) -> str:
         if len(of_method):
             cells = [name, ", ".join(map(str, of_method.seed))]
             cells += [_quartiles(of_method[column(reading, at)]) for at in at_columns for reading in READINGS]
+            if with_fresh:
+                cells.append(_quartiles(of_method["fresh"]))
             if with_goal:
                 steps = pd.to_numeric(of_method["steps_to_goal_single"]).tolist()
                 cells.append(", ".join("never" if np.isnan(one) else f"{one / 1e6:,.0f} M" for one in steps))

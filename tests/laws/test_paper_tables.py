@@ -100,11 +100,13 @@ def test_a_table_has_a_row_for_each_method_with_median_and_quartiles_and_names_w
                 for at in ("1e6", "1e8")
             },
             **{f"{name}_{at}": np.nan for name in ("centre", "single") for at in ("1e7", "1e9")},
+            "fresh": [np.nan, 800.0, 600.0, np.nan],
         }
     )
     text = paper_tables.text(runs)
     assert "| MEMES | 0, 1, 2 | **1,100** (1,050 to 1,150, 2 runs) | **1,100**" in text
     assert "| ARS | 0 | **900** | **900**" in text
+    assert "| **700** (650 to 750, 2 runs) |" in text
     assert "Not finished: MEMES seed 2 (40 M)." in text
     assert "In the paper, with other physics of the ant, after 1e8 unless said: QD-PG 1540 ± 46" in text
     assert "1e7" not in text

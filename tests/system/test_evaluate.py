@@ -10,6 +10,7 @@ import pytest
 
 from es_service.cli.tables.evaluations import csv_file
 from es_service.errors import ConfigError, StoreError
+from tests.benchmarks import paper
 from tests.system.command_line import command
 from tests.system.me_es_runs import run
 
@@ -42,6 +43,11 @@ def test_evaluate_puts_fresh_values_beside_stored_ones(tmp_path, mapped):
         result = command("evaluate", mapped.folder, "--cell", wrong)
         assert result.returncode == 2
         assert message in result.stderr
+
+
+def test_the_fresh_fitness_of_the_paper_s_tables_is_that_of_evaluate(mapped):
+    result = command("evaluate", mapped.folder, "--best", "--episodes", paper.FRESH_EPISODES, "--json")
+    assert paper.fresh_fitness(mapped) == round(json.loads(result.stdout)[0]["fresh_fitness"], 2)
 
 
 def test_evaluate_overwrites_nothing_but_csv_files(tmp_path, mapped):
