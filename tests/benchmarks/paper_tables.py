@@ -144,7 +144,7 @@ def _quartiles(values: pd.Series) -> str:
         for median in [known.median()]
         for value in known.quantile([0.25, 0.5, 0.75])
     )
-    only = "" if len(known) == len(values) else f", {len(known)} runs"
+    only = "" if len(known) == len(values) else f", {len(known)} run{'s' * (len(known) > 1)}"
     return f"**{median}**" + (f" ({low} to {high}{only})" if len(known) > 1 else only)
 
 
