@@ -57,6 +57,17 @@ def test_neighbouring_chunks_around_a_centre_are_one_call_of_the_kernel(monkeypa
     assert lanes == [3 * 16, 2 * 16, 16, 2 * 16, 2 * 16]
 
 
+def test_simd_runs_only_the_evaluation_episodes_that_are_wanted(monkeypatch):
+    wanted, run = [], EpisodeKernel.run
+    monkeypatch.setattr(
+        EpisodeKernel, "run", lambda self, *arguments: wanted.append(arguments[-1]) or run(self, *arguments)
+    )
+    point = centre(random_parameters(1))
+    chunks = [EvaluationChunk(1, 0), EvaluationChunk(1, 1, episodes=3)]
+    make_worker(spec(rollout="simd", episode_steps=5))([(point, chunk) for chunk in chunks])
+    assert [one.tolist() for one in wanted] == [[True] * 19 + [False] * 13]
+
+
 def test_centres_that_take_turns_are_packed_once(monkeypatch):
     kernels = rollout._Kernels(rollout.make_environment("point_maze", {}), spec(), training=True)
     points = [random_parameters(seed) for seed in range(rollout.KEPT_PACKED)]
