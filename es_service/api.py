@@ -158,7 +158,7 @@ def _go_on(
                 value=config.task.environment,
                 run=folder,
             )
-        if (store.meta.columns, store.meta.evaluation_columns) != _columns(config, task):
+        if not _fits(store.meta, *_columns(config, task)):
             raise StoreError(
                 f"{folder} was written by a version of es-service with other history columns; continue it with that "
                 "version",
@@ -241,6 +241,14 @@ def default_folder(config: RunConfig, which: str = "") -> Path:
 def _columns(config: RunConfig, task: TaskSpec) -> tuple[tuple[Column, ...], tuple[Column, ...]]:
     """The columns of a run's history, and those of its evaluated centres."""
     return history_columns(task, config.map.enabled), evaluated_columns(task, config.map.enabled)
+
+
+def _fits(meta: RunMeta, columns: tuple[Column, ...], evaluation_columns: tuple[Column, ...]) -> bool:
+    """Whether this version can continue the tables of a run, which may lack columns that are not in the digest."""
+    lacking = [column for column in evaluation_columns if column not in meta.evaluation_columns]
+    kept = tuple(column for column in evaluation_columns if column not in lacking)
+    has_all = not any(column.deterministic for column in lacking)
+    return meta.columns == columns and meta.evaluation_columns == kept and has_all
 
 
 def _create_and_work(

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service.protocol.messages import WorkerSpec
-from es_service.protocol.noise import Domain, stream_keys
+from es_service.protocol.noise import evaluation_reset_keys
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from workers.environments import Environment, make_environment
 from workers.viewer import shapes
@@ -26,17 +26,13 @@ from workers.xla_cache import xla_cache_settings
 
 
 def record(spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
-    """Record the requested episodes with the run's own rollout.
-
-    With simd, a recorded episode has the bits of the run's own. With xla they may differ, since the states of all steps
-    are results here and the program is therefore another one.
-    """
+    """Record the requested episodes with the run's own rollout, so that they have the bits of the run's own."""
     environment = make_environment(spec.environment, spec.environment_options)
     if spec.rollout == "simd":
         from workers.simd.episodes import rollout as made_by
     else:
         from workers import rollout as made_by
-    watched = made_by.make_watched_rollout(environment, spec)
+    watched = {own: made_by.make_watched_rollout(environment, spec, own_weights=own) for own in (False, True)}
     viewer = environment.viewer
     recordings = tuple(_record(environment, watched, spec, request) for request in requests)
     return Recordings(
@@ -45,10 +41,12 @@ def record(spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
 
 
 def _record(environment: Environment, watched, spec: WorkerSpec, request: RecordRequest) -> Recording:
-    centre, population = request.centre, (request.ask,) if request.ask else ()
-    key = stream_keys(spec.seed, Domain.EVALUATION_RESET, centre.generation, request.episode, *population)
-    carry_T = watched(centre.parameters_D, centre.observation_mean_O, centre.observation_std_O, key)
-    end = int(np.asarray(carry_T.episode.steps)[-1]) + 1
+    centre = request.centre
+    key = evaluation_reset_keys(request.seed, centre.generation, request.episode, request.ask, request.policy)
+    carry_T = watched[request.policy is not None](
+        centre.parameters_D, centre.observation_mean_O, centre.observation_std_O, key, request.slot
+    )
+    end = int(np.asarray(carry_T.episode.steps).max()) + 1
     carry_T = jax.tree.map(lambda leaf: np.asarray(leaf)[:end], carry_T)
     poses = None
     if environment.viewer is not None:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from es_service.protocol.messages import SIGNS, WorkerSpec
+from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, SIGNS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
 from es_service.protocol.policies import POLICY_SLOTS
 from workers.compilable import Compilable, jitted
@@ -96,24 +96,29 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
     return Compilable(rollout, lambda *given: episodes.compile(*filled(*given)))
 
 
-def make_watched_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Carry]:
+def make_watched_rollout(environment: Environment, spec: WorkerSpec, *, own_weights: bool) -> Callable[..., Carry]:
     """Rollout of one evaluation episode that keeps what it went through, for replays; compiled at its first call.
 
+    The episode runs in its slot of a whole chunk, with the loop of `_make_episodes`, since XLA may give other bits for
+    another shape. The loop keeps the carry that each step begins with, which no computation of the step depends on.
+
+    Args:
+        own_weights: whether the episode is that of an explicit policy, or else that of a centre.
+
     Returns:
-        f(centre_D, mean_O, std_O, reset_key_4) -> Carry with leading axis [T + 1], of the reset and after every step.
+        f(centre_D, mean_O, std_O, reset_key_4, slot) -> Carry with leading axis [T + 1], of the reset and after every
+        step until the episode is done; the rest is 0.
     """
-    steps = episode_steps(environment, spec, training=False)
+    lanes = POLICY_SLOTS if own_weights else EVALUATION_EPISODES_PER_CHUNK
+    episodes = _make_episodes(environment, spec, training=False, own_weights=own_weights, watched=True)
 
-    def rollout(centre_D, mean_O, std_O, reset_key):
-        layers = split_layers(spec.policy, centre_D)
+    def rollout(centre_D, mean_O, std_O, reset_key, slot):
+        def in_lanes(array):
+            return jnp.broadcast_to(array, (lanes, *array.shape))
 
-        def body(carry: Carry, _: None) -> tuple[Carry, Carry]:
-            after = steps.move(carry, mean_O, act(jnp, layers, steps.look(carry, mean_O, std_O)), reset_key)
-            return after, after
-
-        start = steps.begin(reset_key)
-        later = lax.scan(body, start, None, spec.episode_steps)[1]
-        return jax.tree.map(lambda first, others: jnp.concatenate([first[None], others]), start, later)
+        if own_weights:
+            centre_D, mean_O, std_O = map(in_lanes, (centre_D, mean_O, std_O))
+        return episodes(centre_D, mean_O, std_O, in_lanes(reset_key), slot=slot)
 
     return jax.jit(rollout)
 
@@ -155,13 +160,16 @@ def _make_member_episodes(environment: Environment, spec: WorkerSpec):
     return episodes
 
 
-def _make_episodes(environment: Environment, spec: WorkerSpec, *, training: bool, own_weights: bool = False):
+def _make_episodes(
+    environment: Environment, spec: WorkerSpec, *, training: bool, own_weights: bool = False, watched: bool = False
+):
     """Function that runs one episode per lane.
 
     Returns:
         f(parameters, mean_O, std_O, reset_keys_L_4[, action_keys_L_4]) -> Episodes with leading axis [L]. In training,
         every lane has its own parameters [L, D] and action noise; otherwise all lanes share parameters [D], or with
-        `own_weights` every lane has its own parameters [L, D] and statistics [L, O].
+        `own_weights` every lane has its own parameters [L, D] and statistics [L, O]. If `watched`, the function has an
+        argument `slot` and returns the carries [T + 1] of that lane instead.
     """
     steps = episode_steps(environment, spec, training=training)
     by_lane, of_statistics = 0 if training or own_weights else None, 0 if own_weights else None
@@ -172,22 +180,28 @@ def _make_episodes(environment: Environment, spec: WorkerSpec, *, training: bool
     def split(parameters_D):
         return split_layers(spec.policy, parameters_D)
 
-    def episodes(parameters, mean_O, std_O, reset_keys_L, action_keys_L=None):
+    def episodes(parameters, mean_O, std_O, reset_keys_L, action_keys_L=None, slot=None):
         layers = (
             split(parameters) if by_lane is None else jax.vmap(split)(parameters)
         )  # inside the loop this would copy them in every step
         keys_L = reset_keys_L if action_keys_L is None else action_keys_L
 
-        def body(at: tuple[Any, Carry]) -> tuple[Any, Carry]:
-            step, carry = at
-            action_L_A = policies(layers, looks(carry, mean_O, std_O))
-            return step + 1, moves(carry, mean_O, action_L_A, keys_L)
+        def keep(seen_T: Carry | None, step: Any, carry: Carry) -> Carry | None:
+            return jax.tree.map(lambda kept, now: kept.at[step].set(now[slot]), seen_T, carry) if watched else None
 
-        def unfinished(at: tuple[Any, Carry]):
-            step, carry = at
+        def body(at: tuple[Any, Carry, Carry | None]) -> tuple[Any, Carry, Carry | None]:
+            step, carry, seen_T = at
+            action_L_A = policies(layers, looks(carry, mean_O, std_O))
+            return step + 1, moves(carry, mean_O, action_L_A, keys_L), keep(seen_T, step, carry)
+
+        def unfinished(at: tuple[Any, Carry, Carry | None]):
+            step, carry, _ = at
             return (step < spec.episode_steps) & carry.alive.any()
 
-        start = (jnp.int32(0), jax.vmap(steps.begin)(reset_keys_L))
-        return lax.while_loop(unfinished, body, start)[1].episode
+        start, seen_T = jax.vmap(steps.begin)(reset_keys_L), None
+        if watched:
+            seen_T = jax.tree.map(lambda x: jnp.zeros((spec.episode_steps + 1, *x.shape[1:]), x.dtype), start)
+        step, end, seen_T = lax.while_loop(unfinished, body, (jnp.int32(0), start, seen_T))
+        return keep(seen_T, step, end) if watched else end.episode
 
     return episodes

@@ -29,7 +29,7 @@ from es_service.protocol.messages import (
     WorkerSpec,
     chunk_name,
 )
-from es_service.protocol.noise import NORMAL_STD, Domain, Keys, stream_keys
+from es_service.protocol.noise import NORMAL_STD, Domain, Keys, evaluation_reset_keys, stream_keys
 from es_service.protocol.policies import slots
 from workers.compilable import Compilable
 from workers.environments import make_environment
@@ -119,7 +119,7 @@ def _kinds(spec: WorkerSpec) -> dict[type[Chunk], _Kind]:
             centre.parameters_D,
             centre.observation_mean_O,
             centre.observation_std_O,
-            stream_keys(spec.seed, Domain.EVALUATION_RESET, first.generation, episodes_E, *population_id(first)),
+            evaluation_reset_keys(spec.seed, first.generation, episodes_E, first.ask),
             np.concatenate([np.arange(EVALUATION_EPISODES_PER_CHUNK) < chunk.episodes for chunk in chunks]),
         )
 
@@ -169,7 +169,7 @@ def _policy_arguments(work: Sequence[tuple[Policies, PolicyChunk]]) -> tuple[Any
         np.concatenate([one.observation_mean_N_O for one in together])[row_L],
         np.concatenate([one.observation_std_N_O for one in together])[row_L],
         row_L,
-        stream_keys(policies.seed, Domain.EVALUATION_RESET, chunk.generation, episode_L, number_L, chunk.ask),
+        evaluation_reset_keys(policies.seed, chunk.generation, episode_L, chunk.ask, number_L),
     )
 
 

@@ -44,6 +44,17 @@ def require_asks(asks: object, state: SearchState, chunk_pairs: int, observation
         raise EvaluationError(f"generation {generation}: {problem}", field="search.algorithm")
 
 
+def require_weights(weights_P: object, asked: Ask, generation: int) -> None:
+    """Raise an EvaluationError if the weights that a search, a user's perhaps, gives to noise make no gradient."""
+    problem = _not_floats(weights_P, (int(asked.pairs),))
+    if isinstance(weights_P, np.ndarray) and not problem and not np.isfinite(weights_P).all():
+        problem = f"are not finite for {np.count_nonzero(~np.isfinite(weights_P))} of {asked.pairs} pairs"
+    if problem:
+        raise EvaluationError(
+            f"generation {generation}: the `weights` of centre {asked.centre} {problem}", field="search.algorithm"
+        )
+
+
 def _wrong_policies(ask: PolicyAsk, size: int, observation_size: int) -> str:
     """Why policies cannot be evaluated; empty if they can."""
     count = len(ask.parameters_N_D) if isinstance(ask.parameters_N_D, np.ndarray) and ask.parameters_N_D.ndim else 1

@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 
 from es_service.config.model import BudgetConfig
 from es_service.loop import budget as budgets
-from es_service.loop.checks import invalidate, require_asks, require_finite, require_some_finite
+from es_service.loop.checks import (
+    invalidate,
+    require_asks,
+    require_finite,
+    require_some_finite,
+    require_weights,
+)
 from es_service.loop.clock import Clock
 from es_service.loop.evaluated import evaluated_rows, in_ask_order, policies_asked
 from es_service.loop.generation import (
@@ -25,6 +31,7 @@ from es_service.loop.generation import (
     estimate_gradients,
     evaluate_centres,
     evaluate_populations,
+    first_episode,
     fittest,
     make_centre,
     steps_of,
@@ -32,6 +39,7 @@ from es_service.loop.generation import (
 )
 from es_service.loop.history import (
     HistoryRow,
+    Resets,
     evaluated_row,
     evaluation_columns,
     fault_columns,
@@ -149,6 +157,7 @@ def _first_generation(
             evaluation,
             search.task,
             learned.map,
+            resets=Resets(config.seed, first_episode(centre, config.search.evaluation_episodes)),
             generation=0,
             centre=centre,
             fitness_weight=algorithm.fitness_weight,
@@ -196,6 +205,8 @@ def _next_generation(
     members = invalidate(members, settings.max_invalid_fraction, generation)
     populations = members[: len(asks)]
     weights = [algorithm.weights(begun, *told) for told in zip(asks, populations, strict=True)]
+    for ask, weights_P in zip(asks, weights, strict=True):
+        require_weights(weights_P, ask, generation)
     clock.lap("seconds_driver")
     gradients = estimate_gradients(evaluator, generation, weights, sizes.gradient_block_pairs)
     clock.lap("seconds_gradient")
@@ -215,6 +226,7 @@ def _next_generation(
         asked,
         zip(new_centres, evaluations, populations, strict=True),
         zip(policies, found, strict=True),
+        seed=config.seed,
         generation=generation,
         centres=len(begun.centres),
         fitness_weight=begun.weight.value,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from es_service.config.model import RunConfig
 from es_service.loop.generation import steps_of
-from es_service.loop.history import HistoryRow, evaluated_row, norm
+from es_service.loop.history import HistoryRow, Resets, evaluated_row, norm
 from es_service.loop.policies import PolicyWork, each_policy, no_statistics, policy_work
 from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, TaskSpec
 from es_service.search.algorithms.base import Ask, PolicyAsk
@@ -24,6 +24,8 @@ class Evaluated:
     """What was evaluated, with its observation statistics."""
     evaluation: EpisodesResult
     """Results of its evaluation episodes [E]."""
+    resets: Resets
+    """Address of the resets of these episodes."""
     fitness_weight: float
     """Weight of fitness in the utilities of its population; for a policy the weight in the state."""
     population: EpisodesResult | None = None
@@ -71,6 +73,7 @@ def in_ask_order(
     new_centres: Iterable[tuple[Centre, EpisodesResult, EpisodesResult]],
     policies: Iterable[tuple[PolicyWork, EpisodesResult]],
     *,
+    seed: int,
     generation: int,
     centres: int,
     fitness_weight: float,
@@ -84,17 +87,20 @@ def in_ask_order(
         fitness_weight: weight of fitness in the state.
     """
     found: list[Evaluated] = []
-    new_centres, policies, index = iter(new_centres), iter(policies), centres
-    for ask in asks:
-        if isinstance(ask, Ask):
-            point, evaluation, population = next(new_centres)
-            found.append(Evaluated(ask.centre, point, evaluation, ask.fitness_weight, population, ask.centre_D))
+    of_centres, of_policies, index = enumerate(new_centres), enumerate(policies), centres
+    for asked in asks:
+        if isinstance(asked, Ask):
+            number, (point, evaluation, population) = next(of_centres)
+            resets, weight = Resets(seed, ask=number), asked.fitness_weight
+            found.append(Evaluated(asked.centre, point, evaluation, resets, weight, population, asked.centre_D))
             continue
-        work, results = next(policies)
+        number, (work, results) = next(of_policies)
         given = work.parameters_N_D, work.observation_mean_N_O, work.observation_std_N_O
-        for parameters_D, mean_O, std_O, evaluation in zip(*given, each_policy(results), strict=True):
-            point = Centre(generation, parameters_D, 0.0, mean_O, std_O)
-            found.append(Evaluated(index, point, evaluation, fitness_weight))
+        for policy, (parameters_D, mean_O, std_O, evaluation) in enumerate(
+            zip(*given, each_policy(results), strict=True)
+        ):
+            point, resets = Centre(generation, parameters_D, 0.0, mean_O, std_O), Resets(seed, 0, number, policy)
+            found.append(Evaluated(index, point, evaluation, resets, fitness_weight))
             index += 1
     return found
 
@@ -113,6 +119,7 @@ def evaluated_rows(
             one.evaluation,
             task,
             map_,
+            resets=one.resets,
             generation=generation,
             centre=one.index,
             fitness_weight=one.fitness_weight,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import islice
 from typing import Literal, TypeVar
 
@@ -34,7 +33,7 @@ from es_service.protocol.messages import (
     around,
     evaluation_chunks,
 )
-from es_service.search.algorithms.base import Algorithm, CentreEvaluation, CentreState, SearchState, read_only
+from es_service.search.algorithms.base import Algorithm, CentreEvaluation, CentreState, SearchState, frozen
 from es_service.search.maps.behaviour_map import Elite, make_elite
 
 Result = TypeVar("Result", EpisodesResult, GradientResult)
@@ -98,12 +97,18 @@ def evaluate_centres(
         resets: which random streams the episodes start from. Each centre has its own, addressed by its ask or, in
             generation 0, by its chunk ids; or all have the same.
     """
-    count = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
     asked = []
     for index, centre in enumerate(centres):
-        first, ask = index * count if resets == "by_chunk" else 0, index if resets == "by_ask" else 0
+        first, ask = 0, index if resets == "by_ask" else 0
+        if resets == "by_chunk":
+            first = first_episode(index, episodes) // EVALUATION_EPISODES_PER_CHUNK
         asked.append(around(centre, evaluation_chunks(centre.generation, episodes, first=first, ask=ask)))
     return [_concatenate(results, episodes) for results in _evaluate(EpisodesResult, evaluator, asked)]
+
+
+def first_episode(centre: int, episodes: int) -> int:
+    """Number of an initial centre's first evaluation episode: each begins with a chunk of its own."""
+    return centre * -(-episodes // EVALUATION_EPISODES_PER_CHUNK) * EVALUATION_EPISODES_PER_CHUNK
 
 
 def estimate_gradients(
@@ -160,9 +165,8 @@ def centre_evaluation(
 
 
 def tell(algorithm: Algorithm, state: SearchState, told: tuple[CentreEvaluation, ...]) -> SearchState:
-    """The state after the search is told a generation's evaluations; arrays of its own are read-only from now on."""
-    state = algorithm.tell(state, told)
-    return replace(state, own=read_only(state.own))
+    """The state after the search is told a generation's evaluations; its arrays are read-only from now on."""
+    return frozen(algorithm.tell(state, told))
 
 
 def fittest(told: Sequence[CentreEvaluation]) -> int:

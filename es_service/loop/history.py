@@ -26,6 +26,8 @@ class Column:
     name: str
     type: Literal["INTEGER", "REAL"]
     deterministic: bool
+    """Whether every run of the config has the same values; also False for a column that a later version has added, so
+    that digests stay comparable between versions."""
     meaning: str = field(compare=False)
     """Explanation for a reader. It is not compared, so that a run with other explanations can be continued."""
 
@@ -72,8 +74,21 @@ _MAP = (
     Column("map_fitness_max", "REAL", True, "highest fitness of an elite, as it was when it entered"),
     Column("qd_score", "REAL", True, "sum over elites of fitness less map.qd_offset"),
 )
+_EPISODES = (
+    Column("fitness_first", "REAL", False, "fitness of its first evaluation episode, which a replay shows"),
+    Column("reset_seed", "INTEGER", False, "seed in the addresses of the resets of its evaluation episodes"),
+    Column("reset_episode", "INTEGER", False, "number of its first episode there; the others follow"),
+    Column("reset_ask", "INTEGER", False, "number of its ask there; populations and policies count separately"),
+    Column("reset_policy", "INTEGER", False, "number of the policy in its ask; none for a centre"),
+)
+"""Which episodes an evaluation consisted of. Runs of versions before 0.12 do not have these columns."""
 _SEARCH_AND_TIMES = (
-    Column("centre", "INTEGER", True, "centre that this row is about: the fittest of those that were evaluated"),
+    Column(
+        "centre",
+        "INTEGER",
+        True,
+        "centre that this row is about: the fittest of those that were evaluated; policies count on from the centres",
+    ),
     Column("fitness_weight", "REAL", True, "weight of fitness beside novelty in this generation's utilities"),
     Column("centre_novelty", "REAL", True, "novelty of the mean descriptor in the archive before it entered"),
     Column("archive_size", "INTEGER", True, "entries of the novelty archive after this generation"),
@@ -109,7 +124,7 @@ def history_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
 def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
     """Columns of the evaluated centres, of which a generation may have several; `generation` comes before them."""
     return (
-        Column("centre", "INTEGER", True, "index of the centre"),
+        Column("centre", "INTEGER", True, "index of the centre; policies count on from the centres"),
         Column(
             "fitness_weight", "REAL", True, "weight of fitness in its utilities; me_es, memes: 0 explores, 1 exploits"
         ),
@@ -130,7 +145,19 @@ def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
         Column("novelty", "REAL", True, "novelty of its mean descriptor in the archive before the generation"),
         Column("update_norm", "REAL", True, "Euclidean norm of its step in this generation"),
         Column("env_steps", "INTEGER", True, "environment steps of its population and of its evaluation"),
+        *_EPISODES,
     )
+
+
+@dataclass(frozen=True)
+class Resets:
+    """Address of the resets of an evaluation's episodes; see `protocol.noise.evaluation_reset_keys`."""
+
+    seed: int
+    episode: int = 0
+    """Number of the first episode; the others follow."""
+    ask: int = 0
+    policy: int | None = None
 
 
 def evaluated_row(
@@ -138,6 +165,7 @@ def evaluated_row(
     task: TaskSpec,
     map_: BehaviourMap | None,
     *,
+    resets: Resets,
     generation: int,
     centre: int,
     fitness_weight: float,
@@ -161,6 +189,8 @@ def evaluated_row(
         "novelty": novelty,
         "update_norm": update_norm,
         "env_steps": env_steps,
+        "fitness_first": float(evaluation.fitness[0]),
+        **{f"reset_{name}": value for name, value in vars(resets).items()},
     }
 
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from es_service.loop.state import Best, RunState, require_successor
 from es_service.protocol.messages import Moments
-from es_service.search.algorithms.base import CentreState, FitnessWeight, SearchState, read_only
-from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map
+from es_service.search.algorithms.base import CentreState, FitnessWeight, SearchState, frozen
+from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map, unchanged_entries
 from es_service.search.maps.geometry import Cvt, Geometry, Grid
 from es_service.search.novelty import NoveltyArchive, archive_of, empty_archive
 from es_service.search.optimizer import Adam
@@ -90,12 +90,14 @@ def state_from_parts(parts: Parts, generation: int, wall_clock_s: float, dimensi
     counters = parts[COUNTERS]
     return RunState(
         generation=generation,
-        search=SearchState(
-            tuple(centres),
-            archive_from_parts(parts, dimensions),
-            weight_from_arrays(parts[WEIGHT]),
-            map_from_parts(parts),
-            read_only(parts.get(OWN, {})),
+        search=frozen(
+            SearchState(
+                tuple(centres),
+                archive_from_parts(parts, dimensions),
+                weight_from_arrays(parts[WEIGHT]),
+                map_from_parts(parts),
+                parts.get(OWN, {}),
+            )
         ),
         observations=moments_from_arrays(parts[OBSERVATIONS]),
         best=best_from_arrays(parts[BEST]),
@@ -198,13 +200,11 @@ def geometry_from_arrays(arrays: Mapping[str, np.ndarray]) -> Geometry:
 
 
 def map_to_parts(map_: BehaviourMap, before: BehaviourMap | None) -> dict[str, Arrays]:
-    """Parts of the cells whose elites differ from an earlier map; for None, of all cells, and the geometry's part."""
+    """Parts of the cells whose entries differ from an earlier map; for None, of all cells, and the geometry's part."""
     parts = {GEOMETRY_PART: geometry_to_arrays(map_.geometry)} if before is None else {}
     same_N = np.zeros(map_.size, bool)
     if before is not None:
-        known = slice(before.size)
-        same_score_N = np.isclose(map_.score_N[known], before.score_N, rtol=0, atol=0, equal_nan=True)
-        same_N[known] = (map_.generation_N[known] == before.generation_N) & same_score_N
+        same_N[: before.size] = unchanged_entries(map_, before)
     for row in np.flatnonzero(~same_N):
         parts[cell_part(int(map_.cell_N[row]))] = {
             "order": np.asarray(row, np.int64),

@@ -10,7 +10,7 @@ import numpy as np
 from es_service.errors import StoreError
 from es_service.protocol.messages import FloatArray, Moments
 from es_service.search.algorithms.base import CentreState, SearchState
-from es_service.search.maps.behaviour_map import BehaviourMap, Elite
+from es_service.search.maps.behaviour_map import COLUMNS, BehaviourMap, Elite
 from es_service.search.novelty import extends
 from es_service.search.observation_statistics import normalisation
 
@@ -72,6 +72,17 @@ def _not_followed(before: SearchState, after: SearchState) -> str:
         return ""
     if not np.array_equal(after.map.cell_N[: before.map.size], before.map.cell_N):
         return "the behaviour map has lost cells or changed their order"
+    return _malformed(after.map)
+
+
+def _malformed(map_: BehaviourMap) -> str:
+    """Which array of a map has another type or shape than its cells need; empty if none has."""
+    for name, type_ in COLUMNS.items():
+        array = getattr(map_, name)
+        shape = (map_.size, len(map_.geometry.bounds)) if name == "descriptor_N_B" else (map_.size,)
+        if not isinstance(array, np.ndarray) or array.dtype != type_ or array.shape != shape:
+            now = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+            return f"the map's {name} is {now}; it must be {np.dtype(type_)} {shape}"
     return ""
 
 

@@ -95,6 +95,19 @@ def stream_keys(seed: int, domain: Domain | tuple[Domain, ...], generation: int,
     return words if isinstance(domain, tuple) else words[0]
 
 
+def evaluation_reset_keys(seed: int, generation: int, episode: Any, ask: int = 0, policy: Any = None) -> Keys:
+    """Keys of the streams of the resets of evaluation episodes.
+
+    Args:
+        episode: number of the episode among those of the centre or of the policy; the initial centres number theirs
+            on.
+        ask: number of the ask in its generation, where populations and policies are counted separately.
+        policy: number of the policy in its ask; None for a centre.
+    """
+    ids = (episode, *((ask,) if ask else ())) if policy is None else (episode, policy, ask)
+    return stream_keys(seed, Domain.EVALUATION_RESET, generation, *ids)
+
+
 def _prefix(seed: int, domain: Domain, generation: int) -> int:
     """State of the hash of a stream's address before its ids."""
     state = 0

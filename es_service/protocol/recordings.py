@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from es_service.protocol.messages import Centre, FloatArray
+from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray
+from es_service.protocol.policies import POLICY_SLOTS
 
 
 @dataclass(frozen=True)
@@ -17,9 +18,16 @@ class RecordRequest:
 
     centre: Centre
     """The policy with its statistics; its generation is part of the episode's address."""
+    seed: int
     ask: int = 0
-    """The place of the policy among those that its generation evaluated."""
+    policy: int | None = None
+    """The rest of the address of its reset; see `protocol.noise.evaluation_reset_keys`."""
     episode: int = 0
+
+    @property
+    def slot(self) -> int:
+        """Slot of the chunk in which a policy's first episode ran, or a centre's episode; with xla it matters."""
+        return self.episode % EVALUATION_EPISODES_PER_CHUNK if self.policy is None else self.policy % POLICY_SLOTS
 
 
 class Shape(NamedTuple):

@@ -74,18 +74,29 @@ def _title(one: Replay) -> str:
     return f"{name}: fitness {number(one.recording.fitness)} in this episode"
 
 
-def _notes(one: Replay) -> str:
-    """Which episode is shown, and how it compares with what the run stored."""
-    text = (
-        f"Evaluation episode 0 of generation {one.candidate.generation:,}, recorded with the stored policy and "
-        f"statistics: {one.recording.returns_T.size - 1:,} steps, fitness {number(one.recording.fitness)} (mean of all "
-        f"its evaluation episodes: {number(one.candidate.stored_fitness)})."
-    )
-    if one.difference is None:
-        return text
-    if one.difference == 0.0:
-        return f"{text} Its path equals the stored one bit for bit."
-    return f"{text} Its path differs from the stored one by up to {number(one.difference)}, as other roundings cause."
+def _notes(one: Replay, hidden: str | None) -> Markup:
+    """Which episode is shown, and how it compares with what the run has stored of it."""
+    stored, shown = one.stored, number(one.recording.fitness)
+    seen = f"{one.recording.returns_T.size - 1:,} steps, fitness {shown}"
+    mean = f"(mean of all its evaluation episodes: {number(one.candidate.stored_fitness)})"
+    if stored is None:
+        text = (
+            "The run does not have the address of this policy's evaluation episodes, as runs of versions before 0.12, "
+            f"so this is another episode of the policy: {seen} {mean}."
+        )
+        return tag("p", text, class_="note episode", hidden=hidden)
+    text = f"First evaluation episode of the policy, of generation {one.candidate.generation:,}: {seen} {mean}."
+    if one.is_the_stored:
+        same = "Its fitness equals the stored one bit for bit."
+        if stored.trace_T_B is not None:
+            same = "Its fitness and its path equal the stored ones bit for bit."
+        return tag("p", f"{text} {same}", class_="note episode", hidden=hidden)
+    other = f"This is not the stored episode, whose fitness is {stored.fitness!r} instead of {one.recording.fitness!r}."
+    if stored.changes:
+        why = f"It was computed with {'; '.join(stored.changes)} (then -> now), which may give other bits."
+        return tag("p", f"{text} {other} {why}", class_="note episode", hidden=hidden)
+    why = "Packages, processor and code are those that computed it, so this is an error; please report it."
+    return tag("p", f"{text} {other} {why}", class_="problem episode", hidden=hidden)
 
 
 def _section(data: RunData, replays: Sequence[Replay], *, solid: bool) -> Markup:
@@ -114,7 +125,7 @@ def _section(data: RunData, replays: Sequence[Replay], *, solid: bool) -> Markup
         tag("p", id="step", class_="readout"),
         stage,
         tag("div", plan, class_="stage flat", id="plan", hidden="" if solid else None),
-        *(tag("p", _notes(one), class_="note episode", hidden="" if i else None) for i, one in enumerate(replays)),
+        *(_notes(one, "" if i else None) for i, one in enumerate(replays)),
         tag(
             "p",
             "Drag to turn; scroll or pinch to zoom; drag with the right button or with two fingers to move.",

@@ -87,8 +87,8 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
     The elites are those of `cells` in the given order or, with `every`, all of the map in the order of discovery. The
     best centre, the newest centre and the elites are each read from one generation, also while a driver is writing.
 
-    Raises NotInRunError for a cell that does not exist or is empty, for `every` with an empty map, and for a run
-    without a finished generation.
+    Raises NotInRunError for a cell that does not exist or is empty, for `every` with an empty map, for `centre` if the
+    run has no newest centre, and for a run without a finished generation.
     """
     if run.generation is None:
         way_out = WayOut("resume", "continue it", str(run.folder))
@@ -99,7 +99,7 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
         found.append(Candidate("best", moment.policy("best"), moment.best.generation, moment.best.fitness))
     if centre:
         moment = run.at(wanted=is_no_elite)
-        fitness = run.history_rows(moment.generation)[0]["centre_fitness_mean"]
+        _, fitness = moment.require_newest_centre()
         found.append(Candidate("centre", moment.policy("centre"), moment.generation, fitness))
     if not cells and not every:
         return found

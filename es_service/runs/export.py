@@ -7,7 +7,7 @@ import math
 import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -69,7 +69,7 @@ def tables(run: Run) -> Iterator[tuple[str, pd.DataFrame]]:
 
 def arrays(run: Run) -> dict[str, np.ndarray]:
     """All policies of a run after one generation, with their observation statistics: the best centre, the newest
-    centre and every elite of the map.
+    centre (none if the generation evaluated only policies, as those of map_elites do) and every elite of the map.
 
     Names: `widths` of the layers, `observation_clip` (NaN: none); for the best and the newest centre `best_parameters`
     [D], `best_mean` [O], `best_std` [O], `centre_parameters`, ...; for N elites `cell` [N, dimensions of the map],
@@ -82,7 +82,8 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
         "widths": np.array(run.policy_shape.widths),
         "observation_clip": np.array(math.nan if clip is None else clip),
     }
-    for which in ("best", "centre"):
+    stored: list[Literal["best", "centre"]] = ["best"] if moment.newest_centre is None else ["best", "centre"]
+    for which in stored:
         policy = moment.policy(which)
         found |= {
             f"{which}_parameters": policy.parameters_D,

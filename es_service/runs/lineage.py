@@ -165,7 +165,8 @@ def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> t
         tell: called with a notice if the new run processes the policy's observations differently.
 
     Raises:
-        ConfigError: the policy has another network. NotInRunError: the cell does not exist or is empty.
+        ConfigError: the policy has another network. NotInRunError: the cell does not exist or is empty, or the run has
+            no newest centre.
     """
     folder, which = start_of(init_from)
     origin, shape = open_run(folder), policy_shape(config, task_of(config))
@@ -180,7 +181,7 @@ def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> t
     moment = origin.at(wanted=is_no_elite)
     moments, own = moments_from_arrays(moment.parts[OBSERVATIONS]), None
     if which == "centre":
-        centre = moment.newest_centre
+        centre, _ = moment.require_newest_centre()
         centre_D = centre.centre_D
         if centre.own_mean_O is not None and centre.own_std_O is not None:
             own = centre.own_mean_O, centre.own_std_O

@@ -147,17 +147,39 @@ class Moment:
         return best_from_arrays(self.parts[BEST])
 
     @property
-    def newest_centre(self) -> CentreState:
-        """The centre that this generation updated, as its history row says."""
-        [row] = reader.read_history(self.folder, self.generation, 1)
-        return centre_from_arrays(self.parts[centre_part(int(row["centre"]))])
+    def newest_centre(self) -> tuple[CentreState, float] | None:
+        """The centre that this generation updated, the fittest of several, and its mean fitness; None if the generation
+        evaluated only policies, as those of map_elites do."""
+        [history] = reader.read_history(self.folder, self.generation, 1)
+        row = {"centre": history["centre"], "fitness_mean": history["centre_fitness_mean"]}
+        if centre_part(int(row["centre"])) not in self.parts:  # the row of the history is about a policy
+            [rows] = reader.read_evaluations(self.folder, self.generation, 1)
+            rows = [one for one in rows if centre_part(int(one["centre"])) in self.parts]
+            if not rows:
+                return None
+            row = max(rows, key=lambda one: np.nan_to_num(one["fitness_mean"], nan=-np.inf))
+        return centre_from_arrays(self.parts[centre_part(int(row["centre"]))]), float(row["fitness_mean"])
+
+    def require_newest_centre(self) -> tuple[CentreState, float]:
+        """`newest_centre`. Raises NotInRunError if there is none."""
+        if (newest := self.newest_centre) is None:
+            raise NotInRunError(
+                f"{self.folder} has no newest centre: its generation {self.generation} evaluated only policies; choose "
+                "the best one, or the elite of a cell",
+                field="policy",
+                value="centre",
+                allowed="best, or a cell",
+                suggestion="best",
+                run=self.folder,
+            )
+        return newest
 
     def policy(self, which: Literal["best", "centre"]) -> Policy:
         """The best or the newest centre as a policy; see `Run.policy`."""
         if which == "best":
             best = self.best
             return make_policy(self.meta, best.centre_D, best.observation_mean_O, best.observation_std_O)
-        centre, enabled = self.newest_centre, self.meta.constants["policy.observation_normalization"]
+        (centre, _), enabled = self.require_newest_centre(), self.meta.constants["policy.observation_normalization"]
         mean_O, std_O = statistics_in_force(moments_from_arrays(self.parts[OBSERVATIONS]), centre, enabled)
         return make_policy(self.meta, centre.centre_D, mean_O, std_O)
 

@@ -1,7 +1,8 @@
 """Recording of episodes of a run's stored policies, for replays: the very episodes that the run evaluated.
 
-A policy's first evaluation episode is recorded, the one whose path the map stores. The recording is compared with that
-path, so that a replay never passes for something that it is not.
+A policy's first evaluation episode is recorded, the one whose path the map stores. The run stores the address of its
+reset, its fitness and, for an elite, its path; the recording is compared with them, so that a replay never passes for
+something that it is not.
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ import pickle
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,12 +22,16 @@ from es_service.config.compute import ENGINE_IMPLIES
 from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
 from es_service.errors import EvaluationError
-from es_service.protocol.messages import Centre
+from es_service.loop.history import Resets
+from es_service.protocol.machine import CODE, platform_info
+from es_service.protocol.messages import Centre, FloatArray
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from es_service.runs.checked_config import changed_config
 from es_service.runs.evaluation import Candidate, candidates
+from es_service.runs.identity import code_changes, code_of, platform_changes
 from es_service.runs.view import Run
+from es_service.store import reader
 
 RECORD_S = 600.0
 """Longest time for the recordings of one report, compilation included."""
@@ -37,9 +43,30 @@ class Replay:
 
     candidate: Candidate
     recording: Recording
-    difference: float | None
-    """Largest difference between the recorded and the stored path, in units of the descriptor: 0 if the recorded
-    episode is the stored one to the bit. None if no path is stored for this policy."""
+    stored: StoredEpisode | None
+    """What the run has stored of the episode; None if it has stored no address, as versions before 0.12: the recording
+    is then of another episode of the policy."""
+
+    @property
+    def is_the_stored(self) -> bool:
+        """Whether fitness and path are those stored, bit for bit."""
+        if self.stored is None:
+            return False
+        trace_T_B = self.stored.trace_T_B
+        same_path = trace_T_B is None or np.array_equal(trace_T_B, self.recording.trace_T_B)
+        return self.recording.fitness == self.stored.fitness and same_path
+
+
+@dataclass(frozen=True)
+class StoredEpisode:
+    """What a run has stored of the first evaluation episode of a policy."""
+
+    resets: Resets
+    fitness: float
+    trace_T_B: FloatArray | None
+    """Its path; None for a policy that is no elite."""
+    changes: tuple[str, ...]
+    """Differences between what computed it and this machine, in words: packages, processor, code."""
 
 
 def record(run: Run, *, best: bool, cells: Sequence[Sequence[int]]) -> tuple[list[Replay], Recordings]:
@@ -52,14 +79,14 @@ def record(run: Run, *, best: bool, cells: Sequence[Sequence[int]]) -> tuple[lis
     overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": "auto"}
     config = changed_config(run.present_config, overrides)
     chosen = candidates(run, best=best, centre=False, cells=cells, every=False)
-    requests = [RecordRequest(_centre(one, config.search.sigma), _ask(run, one)) for one in chosen]
-    found = _answer((worker_spec(config, task_of(config)), requests))
-    traces = {one.cell: run.elite(cell).trace_T_B for one, cell in zip(chosen[int(best) :], cells, strict=True)}
-    replays = [
-        Replay(one, recording, _difference(recording, traces.get(one.cell)))
-        for one, recording in zip(chosen, found.recordings, strict=True)
+    now = {**platform_info(), CODE: code_of(config)}
+    stored = [_stored(run, one, now) for one in chosen]
+    requests = [
+        RecordRequest(_centre(one, config.search.sigma), **vars(Resets(config.seed) if its is None else its.resets))
+        for one, its in zip(chosen, stored, strict=True)
     ]
-    return replays, found
+    found = _answer((worker_spec(config, task_of(config)), requests))
+    return [Replay(*one) for one in zip(chosen, found.recordings, stored, strict=True)], found
 
 
 def _centre(one: Candidate, sigma: float) -> Centre:
@@ -67,17 +94,26 @@ def _centre(one: Candidate, sigma: float) -> Centre:
     return Centre(one.generation, policy.parameters_D, sigma, policy.observation_mean_O, policy.observation_std_O)
 
 
-def _ask(run: Run, one: Candidate) -> int:
-    """The place of a policy among those that its generation evaluated, found by its fitness; the first if unknown."""
-    table = run.evaluations
-    fitness = table[table["generation"] == one.generation]["fitness_mean"].tolist()
-    return fitness.index(one.stored_fitness) if one.stored_fitness in fitness else 0
-
-
-def _difference(recording: Recording, trace_T_B: np.ndarray | None) -> float | None:
-    if trace_T_B is None or trace_T_B.shape != recording.trace_T_B.shape:
+def _stored(run: Run, one: Candidate, now: Mapping[str, Any]) -> StoredEpisode | None:
+    """What is stored of a policy's first evaluation episode; None if its address is not."""
+    if not np.isfinite(one.stored_fitness):
+        return None  # a fork that changed the meaning of fitness has kept the policy, but not its evaluation
+    if one.cell is None:
+        [history] = reader.read_history(run.folder, one.generation, 1)
+        centre, trace_T_B = history["centre"], None  # the best was the fittest of its generation
+    else:
+        map_, elites = run.elites([one.cell])
+        centre, trace_T_B = map_.centre_N[map_.row_of(one.cell)], elites[one.cell].trace_T_B
+    [rows] = reader.read_evaluations(run.folder, one.generation, 1)
+    row = next((row for row in rows if row["centre"] == centre), {})
+    seed, episode, ask, policy = (row.get(f"reset_{field.name}", np.nan) for field in fields(Resets))
+    if np.isnan(seed):
         return None
-    return float(np.abs(recording.trace_T_B - trace_T_B).max())
+    resets = Resets(int(seed), int(episode), int(ask), None if np.isnan(policy) else int(policy))
+    then = next((at for first, at in reversed(reader.read_platforms(run.folder)) if first <= one.generation), {})
+    changes = platform_changes({**then, "workers": None}, {**now, "workers": None})
+    changes += [f"code of {file}" for file in code_changes(then, now)]
+    return StoredEpisode(resets, row["fitness_first"], trace_T_B, tuple(changes))
 
 
 def _answer(question: tuple) -> Recordings:

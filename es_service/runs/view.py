@@ -182,9 +182,11 @@ class Run:
 
         Args:
             which: "best" (the best centre so far) or the place of a cell, such as (3, 17) (its elite), with the
-                statistics of their evaluation; or "centre" (the newest centre), with the statistics it would use next.
+                statistics of their evaluation; or "centre" (the centre that the newest generation updated, the fittest
+                of several), with the statistics it would use next.
 
-        Raises NotInRunError for a cell that does not exist or is empty, ValueError for another name.
+        Raises NotInRunError for a cell that does not exist or is empty, and for "centre" if the newest generation
+        evaluated only policies, as those of map_elites do; ValueError for another name.
         """
         if which == "best":
             return self.at(wanted=lambda part: part == BEST).policy("best")

@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import operator
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -176,13 +177,15 @@ def row_bytes(row: Row) -> bytes:
 def table_bytes(columns: Sequence[Column], rows: Sequence[Mapping[str, int | float | None]]) -> bytes:
     """Bytes of a few rows with the same columns, such as the centres that one generation evaluated.
 
+    A run of an older version may have fewer columns than the rows, whose other values are then left out.
+
     Raises:
-        StoreError: a row has other columns, or a value has the wrong type.
+        StoreError: a row lacks a column, or a value has the wrong type.
     """
     names = {column.name for column in columns}
     for row in rows:
-        if row.keys() != names:
-            raise StoreError(f"a row has the columns {sorted(row)}; it must have {sorted(names)}")
+        if missing := names - row.keys():
+            raise StoreError(f"a row has the columns {sorted(row)}; it lacks {sorted(missing)}")
     return b"".join(row_bytes(tuple(_value(column, row[column.name]) for column in columns)) for row in rows)
 
 
@@ -209,6 +212,24 @@ def table_rows(columns: Sequence[Column], payload: bytes) -> list[Row]:
     if columns and len(values) % len(columns):
         raise ValueError(f"the evaluated centres have {len(values)} values, which {len(columns)} columns do not fit")
     return [tuple(values[i : i + len(columns)]) for i in range(0, len(values), len(columns) or 1)]
+
+
+def leading_values(payload: bytes, count: int, columns: int) -> bytes:
+    """The bytes of the first `count` values of each row that `table_bytes` encoded, of `columns` values each.
+
+    Raises:
+        ValueError: `payload` does not consist of such rows.
+    """
+    value = b"(?:N|[IR].{8})"
+    rows = re.compile(b"(%b{%d})%b{%d}" % (value, count, value, columns - count), re.DOTALL)
+    found, end = [], 0
+    while end < len(payload):
+        row = rows.match(payload, end)
+        if row is None:
+            raise ValueError(f"the evaluated centres are unreadable from byte {end} on")
+        found.append(row[1])
+        end = row.end()
+    return b"".join(found)
 
 
 def column_bytes(columns: Sequence[Column]) -> bytes:

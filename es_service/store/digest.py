@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.loop.parts import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.protocol.machine import is_mixed
-from es_service.store.codec import column_bytes, decode_part, row_bytes
+from es_service.store.codec import column_bytes, decode_part, leading_values, row_bytes
 from es_service.store.connection import reading
 from es_service.store.folder import DATABASE
 from es_service.store.reader import kept_states, platforms, state_payload
@@ -113,10 +113,15 @@ def arrays_sha256(arrays: dict[str, NDArray[Any]]) -> str:
 def _history(connection: Connection, meta: RunMeta, until: int) -> tuple[str, str]:
     """SHA-256s of the deterministic columns of the history, and of the evaluated centres."""
     columns = sorted((column for column in meta.columns if column.deterministic), key=lambda column: column.name)
+    # Columns of the evaluated centres that do not count are the last ones.
+    all_of_centre = meta.evaluation_columns
+    of_centre = [column for column in all_of_centre if column.deterministic]
     total = hashlib.sha256(json.dumps([[column.name, column.type] for column in columns]).encode() + b"\n")
     query = history_select(columns) + " WHERE history.generation <= ? ORDER BY history.generation"
-    centres = hashlib.sha256(column_bytes(meta.evaluation_columns) + b"\n")
+    centres = hashlib.sha256(column_bytes(of_centre) + b"\n")
     for *values, evaluations, _, _ in connection.execute(query, (until,)):
         total.update(row_bytes(tuple(values)))
+        if len(of_centre) < len(all_of_centre):
+            evaluations = leading_values(evaluations, len(of_centre), len(all_of_centre))
         centres.update(len(evaluations).to_bytes(8, "little") + evaluations)
     return total.hexdigest(), centres.hexdigest()

@@ -1,9 +1,12 @@
-"""Recorded episodes are the episodes that a worker evaluates: bit for bit with simd, and as near as xla repeats."""
+"""Recorded episodes are the episodes that a worker evaluates, bit for bit."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import workers.recording
+from es_service.loop.policies import policy_episodes, policy_work
 from es_service.protocol.messages import EvaluationChunk, PolicyShape
 from es_service.protocol.recordings import RecordRequest
 from tests import helpers
@@ -19,21 +22,38 @@ def spec_of(name, rollout, steps):
     return helpers.spec(environment=name, policy=shape, episode_steps=steps, rollout=rollout)
 
 
-@pytest.mark.parametrize("rollout", ["xla", "simd"])
-@pytest.mark.parametrize("ask", [0, 2])
-def test_a_recording_is_the_worker_s_own_episode(rollout, ask):
-    spec = spec_of("point_maze", rollout, 200)
-    centre = helpers.centre(helpers.random_parameters(size=spec.policy.parameters), generation=7)
-    evaluated = helpers.chunk_runner(spec)(centre, EvaluationChunk(7, 0, ask))
-    for episode in (0, 3):
-        [found] = record(spec, [RecordRequest(centre, ask, episode)]).recordings
-        assert found.returns_T.size == evaluated.steps[episode] + 1
-        same = np.testing.assert_array_equal if rollout == "simd" else np.testing.assert_allclose
-        same(found.fitness, evaluated.fitness[episode])
-        same(found.descriptor_T_B[-1], evaluated.descriptor[episode])
-        if episode == 0:
-            same(found.trace_T_B, evaluated.trace_T_B)
-    assert found.poses_T_L_7 is None
+TASKS = [("point_maze", 200, "xla"), ("point_maze", 200, "simd")]
+TASKS += [pytest.param("ant_trap", 60, "simd", marks=pytest.mark.slow)]
+TASKS += [pytest.param("ant_trap", 60, "xla", marks=pytest.mark.long)]  # XLA compiles the ant four times
+
+
+@pytest.mark.parametrize(("name", "steps", "rollout"), TASKS)
+def test_a_recording_is_the_worker_s_own_episode(name, steps, rollout):
+    """That of a centre, also of an initial one, whose episodes are counted on, and that of a policy in any slot."""
+    spec, size = spec_of(name, rollout, steps), SHIPPED[name].observation_size
+    run = helpers.chunk_runner(spec)
+    parameters_N_D = np.stack([helpers.random_parameters(n, spec.policy.parameters) for n in range(19)])
+    centre = helpers.centre(parameters_N_D[0], generation=7, observation_size=size)
+    mean_N_O, std_N_O = (np.tile(array, (19, 1)) for array in (centre.observation_mean_O, centre.observation_std_O))
+    work = policy_work(parameters_N_D, (mean_N_O, std_N_O), 2, seed=5, generation=7, ask=1, traces=True)
+    policies = policy_episodes(work, [run(*one) for one in work.work])
+    asked = []
+    for n in (0, 3, 18):
+        request = RecordRequest(replace(centre, parameters_D=parameters_N_D[n]), seed=5, ask=1, policy=n)
+        asked.append((request, policies, (n, 0), policies.trace_T_B[n]))
+    for chunk, ask in ((0, 0), (2, 0), (0, 2)):
+        found = run(centre, EvaluationChunk(7, chunk, ask))
+        for e in (0, 3):
+            request = RecordRequest(centre, spec.seed, ask, episode=16 * chunk + e)
+            asked.append((request, found, e, None if e else found.trace_T_B))
+    recordings = record(spec, [request for request, *_ in asked]).recordings
+    for one, (_, evaluated, at, trace_T_B) in zip(recordings, asked, strict=True):
+        assert one.returns_T.size == evaluated.steps[at] + 1
+        np.testing.assert_array_equal(one.fitness, evaluated.fitness[at])
+        np.testing.assert_array_equal(one.descriptor_T_B[-1], evaluated.descriptor[at])
+        if trace_T_B is not None:
+            np.testing.assert_array_equal(one.trace_T_B, trace_T_B)
+        assert (one.poses_T_L_7 is None) == (name == "point_maze")
 
 
 @pytest.mark.parametrize("rollout", ["xla", "simd"])
@@ -42,7 +62,7 @@ def test_a_recording_ends_with_its_episode(monkeypatch, rollout):
     environment = counting_environment([5], poison_after_done=False)
     monkeypatch.setattr(workers.recording, "make_environment", lambda name, options: environment)
     spec = helpers.spec(episode_steps=30, rollout=rollout)
-    [found] = record(spec, [RecordRequest(helpers.centre(helpers.random_parameters()))]).recordings
+    [found] = record(spec, [RecordRequest(helpers.centre(helpers.random_parameters()), seed=0)]).recordings
     assert found.returns_T.tolist() == [0, 1, 3, 6, 10, 15]
     assert found.descriptor_T_B[:, 1].tolist() == [0, 1, 2, 3, 4, 5]
     assert found.fitness == 15
@@ -55,7 +75,7 @@ def test_the_poses_of_an_ant_are_those_of_its_links(name):
     size = SHIPPED[name].observation_size
     centre = helpers.centre(helpers.random_parameters(size=spec.policy.parameters), observation_size=size)
     evaluated = helpers.chunk_runner(spec)(centre, EvaluationChunk(1, 0))
-    found = record(spec, [RecordRequest(centre)])
+    found = record(spec, [RecordRequest(centre, spec.seed)])
     [one] = found.recordings
     np.testing.assert_array_equal(one.fitness, evaluated.fitness[0])
     np.testing.assert_array_equal(one.trace_T_B, evaluated.trace_T_B)

@@ -5,7 +5,7 @@ Axes: D policy parameters, O observation, B descriptor dimensions, P antithetic 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -61,8 +61,9 @@ class SearchState:
 
     The store writes only what a generation has changed. A search of your own may therefore replace centres (but not add
     or remove one), extend the novelty archive with `novelty.extended` (but not remove entries; if only the newest ones
-    are to count, compare with those), and insert into the behaviour map with `behaviour_map.insert` (but not empty a
-    cell). Any other change stops the run with a StoreError.
+    are to count, compare with those), insert into the behaviour map with `behaviour_map.insert` (but not empty a cell),
+    and replace the fitness, the descriptor or the score of an elite. Any other change stops the run with a StoreError.
+    All arrays are read-only, since a change in place would not be stored.
     """
 
     centres: tuple[CentreState, ...]
@@ -84,10 +85,24 @@ def read_only(own: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
 
     Otherwise a change in place would not be stored, since the store goes by whether the mapping is another one.
     """
-    for array in own.values():
-        if isinstance(array, np.ndarray):  # a NumPy scalar is read-only; whatever else there is, the store refuses
-            array.flags.writeable = False
+    _freeze(own.values())
     return own if isinstance(own, MappingProxyType) else MappingProxyType(dict(own))
+
+
+def frozen(state: SearchState) -> SearchState:
+    """The same state, all of whose arrays are read-only from now on."""
+    for centre in state.centres:
+        _freeze([*vars(centre).values(), *vars(centre.adam).values()])
+    _freeze(vars(state.archive).values())
+    if state.map is not None:
+        _freeze(vars(state.map).values())
+    return replace(state, own=read_only(state.own))
+
+
+def _freeze(values: Iterable[Any]) -> None:
+    for value in values:
+        if isinstance(value, np.ndarray):  # a NumPy scalar is read-only; whatever else there is, the store refuses
+            value.flags.writeable = False
 
 
 def from_elite(state: SearchState, index: int, cell: int, elite: Elite, *, own_statistics: bool = False) -> SearchState:

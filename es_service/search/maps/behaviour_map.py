@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from es_service.protocol.messages import Centre, FloatArray
 from es_service.search.maps.geometry import Geometry
 
+COLUMNS = {"fitness_N": "f8", "descriptor_N_B": "f8", "generation_N": "i8", "centre_N": "i8", "score_N": "f8"}
+"""Type of each array of a map besides the numbers of its cells."""
+
 
 @dataclass(frozen=True)
 class BehaviourMap:
@@ -26,7 +29,7 @@ class BehaviourMap:
     cell_N: NDArray[np.int64]
     """Number of each filled cell, as `geometry` counts cells."""
     fitness_N: NDArray[np.float64]
-    """Mean fitness over the evaluation episodes; it is never estimated again."""
+    """Mean fitness over the evaluation episodes. Shipped searches never estimate it again."""
     descriptor_N_B: NDArray[np.float64]
     generation_N: NDArray[np.int64]
     """Generation in which each elite was evaluated; 0 for initial centres."""
@@ -124,6 +127,16 @@ def with_score(map_: BehaviourMap, cell: int, score: float) -> BehaviourMap:
     return replace(map_, score_N=_with(map_.score_N, row, score))
 
 
+def unchanged_entries(map_: BehaviourMap, before: BehaviourMap) -> NDArray[np.bool_]:
+    """Whether each entry of an earlier map is still the same, bit for bit, in a map with the same first cells, [N]."""
+    same_N = np.ones(before.size, bool)
+    for name in COLUMNS:
+        now, then = getattr(map_, name)[: before.size], getattr(before, name)
+        if now is not then:
+            same_N &= (_bytes(now) == _bytes(then)).all(axis=1)
+    return same_N
+
+
 def map_statistics(
     map_: BehaviourMap, qd_offset: float, reachable: NDArray[np.bool_] | None
 ) -> dict[str, float | None]:
@@ -148,6 +161,12 @@ def map_statistics(
 def make_elite(centre: Centre, trace_T_B: FloatArray) -> Elite:
     """The elite made of a centre that has entered the map."""
     return Elite(centre.parameters_D, centre.observation_mean_O, centre.observation_std_O, trace_T_B)
+
+
+def _bytes(values_N: np.ndarray) -> NDArray[np.uint8]:
+    """The bytes of each entry, [N, bytes], so that NaN equals NaN, and 0 does not equal -0."""
+    entry_bytes = values_N.dtype.itemsize * math.prod(values_N.shape[1:])
+    return np.frombuffer(values_N.tobytes(), np.uint8).reshape(-1, entry_bytes)
 
 
 def _with(values: np.ndarray, row: int, value: object) -> np.ndarray:

@@ -118,11 +118,14 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
     return Compilable(rollout, compile_for)
 
 
-def make_watched_rollout(environment: Environment, spec: WorkerSpec) -> Callable[..., Carry]:
-    """Rollout of one episode, with the interface of `workers.rollout.make_watched_rollout` and the run's own bits."""
+def make_watched_rollout(environment: Environment, spec: WorkerSpec, *, own_weights: bool) -> Callable[..., Carry]:
+    """Rollout of one episode, with the interface of `workers.rollout.make_watched_rollout`.
+
+    An episode's bits depend neither on its slot nor on whether its weights are those of a centre or of a policy.
+    """
     kernels = _Kernels(environment, spec, training=False)
 
-    def rollout(centre_D, mean_O, std_O, reset_key):
+    def rollout(centre_D, mean_O, std_O, reset_key, slot):
         kernel, weights = kernels.for_centre(centre_D, mean_O)
         return kernel.watch(weights, mean_O, std_O, reset_key)
 
