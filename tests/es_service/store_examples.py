@@ -29,6 +29,7 @@ EVALUATION_COLUMNS = (
     Column("centre", "INTEGER", True, ""),
     Column("cell", "INTEGER", True, ""),
     Column("fitness_mean", "REAL", True, ""),
+    Column("fitness_first", "REAL", False, ""),
 )
 CENTRES = 3
 
@@ -90,7 +91,12 @@ def evaluated(generation):
     """The centres that this generation evaluates: all of them at first, then one or two."""
     centres = range(CENTRES) if generation == 0 else range(1 + generation % 2)
     return [
-        {"centre": centre, "cell": math.nan if centre else generation, "fitness_mean": generation + centre / 7}
+        {
+            "centre": centre,
+            "cell": math.nan if centre else generation,
+            "fitness_mean": generation + centre / 7,
+            "fitness_first": generation + centre / 3,
+        }
         for centre in centres
     ]
 

@@ -139,15 +139,30 @@ def test_one_changed_deterministic_history_value_counts(folder, column):
     assert changed_names(before, digest_parts(folder)) == {"history"}
 
 
-@pytest.mark.parametrize("change_of", ["value", "row", "order"])
+@pytest.mark.parametrize("change_of", ["value", "row", "order", "nothing"])
 def test_every_evaluated_centre_counts(folder, change_of):
+    """In all columns but those that a later version has added."""
     before = digest_parts(folder)
     rows = evaluated(0)
-    if change_of == "value":
-        rows[1]["fitness_mean"] = float(np.nextafter(rows[1]["fitness_mean"], np.inf))
+    if change_of in ("value", "nothing"):
+        name = {"value": "fitness_mean", "nothing": "fitness_first"}[change_of]
+        rows[1][name] = float(np.nextafter(rows[1][name], np.inf))
     rows = rows[:-1] if change_of == "row" else rows[::-1] if change_of == "order" else rows
     change(folder, "UPDATE history SET evaluations = ? WHERE generation = 0", table_bytes(EVALUATION_COLUMNS, rows))
-    assert changed_names(before, digest_parts(folder)) == {"evaluations"}
+    assert changed_names(before, digest_parts(folder)) == ({"evaluations"} if change_of != "nothing" else set())
+
+
+def test_columns_that_do_not_count_leave_the_digest_of_a_run_without_them(folder, tmp_path):
+    with RunStore.create(tmp_path / "older", "", meta(evaluation_columns=EVALUATION_COLUMNS[:-1])) as store:
+        advance(store, GENERATIONS - 1)  # a newer version gives it the other column too
+    assert digest_parts(tmp_path / "older") == digest_parts(folder)
+
+
+def test_evaluated_centres_that_cannot_be_taken_apart_are_an_error(folder):
+    payload = table_bytes(EVALUATION_COLUMNS, evaluated(0))
+    change(folder, "UPDATE history SET evaluations = ? WHERE generation = 0", payload[:-1])
+    with pytest.raises(StoreError, match="the evaluated centres are unreadable from byte"):
+        digest_parts(folder)
 
 
 def test_no_value_is_not_zero(folder):

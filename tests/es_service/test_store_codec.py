@@ -2,15 +2,18 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
+from es_service.loop.history import Column
 from es_service.store.codec import (
     changed_sum,
     decode_part,
     encode_part,
+    leading_values,
     part_sha256,
     row_bytes,
     row_values,
     state_sha256,
     state_sum,
+    table_bytes,
 )
 from tests.es_service.store_examples import COLUMNS, assert_same_state, history_row
 
@@ -88,6 +91,25 @@ def test_history_rows_that_do_not_fit_are_refused_by_name():
         row_values(COLUMNS, 3, {**row, "env_steps": 1.5})
     with pytest.raises(StoreError, match="does not fit into 64 bits"):
         row_values(COLUMNS, 3, {**row, "env_steps": 2**63})
+
+
+def test_the_leading_values_of_rows_are_those_of_the_rows_without_the_rest():
+    """Also where bytes of numbers look like the marks of values, or like the ends of lines."""
+    columns = [
+        Column(name, kind, True, "") for name, kind in zip("abcde", ["INTEGER", "REAL"] * 2 + ["REAL"], strict=True)
+    ]
+    marks = int.from_bytes(b"NIR\nNIR\n", "little")
+    values = [None, 0, -1, marks, 2**62]
+    random = np.random.default_rng(0)
+    rows = [
+        {column.name: values[index] for column, index in zip(columns, random.integers(5, size=5), strict=True)}
+        for _ in range(300)
+    ]
+    payload = table_bytes(columns, rows)
+    for count in range(1, 5):
+        assert leading_values(payload, count, 5) == table_bytes(columns[:count], rows)
+    with pytest.raises(ValueError, match="unreadable from byte"):
+        leading_values(payload + b"N", 2, 5)
 
 
 def test_row_bytes_tell_types_and_positions_apart():

@@ -112,3 +112,26 @@ def test_what_cannot_be_evaluated_is_an_error_with_a_sentence(asks, sentence):
     with pytest.raises(EvaluationError, match=f"generation 1: .*{sentence}") as error:
         run_in_memory(config, algorithm=algorithm)
     assert error.value.field == "search.algorithm"
+
+
+WEIGHTS = np.linspace(-0.5, 0.5, 16, dtype=np.float32)
+
+
+@pytest.mark.parametrize(
+    ("weights", "sentence"),
+    [
+        (WEIGHTS[:-1], r"are float32 \(15,\); must be a float32 array of shape \(16,\)"),
+        (WEIGHTS[:, None], r"are float32 \(16, 1\); must be a float32 array of shape \(16,\)"),
+        (WEIGHTS.astype(float), r"are float64 \(16,\); must be a float32 array"),
+        (WEIGHTS.tolist(), "are list; must be a float32 array"),
+        (None, "are NoneType; must be a float32 array"),
+        (np.where(np.arange(16) < 3, np.float32(np.nan), WEIGHTS), "are not finite for 3 of 16 pairs"),
+        (np.where(np.arange(16) < 1, np.float32(np.inf), WEIGHTS), "are not finite for 1 of 16 pairs"),
+    ],
+)
+def test_weights_that_make_no_gradient_are_an_error_with_a_sentence(weights, sentence):
+    config = config_of(generations=1, algorithm="nsr_es", centres=2, pairs=16)
+    algorithm = replace(ALGORITHMS["nsr_es"](config), weights=lambda state, asked, population: weights)
+    with pytest.raises(EvaluationError, match=f"generation 1: the `weights` of centre [01] {sentence}") as error:
+        run_in_memory(config, algorithm=algorithm)
+    assert error.value.field == "search.algorithm"
