@@ -256,37 +256,32 @@ def test_a_job_is_submitted_followed_stopped_and_goes_on_in_another_cluster(tmp_
 
 def test_a_job_takes_the_user_s_modules_to_every_node_and_may_be_a_sweep(tmp_path, monkeypatch):
     """The driver is on the head and the worker on another node; neither runs in the folder that has the modules."""
-    here, out = tmp_path / "here", tmp_path / "runs"
+    here, out, url = tmp_path / "here", tmp_path / "sweep", "http://127.0.0.1:8265"
     here.mkdir()
     for name, text in {"my_task.py": TASK, "my_reward.py": REWARD, "my_search.py": SEARCH}.items():
         (here / name).write_text(text)
-    task = {"environment": "my_task:Point"}
-    search = {"algorithm": "my_search:search", "pairs": 16, "evaluation_episodes": 4}
+    task, search = {"environment": "my_task:Point"}, {"algorithm": "my_search:search", "pairs": 16}
     config = SMALL | {"task": task, "search": search, "budget": {"generations": 2}}
     (here / "config.yaml").write_text(yaml.safe_dump(config))
-    url = "http://127.0.0.1:8265"
 
     def es(*arguments):
         words = map(str, ("es-service", *arguments, "--address", url))
-        return hosts.run("head", "sh", "-c", f"cd {here} && {shlex.join(words)}")
-
-    def succeeds(*arguments):
-        code, printed = es("submit", "config.yaml", *arguments)
-        assert code == 0, printed
-        assert "sent with it: my_reward.py, my_search.py, my_task.py\n" in printed
-        code, log = es("logs", printed.split()[0], "--follow")
-        assert code == 0, log
+        return hosts.run("head", "sh", "-c", f"cd {here} && {shlex.join(words)}", timeout=120.0)
 
     with Cluster(tmp_path) as hosts:
         hosts.start("one", 1)
         wait_for(lambda: es("jobs")[0] == 0)
-        succeeds("--out", out / "run")
-        succeeds("--out", out / "sweep", "--seeds", "0:1")
-    assert (out / "sweep" / "report.html").exists()
-    assert digest_parts(out / "sweep" / "seed=0") == digest_parts(out / "run")
+        code, printed = es("submit", "config.yaml", "--grid", "search.sigma=0.1", "--seeds", "0:1", "--out", out)
+        assert code == 0, printed
+        assert "sent with it: my_reward.py, my_search.py, my_task.py\n" in printed
+        code, log = es("logs", printed.split()[0], "--follow")
+        assert code == 0, log
+    run = out / "sigma=0.1_seed=0"
+    assert read_generation(run) == 2
+    assert (out / "report.html").exists()
     monkeypatch.chdir(here)
     sources._imported_sources.cache_clear()  # other tests have other modules of these names
-    [(_, platform)] = read_platforms(out / "run")
+    [(_, platform)] = read_platforms(run)
     assert platform[CODE] == sources.worker_sources("my_task:Point") | sources.driver_sources("my_search:search")
     assert {"my_reward.py", "my_search.py", "my_task.py"} <= platform[CODE].keys()
 
