@@ -72,7 +72,7 @@ SEARCH = """
 import sortedcontainers
 from es_service.search.algorithms.es import es
 from . import steps
-import my_numbers
+import sent_numbers
 
 def search(config):
     return es(config)
@@ -83,13 +83,13 @@ def search(config):
 def own(tmp_path, monkeypatch):
     """The working folder of a user with a search in a package, a module that it imports, and other files."""
     here = tmp_path / "here"
-    (here / "my_searches").mkdir(parents=True)
+    (here / "sent_searches").mkdir(parents=True)
     for name, text in {
-        "my_searches/__init__.py": "",
-        "my_searches/first.py": SEARCH,
-        "my_searches/steps.py": "import json\n",
-        "my_searches/data.npz": "data",
-        "my_numbers.py": "import numpy\n",
+        "sent_searches/__init__.py": "",
+        "sent_searches/first.py": SEARCH,
+        "sent_searches/steps.py": "import json\n",
+        "sent_searches/data.npz": "data",
+        "sent_numbers.py": "import numpy\n",
         "my_notes.py": "",
         "config.yaml": dump_yaml(
             {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
@@ -99,7 +99,7 @@ def own(tmp_path, monkeypatch):
     monkeypatch.chdir(here)
     monkeypatch.setattr(sys, "path", [*sys.path])
     yield here
-    for name in [name for name in sys.modules if name.partition(".")[0] in ("my_searches", "my_numbers")]:
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("sent_searches", "sent_numbers")]:
         del sys.modules[name]
 
 
@@ -119,13 +119,13 @@ def submitted(monkeypatch):
     return submit
 
 
-OWN = "search.algorithm=my_searches.first:search"
+OWN = "search.algorithm=sent_searches.first:search"
 
 
 def test_the_files_that_count_as_code_are_sent_and_have_the_same_hashes_there(own, submitted, tmp_path, monkeypatch):
     """So a worker there is not refused, and the run records the code that was sent."""
     package, printed = submitted("--set", OWN)
-    files = ["my_numbers.py", "my_searches/__init__.py", "my_searches/first.py", "my_searches/steps.py"]
+    files = ["sent_numbers.py", "sent_searches/__init__.py", "sent_searches/first.py", "sent_searches/steps.py"]
     assert list(package.files) == files
     assert f"sent with it: {', '.join(files)}\n" in printed
     assert "so the cluster must have: sortedcontainers\n" in printed, "not numpy, which es-service itself needs"
@@ -135,7 +135,7 @@ def test_the_files_that_count_as_code_are_sent_and_have_the_same_hashes_there(ow
     write_package(package, there)
     assert sorted(str(file.relative_to(there)) for file in there.rglob("*.*")) == [SENT_CONFIG, *files]
     config = load_config(there / SENT_CONFIG)
-    assert (config.search.algorithm, config.compute.address) == ("my_searches.first:search", "auto")
+    assert (config.search.algorithm, config.compute.address) == ("sent_searches.first:search", "auto")
     here = driver_sources(config.search.algorithm)
     monkeypatch.chdir(there)
     print_code = "import json\nfrom es_service.protocol.sources import *\n"
@@ -147,14 +147,14 @@ def test_the_files_that_count_as_code_are_sent_and_have_the_same_hashes_there(ow
 
 def test_an_installed_package_is_not_sent_but_named(own, submitted, monkeypatch):
     place = own / "site-packages"
-    (own / "my_searches").rename(place.with_name("moved"))
+    (own / "sent_searches").rename(place.with_name("moved"))
     place.mkdir()
-    (own / "moved").rename(place / "my_searches")
+    (own / "moved").rename(place / "sent_searches")
     monkeypatch.syspath_prepend(place)
     package, printed = submitted("--set", OWN)
     assert package.files == {}
     assert "sent with it" not in printed
-    assert "not sent, so the cluster must have: my_searches\n" in printed
+    assert "not sent, so the cluster must have: sent_searches\n" in printed
 
 
 def test_a_module_that_is_not_found_here_is_refused_before_anything_is_sent(own, submitted):
@@ -176,7 +176,7 @@ def test_a_sweep_is_sent_with_its_options_and_the_modules_of_all_its_runs(own, s
     (tmp_path / "runs").mkdir()
     package, _ = submitted(*grid, "--seeds", "0:2", "--parallel", "2", "--workers", "3", "--set", "search.pairs=32")
     assert package.config == (own / "config.yaml").read_text()
-    assert "my_searches/first.py" in package.files
+    assert "sent_searches/first.py" in package.files
     out: list[Any] = []
 
     def took(config, out_, wanted, values, seeds, parallel, options):
@@ -187,7 +187,7 @@ def test_a_sweep_is_sent_with_its_options_and_the_modules_of_all_its_runs(own, s
         assert CliRunner().invoke(app, list(package.command)).exit_code == 0
     [(config, folder, wanted, values, seeds, parallel)] = out
     assert (config, folder, seeds, parallel) == (SENT_CONFIG, "/runs/x", "0:2", 2)
-    assert values == {"search.algorithm": ["my_searches.first:search", "es"], "policy.hidden": [[8], [16, 16]]}
+    assert values == {"search.algorithm": ["sent_searches.first:search", "es"], "policy.hidden": [[8], [16, 16]]}
     settings = parse_overrides(wanted)[0]
     assert (settings["search.pairs"], settings["compute.workers"]) == (32, 3)
     assert (settings["compute.engine"], settings["compute.address"]) == ("ray", "auto")
