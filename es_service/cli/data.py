@@ -13,6 +13,7 @@ from es_service.config.shipped import shipped_configs
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.standing import Standing, state
 from es_service.search.algorithms import ALGORITHMS
+from es_service.store.digest import digest_of
 
 
 def print_json(value: object) -> None:
@@ -34,6 +35,11 @@ def standing_data(standing: Standing) -> dict[str, Any]:
         "limits": standing.limits,
         "newest": standing.row,
     }
+
+
+def digest_data(parts: Mapping[str, str], *, mixed: bool) -> dict[str, Any]:
+    """What `digest` shows of a run."""
+    return {"digest": digest_of(parts), "mixed": mixed, "parts": dict(parts)}
 
 
 def catalogue_data(tasks: Mapping[str, TaskSpec]) -> dict[str, Any]:

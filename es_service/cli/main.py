@@ -19,7 +19,7 @@ import typer
 from es_service import api
 from es_service.cli.bench import bench
 from es_service.cli.commands import command
-from es_service.cli.data import print_json
+from es_service.cli.evaluate import evaluate
 from es_service.cli.jobs import job_commands
 from es_service.cli.options import (
     AddressOption,
@@ -38,7 +38,6 @@ from es_service.cli.options import (
     console,
     errors,
     overrides,
-    place_of,
     print_config_notes,
     print_error,
     print_note,
@@ -151,48 +150,7 @@ app.command(name="config")(config_)
 app.command(name="list")(list_)
 
 
-@app.command()
-def evaluate(
-    folder: RunArgument,
-    best: Annotated[bool, typer.Option("--best", help="Evaluate the best centre (default).")] = False,
-    centre: Annotated[bool, typer.Option("--centre", help="Evaluate the newest centre.")] = False,
-    cell: Annotated[
-        list[str] | None, typer.Option("--cell", metavar="I,J", help="Evaluate a cell's elite; can be repeated.")
-    ] = None,
-    every: Annotated[bool, typer.Option("--all", help="Evaluate every elite of the map.")] = False,
-    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes per policy.")] = 100,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the episodes.")] = 0,
-    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Also write the rows to this CSV file.")] = None,
-    as_json: JsonOption = False,
-    log_level: LogLevelOption = None,
-) -> None:
-    """Evaluate policies of a run on fresh episodes, and print the results beside the stored values."""
-    from es_service.cli.tables.evaluations import csv_file, print_evaluations, row_of
-    from es_service.runs import evaluation
-
-    if every and cell:
-        raise ConfigError("--all and --cell cannot be combined: --all includes every cell; give one of them")
-    found = api.open_run(folder)
-    chosen = evaluation.candidates(
-        found,
-        best=best or not (centre or cell or every),
-        centre=centre,
-        cells=list(dict.fromkeys(place_of(text) for text in cell or ())),
-        every=every,
-    )
-    with csv_file(out, print_note) as write:
-        results = evaluation.evaluate(found, chosen, episodes, workers, seed)
-        if not as_json:
-            print_evaluations(console, found, results, write, every=every)
-            return
-        rows = []
-        for fresh in results:
-            rows.append(row_of(fresh, found.descriptor_names))
-            write(rows[-1])
-    print_json(rows)
-
-
+app.command()(evaluate)
 app.command()(sweep)
 app.command()(export)
 app.command()(report)

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from es_service import api
 from es_service.cli.commands import command
 from es_service.cli.options import RunArgument, place_of, print_note
+from es_service.cli.several import RunsArgument, is_single, read_each
 from es_service.errors import ConfigError
+
+if TYPE_CHECKING:  # importing it takes time that other commands need not spend
+    from es_service.report.data import RunData
 
 
 def report(
-    folders: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs.", show_default=False)],
+    folders: RunsArgument,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="File to write; default for one run: report.html in its folder."),
+        typer.Option("--out", help="File to write; default for one run or sweep: report.html in its folder."),
     ] = None,
     replay: Annotated[
         list[str] | None,
@@ -40,16 +45,15 @@ def report(
         Path | None, typer.Option("--figures", metavar="DIR", help="Also write each figure as SVG and PNG.")
     ] = None,
 ) -> None:
-    """Write a page about a run: its curves, its map, its policies; or a page that compares several runs."""
-    from es_service.report.write import write_comparison, write_report
+    """Write a page about a run: its curves, its map, its policies; or one that compares several runs, or a sweep."""
+    from es_service.report.write import REPORT, write_report
 
-    if len(folders) > 1:
+    if not is_single(folders):
         if replay:
             raise ConfigError("--replay: shows policies of one run; give one run, or leave it out")
-        if out is None:
+        if out is None and len(folders) > 1:
             raise ConfigError("a comparison of runs belongs to none of their folders; add --out FILE")
-        for file in write_comparison(folders, out, group_by or (), threshold, figures):
-            print(file)
+        _compare(folders, out or folders[0] / REPORT, group_by or (), threshold, figures)
         return
     if group_by or threshold is not None:
         print_note("note: --group-by and --threshold have no effect with one run")
@@ -72,6 +76,27 @@ def report(
         figures=figures,
     ):
         print(file)
+
+
+def _compare(
+    folders: Sequence[Path], out: Path, group_by: Sequence[str], threshold: float | None, figures: Path | None
+) -> None:
+    """Write the comparison of all runs with a finished generation; exit with code 1 if a run cannot be read."""
+    from es_service.report.write import read_compared, write_compared
+
+    problems: list[dict[str, str]] = []
+
+    def comparable() -> Iterator[RunData]:
+        for folder, data in read_each(folders, read_compared, problems):
+            if data.history["generation"].size:
+                yield data
+            else:
+                print_note(f"note: {folder} is left out, since it has no finished generation yet")
+
+    for file in write_compared(comparable(), out, group_by, threshold, figures):
+        print(file)
+    if problems:
+        raise typer.Exit(1)
 
 
 def export(

@@ -2,80 +2,105 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from es_service import api
-from es_service.cli.data import catalogue_data, print_json, standing_data
-from es_service.cli.options import JsonOption, RunArgument, console, print_note
+from es_service.cli.data import catalogue_data, digest_data, print_json, standing_data
+from es_service.cli.options import JsonOption, console, print_note
+from es_service.cli.several import RunsArgument, is_single, of_each, problem_data, read_each
 from es_service.cli.tables.catalogue import print_catalogue
-from es_service.cli.tables.overview import print_overview
+from es_service.cli.tables.overview import NOT_STARTED, print_overview
 from es_service.cli.tables.status import follow_status, print_status
 from es_service.config.shipped import shipped_text
 from es_service.config.tasks import TASKS
 from es_service.errors import ConfigError, ServiceError
+from es_service.runs.folders import runs_of
 from es_service.runs.standing import look, newest_runs
 from es_service.store import digest
 
 
 def status(
     folders: Annotated[
-        list[Path] | None, typer.Argument(help="Folders of runs; default: the newest under runs/.", show_default=False)
+        list[Path] | None,
+        typer.Argument(
+            metavar="[RUN]...",
+            help="Folders of runs or of sweeps; default: the newest runs under runs/.",
+            show_default=False,
+        ),
     ] = None,
     follow: Annotated[bool, typer.Option("--follow", help="Watch one run until its driver ends.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the state of a run, also while it is running; for several runs, print one line each."""
+    """Show the state of a run, also while it is running; for a sweep or several runs, print one line each."""
     if follow and len(folders or ()) != 1:
         raise ConfigError(f"--follow: needs exactly one folder, got {len(folders or ())}; give one, or omit --follow")
     if follow and as_json:
         raise ConfigError("--follow and --json cannot be combined; omit one of them")
-    if as_json:
-        raise typer.Exit(0 if _print_standings(folders or newest_runs(api.RUNS_FOLDER)) else 1)
     if not folders:
         folders = newest_runs(api.RUNS_FOLDER)
-        if not folders:
+        if not folders and not as_json:
             print_note(f"there is no run under {api.RUNS_FOLDER}/ in this folder; give the folder of a run")
             return
-        print_overview(console, folders)
+    elif is_single(folders) and not as_json:
+        run = api.open_run(folders[0])
+        (follow_status if follow else print_status)(console, run)
         return
-    if len(folders) > 1:
-        raise typer.Exit(0 if print_overview(console, folders) else 1)
-    run = api.open_run(folders[0])
     if follow:
-        follow_status(console, run)
-    else:
-        print_status(console, run)
+        names = ", ".join(run.name for run in runs_of(folders[0]))
+        raise ConfigError(f"--follow: needs one run; {folders[0]} has several: {names}")
+    shown = _print_standings(folders) if as_json else print_overview(console, folders)
+    raise typer.Exit(0 if shown else 1)
 
 
 def _print_standings(folders: list[Path]) -> bool:
-    """Print a list with an object for each run; returns whether all runs could be read."""
+    """Print a list with an object for each run; return whether all runs could be read."""
     found: list[dict[str, Any]] = []
-    for folder in folders:
-        try:
-            found.append(standing_data(look(api.open_run(folder))))
-        except ServiceError as error:
-            found.append({"run": str(folder), "error": error.sentence})
+    for folder, data in of_each(folders, lambda run: standing_data(look(api.open_run(run)))):
+        if isinstance(data, ServiceError):
+            found.append(problem_data(folder, data))
+        else:
+            found.append(data or {"run": str(folder), "state": NOT_STARTED, "newest": None})
     print_json(found)
     return not any("error" in one for one in found)
 
 
 def digest_(
-    folder: RunArgument,
+    folders: RunsArgument,
     parts: Annotated[bool, typer.Option("--parts", help="Also print a line for each part of the run.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check all data of a run and print a SHA-256 of everything deterministic in it."""
-    found, mixed = digest.checked_parts(folder)
-    if as_json:
-        print_json({"digest": digest.digest_of(found), "mixed": mixed, "parts": found})
+    """Check all data of a run and print a SHA-256 of everything deterministic in it; of several runs, a line each."""
+    if is_single(folders):
+        found, mixed = digest.checked_parts(folders[0])
+        if as_json:
+            print_json(digest_data(found, mixed=mixed))
+        else:
+            _print_digest(found, "  mixed" if mixed else "", parts=parts)
         return
+
+    def show(folder: Path) -> dict[str, Any]:
+        found, mixed = digest.checked_parts(folder)
+        if not as_json:
+            _print_digest(found, f"  {folder}{'  mixed' if mixed else ''}", parts=parts)
+        return {"run": str(folder), **digest_data(found, mixed=mixed)}
+
+    problems: list[dict[str, str]] = []
+    results = [data for _, data in read_each(folders, show, problems)]
+    if as_json:
+        print_json([*results, *problems])
+    if problems:
+        raise typer.Exit(1)
+
+
+def _print_digest(found: Mapping[str, str], ending: str, *, parts: bool) -> None:
     if parts:
         for name, value in found.items():
             print(f"{value}  {name}")
-    print(f"{digest.digest_of(found)}{'  mixed' if mixed else ''}")
+    print(f"{digest.digest_of(found)}{ending}", flush=True)
 
 
 def config_(

@@ -36,21 +36,23 @@ SeedsOption = Annotated[
     str | None,
     typer.Option("--seeds", metavar="A:B", help="A run for each seed from A to B-1, or of a list such as 0,7."),
 ]
+GridOption = Annotated[
+    list[str] | None,
+    typer.Option("--grid", metavar="KEY=A,B", help="Run with each value of a key; several keys are combined."),
+]
+ParallelOption = Annotated[
+    int | None,
+    typer.Option("--parallel", min=1, help="Runs at a time, which share the cores; default: one per core."),
+]
 
 
 def sweep(
     config: ConfigArgument,
     out: Annotated[Path, typer.Option("--out", help="Folder, in which each run gets a folder.", show_default=False)],
-    grid: Annotated[
-        list[str] | None,
-        typer.Option("--grid", metavar="KEY=A,B", help="Run with each value of a key; several keys are combined."),
-    ] = None,
+    grid: GridOption = None,
     seeds: SeedsOption = None,
     set_: SetOption = None,
-    parallel: Annotated[
-        int | None,
-        typer.Option("--parallel", min=1, help="Runs at a time, which share the cores; default: one per core."),
-    ] = None,
+    parallel: ParallelOption = None,
     workers: Annotated[
         int | None, typer.Option("--workers", help="Workers of each run; default: an equal share of the cores.")
     ] = None,

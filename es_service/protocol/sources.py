@@ -18,6 +18,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 Sources = Mapping[str, str]
 """Name of a source file, such as `workers/episode.py` -> the first half of its SHA-256, in hexadecimal digits."""
@@ -49,6 +50,17 @@ def driver_sources(algorithm: str) -> dict[str, str]:
         algorithm: the value of `search.algorithm`.
     """
     return _package_sources(*DRIVER) | (_imported_sources(algorithm) if is_own(algorithm) else {})
+
+
+class Modules(NamedTuple):
+    """The modules of a user's task or search."""
+
+    files: Mapping[str, Path]
+    """Name of a source file that counts as code, such as `my_tasks/maze.py` -> the file."""
+    others: frozenset[str]
+    """Top packages outside the standard library that these files import from other places."""
+    is_installed: bool
+    """Whether they are a package that is installed beside those of other projects."""
 
 
 def other_files(ours: Sources, theirs: Sources) -> list[str]:
@@ -104,6 +116,10 @@ def _imported_sources(path: str) -> dict[str, str]:
 
 
 def _module_sources(path: str) -> dict[str, str]:
+    return {name: _sha256(file) for name, file in modules_of(path).files.items()}
+
+
+def modules_of(path: str) -> Modules:
     """The module of `package.module:name`, its packages, and what they import from the same place, directly or not.
 
     Nothing is imported, so that the driver need not load what only the workers use: the modules are found by the import
@@ -113,24 +129,28 @@ def _module_sources(path: str) -> dict[str, str]:
     name = path.partition(":")[0]
     top = _find(name.partition(".")[0], None)
     if top is None or top.name in sys.stdlib_module_names or not (place := _place(top)):
-        return {}
+        return Modules({}, frozenset(), is_installed=False)
     is_shared = os.path.basename(place) in _SHARED_FOLDERS
-    found: dict[str, str] = {}
+    files: dict[str, Path] = {}
+    others: set[str] = set()
     seen: set[str] = set()
     wanted = [name]
     while wanted:
         for spec in _chain(wanted.pop()):
             top_name = spec.name.partition(".")[0]
-            if spec.name in seen or top_name in OURS or (is_shared and top_name != top.name) or _place(spec) != place:
+            if spec.name in seen or top_name in OURS:
+                continue
+            if (is_shared and top_name != top.name) or _place(spec) != place:
+                others.add(top_name)
                 continue
             seen.add(spec.name)
             if spec.origin is None:
                 continue  # a package without a file of its own
             file, is_package = Path(spec.origin), spec.submodule_search_locations is not None
-            found["/".join(file.parts[-1 - spec.name.count(".") - is_package :])] = _sha256(file)
+            files["/".join(file.parts[-1 - spec.name.count(".") - is_package :])] = file
             if file.suffix == ".py":
                 wanted += _imports(file, spec.name if is_package else spec.name.rpartition(".")[0])
-    return found
+    return Modules(files, frozenset(others - sys.stdlib_module_names), is_shared)
 
 
 def _chain(name: str) -> Iterator[importlib.machinery.ModuleSpec]:

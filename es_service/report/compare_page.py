@@ -31,8 +31,11 @@ def comparison_page(runs: Sequence[RunData], keys: Sequence[str] = (), threshold
         threshold: fitness from which a run counts as solved; None: the target fitness of all runs, if there is one.
 
     Raises:
-        ConfigError: the runs cannot be compared. NotInRunError: a run has no finished generation.
+        ConfigError: the runs cannot be compared. NotInRunError: a run has no finished generation, or there is no
+            run.
     """
+    if not runs:
+        raise NotInRunError("there is no run with a finished generation to compare")
     for run in runs:
         if not run.history["generation"].size:
             raise NotInRunError(f"{run.folder} has no finished generation yet; leave it out", run=run.folder)

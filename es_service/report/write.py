@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from es_service.errors import ConfigError, StoreError
 from es_service.report.compare_page import comparison_page
-from es_service.report.data import read_run
+from es_service.report.data import RunData, read_run
 from es_service.report.figures import empty_figure, write_figures
 from es_service.report.page import Evaluate, run_page
 from es_service.report.replays import MOST_CELLS, replay_section
@@ -87,12 +87,27 @@ def write_comparison(
         ConfigError: the runs cannot be compared or grouped, or figures without matplotlib. NotInRunError: a run has no
             finished generation. StoreError: a run cannot be read, or a file cannot be written.
     """
+    return write_compared(map(read_compared, map(Path, folders)), out, group_by, threshold, figures)
+
+
+def read_compared(folder: Path) -> RunData:
+    """What a comparison needs of a run. Raises StoreError if the run cannot be read."""
+    return read_run(folder, paths=False, digest=False)
+
+
+def write_compared(
+    runs: Iterable[RunData],
+    out: AnyPath,
+    group_by: Sequence[str] = (),
+    threshold: float | None = None,
+    figures: AnyPath | None = None,
+) -> list[Path]:
+    """The same for runs that are read already, or while this function iterates over them."""
     if figures is not None:
-        empty_figure()
-    different = {Path(folder).resolve(): Path(folder) for folder in folders}  # a run that is given twice counts once
-    runs = [read_run(folder, paths=False, digest=False) for folder in different.values()]
-    page = write_page(comparison_page(runs, group_by, threshold), Path(out))
-    return [page, *(write_figures(runs, Path(figures), group_by, threshold) if figures is not None else [])]
+        empty_figure()  # a missing matplotlib is reported before anything is read
+    different = list({run.folder.resolve(): run for run in runs}.values())  # a run that is given twice counts once
+    page = write_page(comparison_page(different, group_by, threshold), Path(out))
+    return [page, *(write_figures(different, Path(figures), group_by, threshold) if figures is not None else [])]
 
 
 def write_page(page: str, file: Path) -> Path:

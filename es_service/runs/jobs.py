@@ -1,8 +1,9 @@
-"""Runs as jobs of a Ray cluster: submit, list and stop them, and read their output.
+"""Runs and sweeps as jobs of a Ray cluster: submit, list and stop them, and read their output.
 
-A job is `es-service run ... --or-resume` on the cluster's head, in a working directory that holds just the resolved
-config; es-service itself is installed there. The run's folder is a path on the head or on a disk that it shares. Ray's
-list of jobs ends with the cluster, but the run does not: the same submission to another cluster resumes it.
+A job is `es-service run ... --or-resume` or `es-service sweep ...` on the cluster's head, in a working directory that
+holds just the config and the user's modules that it names; es-service itself is installed there. The run's folder is a
+path on the head or on a disk that it shares. Ray's list of jobs ends with the cluster, but the run does not: the same
+submission to another cluster resumes it.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from typing import Any
 from urllib.parse import urlsplit
 from uuid import uuid4
 
-from es_service.config.model import RunConfig
 from es_service.errors import ConfigError, EvaluationError, ServiceError, WayOut
+from es_service.runs.job_package import JobPackage, write_package
 
 FOLDER = "es_service_run"
-"""Key of a job's metadata: the run folder."""
+"""Key of a job's metadata: the folder of the run or of the sweep."""
 ENDED = ("SUCCEEDED", "FAILED", "STOPPED")
 STOP_S = 15.0
 """Longest wait for a stopped job to end; Ray kills it after three seconds."""
@@ -41,36 +42,21 @@ class Job:
     started_ms: int
 
 
-def submit(config: RunConfig, address: str, out: str) -> str:
-    """Submit a run to the cluster whose dashboard is at `address`, and return the id of its job.
-
-    Args:
-        config: must have engine ray and the address "auto", the cluster in which the job runs.
-        out: absolute path of the run folder, as the cluster's head sees it. If it holds the run, the job continues
-            it; if it holds another run, the job fails and says what differs.
+def submit(package: JobPackage, address: str) -> str:
+    """Submit a job to the cluster whose dashboard is at `address`, and return its id.
 
     Raises:
-        ConfigError: `out` is relative. EvaluationError: the cluster does not answer, or refuses the job.
+        EvaluationError: the cluster does not answer, or refuses the job.
     """
-    if not out.startswith("/"):
-        raise ConfigError(
-            f"the run folder {out} must be an absolute path, such as /runs/{out}: Ray deletes a job's own directory",
-            field="out",
-            value=out,
-            allowed="an absolute path",
-            suggestion=f"/runs/{out}",
-        )
     client = _client(address)
-    name = f"es-{uuid4().hex[:8]}"
-    command = ["es-service", "run", "config.yaml", "--or-resume", "--out", out]
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "config.yaml").write_text(config.resolved_yaml())
+        write_package(package, Path(folder))
         with _explained(address):
             return client.submit_job(
-                entrypoint=shlex.join(command),
-                submission_id=name,
+                entrypoint=shlex.join(["es-service", *package.command]),
+                submission_id=f"es-{uuid4().hex[:8]}",
                 runtime_env={"working_dir": folder},
-                metadata={FOLDER: out},
+                metadata={FOLDER: package.out},
             )
 
 

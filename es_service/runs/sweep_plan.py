@@ -45,6 +45,8 @@ def plan(
     grid: Grid = MappingProxyType({}),
     seeds: Iterable[int] | None = None,
     overrides: Overrides = (),
+    *,
+    here: bool = True,
 ) -> list[PlannedRun]:
     """The runs of a sweep, the seed changing fastest, then the last key of the grid.
 
@@ -54,12 +56,13 @@ def plan(
         out: folder in which each run has a folder.
         seeds: None: the seed of the config.
         overrides: settings of all runs.
+        here: whether `out` is a folder on this machine; if not, nothing is looked for there.
 
     Raises:
         ConfigError: a config, the grid or the seeds are wrong (all problems are listed), or the folder of a run holds
             a run with other settings, or `out` is a run itself.
     """
-    if holds_run(out):
+    if here and holds_run(out):
         raise ConfigError(f"{out} is the folder of a run; choose another folder for the sweep", field="out", run=out)
     common, problems = parse_overrides(overrides)
     by_seed = {} if seeds is None else {SEED: list(seeds)}
@@ -77,13 +80,14 @@ def plan(
     for name, settings in named.items():
         wanted, folder = {**common, **settings}, out / name
         try:
-            found.append(PlannedRun(name, folder, wanted, load_config(source, wanted, new=not holds_run(folder))))
+            new = here and not holds_run(folder)
+            found.append(PlannedRun(name, folder, wanted, load_config(source, wanted, new=new)))
         except ConfigError as error:
             whole = Problem(error.sentence, error.field, error.value, error.allowed, error.suggestion)
             wrong |= {problem.sentence: problem for problem in error.problems or (whole,)}
     if wrong:
         raise _refused(source, list(wrong.values()))
-    for run in found:
+    for run in found if here else ():
         _require_same_constants(run)
     return found
 

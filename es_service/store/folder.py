@@ -125,8 +125,8 @@ def require_run_folder(folder: Path) -> None:
             )
             raise StoreError(f"{folder} is not a run folder, but contains {runs}", run=folder)
         raise StoreError(
-            f"{folder} is not a run folder: it contains no {DATABASE}. If the creation of a run was interrupted here, "
-            f"nothing was lost; start the run again.",
+            f"{folder} is not a run folder: it contains no {DATABASE}, and no run folders, as a sweep does. If the "
+            "creation of a run was interrupted here, nothing was lost; start the run again.",
             run=folder,
         )
 

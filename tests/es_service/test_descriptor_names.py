@@ -1,12 +1,9 @@
 """Names of a descriptor become columns of a run's tables: none may be taken for another one."""
 
-import io
-
 import pytest
-from rich.console import Console
 
 from es_service import api
-from es_service.cli.tables.evaluations import print_evaluations
+from es_service.cli.tables.evaluations import row_of
 from es_service.runs.evaluation import candidates, evaluate
 from tests.examples.sorting import Sorting
 from workers.environments import TaskError, user_task
@@ -23,14 +20,13 @@ CONFIG = {
 
 def columns_of(run):
     """Of every table: as they are in a run."""
-    rows = []
     chosen = candidates(run, best=True, centre=False, cells=(), every=False)
-    print_evaluations(Console(file=io.StringIO()), run, evaluate(run, chosen, 2, 1), rows.append, every=False)
+    (fresh,) = evaluate(run, chosen, 2, 1)
     return {
         "the history": [column for column in run.history.reset_index().columns if column.startswith("centre_")],
         "the map": list(run.map.columns),
         "the novelty archive": list(run.novelty.columns),
-        "evaluate --out": list(rows[0]),
+        "evaluate --out": list(row_of(fresh, run.descriptor_names, run.folder)),
     }
 
 
@@ -53,6 +49,7 @@ def test_the_columns_that_names_are_held_against_are_those_of_a_run(tmp_path):
         (("x", "novelty"), "'novelty' would be the column centre_novelty of the history"),
         (("episodes", "y"), "'episodes' would be the column episodes of evaluate --out"),
         (("x", "X"), "'X' would be the column centre_X of the history"),
+        (("run", "y"), "'run' would be the column run of evaluate --out"),
         (("x_std", "x"), "'x' would be the column centre_x_std of the history"),
         (("x", "cell_x"), "'cell_x' would be the column cell_x of the map"),
     ],

@@ -1,23 +1,33 @@
-"""What is refused before a job is sent. Jobs need a cluster: `tests/system/test_cluster.py`."""
+"""What a job is sent, and what is refused before. Jobs need a cluster: `tests/system/test_cluster.py`."""
 
 from __future__ import annotations
 
+import json
 import re
+import subprocess
 import sys
 from collections.abc import AsyncIterator
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 from es_service.api import load_config
 from es_service.cli import jobs as cli_jobs
+from es_service.cli import sweep
 from es_service.cli.commands import error_message
 from es_service.cli.main import app
+from es_service.config.keys import parse_overrides
 from es_service.config.yaml_text import dump_yaml
 from es_service.errors import ConfigError, EvaluationError
+from es_service.protocol.sources import driver_sources, worker_sources
 from es_service.runs import jobs
+from es_service.runs.job_package import CONFIG as SENT_CONFIG
+from es_service.runs.job_package import JobPackage, run_package, write_package
 
+ROOT = Path(__file__).parents[2]
 CONFIG = load_config(
     {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
 )
@@ -26,7 +36,7 @@ CONFIG = load_config(
 def test_without_the_extra_the_error_names_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "aiohttp", None)
     with pytest.raises(EvaluationError, match="extra `cluster`") as error:
-        jobs.submit(CONFIG, "http://127.0.0.1:8265", "/runs/x")
+        jobs.submit(run_package(CONFIG, "/runs/x"), "http://127.0.0.1:8265")
     install, without = error.value.ways_out
     assert (install.action, install.extra, without.action) == ("install", "cluster", "run")
     assert re.search(r"in a clone .*pip install .*'\.\[cluster\]'", error_message(error.value))
@@ -55,7 +65,145 @@ def test_the_address_is_that_of_the_dashboard(address, host):
 
 def test_a_relative_folder_is_refused():
     with pytest.raises(ConfigError, match=r"the run folder runs/x must be an absolute path"):
-        jobs.submit(CONFIG, "http://127.0.0.1:8265", "runs/x")
+        run_package(CONFIG, "runs/x")
+
+
+SEARCH = """
+import sortedcontainers
+from es_service.search.algorithms.es import es
+from . import steps
+import sent_numbers
+
+def search(config):
+    return es(config)
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """The working folder of a user with a search in a package, a module that it imports, and other files."""
+    here = tmp_path / "here"
+    (here / "sent_searches").mkdir(parents=True)
+    for name, text in {
+        "sent_searches/__init__.py": "",
+        "sent_searches/first.py": SEARCH,
+        "sent_searches/steps.py": "import json\n",
+        "sent_searches/data.npz": "data",
+        "sent_numbers.py": "import numpy\n",
+        "my_notes.py": "",
+        "config.yaml": dump_yaml(
+            {"task": {"environment": "point_maze"}, "search": {"algorithm": "es"}, "budget": {"generations": 1}}
+        ),
+    }.items():
+        (here / name).write_text(text)
+    monkeypatch.chdir(here)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    yield here
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("sent_searches", "sent_numbers")]:
+        del sys.modules[name]
+
+
+@pytest.fixture
+def submitted(monkeypatch):
+    """A function that submits with the command line, and returns (package, printed text), and sends nothing."""
+    sent: list[JobPackage] = []
+    monkeypatch.setattr(jobs, "submit", lambda package, address: sent.append(package) or "es-1")
+
+    def submit(*words):
+        command = ["submit", "config.yaml", "--address", "http://h:8265", "--out", "/runs/x", *words]
+        result = CliRunner().invoke(app, command)
+        if result.exception is not None:
+            raise result.exception
+        return sent.pop(), result.output
+
+    return submit
+
+
+OWN = "search.algorithm=sent_searches.first:search"
+
+
+def test_the_files_that_count_as_code_are_sent_and_have_the_same_hashes_there(own, submitted, tmp_path, monkeypatch):
+    """So a worker there is not refused, and the run records the code that was sent."""
+    package, printed = submitted("--set", OWN)
+    files = ["sent_numbers.py", "sent_searches/__init__.py", "sent_searches/first.py", "sent_searches/steps.py"]
+    assert list(package.files) == files
+    assert f"sent with it: {', '.join(files)}\n" in printed
+    assert "so the cluster must have: sortedcontainers\n" in printed, "not numpy, which es-service itself needs"
+    assert printed.startswith("es-1\n")
+    there = tmp_path / "there"
+    there.mkdir()
+    write_package(package, there)
+    assert sorted(str(file.relative_to(there)) for file in there.rglob("*.*")) == [SENT_CONFIG, *files]
+    config = load_config(there / SENT_CONFIG)
+    assert (config.search.algorithm, config.compute.address) == ("sent_searches.first:search", "auto")
+    here = driver_sources(config.search.algorithm)
+    monkeypatch.chdir(there)
+    print_code = "import json\nfrom es_service.protocol.sources import *\n"
+    print_code += f"print(json.dumps([driver_sources({config.search.algorithm!r}), worker_sources('point_maze')]))"
+    environment = {"PYTHONPATH": f"{there}:{ROOT}"}
+    process = subprocess.run([sys.executable, "-c", print_code], env=environment, capture_output=True, check=True)
+    assert json.loads(process.stdout) == [here, worker_sources("point_maze")]
+
+
+def test_an_installed_package_is_not_sent_but_named(own, submitted, monkeypatch):
+    place = own / "site-packages"
+    (own / "sent_searches").rename(place.with_name("moved"))
+    place.mkdir()
+    (own / "moved").rename(place / "sent_searches")
+    monkeypatch.syspath_prepend(place)
+    package, printed = submitted("--set", OWN)
+    assert package.files == {}
+    assert "sent with it" not in printed
+    assert "not sent, so the cluster must have: sent_searches\n" in printed
+
+
+def test_a_module_that_is_not_found_here_is_refused_before_anything_is_sent(own, submitted):
+    for key, module in (("search.algorithm", "my_serches"), ("task.environment", "my_taks")):
+        with pytest.raises(ConfigError, match=rf"{key}: .*cannot import {module} .*; start in the folder that"):
+            submitted("--set", f"{key}={module}:Name")
+
+
+def test_shipped_tasks_and_searches_send_nothing(own, submitted):
+    package, printed = submitted()
+    assert (package.files, package.expected) == ({}, ())
+    assert package.command == ("run", SENT_CONFIG, "--or-resume", "--out", "/runs/x")
+    assert "sent" not in printed.replace("submitted", "")
+
+
+def test_a_sweep_is_sent_with_its_options_and_the_modules_of_all_its_runs(own, submitted, tmp_path):
+    """The config is sent as it is, since presets and derived values depend on the settings of each run."""
+    grid = ("--grid", f"{OWN},es", "--grid", "policy.hidden=[8],[16, 16]")
+    (tmp_path / "runs").mkdir()
+    package, _ = submitted(*grid, "--seeds", "0:2", "--parallel", "2", "--workers", "3", "--set", "search.pairs=32")
+    assert package.config == (own / "config.yaml").read_text()
+    assert "sent_searches/first.py" in package.files
+    out: list[Any] = []
+
+    def took(config, out_, wanted, values, seeds, parallel, options):
+        out.append((str(config), str(out_), wanted, values, seeds, parallel))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep, "run_sweep", took)
+        assert CliRunner().invoke(app, list(package.command)).exit_code == 0
+    [(config, folder, wanted, values, seeds, parallel)] = out
+    assert (config, folder, seeds, parallel) == (SENT_CONFIG, "/runs/x", "0:2", 2)
+    assert values == {"search.algorithm": ["sent_searches.first:search", "es"], "policy.hidden": [[8], [16, 16]]}
+    settings = parse_overrides(wanted)[0]
+    assert (settings["search.pairs"], settings["compute.workers"]) == (32, 3)
+    assert (settings["compute.engine"], settings["compute.address"]) == ("ray", "auto")
+
+
+def test_what_a_sweep_refuses_is_refused_before_it_is_sent(own, submitted):
+    for words, message in (
+        (("--grid", "search.sigma=0.1,big"), "search.sigma: big is not allowed"),
+        (("--grid", "search.init_from=/runs/a,runs/b"), "search.init_from: runs/b must be an absolute path"),
+        (("--grid", "search.sigma=0.1", "--seeds", "x"), "--seeds x: x is no seed"),
+        (("--seeds", "0:2", "--seed", "1"), "seed: it has values in the sweep, and 1 for all runs"),
+        (("--parallel", "2"), "--parallel is for a sweep"),
+    ):
+        with pytest.raises(ConfigError) as error:
+            submitted(*words)
+        assert message in str(error.value)
 
 
 def test_where_nothing_answers_the_error_says_what_to_check():

@@ -8,6 +8,7 @@ import json
 import mmap
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -20,13 +21,16 @@ import yaml
 
 from es_service import api
 from es_service.dispatch.dispatch_log import FILE
+from es_service.protocol import sources
+from es_service.protocol.machine import CODE
 from es_service.store.digest import digest_parts
-from es_service.store.reader import read_generation
+from es_service.store.reader import read_generation, read_platforms
 from tests.dispatch_checker import check_dispatch, read_dispatch_log
 from tests.system import cluster
 from tests.system.cluster import ROOT, Cluster
 from tests.system.processes import committed, wait_for
 from tests.system.session import SMALL
+from tests.system.test_code_identity import REWARD, SEARCH, TASK
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
 
@@ -248,6 +252,38 @@ def test_a_job_is_submitted_followed_stopped_and_goes_on_in_another_cluster(tmp_
         assert printed.endswith(f"{job} succeeded\n")
         print(f"head lost: {time.time() - lost_at:.1f} s to the end of the run in a new cluster")
     assert digest_parts(run) == inline_digest(tmp_path / "inline", CONFIG, reached + 20)
+
+
+def test_a_job_takes_the_user_s_modules_to_every_node_and_may_be_a_sweep(tmp_path, monkeypatch):
+    """The driver is on the head and the worker on another node; neither runs in the folder that has the modules."""
+    here, out, url = tmp_path / "here", tmp_path / "sweep", "http://127.0.0.1:8265"
+    here.mkdir()
+    for name, text in {"my_task.py": TASK, "my_reward.py": REWARD, "my_search.py": SEARCH}.items():
+        (here / name).write_text(text)
+    task, search = {"environment": "my_task:Point"}, {"algorithm": "my_search:search", "pairs": 16}
+    config = SMALL | {"task": task, "search": search, "budget": {"generations": 2}}
+    (here / "config.yaml").write_text(yaml.safe_dump(config))
+
+    def es(*arguments):
+        words = map(str, ("es-service", *arguments, "--address", url))
+        return hosts.run("head", "sh", "-c", f"cd {here} && {shlex.join(words)}", timeout=120.0)
+
+    with Cluster(tmp_path) as hosts:
+        hosts.start("one", 1)
+        wait_for(lambda: es("jobs")[0] == 0)
+        code, printed = es("submit", "config.yaml", "--grid", "search.sigma=0.1", "--seeds", "0:1", "--out", out)
+        assert code == 0, printed
+        assert "sent with it: my_reward.py, my_search.py, my_task.py\n" in printed
+        code, log = es("logs", printed.split()[0], "--follow")
+        assert code == 0, log
+    run = out / "sigma=0.1_seed=0"
+    assert read_generation(run) == 2
+    assert (out / "report.html").exists()
+    monkeypatch.chdir(here)
+    sources._imported_sources.cache_clear()  # other tests have other modules of these names
+    [(_, platform)] = read_platforms(run)
+    assert platform[CODE] == sources.worker_sources("my_task:Point") | sources.driver_sources("my_search:search")
+    assert {"my_reward.py", "my_search.py", "my_task.py"} <= platform[CODE].keys()
 
 
 def test_what_cannot_be_joined_is_named(tmp_path):

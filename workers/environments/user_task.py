@@ -64,7 +64,7 @@ TABLES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "the novelty archive": (("{}",), ("generation", "centre")),
     "evaluate --out": (
         ("{}", "{}_std"),
-        ("policy", "generation", "episodes", "stored_fitness", "fresh_fitness", "fresh_standard_error"),
+        ("run", "policy", "generation", "episodes", "stored_fitness", "fresh_fitness", "fresh_standard_error"),
     ),
 }
 """Tables of a run with columns named after the descriptor: (patterns of these columns, other columns)."""

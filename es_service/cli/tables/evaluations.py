@@ -6,7 +6,7 @@ import contextlib
 import csv
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,29 +26,35 @@ def csv_file(path: Path | None, note: Callable[[str], None]) -> Iterator[Write]:
     The rows are written to a new file beside `path`, which replaces `path` when the block ends. If the block ends
     with an error, the new file is kept, and `note` is called with a sentence that names it.
 
-    Raises ConfigError for a name that does not end in .csv, so that no other kind of file is overwritten, and
-    StoreError if the file cannot be written.
+    Raises ConfigError for a name that does not end in .csv, so that no other kind of file is overwritten, and for a row
+    with other columns than the first; StoreError if the file cannot be written.
     """
     if path is None:
         yield lambda row: None
         return
     if path.suffix != ".csv":
         raise ConfigError(f"--out {path}: must end in .csv")
-    new, is_empty = path.with_name(f"{path.name}.new"), True
+    new = path.with_name(f"{path.name}.new")
+    columns: list[str] = []
     with _explained(path):
         if path.is_dir():
             raise ConfigError(f"--out {path}: is a folder; give the name of a file")
         file = new.open("w", newline="")
 
     def write(row: Mapping[str, Any]) -> None:
-        nonlocal is_empty
-        writer = csv.DictWriter(file, list(row), lineterminator="\n")
+        is_first = not columns
+        columns.extend(row if is_first else ())
+        if list(row) != columns:
+            raise ConfigError(
+                f"--out {path}: its columns are {', '.join(columns)}, and this run has {', '.join(row)}; evaluate runs "
+                "with other descriptors separately"
+            )
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
         with _explained(path):
-            if is_empty:
+            if is_first:
                 writer.writeheader()
             writer.writerow(row)
             file.flush()
-        is_empty = False
 
     try:
         yield write
@@ -58,7 +64,7 @@ def csv_file(path: Path | None, note: Callable[[str], None]) -> Iterator[Write]:
     except BaseException:
         with contextlib.suppress(OSError):  # closing writes the last rows, which fails on a full disk
             file.close()
-        if is_empty:
+        if not columns:
             new.unlink(missing_ok=True)
         else:
             note(f"the results so far are in {new}")
@@ -73,30 +79,31 @@ def _explained(path: Path) -> Iterator[None]:
         raise StoreError(f"cannot write {path}: {error.strerror}; choose another --out") from error
 
 
-def print_evaluations(console: Console, run: Run, results: Iterable[Fresh], write: Write, *, every: bool) -> None:
-    """Print a line per policy as results arrive, and `write` its row; with `every`, end with a summary of the map."""
-    names = run.descriptor_names
-    found: list[Fresh] = []
-    _line(console, f"{'policy':<10} {'generation':>10} {'stored':>10} {'fresh':>10} {'± s.e.':>8}  descriptor (± std)")
-    for fresh in results:
-        found.append(fresh)
-        row = row_of(fresh, names)
-        write(row)
-        where = ", ".join(f"{name} {row[name]:.3g} ± {row[f'{name}_std']:.2g}" for name in names)
-        one = fresh.candidate
-        _line(
-            console,
-            f"{one.name:<10} {one.generation:>10} {one.stored_fitness:>10.2f} {fresh.mean:>10.2f} "
-            f"{fresh.standard_error:>8.2f}  {where}",
-        )
-    if every:
-        _line(console, _about_elites(run, [fresh for fresh in found if fresh.candidate.cell is not None]))
+def print_header(console: Console, run_width: int | None = None) -> None:
+    """Print the names of the columns. `run_width`: width of the column with the run; None: there is none."""
+    run = "" if run_width is None else f"{'run':<{run_width}}  "
+    head = f"{'policy':<10} {'generation':>10} {'stored':>10} {'fresh':>10} {'± s.e.':>8}  descriptor (± std)"
+    _line(console, run + head)
 
 
-def row_of(fresh: Fresh, names: list[str]) -> dict[str, Any]:
-    """The row of a policy, of which `names` are the descriptor's dimensions."""
+def print_row(console: Console, row: Mapping[str, Any], names: list[str], run_width: int | None = None) -> None:
+    """Print the line of a policy, of which `names` are the descriptor's dimensions."""
+    run = "" if run_width is None else f"{row['run']:<{run_width}}  "
+    values = f"{row['stored_fitness']:>10.2f} {row['fresh_fitness']:>10.2f} {row['fresh_standard_error']:>8.2f}"
+    where = ", ".join(f"{name} {row[name]:.3g} ± {row[f'{name}_std']:.2g}" for name in names)
+    _line(console, f"{run}{row['policy']:<10} {row['generation']:>10} {values}  {where}")
+
+
+def row_of(fresh: Fresh, names: list[str], run: Path | None = None) -> dict[str, Any]:
+    """The row of a policy.
+
+    Args:
+        names: the descriptor's dimensions.
+        run: the first column; None if all rows are of one run, which then have no such column.
+    """
     one = fresh.candidate
     return {
+        **({} if run is None else {"run": str(run)}),
         "policy": one.name,
         "generation": one.generation,
         "episodes": fresh.fitness_E.size,
@@ -108,8 +115,9 @@ def row_of(fresh: Fresh, names: list[str]) -> dict[str, Any]:
     }
 
 
-def _about_elites(run: Run, elites: list[Fresh]) -> str:
-    """Summary of a map: how many elites still end in their cells, and the QD-score, stored and fresh."""
+def print_map_summary(console: Console, run: Run, results: list[Fresh]) -> None:
+    """Print how many elites of a map still end in their cells, and its QD-score, stored and fresh."""
+    elites = [fresh for fresh in results if fresh.candidate.cell is not None]
     offset = run.constants["map.qd_offset"]
     stayed = sum(fresh.cell == fresh.candidate.cell for fresh in elites)
     best: dict[int, float] = {}
@@ -118,10 +126,11 @@ def _about_elites(run: Run, elites: list[Fresh]) -> str:
             best[fresh.cell] = max(best.get(fresh.cell, -math.inf), fresh.mean)
     stored = math.fsum(fresh.candidate.stored_fitness - offset for fresh in elites)
     again = math.fsum(fitness - offset for fitness in best.values())
-    return (
+    _line(
+        console,
         f"{len(elites)} elites: the mean descriptor of {stayed} still lies in their cell; a new map built from the "
         f"fresh values has {len(best)} filled cells.\n"
-        f"QD-score (offset {offset:g}): {stored:,.0f} stored, {again:,.0f} fresh"
+        f"QD-score (offset {offset:g}): {stored:,.0f} stored, {again:,.0f} fresh",
     )
 
 

@@ -7,28 +7,43 @@ from pathlib import Path
 
 from rich.console import Console
 
+from es_service.cli.several import of_each
 from es_service.cli.tables.progress import short
 from es_service.errors import ServiceError
+from es_service.runs.folders import output_of
 from es_service.runs.standing import Standing, look, state
 from es_service.runs.view import open_run
 
 _COLUMNS = ("run", "algorithm", "task", "seed", "generation", "env steps", "best", "cells", "state")
+NOT_STARTED = "not started"
+"""State of a sweep's run that has no folder yet."""
 
 
 def print_overview(console: Console, folders: Sequence[Path]) -> bool:
-    """Print a line for each run, with the error if it cannot be read; return whether all could be read."""
+    """Print a line for each run, with the error if it cannot be read; return whether all could be read.
+
+    Args:
+        folders: those of runs or of sweeps.
+    """
     rows, problems = [], 0
-    for folder in folders:
-        try:
-            rows.append(_row(look(open_run(folder))))
-        except ServiceError as error:
-            rows.append((str(folder), *["-"] * (len(_COLUMNS) - 2), f"error: {' '.join(error.sentence.split())}"))
+    for folder, found in of_each(folders, lambda run: _row(look(open_run(run)))):
+        if isinstance(found, ServiceError):
+            rows.append(_without_row(folder, f"error: {' '.join(found.sentence.split())}"))
             problems += 1
+        elif found is None:
+            output = output_of(folder)
+            rows.append(_without_row(folder, NOT_STARTED + (f"; its output is in {output}" if output else "")))
+        else:
+            rows.append(found)
     widths = [max(map(len, column)) for column in zip(_COLUMNS, *rows, strict=True)]
     for row in (_COLUMNS, *rows):
         line = "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
         console.print(line, highlight=False, markup=False, soft_wrap=True)  # not wrapped, so that folders can be copied
     return not problems
+
+
+def _without_row(folder: Path, state: str) -> tuple[str, ...]:
+    return (str(folder), *["-"] * (len(_COLUMNS) - 2), state)
 
 
 def _row(standing: Standing) -> tuple[str, ...]:

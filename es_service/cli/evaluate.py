@@ -1,0 +1,75 @@
+"""The command `evaluate`: policies of runs on fresh episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from es_service import api
+from es_service.cli.data import print_json
+from es_service.cli.options import JsonOption, LogLevelOption, console, place_of, print_note
+from es_service.cli.several import RunsArgument, is_single, read_each, started_runs
+from es_service.errors import ConfigError
+
+
+def evaluate(
+    folders: RunsArgument,
+    best: Annotated[bool, typer.Option("--best", help="Evaluate the best centre (default).")] = False,
+    centre: Annotated[bool, typer.Option("--centre", help="Evaluate the newest centre.")] = False,
+    cell: Annotated[
+        list[str] | None, typer.Option("--cell", metavar="I,J", help="Evaluate a cell's elite; can be repeated.")
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="Evaluate every elite of the map.")] = False,
+    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes per policy.")] = 100,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the episodes.")] = 0,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Also write the rows to this CSV file.")] = None,
+    as_json: JsonOption = False,
+    log_level: LogLevelOption = None,
+) -> None:
+    """Evaluate policies of a run, or of several, on fresh episodes; print the results beside the stored values."""
+    from es_service.cli.tables.evaluations import csv_file, print_header, print_map_summary, print_row, row_of
+    from es_service.runs import evaluation
+
+    if every and cell:
+        raise ConfigError("--all and --cell cannot be combined: --all includes every cell; give one of them")
+    cells = list(dict.fromkeys(place_of(text) for text in cell or ()))
+    single = is_single(folders)
+    width = None if single else max(map(len, map(str, started_runs(folders))), default=0)
+
+    def rows_of(folder: Path) -> Iterator[dict[str, Any]]:
+        run = api.open_run(folder)
+        best_too = best or not (centre or cell or every)
+        chosen = evaluation.candidates(run, best=best_too, centre=centre, cells=cells, every=every)
+        if single and not as_json:
+            print_header(console)
+        results = []
+        for fresh in evaluation.evaluate(run, chosen, episodes, workers, seed):
+            results.append(fresh)
+            row = row_of(fresh, run.descriptor_names, None if single else folder)
+            if not as_json:
+                print_row(console, row, run.descriptor_names, width)
+            yield row
+        if every and not as_json:
+            print_map_summary(console, run, results)
+
+    rows: list[dict[str, Any]] = []
+    problems: list[dict[str, str]] = []
+    with csv_file(out, print_note) as write:
+        if single:
+            found = ([row] for row in rows_of(folders[0]))
+        else:
+            if not as_json:
+                print_header(console, width)
+            found = (rows for _, rows in read_each(folders, lambda folder: list(rows_of(folder)), problems))
+        for row in chain.from_iterable(found):
+            rows.append(row)
+            write(row)
+    if as_json:
+        print_json([*rows, *problems])
+    if problems:
+        raise typer.Exit(1)

@@ -1,0 +1,74 @@
+"""Commands that take several runs: folders of runs or of sweeps, of which each run is read by itself, so that one that
+is damaged hides no other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import typer
+
+from es_service.cli.commands import error_message
+from es_service.cli.options import print_error, print_note
+from es_service.errors import Interrupted, ServiceError
+from es_service.runs.folders import holds_runs, runs_of
+from es_service.store.folder import holds_run
+
+RunsArgument = Annotated[
+    list[Path], typer.Argument(metavar="RUN...", help="Folders of runs or of sweeps.", show_default=False)
+]
+T = TypeVar("T")
+
+
+def is_single(folders: Sequence[Path]) -> bool:
+    """Whether the folders of a command are one run; if not, its output names each run."""
+    return len(folders) == 1 and not holds_runs(folders[0])
+
+
+def started_runs(folders: Sequence[Path]) -> list[Path]:
+    """Folders of the runs that have started, and of those that cannot be found."""
+    return [folder for folder, found in of_each(folders, lambda run: run) if found is not None]
+
+
+def of_each(folders: Sequence[Path], read: Callable[[Path], T]) -> Iterator[tuple[Path, T | ServiceError | None]]:
+    """What is read of each run in some folders: (its folder, the result). The result is the error if a run cannot be
+    read, and None if it is one that its sweep has not started."""
+    for folder in folders:
+        try:
+            runs = runs_of(folder)
+        except ServiceError as error:
+            yield folder, error
+            continue
+        for run in runs:
+            try:
+                waits = run != folder and not holds_run(run)
+                yield run, None if waits else read(run)
+            except Interrupted:
+                raise
+            except ServiceError as error:
+                yield run, error
+
+
+def read_each(
+    folders: Sequence[Path], read: Callable[[Path], T], problems: list[dict[str, str]]
+) -> Iterator[tuple[Path, T]]:
+    """The same for the runs that can be read. The others are named on stderr at once.
+
+    Args:
+        problems: gets what `--json` prints of each run that cannot be read.
+    """
+    for folder, found in of_each(folders, read):
+        if found is None:
+            print_note(f"note: {folder} has not started")
+        elif isinstance(found, ServiceError):
+            message = error_message(found)
+            print_error(message if str(folder) in message else f"{folder}: {message}")
+            problems.append(problem_data(folder, found))
+        else:
+            yield folder, found
+
+
+def problem_data(folder: Path, error: ServiceError) -> dict[str, str]:
+    """What `--json` prints of a run that cannot be read."""
+    return {"run": str(folder), "error": error.sentence}
