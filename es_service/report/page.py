@@ -102,13 +102,13 @@ def _head(data: RunData) -> Markup:
 
 
 def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
-    drawn = curves.draw_charts(series.charts(data.history), series.x_axes(data.history))
+    drawn = curves.draw_charts(series.charts(data.history, data.centres), series.x_axes(data.history))
     scripts["charts"] = [one.points for one in drawn]
     generations = data.history["generation"].size
     together = series.groups(generations)[0]
     grouped = None
     if together > 1:
-        text = f"Each point summarises {together} neighbouring generations: the best centre so far, coverage and "
+        text = f"Each point summarises {together} neighbouring generations: what is said to be so far, coverage and "
         text += "QD-score by their last value, everything else by the mean."
         grouped = tag("p", text, class_="note")
     return section(
