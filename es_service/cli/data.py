@@ -11,6 +11,7 @@ from typing import Any
 from es_service.config.presets import preset_table
 from es_service.config.shipped import shipped_configs
 from es_service.protocol.messages import TaskSpec
+from es_service.runs.objectives import recent_objectives
 from es_service.runs.standing import Standing, state
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store.digest import digest_of
@@ -22,8 +23,10 @@ def print_json(value: object) -> None:
 
 
 def standing_data(standing: Standing) -> dict[str, Any]:
-    """What `status` shows of a run; `newest` is the newest row of its history."""
-    run = standing.run
+    """What `status` shows of a run: `newest` is the newest row of its history, `objectives` says what the centres of
+    that generation climb, and those of recent ones."""
+    run, row = standing.run, standing.row
+    newest, recent = recent_objectives(run, row["generation"]) if row else (None, None)
     return {
         "run": str(run.folder),
         "run_id": run.run_id,
@@ -33,7 +36,11 @@ def standing_data(standing: Standing) -> dict[str, Any]:
         "state": state(standing),
         "driver": standing.driver,
         "limits": standing.limits,
-        "newest": standing.row,
+        "newest": row,
+        "objectives": {
+            "newest": newest and newest._asdict(),
+            "recent": recent and recent._asdict(),
+        },
     }
 
 

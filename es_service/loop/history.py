@@ -89,7 +89,7 @@ _SEARCH_AND_TIMES = (
         True,
         "centre that this row is about: the fittest of those that were evaluated; policies count on from the centres",
     ),
-    Column("fitness_weight", "REAL", True, "weight of fitness beside novelty in this generation's utilities"),
+    Column("fitness_weight", "REAL", True, "weight of fitness beside novelty in the utilities of that centre"),
     Column("centre_novelty", "REAL", True, "novelty of the mean descriptor in the archive before it entered"),
     Column("archive_size", "INTEGER", True, "entries of the novelty archive after this generation"),
     Column("update_norm", "REAL", True, "Euclidean norm of the step from the old centre to the new one"),
@@ -125,9 +125,7 @@ def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
     """Columns of the evaluated centres, of which a generation may have several; `generation` comes before them."""
     return (
         Column("centre", "INTEGER", True, "index of the centre; policies count on from the centres"),
-        Column(
-            "fitness_weight", "REAL", True, "weight of fitness in its utilities; me_es, memes: 0 explores, 1 exploits"
-        ),
+        Column("fitness_weight", "REAL", True, "weight of fitness in its utilities: 0 explores, 1 exploits, else both"),
         *(
             (
                 Column("start_cell", "INTEGER", True, "cell whose elite it started from in this generation"),

@@ -12,6 +12,7 @@ from es_service.protocol.sources import in_words
 from es_service.report.data import RunData
 from es_service.report.series import phase_seconds
 from es_service.runs.identity import code_changes
+from es_service.runs.objectives import objectives, weights
 from es_service.runs.standing import population_size, state
 
 
@@ -63,12 +64,22 @@ def what_was_run(data: RunData) -> list[tuple[str, str]]:
                 "environment steps",
                 f"{data.last('env_steps'):,.0f}{of.get('env_steps', '')} in {data.last('episodes'):,.0f} episodes",
             ),
+            *_objectives(data),
             ("time", f"{duration(data.last('wall_clock_s'))} on {count(int(data.last('workers')), 'worker')}"),
         ]
     if data.meta.parent:
         parent = data.meta.parent
         fields.append(("started from", f"{parent['folder']}, generation {parent['generation']}"))
     return fields
+
+
+def _objectives(data: RunData) -> list[tuple[str, str]]:
+    """How many centres have explored, as (label, text), where each either explores or exploits."""
+    found = objectives(weights(data.centres)[1])
+    if not found.are_separate:
+        return []
+    exploring, exploiting = (f"{100 * part / found.centres:.1f} %" for part in (found.exploring, found.exploiting))
+    return [("centres", f"{exploring} of {found.centres:,} explored, {exploiting} exploited")]
 
 
 def provenance(data: RunData) -> list[tuple[str, str]]:

@@ -19,6 +19,7 @@ from es_service.report import floor
 from es_service.report.colours import LEVELS, SCALE, level, value_range
 from es_service.report.curves import axis_lines
 from es_service.report.data import RunData
+from es_service.report.detours import detours
 from es_service.report.facts import number
 from es_service.report.markup import Frame, Markup, joined, packed, spread, tag
 from es_service.search.maps.behaviour_map import BehaviourMap
@@ -41,7 +42,8 @@ class MapView(NamedTuple):
     """How to read the figure; one or two sentences."""
     cells: dict[str, Any]
     """`rows`: number of a cell -> [name, text]; `paths`: all paths in base64; `points`: their length; `lines`: number
-    of curves of a path, each with x and y; `overlay`: whether they are drawn above the map."""
+    of curves of a path, each with x and y; `overlay`: whether they are drawn above the map; `detours`: number of a cell
+    -> [number of a point, way from there to the next point as SVG] where no straight line is drawn."""
     path_figure: Markup | None
     """Empty figure for the path of a chosen cell where it cannot be drawn above the map."""
 
@@ -243,6 +245,7 @@ def _paths(data: RunData, frame: Frame | None) -> tuple[dict[str, Any], Markup |
         rows[str(cell)] = [data.cell_name(cell), text]
     known = [cell for cell in map_.cell_N.tolist() if cell in data.paths]
     found: dict[str, Any] = {"rows": rows, "order": known, "overlay": frame is not None, "points": 0, "lines": 1}
+    found["detours"] = {}
     if not known:
         return found | {"paths": ""}, None
     path_N_T_B = np.stack([data.paths[cell] for cell in known]).astype(np.float64)
@@ -250,6 +253,11 @@ def _paths(data: RunData, frame: Frame | None) -> tuple[dict[str, Any], Markup |
     if frame is not None:
         inside_N_T_B = np.clip(path_N_T_B, *np.array(map_.geometry.bounds).T)  # an episode may leave the map meanwhile
         lines = np.stack([frame.across(inside_N_T_B[..., 0]), frame.down(inside_N_T_B[..., 1])], axis=-1)
+        found["detours"] = {
+            str(cell): [[at, _way(frame, places)] for at, places in around.items()]
+            for cell, inside_T_B in zip(known, inside_N_T_B, strict=True)
+            if (around := detours(inside_T_B, data.task, map_.geometry.bounds))
+        }
         return found | {"points": points, "paths": packed(TENTHS * lines, "int16")}, None
     shown = min(len(data.names), PAIRED_DIMENSIONS)
     time = Frame(
@@ -272,3 +280,9 @@ def _paths(data: RunData, frame: Frame | None) -> tuple[dict[str, Any], Markup |
     caption = tag("figcaption", "Descriptor in the course of the chosen elite's episode, between the map's bounds")
     figure = tag("figure", caption, chart, tag("div", *legend, class_="legend"))
     return found | {"points": points, "lines": shown, "paths": packed(TENTHS * lines, "int16")}, figure
+
+
+def _way(frame: Frame, place_N_2: NDArray[np.float64]) -> str:
+    """Lines to places of the plane, one after the other, for the `d` of a path."""
+    across, down = frame.across(place_N_2[:, 0]), frame.down(place_N_2[:, 1])
+    return "".join(f"L{x:.1f} {y:.1f}" for x, y in zip(across, down, strict=True))

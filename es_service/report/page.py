@@ -19,6 +19,10 @@ MOST_FAULTS = 20
 """Generations with faults that are listed one by one."""
 
 MAP_NOTE = "Point at a cell for its values; click it for its elite's path, a line through points of the episode."
+DETOUR_NOTE = (
+    "Where a wall is between two of these points, the episode's way is unknown: the shortest way round the wall is "
+    "dashed, and a gap is left if that is too long."
+)
 
 
 def run_page(data: RunData, evaluate: Evaluate, replays: Mapping[str, Any] | None = None) -> str:
@@ -98,13 +102,13 @@ def _head(data: RunData) -> Markup:
 
 
 def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
-    drawn = curves.draw_charts(series.charts(data.history), series.x_axes(data.history))
+    drawn = curves.draw_charts(series.charts(data.history, data.centres), series.x_axes(data.history))
     scripts["charts"] = [one.points for one in drawn]
     generations = data.history["generation"].size
     together = series.groups(generations)[0]
     grouped = None
     if together > 1:
-        text = f"Each point summarises {together} neighbouring generations: the best centre so far, coverage and "
+        text = f"Each point summarises {together} neighbouring generations: what is said to be so far, coverage and "
         text += "QD-score by their last value, everything else by the mean."
         grouped = tag("p", text, class_="note")
     return section(
@@ -130,7 +134,7 @@ def _map(data: RunData, evaluate: Evaluate, scripts: dict[str, Any]) -> Markup:
     scripts["map"]["first"] = fittest
     return section(
         "Behaviour map",
-        tag("p", f"{view.explanation} {MAP_NOTE}", class_="note"),
+        tag("p", f"{view.explanation} {MAP_NOTE}{f' {DETOUR_NOTE}' if view.cells['detours'] else ''}", class_="note"),
         tag(
             "div",
             tag("div", view.figure, maps.colour_bar(value_range(data.map.fitness_N), cells=maps.has_area(data.map))),

@@ -20,6 +20,7 @@ from es_service.errors import ConfigError, NotInRunError
 from es_service.report import compare
 from es_service.report.colours import value_range
 from es_service.report.data import RunData, read_run
+from es_service.report.detours import detours
 from es_service.report.floor import is_plan
 from es_service.report.series import X_AXES
 from es_service.runs.view import Run
@@ -103,7 +104,9 @@ def centres(run: Source, axes: Axes, colours: tuple[float, float] | None = None)
 
 
 def trajectory(run: Source, axes: Axes, cell: int | Sequence[int] | None = None, **style: Any) -> None:
-    """Draw the path of an elite's first evaluation episode, as the run stored it.
+    """Draw the path of an elite's first evaluation episode: a line through the points that the run stored.
+
+    Where a wall is between two of them, the shortest way round it is dashed; see `es_service.report.detours`.
 
     Args:
         cell: place of the elite's cell; None: that of the fittest elite.
@@ -121,7 +124,17 @@ def trajectory(run: Source, axes: Axes, cell: int | Sequence[int] | None = None,
             raise NotInRunError(f"the map of {data.folder} is empty", run=data.folder)
         cell = map_.geometry.index_of(int(map_.cell_N[map_.fitness_N.argmax()]))
     _plane(data, axes)
-    axes.plot(*opened.elite(cell).trace_T_B.T, **{"color": PATH, "linewidth": 1.4, "zorder": 4} | style)
+    path_T_2 = opened.elite(cell).trace_T_B
+    around = detours(path_T_2, data.task, data.bounds)
+    gaps = [at + 1 for at in around]
+    [line] = axes.plot(
+        *np.insert(path_T_2, gaps, np.nan, axis=0).T, **{"color": PATH, "linewidth": 1.4, "zorder": 4} | style
+    )
+    for at, place_N_2 in around.items():
+        if len(place_N_2):
+            [dashed] = axes.plot(*np.concatenate([path_T_2[at, None], place_N_2, path_T_2[at + 1, None]]).T)
+            dashed.update_from(line)
+            dashed.set(linestyle="--", label="_a part of the path")
 
 
 def curves(

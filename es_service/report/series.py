@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.report.data import Columns
+from es_service.runs.objectives import objectives, weights
 
 MOST_POINTS = 300
 """A curve of more generations shows groups of neighbouring ones."""
@@ -90,16 +91,28 @@ _SPECS = (
         (("novelty", "centre_novelty", "mean"),),
     ),
     _Spec(
+        "Exploring and exploiting centres",
+        "Share of the centres that climb novelty alone, and of those that climb fitness alone.",
+        (
+            ("exploring", "exploring", "mean"),
+            ("exploiting", "exploiting", "mean"),
+            ("exploring so far", "exploring_so_far", "last"),
+            ("exploiting so far", "exploiting_so_far", "last"),
+        ),
+        percent=True,
+    ),
+    _Spec(
         "Weight of fitness (w)",
-        "Weight of fitness beside novelty in the utilities: 1 follows fitness alone, 0 novelty alone.",
-        (("w", "fitness_weight", "mean"),),
+        "Weight beside novelty in the utilities, mean over centres: 1 follows fitness alone, 0 novelty alone.",
+        (("w", "w", "mean"),),
     ),
 )
 
 
-def charts(history: Columns) -> list[Chart]:
-    """The charts of a run that have values; w is left out where it never changes."""
+def charts(history: Columns, centres: Columns) -> list[Chart]:
+    """The charts of a run that have values, from the columns of its history and of its evaluated centres."""
     ends_K = groups(len(history["generation"]))
+    history = {**history, **weight_columns(history["generation"], centres)}
     found = []
     for spec in _SPECS:
         lines = tuple(
@@ -107,7 +120,7 @@ def charts(history: Columns) -> list[Chart]:
             for label, column, group in spec.lines
             if column in history and np.isfinite(history[column]).any()
         )
-        if not lines or (spec.lines[0][1] == "fitness_weight" and np.ptp(history["fitness_weight"]) == 0.0):
+        if not lines:
             continue
         band = None
         if spec.band is not None and np.isfinite(history.get(spec.band[1], np.full(1, np.nan))).any():
@@ -115,6 +128,28 @@ def charts(history: Columns) -> list[Chart]:
             band = (label, thinned(history[low], ends_K, "mean"), thinned(history[high], ends_K, "mean"))
         found.append(Chart(spec.title, spec.note, lines, band, spec.percent))
     return found
+
+
+def weight_columns(generation_G: NDArray[np.float64], centres: Columns) -> Columns:
+    """What the centres of each generation climb; nothing if all weights of fitness are the same.
+
+    Where each centre of the run either explores or exploits: the shares of both, `exploring` and `exploiting`. With a
+    single centre a generation, each share would be 0 or 1, so they are those of all centres so far. Where centres climb
+    a mixture: their mean weight of fitness, `w`.
+    """
+    generation_N, weight_N = weights(centres)
+    if not weight_N.size or np.ptp(weight_N) == 0.0:
+        return {}
+    row_N = np.searchsorted(generation_G, generation_N)
+    count_G = np.bincount(row_N, minlength=generation_G.size)
+    sum_G = np.bincount(row_N, weight_N, generation_G.size)
+    with np.errstate(invalid="ignore"):  # no centre, in generation 0
+        mean_G, so_far_G = sum_G / count_G, np.cumsum(sum_G) / np.cumsum(count_G)
+    if not objectives(weight_N).are_separate:
+        return {"w": mean_G}
+    if count_G.max() == 1:
+        return {"exploring_so_far": 1.0 - so_far_G, "exploiting_so_far": so_far_G}
+    return {"exploring": 1.0 - mean_G, "exploiting": mean_G}
 
 
 def x_axes(history: Columns) -> dict[str, NDArray[np.float64]]:

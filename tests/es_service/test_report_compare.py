@@ -235,9 +235,9 @@ def test_a_plot_of_a_path_is_the_stored_path(folders, axes):
     table = open_run(folders[0]).map
     fittest = table.loc[table.fitness.idxmax()]
     plots.trajectory(folders[0], axes)
-    drawn = axes.lines[-1].get_xydata()
+    drawn = axes.lines[3].get_xydata()  # after two walls and the goal
     np.testing.assert_array_equal(
-        drawn, open_run(folders[0]).elite((fittest.cell_x, fittest.cell_y)).trace_T_B.astype(float)
+        drawn[~np.isnan(drawn[:, 0])], open_run(folders[0]).elite((fittest.cell_x, fittest.cell_y)).trace_T_B
     )
 
 

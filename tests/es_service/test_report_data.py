@@ -95,7 +95,7 @@ def test_generation_0_alone_is_shown(tmp_path):
     data = read_run(write_run(tmp_path / "begun", generations=0, filled=0.01))
     assert "Only the initial centres were evaluated" in facts.verdict(data)
     assert "before any update" in facts.verdict(data)
-    assert series.charts(data.history)[0].title == "Fitness"
+    assert series.charts(data.history, data.centres)[0].title == "Fitness"
 
 
 def test_curves_of_long_runs_are_groups_of_generations():
@@ -119,11 +119,54 @@ def test_values_that_are_missing_leave_gaps_and_count_for_nothing():
     assert series.thinned(np.zeros(0), np.zeros(0, int), "last").size == 0
 
 
-def test_a_weight_that_never_changes_is_not_drawn(folder):
-    history = dict(read_run(folder).history)
-    assert "Weight of fitness (w)" in [chart.title for chart in series.charts(history)]
-    history["fitness_weight"] = np.ones_like(history["fitness_weight"])
-    assert "Weight of fitness (w)" not in [chart.title for chart in series.charts(history)]
+EXPLORING, WEIGHT = "Exploring and exploiting centres", "Weight of fitness (w)"
+
+
+@pytest.mark.parametrize(
+    ("weights", "title", "lines"),
+    [
+        # Four emitters by turns, and by the toss of a coin. The history has the weight of the fittest, mostly 1.
+        ([[0, 1, 0, 1], [1, 0, 1, 0]], EXPLORING, {"exploring": [0.5, 0.5], "exploiting": [0.5, 0.5]}),
+        ([[0, 1, 1, 1], [0, 0, 0, 0]], EXPLORING, {"exploring": [0.25, 1.0], "exploiting": [0.75, 0.0]}),
+        # One emitter.
+        (
+            [[0], [0], [1], [1]],
+            EXPLORING,
+            {"exploring so far": [1, 1, 2 / 3, 0.5], "exploiting so far": [0, 0, 1 / 3, 0.5]},
+        ),
+        # Mixtures: the same for all centres, or another for each.
+        ([[1.0, 1.0], [0.75, 0.75]], WEIGHT, {"w": [1.0, 0.75]}),
+        ([[0.0, 0.5], [0.5, 1.0]], WEIGHT, {"w": [0.25, 0.75]}),
+        # Methods whose weight is constant.
+        ([[1.0], [1.0]], None, {}),
+        ([[0.5, 0.5], [0.5, 0.5]], None, {}),
+        # Policies, which no population has moved.
+        ([[], []], None, {}),
+    ],
+)
+def test_what_all_centres_climb_is_drawn_if_it_differs(weights, title, lines):
+    """The weights that are stored of generation 0 and of policies are not counted: nothing was climbed with them."""
+    rows = [
+        (0, 0.0, np.nan),
+        *((g, w, 1.0) for g, ws in enumerate(weights, 1) for w in ws),
+        (len(weights), 0.0, np.nan),
+    ]
+    columns = dict(zip(("generation", "fitness_weight", "update_norm"), np.array(rows).T, strict=True))
+    history = {"generation": np.arange(len(weights) + 1.0), "fitness_weight": np.ones(len(weights) + 1)}
+    charts = series.charts(history, columns)
+    assert [chart.title for chart in charts] == ([] if title is None else [title])
+    found = {line.label: line.y_K for chart in charts for line in chart.lines}
+    assert found.keys() == lines.keys()
+    for label, expected in lines.items():
+        np.testing.assert_allclose(found[label], [np.nan, *expected])
+
+
+def test_the_share_of_exploring_centres_is_told_where_each_explores_or_exploits(folder):
+    """Of generations 1 to 20, those from 10 to 19 exploited."""
+    data = read_run(folder)
+    assert dict(facts.what_was_run(data))["centres"] == "50.0 % of 20 explored, 50.0 % exploited"
+    mixed = replace(data, centres={**data.centres, "fitness_weight": 0.5 * data.centres["fitness_weight"]})
+    assert "centres" not in dict(facts.what_was_run(mixed))
 
 
 def test_a_run_without_a_map_has_none(tmp_path):

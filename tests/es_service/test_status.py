@@ -19,6 +19,7 @@ from es_service.cli.tables import status
 from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.status import follow_status, print_status, print_summary
 from es_service.errors import ConfigError
+from es_service.runs import objectives
 from es_service.runs.standing import Standing, look, more, state
 from es_service.store import reader
 from es_service.store.lock import acquire_lock
@@ -45,6 +46,7 @@ def test_of_a_long_history_only_the_newest_row_is_read(run, console, monkeypatch
     sound_rows = reader._sound_rows
     monkeypatch.setattr(reader, "_sound_rows", no_more_than_one)
     monkeypatch.setattr(status, "FAULTS_OF", 1)
+    monkeypatch.setattr(objectives, "RECENT", 1)
     print_status(console, run)
     follow_status(console, run)
     print_summary(console, run, "")
@@ -58,6 +60,35 @@ def test_the_faults_of_the_newest_generations_are_counted(console, tmp_path, mon
         monkeypatch.setattr(status, "FAULTS_OF", most)
         print_status(console, run)
         assert re.findall("\nfaults .*\n", capsys.readouterr().out) == expected
+
+
+@pytest.mark.parametrize(
+    ("search", "expected"),
+    [
+        (
+            {"algorithm": "me_es", "emitters": 4},
+            ["centres            2 exploring, 2 exploiting; of the last 12, 50.0 % explored"],
+        ),
+        ({"algorithm": "ns_es"}, ["weight of fitness  0 (novelty: 1)"]),
+        ({"algorithm": "map_elites", "batch": 16}, []),
+    ],
+)
+def test_what_the_centres_climb_is_told_of_all_and_not_of_the_fittest(search, expected, console, tmp_path, capsys):
+    config = {"search": {"pairs": 16, "evaluation_episodes": 1} | search, "budget": {"generations": 3}}
+    if "batch" in search:
+        del config["search"]["pairs"]
+    run = api.run(SMALL | config, tmp_path / "run").run
+    print_status(console, run)
+    assert re.findall("\n((?:centres|weight of fitness) .*)", capsys.readouterr().out) == expected
+
+
+def test_with_one_centre_a_generation_the_share_is_that_of_recent_generations(console, tmp_path, monkeypatch, capsys):
+    """It exploited in generations 10 to 19, and explored before and after."""
+    run = api.open_run(write_run(tmp_path / "run", generations=20))
+    for recent, expected in ((1000, "of the last 20, 50.0 % explored"), (3, "of the last 3, 33.3 % explored")):
+        monkeypatch.setattr(objectives, "RECENT", recent)
+        print_status(console, run)
+        assert f"\ncentres            1 exploring, 0 exploiting; {expected}\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,10 @@ def test_status_is_a_list_of_runs_in_the_order_given(finished, tmp_path):
     assert ours["newest"].keys() == {column.name for column in run.meta.columns}
     assert (ours["newest"]["generation"], ours["limits"], ours["driver"]) == (30, {"generations": 30}, None)
     assert "finished" in ours["state"]
+    weight = ours["newest"]["fitness_weight"]
+    newest = {"centres": 1, "exploring": int(weight == 0), "exploiting": int(weight == 1), "fitness_weight": weight}
+    assert ours["objectives"]["newest"] == newest
+    assert ours["objectives"]["recent"]["centres"] == 30
     assert gone["run"] == str(tmp_path)
     assert "is not a run folder" in gone["error"]
     assert said("status", finished[0]) == [ours]

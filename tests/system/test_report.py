@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from es_service.config.tasks import TASKS
+from tests import run_examples
 from tests.run_examples import write_run
 from tests.system.browser import browser
 from tests.system.command_line import es
@@ -56,6 +57,35 @@ def test_a_cell_is_shown_and_chosen_by_a_pointer(page, point_maze):
         "return [(end.x - box.x) / box.width, (end.y - box.y) / box.height]; })()"
     )
     assert (x, y) == pytest.approx((0.5, 0.5), abs=0.1)
+
+
+def test_no_path_that_is_drawn_crosses_a_wall(page, tmp_path, monkeypatch):
+    """The paths of this run go to and fro round the end of the lower wall, in long steps, and once through a wall."""
+    monkeypatch.setattr(
+        run_examples, "_path", lambda end_B, rng: np.array([(-0.6, -0.4), (-0.2, -0.6)] * 31 + [(0.0, 0.5), end_B])
+    )
+    write_run(tmp_path / "run", generations=1)
+    assert es("report", tmp_path / "run", "--replay", "none")[0] == 0
+    page.open(tmp_path / "run/report.html")
+    found = page.value(
+        "[[...document.querySelectorAll('#map .wall')].map((one) => ['x1', 'y1', 'x2', 'y2'].map((name) => "
+        "Number(one.getAttribute(name)))), [...document.querySelectorAll('#map [data-c]')].map((cell) => { "
+        "cell.dispatchEvent(new MouseEvent('click', {bubbles: true})); "
+        "return [...document.querySelectorAll('#map .way')].map((one) => one.getAttribute('d')); })]"
+    )
+    walls, (paths, rounds) = np.array(found[0]).reshape(-1, 2, 2), zip(*found[1], strict=True)
+    assert len(walls) == 2
+    assert len(paths) == 200
+    assert all(way.count("M") >= 61 for way in rounds)
+    for way in (*paths, *rounds):
+        for part in filter(None, way.split("M")):
+            points = np.array([place.split() for place in part.split("L")], float)
+            for (x0, y), (x1, _) in walls:
+                rise = np.diff(points[:, 1])
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    x = points[:-1, 0] + np.diff(points[:, 0]) * (y - points[:-1, 1]) / rise
+                apart = (np.abs(points[:, 1] - y) > 0.1) * np.sign(points[:, 1] - y)  # places are rounded to 0.1
+                assert not ((apart[:-1] * apart[1:] < 0) & (min(x0, x1) < x) & (x < max(x0, x1))).any()
 
 
 def slowest_hover(page) -> float:

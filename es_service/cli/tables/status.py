@@ -8,6 +8,7 @@ from rich.console import Console
 
 from es_service.cli.commands import command, settings, way_command
 from es_service.cli.tables.progress import plain_line
+from es_service.runs.objectives import recent_objectives
 from es_service.runs.standing import Standing, is_waiting, look, more, population_size, state, way_on
 from es_service.runs.view import Run
 
@@ -97,11 +98,24 @@ def _progress(standing: Standing) -> dict[str, str]:
         **goal,
         **filled,
         "novelty archive": f"{last['archive_size']:,} centres",
-        "weight of fitness": f"{last['fitness_weight']:g} (novelty: {1.0 - last['fitness_weight']:g})",
+        **_objectives(standing.run, last["generation"]),
         "environment steps": f"{last['env_steps']:,}{of.get('env_steps', '')} in {last['episodes']:,} episodes",
         "time": f"{last['wall_clock_s']:.1f}{of.get('wall_clock_s', '')} s, {rate:,.0f} steps/s overall",
         **faults,
     }
+
+
+def _objectives(run: Run, generation: int) -> dict[str, str]:
+    """What the centres of the newest generation climb; nothing if it moved none."""
+    newest, recent = recent_objectives(run, generation)
+    if recent.are_separate:
+        share = 100 * recent.exploring / recent.centres
+        text = f"{newest.exploring:,} exploring, {newest.exploiting:,} exploiting"
+        return {"centres": f"{text}; of the last {recent.centres:,}, {share:.1f} % explored"}
+    if not newest.centres:
+        return {}
+    weight = newest.fitness_weight
+    return {"weight of fitness": f"{weight:g} (novelty: {1.0 - weight:g})"}
 
 
 def _print_fields(console: Console, fields: dict[str, str]) -> None:

@@ -68,12 +68,15 @@
         byId("cell").textContent += "; its path is damaged or was not read";
         return;
       }
+      const detours = new Map(map.detours[cell]); // from these points, no straight line leads to the next
       for (let line = 0; line < map.lines; line++) {
         const first = 2 * map.points * (row * map.lines + line);
-        let points = "";
-        for (let k = 0; k < map.points; k++) points += `${k ? "L" : "M"}${paths[first + 2 * k] / 10} ${paths[first + 2 * k + 1] / 10}`;
+        const point = (k) => `${paths[first + 2 * k] / 10} ${paths[first + 2 * k + 1] / 10}`;
+        let points = "", round = "";
+        for (let k = 0; k < map.points; k++) points += (k && !detours.has(k - 1) ? "L" : "M") + point(k);
+        detours.forEach((way, k) => { if (way) round += `M${point(k)}${way}L${point(k + 1)}`; });
         for (const group of groups) {
-          if (map.overlay) group.append(shape(points, "under"), shape(points, "way"));
+          if (map.overlay) group.append(shape(points, "under"), shape(round, "under"), shape(points, "way"), shape(round, "way round"));
           else group.append(shape(points, "way", colours[line]));
         }
       }
