@@ -22,6 +22,7 @@ from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.logs import in_run
 from es_service.loop.budget import REACHED, limits_of, raised
 from es_service.loop.history import Column, evaluated_columns, history_columns
+from es_service.loop.interfaces import Stop as Stop
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
@@ -65,7 +66,8 @@ def run(
         config: a RunConfig, or what `load_config` accepts.
         out: folder of the run, new or empty, which is created with its parents; default
             runs/<environment>_<algorithm>_seed<seed>_<time>-<process>.
-        on_generation: called with the history row of each generation after it is committed.
+        on_generation: called with the history row of each generation after it is committed. If it returns
+            `Stop("reason")`, the run ends there with this reason, and can be resumed; other values have no effect.
         on_notice: called with each notice for the user; by default, notices are RuntimeWarnings.
         hook: called with the name of each point of the store that is passed; for tests that kill the process there.
 

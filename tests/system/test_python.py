@@ -1,0 +1,66 @@
+"""What a program or a notebook can do with runs: end them, show them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import es_service
+from es_service import Stop
+from tests.system.session import SMALL
+
+
+def row_of(generation: int, answer: object):
+    """A function that answers at one generation, and the list of the generations with which it was called."""
+    seen: list[int] = []
+
+    def on_generation(row):
+        seen.append(row["generation"])
+        return answer if row["generation"] == generation else None
+
+    return on_generation, seen
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Digest of an uninterrupted run of six generations."""
+    return es_service.run(of(6), tmp_path_factory.mktemp("whole") / "run").run.digest()
+
+
+def of(generations: int, **compute) -> dict:
+    return SMALL | {"budget": {"generations": generations}, "compute": SMALL["compute"] | compute}
+
+
+@pytest.mark.parametrize("engine", ["inline", pytest.param("ray", marks=pytest.mark.slow)])
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # Ray leaves files and processes to the garbage collector
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_stop_ends_a_run_after_its_commit_and_the_run_can_go_on(tmp_path, whole, engine):
+    on_generation, seen = row_of(2, Stop("pruned"))
+    outcome = es_service.run(of(6, engine=engine), tmp_path / "run", on_generation=on_generation)
+    assert (outcome.reason, outcome.run.generation, seen) == ("pruned", 2, [0, 1, 2])
+    on_generation, seen = row_of(4, Stop("again"))
+    outcome = es_service.resume(tmp_path / "run", {"compute.engine": "inline"}, on_generation=on_generation)
+    assert (outcome.reason, outcome.run.generation, seen) == ("again", 4, [3, 4])
+    outcome = es_service.run_or_resume(of(6), tmp_path / "run")
+    assert "6 generations" in outcome.reason
+    assert outcome.run.digest() == whole
+
+
+def test_stop_ends_forks_and_runs_that_start_or_continue(tmp_path):
+    for generation in (0, 3):
+        on_generation, _ = row_of(generation, Stop("enough"))
+        outcome = es_service.run_or_resume(of(6), tmp_path / "run", on_generation=on_generation)
+        assert (outcome.reason, outcome.run.generation) == ("enough", generation)
+    on_generation, seen = row_of(4, Stop("enough"))
+    outcome = es_service.fork(
+        tmp_path / "run", {"search.sigma": 0.1}, out=Path(tmp_path, "fork"), on_generation=on_generation
+    )
+    assert (outcome.reason, outcome.run.generation, seen) == ("enough", 4, [4])
+
+
+@pytest.mark.parametrize("answer", [True, "enough", False, Stop])
+def test_other_answers_have_no_effect(tmp_path, answer):
+    on_generation, seen = row_of(1, answer)
+    assert "2 generations" in es_service.run(of(2), tmp_path / "run", on_generation=on_generation).reason
+    assert seen == [0, 1, 2]
