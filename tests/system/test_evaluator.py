@@ -7,6 +7,7 @@ import os
 import pickle
 import signal
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -249,6 +250,21 @@ def test_a_closed_evaluator_and_one_that_was_interrupted_say_so(monkeypatch):
         assert children() == before
         with pytest.raises(ServiceError, match=r"closed by an error during a call \(KeyboardInterrupt"):
             evaluate(POLICIES[:1])
+
+
+def test_workers_outlive_the_thread_that_started_them():
+    """Linux kills a child that is bound to its parent at the end of the thread that created it."""
+    made = es_service.evaluator(CONFIG)
+    with ThreadPoolExecutor(1) as thread:
+        evaluate = thread.submit(made.__enter__).result()
+        thread.submit(evaluate, POLICIES[:1]).result()  # now the worker is bound
+    try:
+        (worker,) = evaluate._engine.transport.process_ids().values()
+        assert evaluate(POLICIES[:1]).valid.all()
+        assert evaluate._engine.counts.lost_workers == 0
+        assert worker in evaluate._engine.transport.process_ids().values()
+    finally:
+        made.__exit__(None, None, None)
 
 
 @pytest.mark.parametrize("name", ["pyribs_scheduler", "evosax_strategy"])
