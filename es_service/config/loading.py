@@ -156,7 +156,8 @@ def _load(
     if problems:
         count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
         raise ConfigError.listing(f"{name}: {count}", problems)
-    return RunConfig.model_validate(_nested(values))
+    config = RunConfig.model_validate(_nested(values))
+    return config if task is None else config.with_task(task)
 
 
 def _asks(value: object, ask: str | None) -> bool:

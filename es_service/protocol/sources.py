@@ -18,6 +18,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 Sources = Mapping[str, str]
 """Name of a source file, such as `workers/episode.py` -> the first half of its SHA-256, in hexadecimal digits."""
@@ -34,21 +35,27 @@ def worker_sources(environment: str) -> dict[str, str]:
     """Sources with which a worker computes.
 
     Those of this project are read once per process, because a process goes on with what it has imported. Those of the
-    task are read anew, because the driver asks for them without importing them.
+    task are read anew, because new workers import them as they are now.
 
     Args:
         environment: the value of `task.environment`.
     """
-    return _package_sources(*WORKERS) | (_module_sources(environment) if is_own(environment) else {})
+    return _package_sources(*WORKERS) | own_sources(environment)
 
 
 def driver_sources(algorithm: str) -> dict[str, str]:
-    """Sources with which the driver computes besides those of the workers; each is read once per process.
+    """Sources with which the driver computes besides those of the workers. Those of a user's search are read anew,
+    because each run imports what has changed of them (`own_code.import_own`).
 
     Args:
         algorithm: the value of `search.algorithm`.
     """
-    return _package_sources(*DRIVER) | (_imported_sources(algorithm) if is_own(algorithm) else {})
+    return _package_sources(*DRIVER) | own_sources(algorithm)
+
+
+def own_sources(path: str) -> dict[str, str]:
+    """Sources of a task or an algorithm of a user, as they are now; empty if the name is none of a user."""
+    return {own.source: own.sha256 for own in own_modules(path).values()} if is_own(path) else {}
 
 
 def other_files(ours: Sources, theirs: Sources) -> list[str]:
@@ -94,16 +101,22 @@ def _package_sources(*packages: str) -> dict[str, str]:
         spec = importlib.util.find_spec(package)
         for folder in map(Path, (spec and spec.submodule_search_locations) or ()):
             for file in filter(Path.is_file, folder.rglob("*.py")):  # editors leave links that lead nowhere
-                found["/".join((*package.split("."), *file.relative_to(folder).parts))] = _sha256(file)
+                found["/".join((*package.split("."), *file.relative_to(folder).parts))] = sha256(file.read_bytes())
     return found
 
 
-@cache
-def _imported_sources(path: str) -> dict[str, str]:
-    return _module_sources(path)
+class OwnModule(NamedTuple):
+    """A module of a user, as its file is now."""
+
+    file: Path
+    source: str
+    """Name of the file in `Sources`."""
+    sha256: str
+    needs: frozenset[str]
+    """Names of the packages that contain it, and of the modules that it may import."""
 
 
-def _module_sources(path: str) -> dict[str, str]:
+def own_modules(path: str) -> dict[str, OwnModule]:
     """The module of `package.module:name`, its packages, and what they import from the same place, directly or not.
 
     Nothing is imported, so that the driver need not load what only the workers use: the modules are found by the import
@@ -115,7 +128,7 @@ def _module_sources(path: str) -> dict[str, str]:
     if top is None or top.name in sys.stdlib_module_names or not (place := _place(top)):
         return {}
     is_shared = os.path.basename(place) in _SHARED_FOLDERS
-    found: dict[str, str] = {}
+    found: dict[str, OwnModule] = {}
     seen: set[str] = set()
     wanted = [name]
     while wanted:
@@ -127,9 +140,13 @@ def _module_sources(path: str) -> dict[str, str]:
             if spec.origin is None:
                 continue  # a package without a file of its own
             file, is_package = Path(spec.origin), spec.submodule_search_locations is not None
-            found["/".join(file.parts[-1 - spec.name.count(".") - is_package :])] = _sha256(file)
-            if file.suffix == ".py":
-                wanted += _imports(file, spec.name if is_package else spec.name.rpartition(".")[0])
+            source = "/".join(file.parts[-1 - spec.name.count(".") - is_package :])
+            content, package = file.read_bytes(), spec.name if is_package else spec.name.rpartition(".")[0]
+            needs = _imports(content, package) if file.suffix == ".py" else []
+            wanted += needs
+            above = spec.name.split(".")[:-1]
+            needs += [".".join(above[:count]) for count in range(1, len(above) + 1)]
+            found[spec.name] = OwnModule(file, source, sha256(content), frozenset(needs))
     return found
 
 
@@ -170,10 +187,10 @@ def _place(spec: importlib.machinery.ModuleSpec) -> str:
     return str(Path(os.path.abspath(own)).parents[spec.name.count(".")])
 
 
-def _imports(file: Path, package: str) -> list[str]:
-    """Names of the modules that a file may import, also inside its functions."""
+def _imports(content: bytes, package: str) -> list[str]:
+    """Names of the modules that a source file may import, also inside its functions."""
     try:
-        tree = ast.parse(file.read_bytes())
+        tree = ast.parse(content)
     except (SyntaxError, ValueError):
         return []  # its import is going to fail
     found: list[str] = []
@@ -187,5 +204,6 @@ def _imports(file: Path, package: str) -> list[str]:
     return [name for name in found if name]
 
 
-def _sha256(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()[:32]
+def sha256(content: bytes) -> str:
+    """The hash of a source file in `Sources`."""
+    return hashlib.sha256(content).hexdigest()[:32]

@@ -33,10 +33,7 @@ them. Observations are summed in float32, so their mean must be less than a thou
 
 from __future__ import annotations
 
-import importlib
 import math
-import os
-import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -44,6 +41,7 @@ import jax
 import jax.numpy as jnp
 
 from es_service.protocol.messages import TaskSpec
+from es_service.protocol.own_code import import_own
 from workers.environments import Environment, TaskError
 
 METHODS = ("reset", "observe", "step", "descriptor")
@@ -212,10 +210,8 @@ def make(path: str, options: Mapping[str, str]) -> Environment:
 def _import(path: str) -> Any:
     """The class that `package.module:Class` names."""
     module, _, name = path.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # a console script does not search the current folder
     try:
-        found = importlib.import_module(module)
+        found = import_own(path)
     except (ImportError, ValueError, TypeError) as error:  # the latter two if the name is no module name
         raise TaskError(
             f"{path}: cannot import {module} ({error}); start in the folder that contains it, or install it"
