@@ -38,6 +38,8 @@ from es_service.protocol.messages import TaskSpec
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
 """Where a config comes from: the path of a YAML file, the name of a shipped one, or the content of one."""
+WITHOUT_SEARCH = {"search.algorithm": "es", "budget.generations": 1}
+"""Values of a config that no search uses, where it leaves out what only a search needs."""
 
 
 def load_config(
@@ -48,6 +50,7 @@ def load_config(
     algorithms: Mapping[str, object],
     no_vectors: str = "",
     new: bool = True,
+    searches: bool = True,
 ) -> RunConfig:
     """Load the config of a new run.
 
@@ -60,11 +63,13 @@ def load_config(
         algorithms: the algorithms that `search.algorithm` may name.
         no_vectors: why this machine's processor cannot run the code that simd compiles; empty if it can.
         new: whether the run that `search.init_from` names, if any, must exist.
+        searches: whether a search uses the config; if none does, `search.algorithm` and the budget may be left out.
 
     Raises:
         ConfigError: names the file, then lists every problem on a line of its own.
     """
-    return _load(source, overrides, tasks, algorithms, no_vectors, new=new, resolved=False)
+    defaults = {} if searches else WITHOUT_SEARCH
+    return _load(source, overrides, tasks, algorithms, no_vectors, defaults, new=new, resolved=False)
 
 
 def left_out(source: Source, overrides: Overrides) -> list[str]:
@@ -93,7 +98,7 @@ def changed_config(
     Raises:
         ConfigError: as for `load_config`.
     """
-    return _load(source, overrides, tasks, algorithms, no_vectors, new=False, resolved=True)
+    return _load(source, overrides, tasks, algorithms, no_vectors, {}, new=False, resolved=True)
 
 
 def _load(
@@ -102,6 +107,7 @@ def _load(
     tasks: Mapping[str, TaskSpec],
     algorithms: Mapping[str, object],
     no_vectors: str,
+    defaults: Mapping[str, Any],
     *,
     new: bool,
     resolved: bool,
@@ -117,7 +123,7 @@ def _load(
     if resolved:
         values = without_followers(values, wanted)
     foreign = foreign_options(values, wanted)
-    values = {key: value for key, value in values.items() if key not in foreign} | wanted
+    values = {**defaults, **{key: value for key, value in values.items() if key not in foreign}, **wanted}
 
     left_open = {key for key, ask in LEFT_OPEN.items() if _asks(values.get(key, ask), ask)}
     values = {key: value for key, value in values.items() if key not in left_open}

@@ -224,6 +224,21 @@ def one_evaluator():
         yield evaluate
 
 
+def test_a_config_needs_no_search_and_no_budget_and_is_checked_nevertheless(reference):
+    bare = {name: section for name, section in CONFIG.items() if name not in ("search", "budget")}
+    for config in (bare, bare | {"search": {"pairs": 32}, "budget": {"env_steps": 9}, "map": {"enabled": False}}):
+        with es_service.evaluator(config) as evaluate:
+            assert twice(evaluate) == reference
+    with pytest.raises(ConfigError, match=r"search\.algorithm: missing[^$]*budget: this run has no limit"):
+        api.load_config(bare)
+    wrong = bare | {"search": {"algorithm": "sgd", "sigmas": 1}, "budget": {"generations": 0}}
+    with (
+        pytest.raises(ConfigError, match=r"search\.sigmas[^$]*budget\.generations[^$]*search\.algorithm: sgd"),
+        es_service.evaluator(wrong),
+    ):
+        pass
+
+
 def test_a_wrong_config_or_engine_is_an_error_before_anything_starts():
     before = children()
     for given in ({"engine": "other"}, {"workers": 0}, {"workers": "many"}, {"engine": "inline", "address": "h:1"}):
