@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from types import NoneType, UnionType
+from types import FunctionType, NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import ValidationError
@@ -35,6 +35,7 @@ from es_service.config.start import folder_problems
 from es_service.config.yaml_text import parse_value, show
 from es_service.errors import ConfigError, Problem
 from es_service.protocol.messages import TaskSpec
+from es_service.protocol.own_code import in_no_file
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
 """Where a config comes from: the path of a YAML file, the name of a shipped one, or the content of one."""
@@ -217,7 +218,10 @@ def _bad_value(name: str, value: object) -> Problem:
     if name in LEFT_OPEN:
         allowed = f"{show(LEFT_OPEN[name])} or {allowed}"
     hint, meant = "", None
-    if value is None:
+    if isinstance(value, type | FunctionType):
+        path = f"{value.__module__}:{value.__qualname__}"
+        hint = f"; {in_no_file(path) or f'name it as text: {path}'}"
+    elif value is None:
         hint = "; leave the key out to use its default"
     elif isinstance(value, str) and "number" in allowed and _is_number(value):
         hint, meant = f"; remove the quotes around {value}", parse_value(value)

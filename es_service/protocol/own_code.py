@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
+import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -46,6 +47,18 @@ def import_own(path: str) -> ModuleType:
             raise
         finally:
             sys.meta_path.remove(finder)
+
+
+def in_no_file(path: str) -> str:
+    """Why `module:name` cannot be imported elsewhere, if it is of a notebook or of the program itself; else empty."""
+    module, _, name = path.partition(":")
+    if module != "__main__":
+        return ""
+    file = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+    return (
+        f"{path} is defined in a notebook or in the program that runs, which other processes cannot import; put it in "
+        f"a file, such as {file}.py in this folder, and name it {file}:{name}"
+    )
 
 
 def _remove(name: str) -> None:

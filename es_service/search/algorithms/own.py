@@ -14,13 +14,15 @@ from collections.abc import Callable
 
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
-from es_service.protocol.own_code import import_own
+from es_service.protocol.own_code import import_own, in_no_file
 from es_service.search.algorithms.base import Algorithm
 
 
 def import_factory(path: str) -> Callable[[RunConfig], object]:
     """The user's function, from its module as it is now; raises ConfigError if there is none or the import fails."""
     module, _, name = path.partition(":")
+    if problem := in_no_file(path):
+        raise ConfigError(problem)
     try:
         found = getattr(import_own(path), name, None)
     except Exception as error:  # the user's code can raise anything
