@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from jupyter_client.manager import start_new_kernel
 
 import es_service
 from es_service import Stop
@@ -64,3 +65,46 @@ def test_other_answers_have_no_effect(tmp_path, answer):
     on_generation, seen = row_of(1, answer)
     assert "2 generations" in es_service.run(of(2), tmp_path / "run", on_generation=on_generation).reason
     assert seen == [0, 1, 2]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:jupyter_client")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_a_notebook_shows_the_progress_unless_it_is_told_each_generation_or_not_to(tmp_path, monkeypatch):
+    """In a real kernel: one output of the cell, which changes in place and ends with the last generation."""
+    monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
+    manager, client = start_new_kernel(cwd=str(tmp_path))
+
+    def shown(cell: str) -> list[tuple[str, dict]]:
+        """What a cell outputs: (kind of message, its content)."""
+        messages: list[dict] = []
+        answer = client.execute_interactive(cell, timeout=120, output_hook=messages.append)["content"]
+        assert answer["status"] == "ok", answer
+        kinds = ("stream", "display_data", "update_display_data", "execute_result")
+        return [(one["msg_type"], one["content"]) for one in messages if one["msg_type"] in kinds]
+
+    try:
+        outputs = shown(f"from es_service import fork, resume, run, run_or_resume\nrun({of(3)}, 'a');")
+        assert [kind for kind, _ in outputs[:2]] == ["display_data", "update_display_data"]
+        assert {kind for kind, _ in outputs[1:]} == {"update_display_data"}
+        assert len({content["transient"]["display_id"] for _, content in outputs}) == 1
+        assert "a: starting workers" in outputs[0][1]["data"]["text/html"]
+        assert "centre fitness" in outputs[-1][1]["data"]["text/html"]
+        assert [line.split()[1] for line in outputs[-1][1]["data"]["text/plain"].splitlines() if " ± " in line] == [
+            "0",
+            "1",
+            "2",
+            "3",
+        ]
+        calls = (f"run_or_resume({of(4)}, 'a')", "fork('a', {'budget.generations': 5}, out='b')")
+        assert all("centre fitness" in shown(f"{call};")[-1][1]["data"]["text/html"] for call in calls)
+        assert "no generation was run" in shown("resume('b');")[-1][1]["data"]["text/html"]
+        for told in ("progress=False", "on_generation=print"):
+            assert shown(f"resume('b', {told});") == []
+    finally:
+        client.stop_channels()
+        manager.shutdown_kernel(now=True)
+
+
+def test_other_programs_print_nothing(tmp_path, capfd):
+    es_service.run(of(1), tmp_path / "run")
+    assert capfd.readouterr() == ("", "")
