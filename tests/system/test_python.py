@@ -9,6 +9,7 @@ from jupyter_client.manager import start_new_kernel
 
 import es_service
 from es_service import Stop
+from tests.examples import optuna_pruning
 from tests.system.session import SMALL
 
 
@@ -108,3 +109,14 @@ def test_a_notebook_shows_the_progress_unless_it_is_told_each_generation_or_not_
 def test_other_programs_print_nothing(tmp_path, capfd):
     es_service.run(of(1), tmp_path / "run")
     assert capfd.readouterr() == ("", "")
+
+
+def test_the_example_with_optuna_prunes_runs_which_are_stored_as_far_as_they_came(tmp_path):
+    study = optuna_pruning.search(6, 10, tmp_path)
+    kinds = {trial.number: trial.state.name for trial in study.trials}
+    assert {"COMPLETE", "PRUNED"} == set(kinds.values())
+    for trial in study.trials:
+        run = es_service.open_run(tmp_path / str(trial.number))
+        assert run.history["centre_fitness_mean"].to_dict() == trial.intermediate_values
+        assert (run.generation == 10) == (kinds[trial.number] == "COMPLETE")
+    assert study.best_value > study.trials[0].intermediate_values[0]
