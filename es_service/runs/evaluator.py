@@ -186,6 +186,7 @@ def evaluator(
     if not isinstance(config, RunConfig):
         config = load_config(config, overrides, new=False, searches=False)
     elif overrides:
+        task_of(config)  # refuses a task that has changed, which `changed_config` would take as it is now
         config = changed_config(config.model_dump(mode="json"), overrides)
     made = PolicyEvaluator(config, make_engine(config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER))
     try:

@@ -147,7 +147,12 @@ def test_a_task_that_is_edited_between_two_runs_of_one_process_is_new_in_the_sec
     (fresh,) = evaluation.evaluate(first, best, 1)
     assert fresh.mean == 1000.0  # the length is a constant of the first run
 
-    for start in (lambda: api.run(loaded, "third"), lambda: api.run_or_resume(loaded, "third")):
+    for start in (
+        lambda: api.run(loaded, "third"),
+        lambda: api.run_or_resume(loaded, "third"),
+        lambda: api.evaluator(loaded).__enter__(),
+        lambda: api.evaluator(loaded, workers=2).__enter__(),
+    ):
         with pytest.raises(ConfigError, match=r"has changed since .*\(episode_steps: 10 -> 5\); load") as caught:
             start()
         assert (caught.value.field, (folder / "third").exists()) == ("task.environment", False)
