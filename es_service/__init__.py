@@ -9,7 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from es_service.api import evaluator, fork, load_config, open_run, resume, run
+    from es_service.api import Stop, evaluator, fork, load_config, open_run, resume, run, run_or_resume
     from es_service.report import plots
     from es_service.report.write import write_comparison, write_report
     from es_service.runs.sweep import sweep
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
+    "Stop",
     "__version__",
     "evaluator",
     "fork",
@@ -25,6 +26,7 @@ __all__ = [
     "plots",
     "resume",
     "run",
+    "run_or_resume",
     "sweep",
     "write_comparison",
     "write_report",

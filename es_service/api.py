@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import count
@@ -22,7 +23,9 @@ from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.logs import in_run
 from es_service.loop.budget import REACHED, limits_of, raised
 from es_service.loop.history import Column, evaluated_columns, history_columns
+from es_service.loop.interfaces import Stop as Stop
 from es_service.protocol.messages import TaskSpec
+from es_service.report.progress import in_notebook, show_in_notebook
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.identity import require_unchanged
@@ -43,8 +46,17 @@ _KEPT_OF_A_TASK = ("observation_size", "action_size", "descriptor_names", "has_g
 """Fields of a task that the policies and the history of a run depend on."""
 
 
-def _ignore(row: Mapping[str, Any]) -> None:
-    """Do nothing; the default for `on_generation`."""
+@contextmanager
+def _shown(folder: Path, on_generation: OnGeneration | None, progress: bool) -> Iterator[OnGeneration]:
+    """Yield what is to be called with each history row: `on_generation`, or if there is none, what shows the progress
+    in a notebook."""
+    if on_generation is not None:
+        yield on_generation
+    elif progress and in_notebook():
+        with show_in_notebook(str(folder)) as show:
+            yield show
+    else:
+        yield lambda row: None
 
 
 def _warn(notice: str) -> None:
@@ -55,8 +67,9 @@ def run(
     config: RunConfig | Source,
     out: str | os.PathLike[str] | None = None,
     *,
-    on_generation: OnGeneration = _ignore,
+    on_generation: OnGeneration | None = None,
     on_notice: OnNotice = _warn,
+    progress: bool = True,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Start a run and continue it until its budget is spent.
@@ -65,8 +78,11 @@ def run(
         config: a RunConfig, or what `load_config` accepts.
         out: folder of the run, new or empty, which is created with its parents; default
             runs/<environment>_<algorithm>_seed<seed>_<time>-<process>.
-        on_generation: called with the history row of each generation after it is committed.
+        on_generation: called with the history row of each generation after it is committed. If it returns
+            `Stop("reason")`, the run ends there with this reason, and can be resumed; other values have no effect.
         on_notice: called with each notice for the user; by default, notices are RuntimeWarnings.
+        progress: whether a notebook shows the progress of the run, if there is no `on_generation`. Other programs print
+            nothing.
         hook: called with the name of each point of the store that is passed; for tests that kill the process there.
 
     Raises:
@@ -78,7 +94,7 @@ def run(
     parent, beginning = None, Beginning()
     if config.search.init_from is not None:
         parent, beginning = started(config, config.search.init_from, on_notice)
-    return _create_and_work(config, out, parent, beginning, on_generation, on_notice, hook)
+    return _create_and_work(config, out, parent, beginning, on_generation, on_notice, progress, hook)
 
 
 def resume(
@@ -86,8 +102,9 @@ def resume(
     overrides: Overrides = (),
     *,
     strict: bool = False,
-    on_generation: OnGeneration = _ignore,
+    on_generation: OnGeneration | None = None,
     on_notice: OnNotice = _warn,
+    progress: bool = True,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Continue a run from its last committed generation; its result has the same bits as without an interruption.
@@ -108,15 +125,16 @@ def resume(
         source = recorded if recorded.exists() else store.meta.config
         return changed_config(source, overrides)
 
-    return _go_on(Path(folder), changed, on_generation, on_notice, hook, strict=strict)
+    return _go_on(Path(folder), changed, on_generation, on_notice, progress, hook, strict=strict)
 
 
 def run_or_resume(
     config: RunConfig | Source,
     out: str | os.PathLike[str],
     *,
-    on_generation: OnGeneration = _ignore,
+    on_generation: OnGeneration | None = None,
     on_notice: OnNotice = _warn,
+    progress: bool = True,
 ) -> Outcome:
     """Start a run, or resume it if the folder already holds it; the same call can be repeated after any interruption.
 
@@ -126,15 +144,16 @@ def run_or_resume(
     begun = holds_run(Path(out))
     wanted = config if isinstance(config, RunConfig) else load_config(config, new=not begun)
     if not begun:
-        return run(wanted, out, on_generation=on_generation, on_notice=on_notice)
-    return _go_on(Path(out), lambda store: wanted, on_generation, on_notice)
+        return run(wanted, out, on_generation=on_generation, on_notice=on_notice, progress=progress)
+    return _go_on(Path(out), lambda store: wanted, on_generation, on_notice, progress)
 
 
 def _go_on(
     folder: Path,
     make_config: Callable[[RunStore], RunConfig],
-    on_generation: OnGeneration,
+    on_generation: OnGeneration | None,
     on_notice: OnNotice,
+    progress: bool,
     hook: Callable[[str], None] = no_hook,
     *,
     strict: bool = False,
@@ -171,7 +190,8 @@ def _go_on(
             write_config(folder, config.resolved_yaml())
         except OSError as error:
             raise explained(error, folder, f"writing {CONFIG}") from error
-        return work(config, store, on_generation, on_notice, strict=strict)
+        with _shown(folder, on_generation, progress) as told:
+            return work(config, store, told, on_notice, strict=strict)
 
 
 def _budget_of_a_fork(config: RunConfig, standing: Standing) -> dict[str, Any]:
@@ -196,8 +216,9 @@ def fork(
     *,
     generation: int | None = None,
     out: str | os.PathLike[str] | None = None,
-    on_generation: OnGeneration = _ignore,
+    on_generation: OnGeneration | None = None,
     on_notice: OnNotice = _warn,
+    progress: bool = True,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Start a new run from another run's state, with changed settings.
@@ -218,7 +239,7 @@ def fork(
     """
     config = fork_config(parent, overrides)
     lineage, beginning = forked(open_run(parent), config, generation)
-    outcome = _create_and_work(config, out, lineage, beginning, on_generation, on_notice, hook)
+    outcome = _create_and_work(config, out, lineage, beginning, on_generation, on_notice, progress, hook)
     if outcome.run.generation == (begun := lineage["generation"]):
         on_notice(
             f"no generation was run: {outcome.reason} already at generation {begun}, where this fork begins; resume it "
@@ -256,8 +277,9 @@ def _create_and_work(
     out: str | os.PathLike[str] | None,
     parent: dict[str, Any] | None,
     beginning: Beginning,
-    on_generation: OnGeneration,
+    on_generation: OnGeneration | None,
     on_notice: OnNotice,
+    progress: bool,
     hook: Callable[[str], None],
 ) -> Outcome:
     folder = Path(out) if out is not None else default_folder(config)
@@ -273,5 +295,9 @@ def _create_and_work(
         evaluation_columns=evaluation_columns,
         parent=parent,
     )
-    with RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=hook) as store, in_run(meta.run_id):
-        return work(config, store, on_generation, on_notice)
+    with (
+        RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=hook) as store,
+        in_run(meta.run_id),
+        _shown(folder, on_generation, progress) as told,
+    ):
+        return work(config, store, told, on_notice)

@@ -45,13 +45,13 @@ from es_service.cli.options import (
 from es_service.cli.report import export, report
 from es_service.cli.show import config_, digest_, list_, status
 from es_service.cli.sweep import SeedsOption, run_seeds, sweep
-from es_service.cli.tables.progress import show_progress
 from es_service.cli.tables.status import print_summary
 from es_service.cli.verify import verify
 from es_service.config.parallel import parallel_sentence
 from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError
 from es_service.loop.history import Row
 from es_service.protocol.machine import VERSION
+from es_service.report.progress import show_progress
 from es_service.runs.tracking import tracked
 from es_service.store.folder import holds_run
 

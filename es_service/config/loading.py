@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from types import NoneType, UnionType
+from types import FunctionType, NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import ValidationError
@@ -35,9 +35,12 @@ from es_service.config.start import folder_problems
 from es_service.config.yaml_text import parse_value, show
 from es_service.errors import ConfigError, Problem
 from es_service.protocol.messages import TaskSpec
+from es_service.protocol.own_code import in_no_file
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
 """Where a config comes from: the path of a YAML file, the name of a shipped one, or the content of one."""
+WITHOUT_SEARCH = {"search.algorithm": "es", "budget.generations": 1}
+"""Values of a config that no search uses, where it leaves out what only a search needs."""
 
 
 def load_config(
@@ -48,6 +51,7 @@ def load_config(
     algorithms: Mapping[str, object],
     no_vectors: str = "",
     new: bool = True,
+    searches: bool = True,
 ) -> RunConfig:
     """Load the config of a new run.
 
@@ -60,11 +64,13 @@ def load_config(
         algorithms: the algorithms that `search.algorithm` may name.
         no_vectors: why this machine's processor cannot run the code that simd compiles; empty if it can.
         new: whether the run that `search.init_from` names, if any, must exist.
+        searches: whether a search uses the config; if none does, `search.algorithm` and the budget may be left out.
 
     Raises:
         ConfigError: names the file, then lists every problem on a line of its own.
     """
-    return _load(source, overrides, tasks, algorithms, no_vectors, new=new, resolved=False)
+    defaults = {} if searches else WITHOUT_SEARCH
+    return _load(source, overrides, tasks, algorithms, no_vectors, defaults, new=new, resolved=False)
 
 
 def left_out(source: Source, overrides: Overrides) -> list[str]:
@@ -93,7 +99,7 @@ def changed_config(
     Raises:
         ConfigError: as for `load_config`.
     """
-    return _load(source, overrides, tasks, algorithms, no_vectors, new=False, resolved=True)
+    return _load(source, overrides, tasks, algorithms, no_vectors, {}, new=False, resolved=True)
 
 
 def _load(
@@ -102,6 +108,7 @@ def _load(
     tasks: Mapping[str, TaskSpec],
     algorithms: Mapping[str, object],
     no_vectors: str,
+    defaults: Mapping[str, Any],
     *,
     new: bool,
     resolved: bool,
@@ -117,7 +124,7 @@ def _load(
     if resolved:
         values = without_followers(values, wanted)
     foreign = foreign_options(values, wanted)
-    values = {key: value for key, value in values.items() if key not in foreign} | wanted
+    values = {**defaults, **{key: value for key, value in values.items() if key not in foreign}, **wanted}
 
     left_open = {key for key, ask in LEFT_OPEN.items() if _asks(values.get(key, ask), ask)}
     values = {key: value for key, value in values.items() if key not in left_open}
@@ -156,7 +163,8 @@ def _load(
     if problems:
         count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
         raise ConfigError.listing(f"{name}: {count}", problems)
-    return RunConfig.model_validate(_nested(values))
+    config = RunConfig.model_validate(_nested(values))
+    return config if task is None else config.with_task(task)
 
 
 def _asks(value: object, ask: str | None) -> bool:
@@ -210,7 +218,10 @@ def _bad_value(name: str, value: object) -> Problem:
     if name in LEFT_OPEN:
         allowed = f"{show(LEFT_OPEN[name])} or {allowed}"
     hint, meant = "", None
-    if value is None:
+    if isinstance(value, type | FunctionType):
+        path = f"{value.__module__}:{value.__qualname__}"
+        hint = f"; {in_no_file(path) or f'name it as text: {path}'}"
+    elif value is None:
         hint = "; leave the key out to use its default"
     elif isinstance(value, str) and "number" in allowed and _is_number(value):
         hint, meant = f"; remove the quotes around {value}", parse_value(value)

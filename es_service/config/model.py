@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from es_service.config.compute import COMPUTE_CONSTANTS, ComputeConfig
 from es_service.config.fields import (
@@ -144,6 +144,18 @@ class RunConfig(Section):
     compute: ComputeConfig
     store: StoreConfig
     seed: Seed = Field(0, description="Seed of all random numbers of the run.")
+    _task: TaskSpec | None = PrivateAttr(None)
+
+    def with_task(self, task: TaskSpec) -> RunConfig:
+        """The same config, which knows the task from which its values were resolved."""
+        config = self.model_copy()
+        config._task = task
+        return config
+
+    @property
+    def resolved_with(self) -> TaskSpec | None:
+        """The task from which values that were left open were resolved; None if it is not known."""
+        return self._task
 
     def resolved_yaml(self) -> str:
         """The text of the run folder's `config.yaml`, with every value. Loading it gives an equal config."""

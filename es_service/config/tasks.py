@@ -1,11 +1,12 @@
 """Descriptions of tasks by name, for the driver.
 
 Shipped tasks are in a table. `brax:NAME` and `package.module:Class` are described by a child process, because this
-imports JAX and Brax; each name is described once.
+imports JAX and Brax; it is described again only if its code has changed.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -14,9 +15,11 @@ from functools import cache
 from typing import Any
 
 from es_service.config.model import RunConfig
+from es_service.config.yaml_text import show
 from es_service.errors import ConfigError
 from es_service.protocol.messages import TaskSpec, with_options
 from es_service.protocol.process_environment import child_environment
+from es_service.protocol.sources import own_sources
 from workers import environments
 from workers.simd.backend.target import NoVectorsError, host_target
 
@@ -29,7 +32,7 @@ class Tasks(Mapping[str, TaskSpec]):
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is not shipped, ConfigError for another that cannot be described."""
-        return _described(name) if ":" in name else environments.SHIPPED[name]
+        return _described(name, tuple(own_sources(name).items())) if ":" in name else environments.SHIPPED[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(environments.SHIPPED)
@@ -43,8 +46,27 @@ TASKS = Tasks()
 
 
 def task_of(config: RunConfig) -> TaskSpec:
-    """The task of a run, with the descriptor that its options choose."""
-    return with_options(TASKS[config.task.environment], config.task.options)
+    """The task of a run, with the descriptor that its options choose.
+
+    Raises ConfigError if the task has changed since its values were filled into the config, such as its episode length:
+    the run would have some values of the old task and some of the new one.
+    """
+    task, before = TASKS[config.task.environment], config.resolved_with
+    changes = [] if before is None else _changes(before, task)
+    if changes:
+        raise ConfigError(
+            f"the task {task.name} has changed since this config was loaded ({', '.join(changes)}); load the config "
+            "again",
+            field="task.environment",
+            value=task.name,
+        )
+    return with_options(task, config.task.options)
+
+
+def _changes(before: TaskSpec, now: TaskSpec) -> list[str]:
+    """Differences between two descriptions of a task, apart from the line that is only shown."""
+    values = [(one.name, getattr(before, one.name), getattr(now, one.name)) for one in dataclasses.fields(TaskSpec)]
+    return [f"{name}: {show(old)} -> {show(new)}" for name, old, new in values if name != "summary" and old != new]
 
 
 @cache
@@ -61,7 +83,8 @@ def no_vectors() -> str:
 
 
 @cache
-def _described(name: str) -> TaskSpec:
+def _described(name: str, code: tuple[tuple[str, str], ...]) -> TaskSpec:
+    """Description of a task whose code has these hashes."""
     try:
         process = subprocess.run(
             [sys.executable, "-m", "workers.describe", name],

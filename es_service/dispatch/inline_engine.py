@@ -26,6 +26,7 @@ from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
 from es_service.protocol.messages import Subject, Work, WorkerSpec, forget_oldest
+from es_service.protocol.parent import start_child
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.wire import BUFFER_BYTES, Channel, framed
 
@@ -275,14 +276,16 @@ def _start_child(spec: bytes, undo: ExitStack) -> _Child:
     ours, theirs = _socket_pair()
     undo.enter_context(ours)
     with theirs:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "workers.process", str(theirs.fileno()), str(os.getpid())],
-            env=child_environment(),
-            pass_fds=[theirs.fileno()],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
+        process = start_child(
+            lambda: subprocess.Popen(
+                [sys.executable, "-m", "workers.process", str(theirs.fileno()), str(os.getpid())],
+                env=child_environment(),
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
         )
     undo.callback(process.wait)
     undo.callback(process.kill)

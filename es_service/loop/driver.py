@@ -48,7 +48,7 @@ from es_service.loop.history import (
     search_columns,
     step_columns,
 )
-from es_service.loop.interfaces import Search, Store, Stored
+from es_service.loop.interfaces import Search, Stop, Store, Stored
 from es_service.loop.parts import ELITE_PREFIX, elite_from_arrays, elite_part, state_from_parts, state_parts
 from es_service.loop.policies import as_population
 from es_service.loop.state import Best, RunState
@@ -70,13 +70,14 @@ def run(
     evaluator: Evaluator,
     store: Store,
     state: RunState | None,
-    report: Callable[[HistoryRow], None],
+    report: Callable[[HistoryRow], object],
 ) -> tuple[RunState, str]:
-    """Run generations until the budget is spent.
+    """Run generations until the budget is spent or `report` returns a `Stop`.
 
     Args:
         state: the newest state in `store`, from which to continue; None to begin a run, with an empty store.
-        report: called with each history row after it has been committed.
+        report: called with each history row after it has been committed. A `Stop` that it returns ends the session, and
+            any other value has no effect.
 
     Returns:
         The last state and the reason for ending, in words.
@@ -86,16 +87,18 @@ def run(
         Interrupted: a signal asked the run to stop.
     """
     budget = search.config.budget
-    clock = Clock(0.0)
+    clock, answer = Clock(0.0), None
     if state is None:
         map_ = empty_map(make_geometry(search.config.map)) if search.config.map.enabled else None
         reachable = _reachable(search, map_)
-        state = _keep(store, report, clock, None, *_first_generation(search, evaluator, clock, map_, reachable))
+        first = _first_generation(search, evaluator, clock, map_, reachable)
+        state, answer = _keep(store, report, clock, None, *first)
     else:
         reachable = _reachable(search, state.search.map)
         clock = Clock(state.wall_clock_s)
-    while (reason := spent(budget, state)) is None:
-        state = _keep(store, report, clock, state, *_next_generation(search, evaluator, store, clock, state, reachable))
+    while (reason := answer.reason if isinstance(answer, Stop) else spent(budget, state)) is None:
+        following = _next_generation(search, evaluator, store, clock, state, reachable)
+        state, answer = _keep(store, report, clock, state, *following)
     return state, reason
 
 
@@ -274,14 +277,14 @@ def _next_generation(
 
 def _keep(
     store: Store,
-    report: Callable[[HistoryRow], None],
+    report: Callable[[HistoryRow], object],
     clock: Clock,
     before: RunState | None,
     state: RunState,
     row: HistoryRow,
     evaluations: list[HistoryRow],
-) -> RunState:
-    """Commit a finished generation, then report it."""
+) -> tuple[RunState, object]:
+    """Commit a finished generation, then report it; returns its state and what `report` returns."""
     clock.lap("seconds_driver")
     seconds, laps = clock.finish_generation()
     steps = state.env_steps - (before.env_steps if before else 0)
@@ -297,8 +300,7 @@ def _keep(
     }
     store.commit(state.generation, state_parts(state, before), row, evaluations)
     clock.lap("seconds_store")
-    report(row)
-    return state
+    return state, report(row)
 
 
 def _elite(store: Store, cell: int) -> Elite:

@@ -1,4 +1,4 @@
-"""What the loop needs of the rest: a run's search, and the store in which it is kept."""
+"""What the loop needs of the rest: a run's search, the store in which it is kept, and a request to stop."""
 
 from __future__ import annotations
 
@@ -32,6 +32,14 @@ class Store(Protocol):
     def commit(
         self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow, evaluations: Sequence[HistoryRow]
     ) -> None: ...
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A request to end a session, returned by the function that is called with each committed history row."""
+
+    reason: str
+    """Why the session ends, in words."""
 
 
 @dataclass(frozen=True)

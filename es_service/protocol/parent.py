@@ -9,7 +9,13 @@ import ctypes
 import os
 import runpy
 import signal
+import subprocess
 import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from functools import cache
+from queue import SimpleQueue
 
 PR_SET_PDEATHSIG = 1
 """Linux's `prctl` option that sets the signal sent to a process when its parent dies."""
@@ -20,6 +26,36 @@ def end_with(parent: int) -> None:
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
+
+
+def start_child(start: Callable[[], subprocess.Popen[bytes]]) -> subprocess.Popen[bytes]:
+    """Start a process whose `end_with` means this process.
+
+    For Linux, the parent is the thread that starts a child, and a bound child is killed when that thread ends. So a
+    thread other than the main one has another thread do it, which lasts as long as this process.
+    """
+    if threading.current_thread() is threading.main_thread():
+        return start()
+    started: Future[subprocess.Popen[bytes]] = Future()
+    _starts(os.getpid()).put((start, started))
+    return started.result()
+
+
+@cache
+def _starts(process: int) -> SimpleQueue:
+    """Queue of what a thread of this process is to start; a forked process has no threads but the one that forked."""
+    queue: SimpleQueue[tuple[Callable[[], subprocess.Popen[bytes]], Future[subprocess.Popen[bytes]]]] = SimpleQueue()
+
+    def serve() -> None:
+        while True:
+            start, started = queue.get()
+            try:
+                started.set_result(start())
+            except BaseException as error:
+                started.set_exception(error)
+
+    threading.Thread(target=serve, daemon=True, name="starts child processes").start()
+    return queue
 
 
 def bound(module: str, *arguments: str) -> list[str]:

@@ -35,32 +35,27 @@ def worker_sources(environment: str) -> dict[str, str]:
     """Sources with which a worker computes.
 
     Those of this project are read once per process, because a process goes on with what it has imported. Those of the
-    task are read anew, because the driver asks for them without importing them.
+    task are read anew, because new workers import them as they are now.
 
     Args:
         environment: the value of `task.environment`.
     """
-    return _package_sources(*WORKERS) | (_module_sources(environment) if is_own(environment) else {})
+    return _package_sources(*WORKERS) | own_sources(environment)
 
 
 def driver_sources(algorithm: str) -> dict[str, str]:
-    """Sources with which the driver computes besides those of the workers; each is read once per process.
+    """Sources with which the driver computes besides those of the workers. Those of a user's search are read anew,
+    because each run imports what has changed of them (`own_code.import_own`).
 
     Args:
         algorithm: the value of `search.algorithm`.
     """
-    return _package_sources(*DRIVER) | (_imported_sources(algorithm) if is_own(algorithm) else {})
+    return _package_sources(*DRIVER) | own_sources(algorithm)
 
 
-class Modules(NamedTuple):
-    """The modules of a user's task or search."""
-
-    files: Mapping[str, Path]
-    """Name of a source file that counts as code, such as `my_tasks/maze.py` -> the file."""
-    others: frozenset[str]
-    """Top packages outside the standard library that these files import from other places."""
-    is_installed: bool
-    """Whether they are a package that is installed beside those of other projects."""
+def own_sources(path: str) -> dict[str, str]:
+    """Sources of a task or an algorithm of a user, as they are now; empty if the name is none of a user."""
+    return {own.source: own.sha256 for own in modules_of(path).own.values()} if is_own(path) else {}
 
 
 def other_files(ours: Sources, theirs: Sources) -> list[str]:
@@ -106,17 +101,30 @@ def _package_sources(*packages: str) -> dict[str, str]:
         spec = importlib.util.find_spec(package)
         for folder in map(Path, (spec and spec.submodule_search_locations) or ()):
             for file in filter(Path.is_file, folder.rglob("*.py")):  # editors leave links that lead nowhere
-                found["/".join((*package.split("."), *file.relative_to(folder).parts))] = _sha256(file)
+                found["/".join((*package.split("."), *file.relative_to(folder).parts))] = sha256(file.read_bytes())
     return found
 
 
-@cache
-def _imported_sources(path: str) -> dict[str, str]:
-    return _module_sources(path)
+class OwnModule(NamedTuple):
+    """A module of a user, as its file is now."""
+
+    file: Path
+    source: str
+    """Name of the file in `Sources`."""
+    sha256: str
+    needs: frozenset[str]
+    """Names of the packages that contain it, and of the modules that it may import."""
 
 
-def _module_sources(path: str) -> dict[str, str]:
-    return {name: _sha256(file) for name, file in modules_of(path).files.items()}
+class Modules(NamedTuple):
+    """The modules of a user's task or search."""
+
+    own: Mapping[str, OwnModule]
+    """Name of a module whose file counts as code -> the module."""
+    others: frozenset[str]
+    """Top packages outside the standard library that these files import from other places."""
+    is_installed: bool
+    """Whether they are a package that is installed beside those of other projects."""
 
 
 def modules_of(path: str) -> Modules:
@@ -131,7 +139,7 @@ def modules_of(path: str) -> Modules:
     if top is None or top.name in sys.stdlib_module_names or not (place := _place(top)):
         return Modules({}, frozenset(), is_installed=False)
     is_shared = os.path.basename(place) in _SHARED_FOLDERS
-    files: dict[str, Path] = {}
+    found: dict[str, OwnModule] = {}
     others: set[str] = set()
     seen: set[str] = set()
     wanted = [name]
@@ -147,10 +155,14 @@ def modules_of(path: str) -> Modules:
             if spec.origin is None:
                 continue  # a package without a file of its own
             file, is_package = Path(spec.origin), spec.submodule_search_locations is not None
-            files["/".join(file.parts[-1 - spec.name.count(".") - is_package :])] = file
-            if file.suffix == ".py":
-                wanted += _imports(file, spec.name if is_package else spec.name.rpartition(".")[0])
-    return Modules(files, frozenset(others - sys.stdlib_module_names), is_shared)
+            source = "/".join(file.parts[-1 - spec.name.count(".") - is_package :])
+            content, package = file.read_bytes(), spec.name if is_package else spec.name.rpartition(".")[0]
+            needs = _imports(content, package) if file.suffix == ".py" else []
+            wanted += needs
+            above = spec.name.split(".")[:-1]
+            needs += [".".join(above[:count]) for count in range(1, len(above) + 1)]
+            found[spec.name] = OwnModule(file, source, sha256(content), frozenset(needs))
+    return Modules(found, frozenset(others - sys.stdlib_module_names), is_shared)
 
 
 def _chain(name: str) -> Iterator[importlib.machinery.ModuleSpec]:
@@ -190,10 +202,10 @@ def _place(spec: importlib.machinery.ModuleSpec) -> str:
     return str(Path(os.path.abspath(own)).parents[spec.name.count(".")])
 
 
-def _imports(file: Path, package: str) -> list[str]:
-    """Names of the modules that a file may import, also inside its functions."""
+def _imports(content: bytes, package: str) -> list[str]:
+    """Names of the modules that a source file may import, also inside its functions."""
     try:
-        tree = ast.parse(file.read_bytes())
+        tree = ast.parse(content)
     except (SyntaxError, ValueError):
         return []  # its import is going to fail
     found: list[str] = []
@@ -207,5 +219,6 @@ def _imports(file: Path, package: str) -> list[str]:
     return [name for name in found if name]
 
 
-def _sha256(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()[:32]
+def sha256(content: bytes) -> str:
+    """The hash of a source file in `Sources`."""
+    return hashlib.sha256(content).hexdigest()[:32]

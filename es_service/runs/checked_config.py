@@ -13,17 +13,26 @@ from es_service.config.tasks import TASKS, no_vectors
 from es_service.search.algorithms import ALGORITHMS
 
 
-def load_config(source: Source, overrides: Overrides = (), *, new: bool = True) -> RunConfig:
+def load_config(source: Source, overrides: Overrides = (), *, new: bool = True, searches: bool = True) -> RunConfig:
     """Read a YAML file (or a mapping like one), apply overrides such as "search.sigma=0.05", resolve and check it all.
 
     Args:
         new: whether a run is about to start with it on this machine; the folder of `search.init_from` must then exist.
+        searches: whether a search uses it; if none does, `search.algorithm` and the budget may be left out.
 
     Raises:
         ConfigError: lists every problem found.
     """
     return _accepted(
-        loading.load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, no_vectors=no_vectors(), new=new)
+        loading.load_config(
+            source,
+            overrides,
+            tasks=TASKS,
+            algorithms=ALGORITHMS,
+            no_vectors=no_vectors(),
+            new=new,
+            searches=searches,
+        )
     )
 
 

@@ -168,10 +168,12 @@ def evaluator(
         with evaluator("point_maze_es.yaml") as evaluate:
             result = evaluate(parameters_N_D, episodes=4, seed=0, generation=7)
 
-    Task, policy, seed and `compute` of the config are used; the search and the budget are not.
+    Task, policy, seed and `compute` of the config are used. The search is not, except that its preset and its algorithm
+    fill in keys of the policy that are left out; neither are `novelty`, `map`, `budget` and `store`. Whatever the
+    config says must be valid nevertheless.
 
     Args:
-        config: a RunConfig, or what `load_config` accepts.
+        config: a RunConfig, or what `load_config` accepts, and then `search.algorithm` and the budget may be left out.
         workers, engine, address: as `--workers`, `--engine` and `--address` of the command line: number of workers
             ("auto": one for each core of the machine or the cluster), "inline" or "ray", and the Ray cluster to join;
             None: as configured.
@@ -182,8 +184,9 @@ def evaluator(
     given = {"compute.workers": workers, "compute.engine": engine, "compute.address": address}
     overrides = implied_by(engine, address) | {key: value for key, value in given.items() if value is not None}
     if not isinstance(config, RunConfig):
-        config = load_config(config, overrides, new=False)
+        config = load_config(config, overrides, new=False, searches=False)
     elif overrides:
+        task_of(config)  # refuses a task that has changed, which `changed_config` would take as it is now
         config = changed_config(config.model_dump(mode="json"), overrides)
     made = PolicyEvaluator(config, make_engine(config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER))
     try:

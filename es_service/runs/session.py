@@ -44,8 +44,8 @@ LIMIT_NAMES = {
 }
 """Config keys that set the engine's time limits, as its messages name them."""
 
-OnGeneration = Callable[[Mapping[str, Any]], None]
-"""Called with each history row after its generation is committed."""
+OnGeneration = Callable[[Mapping[str, Any]], object]
+"""Called with each history row after its generation is committed. A `Stop` that it returns ends the session."""
 OnNotice = Callable[[str], None]
 """Called with each notice for the user, such as a repair of the run or a lost worker."""
 
@@ -56,7 +56,7 @@ class Outcome:
 
     run: Run
     reason: str
-    """Which part of the budget is spent, in words."""
+    """Which part of the budget is spent, in words; or the reason of the `Stop` that `on_generation` returned."""
 
 
 def work(
@@ -67,7 +67,7 @@ def work(
     *,
     strict: bool = False,
 ) -> Outcome:
-    """Run generations until the budget is spent.
+    """Run generations until the budget is spent or `on_generation` returns a `Stop`.
 
     Args:
         strict: whether workers on another platform than the run's are an error.
@@ -118,13 +118,13 @@ def work(
         make_engine(config, should_stop, log, tell_wait, tell) as engine,
     ):
 
-        def after_generation(row: Mapping[str, Any]) -> None:
+        def after_generation(row: Mapping[str, Any]) -> object:
             log(Committed(row["generation"]))
             tell_notices()
             if lost := row["lost_workers"]:
                 who = "a worker" if lost == 1 else f"{lost} workers"
                 tell(f"generation {row['generation']}: lost {who}; {engine.last_loss}")
-            on_generation(row)
+            answer = on_generation(row)
             _LOG.info(
                 "centre fitness %.6g, best %.6g, env steps %d, steps/s %.3g",
                 row["centre_fitness_mean"],
@@ -133,6 +133,7 @@ def work(
                 row["steps_per_second"],
             )
             in_generation(row["generation"] + 1)
+            return answer
 
         engine.wait_for_place()  # before the loop, whose time is that of the run and of its budget
         recorder = Recorder(store, engine, platform_info(), code, tell, strict=strict)

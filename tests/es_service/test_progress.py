@@ -6,7 +6,7 @@ from collections import deque
 import pytest
 from rich.console import Console
 
-from es_service.cli.tables.progress import live_table, show_progress
+from es_service.report.progress import live_table, show_progress
 
 ROW = {
     "generation": 123456,

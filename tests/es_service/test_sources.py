@@ -133,13 +133,6 @@ def test_a_user_s_modules_count_with_what_they_import_from_the_same_place(own):
     assert other_files(task, worker_sources("my_task:Maze")) == ["my_constants.py", "my_physics.py"]
 
 
-def test_a_search_that_this_process_has_imported_stays_what_it_was(own):
-    """The driver goes on with the module that it has; new workers would import a task anew."""
-    before = driver_sources("my_searches.second:search")
-    (own / "my_searches/second.py").write_text("x = 1")
-    assert driver_sources("my_searches.second:search") == before
-
-
 @pytest.mark.parametrize("name", ["brax:ant", "no_such_module:Class", "sys:path", "rich.table:Table", "json:loads"])
 def test_other_packages_count_by_their_versions(name):
     """An installed package counts if the task itself is in it, but not the packages that are installed beside it."""

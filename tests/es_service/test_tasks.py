@@ -2,15 +2,62 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from es_service.cli.bench_rollouts import bench_rollouts
+from es_service.config.loading import load_config
 from es_service.config.tasks import TASKS
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError
 from es_service.protocol.messages import TrainingChunk, around
+from es_service.search.algorithms import ALGORITHMS
 from tests.helpers import SPEC, centre, random_parameters
+from workers.environments import TaskError, describe_environment, make_environment
+
+HERE = __name__
+
+
+class Still:
+    """a point stays where it is"""
+
+    observation_size = action_size = 2
+    episode_steps = 5
+    descriptor_names = ("x", "y")
+    descriptor_bounds = ((0.0, 1.0), (0.0, 1.0))
+
+    def observe(self, state):
+        return state
+
+    def step(self, state, action):
+        return state, state[0], jnp.array(False)
+
+    def descriptor(self, state):
+        return state
+
+
+class TakesItForJax(Still):
+    """its key is passed to jax.random"""
+
+    def reset(self, key):
+        return jax.random.uniform(jax.random.split(key)[0], (2,))
+
+
+class MakesOne(Still):
+    """its key is made a key of JAX"""
+
+    def reset(self, key):
+        return jax.random.uniform(jax.random.wrap_key_data(key[:2]), (2,))
+
+
+class FailsAnyway(Still):
+    """its reset has another fault"""
+
+    def reset(self, key):
+        return jax.random.uniform(key, (2,)) + jnp.zeros(3)
 
 
 def test_a_current_folder_with_modules_of_our_names_is_nobody_s_business(tmp_path, monkeypatch):
@@ -24,3 +71,34 @@ def test_a_current_folder_with_modules_of_our_names_is_nobody_s_business(tmp_pat
     assert row["batch"] == 8
     with inline_engine(SPEC, Limits(1, max_start_failures=1)) as engine:
         assert len(engine.evaluate(around(centre(random_parameters()), [TrainingChunk(1, 0)]))) == 1
+
+
+def test_a_reset_that_takes_its_key_for_one_of_jax_is_told_how_to_make_one():
+    """Both before the run, by the driver, and in a worker."""
+    sentence = (
+        r"reset\(key\) passes its key to jax\.random.*noise\.uniforms\(key.*jax\.random\.wrap_key_data\(key\[:2\]\)"
+    )
+    with pytest.raises(TaskError, match=f"TakesItForJax: .*{sentence}"):
+        describe_environment(f"{HERE}:TakesItForJax")
+    keys_2_4 = np.arange(8, dtype=np.uint32).reshape(2, 4)
+    with pytest.raises(TaskError, match=sentence):
+        jax.jit(jax.vmap(make_environment(f"{HERE}:TakesItForJax", {}).reset))(keys_2_4)
+    with pytest.raises(TaskError, match="FailsAnyway cannot be traced by JAX: TypeError"):
+        describe_environment(f"{HERE}:FailsAnyway")
+    states_2_2 = jax.vmap(make_environment(f"{HERE}:MakesOne", {}).reset)(keys_2_4)
+    assert len(np.unique(states_2_2)) == 4
+    assert describe_environment(f"{HERE}:MakesOne").name == f"{HERE}:MakesOne"
+
+
+@pytest.mark.parametrize(("key", "known"), [("task.environment", TASKS), ("search.algorithm", ALGORITHMS)])
+def test_what_is_defined_in_a_notebook_belongs_into_a_file(key, known):
+    with pytest.raises(ConfigError, match=r"put it in a file, such as my_maze\.py .*name it my_maze:MyMaze"):
+        known["__main__:MyMaze"]
+    for given, told in (
+        (Still, f"name it as text: {HERE}:Still"),
+        (type("MyMaze", (), {"__module__": "__main__"}), "my_maze:MyMaze"),
+    ):
+        section, name = key.split(".")
+        with pytest.raises(ConfigError, match=told) as caught:
+            load_config({section: {name: given}}, tasks=TASKS, algorithms=ALGORITHMS)
+        assert caught.value.problems[0].field == key

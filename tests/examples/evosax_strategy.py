@@ -14,8 +14,6 @@ from es_service import evaluator
 CONFIG = {
     "task": {"environment": "point_maze"},
     "policy": {"hidden": [8, 8], "observation_normalization": False},
-    "search": {"algorithm": "es"},  # not used, like the budget
-    "budget": {"generations": 1},
 }
 
 

@@ -12,8 +12,9 @@ import pytest
 from es_service import api
 from es_service.cli.commands import command
 from es_service.errors import ConfigError
-from es_service.protocol import sources
 from es_service.protocol.machine import CODE
+from es_service.protocol.sources import sha256
+from es_service.runs import evaluation
 from es_service.store.codec import text_sha256
 from es_service.store.digest import checked_parts
 from es_service.store.reader import read_platforms
@@ -67,7 +68,6 @@ def own(tmp_path, monkeypatch):
     }
 
     def go_on(generations, **options):
-        sources._imported_sources.cache_clear()  # a new process imports the search as it is now
         told = []
         if (tmp_path / "run").exists():
             api.resume("run", {"budget.generations": generations}, on_notice=told.append, **options)
@@ -76,7 +76,8 @@ def own(tmp_path, monkeypatch):
         return told
 
     yield tmp_path, go_on
-    sys.modules.pop("my_search")
+    for name in ("my_search", "my_version"):
+        sys.modules.pop(name, None)
 
 
 def test_a_task_and_a_search_that_are_edited_between_stop_and_resume(own):
@@ -101,6 +102,98 @@ def test_a_task_and_a_search_that_are_edited_between_stop_and_resume(own):
     assert [first for first, _ in read_platforms(folder / "run")] == [0, 3]
     assert checked_parts(folder / "run")[1] is True
     assert go_on(4, strict=True) == []
+
+
+EDITED_TASK = TASK.replace("episode_steps = 10", "episode_steps = 5")
+LENGTH = """
+from dataclasses import replace
+from pathlib import Path
+import numpy as np
+from es_service.search.algorithms.ns_es import ns_es
+from my_version import VERSION
+
+def search(config):
+    Path("said").write_text(str(VERSION))
+    return replace(ns_es(config), own={"version": np.asarray(VERSION)})
+"""
+
+
+def hashes(run):
+    """File -> recorded hash, of the newest code of a run."""
+    return read_platforms(run.folder)[-1][1][CODE]
+
+
+def test_a_task_that_is_edited_between_two_runs_of_one_process_is_new_in_the_second(own):
+    """With its helper, in all its parts: what the driver knows of it, what workers compute, what is recorded."""
+    folder, _ = own
+    config = SMALL | {
+        "task": {"environment": "my_task:Point"},
+        "search": {"algorithm": "es", "pairs": 16, "evaluation_episodes": 4},
+        "budget": {"generations": 1},
+    }
+    loaded = api.load_config(config)
+    first = api.run(config, "first").run
+    assert first.history["centre_fitness_mean"].abs().max() <= 10.0
+
+    (folder / "my_task.py").write_text(EDITED_TASK)
+    (folder / "my_reward.py").write_text(REWARD.replace("state[0]", "state[0] * 0 + 100"))
+    second = api.run(config, "second").run
+    assert second.history["centre_fitness_mean"].tolist() == [500.0, 500.0]
+    for name in ("my_task.py", "my_reward.py"):
+        assert hashes(second)[name] == sha256((folder / name).read_bytes()) != hashes(first)[name]
+    with api.evaluator(config) as evaluate:
+        assert (evaluate.task.episode_steps, evaluate(evaluate.initial()[None]).fitness.item()) == (5, 500.0)
+    best = evaluation.candidates(first, best=True, centre=False, cells=(), every=False)
+    (fresh,) = evaluation.evaluate(first, best, 1)
+    assert fresh.mean == 1000.0  # the length is a constant of the first run
+
+    for start in (
+        lambda: api.run(loaded, "third"),
+        lambda: api.run_or_resume(loaded, "third"),
+        lambda: api.evaluator(loaded).__enter__(),
+        lambda: api.evaluator(loaded, workers=2).__enter__(),
+    ):
+        with pytest.raises(ConfigError, match=r"has changed since .*\(episode_steps: 10 -> 5\); load") as caught:
+            start()
+        assert (caught.value.field, (folder / "third").exists()) == ("task.environment", False)
+    notices = []
+    resumed = api.resume("first", {"budget.generations": 2}, on_notice=notices.append).run
+    assert resumed.history["centre_fitness_mean"].tolist()[-1] == 1000.0
+    assert "from generation 2 on" in notices[0]
+    assert "my_reward.py, my_task.py changed" in notices[0]
+    assert hashes(resumed)["my_task.py"] == hashes(second)["my_task.py"]
+
+
+def test_a_search_that_is_edited_between_two_runs_of_one_process_is_new_in_the_second(own):
+    """It, or a module that it imports."""
+    folder, _ = own
+    files = {"my_search.py": LENGTH, "my_version.py": "VERSION = 1\n"}
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    search = {"algorithm": "my_search:search", "pairs": 16, "evaluation_episodes": 4}
+    config = SMALL | {"search": search, "budget": {"generations": 1}}
+    loaded = api.load_config(config)
+    runs = [api.run(config, "first").run]
+    kept = sys.modules["json"], sys.modules[__name__]
+    for name, old, new in (("my_version.py", "1", "2"), ("my_search.py", "(VERSION)})", "(VERSION + 1)})")):
+        (folder / name).write_text(files[name].replace(old, new))
+        runs.append(api.run(loaded, f"after_{name}").run)
+        assert hashes(runs[-1])[name] == sha256((folder / name).read_bytes()) != hashes(runs[-2])[name]
+    assert [run.parts()[1]["own"]["version"].item() for run in runs] == [1, 2, 3]
+
+    (folder / "my_version.py").write_text("VERSION = 7\n")
+    notices = []
+    for go_on in (
+        lambda: api.resume("first", {"budget.generations": 2}, on_notice=notices.append),
+        lambda: api.fork("first", {"budget.generations": 3}, out="fork", on_notice=notices.append),
+    ):
+        (folder / "said").unlink()
+        run = go_on().run
+        assert (folder / "said").read_text() == "7"
+        assert hashes(run)["my_version.py"] == sha256(b"VERSION = 7\n")
+        (folder / "my_version.py").write_text("VERSION = 7\n")
+    assert "my_search.py, my_version.py changed" in notices[0]
+    assert (sys.modules["json"], sys.modules[__name__]) == kept
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import os
 import pickle
 import signal
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -223,6 +224,21 @@ def one_evaluator():
         yield evaluate
 
 
+def test_a_config_needs_no_search_and_no_budget_and_is_checked_nevertheless(reference):
+    bare = {name: section for name, section in CONFIG.items() if name not in ("search", "budget")}
+    for config in (bare, bare | {"search": {"pairs": 32}, "budget": {"env_steps": 9}, "map": {"enabled": False}}):
+        with es_service.evaluator(config) as evaluate:
+            assert twice(evaluate) == reference
+    with pytest.raises(ConfigError, match=r"search\.algorithm: missing[^$]*budget: this run has no limit"):
+        api.load_config(bare)
+    wrong = bare | {"search": {"algorithm": "sgd", "sigmas": 1}, "budget": {"generations": 0}}
+    with (
+        pytest.raises(ConfigError, match=r"search\.sigmas[^$]*budget\.generations[^$]*search\.algorithm: sgd"),
+        es_service.evaluator(wrong),
+    ):
+        pass
+
+
 def test_a_wrong_config_or_engine_is_an_error_before_anything_starts():
     before = children()
     for given in ({"engine": "other"}, {"workers": 0}, {"workers": "many"}, {"engine": "inline", "address": "h:1"}):
@@ -249,6 +265,21 @@ def test_a_closed_evaluator_and_one_that_was_interrupted_say_so(monkeypatch):
         assert children() == before
         with pytest.raises(ServiceError, match=r"closed by an error during a call \(KeyboardInterrupt"):
             evaluate(POLICIES[:1])
+
+
+def test_workers_outlive_the_thread_that_started_them():
+    """Linux kills a child that is bound to its parent at the end of the thread that created it."""
+    made = es_service.evaluator(CONFIG)
+    with ThreadPoolExecutor(1) as thread:
+        evaluate = thread.submit(made.__enter__).result()
+        thread.submit(evaluate, POLICIES[:1]).result()  # now the worker is bound
+    try:
+        (worker,) = evaluate._engine.transport.process_ids().values()
+        assert evaluate(POLICIES[:1]).valid.all()
+        assert evaluate._engine.counts.lost_workers == 0
+        assert worker in evaluate._engine.transport.process_ids().values()
+    finally:
+        made.__exit__(None, None, None)
 
 
 @pytest.mark.parametrize("name", ["pyribs_scheduler", "evosax_strategy"])

@@ -26,17 +26,16 @@ It may also have:
 - a docstring, whose first line `es-service` shows.
 
 All methods are pure functions of one state that JAX can trace; they are batched and compiled by the service.
-`es_service.protocol.noise.uniforms(key, counters)` makes random numbers. In training, actions may exceed [-1, 1] by up
-to 7.95 times `policy.action_noise`, which is added after the last tanh; a task that needs bounded actions must clip
-them. Observations are summed in float32, so their mean must be less than a thousand standard deviations from 0.
+`es_service.protocol.noise.uniforms(key, counters)` makes random numbers of the key of `reset`, which is no key of JAX;
+`jax.random.wrap_key_data(key[:2])` makes one of it, which the functions of `jax.random` accept. In training, actions
+may exceed [-1, 1] by up to 7.95 times `policy.action_noise`, which is added after the last tanh; a task that needs
+bounded actions must clip them. Observations are summed in float32, so their mean must be less than a thousand standard
+deviations from 0.
 """
 
 from __future__ import annotations
 
-import importlib
 import math
-import os
-import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -44,6 +43,7 @@ import jax
 import jax.numpy as jnp
 
 from es_service.protocol.messages import TaskSpec
+from es_service.protocol.own_code import import_own, in_no_file
 from workers.environments import Environment, TaskError
 
 METHODS = ("reset", "observe", "step", "descriptor")
@@ -55,6 +55,10 @@ ATTRIBUTES = {
     "descriptor_bounds": tuple,
 }
 
+JAX_KEY_WANTED = (
+    "reset(key) passes its key to jax.random, but it is a stream key of es-service, uint32 [4]. Make random numbers "
+    "with es_service.protocol.noise.uniforms(key, counters), or a key of JAX with jax.random.wrap_key_data(key[:2])"
+)
 TABLES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "the history": (
         ("centre_{}", "centre_{}_std"),
@@ -186,6 +190,8 @@ def _check_shapes(path: str) -> None:
             "done of step": (done.shape, ()),
             "goal_distance": (jax.eval_shape(environment.goal_distance, state).shape, ()),
         }
+    except TaskError as error:
+        raise TaskError(f"{path}: {error}") from error.__cause__
     except Exception as error:  # the user's code can raise anything
         raise TaskError(f"{path} cannot be traced by JAX: {type(error).__name__}: {error}") from error
     wrong = [f"{what} has the shape {is_}, not {should}" for what, (is_, should) in found.items() if is_ != should]
@@ -205,17 +211,34 @@ def make(path: str, options: Mapping[str, str]) -> Environment:
         state, reward, done = task.step(state, action)
         return state, jnp.asarray(reward, jnp.float32), jnp.asarray(done, bool)
 
+    def reset(key: Any) -> Any:
+        try:
+            return task.reset(key)
+        except Exception as error:
+            if _takes_jax_key(task.reset):
+                raise TaskError(JAX_KEY_WANTED) from error
+            raise
+
     viewer = task.viewer() if hasattr(task, "viewer") else None
-    return Environment(task.reset, task.observe, step, task.descriptor, goal_distance, viewer)
+    return Environment(reset, task.observe, step, task.descriptor, goal_distance, viewer)
+
+
+def _takes_jax_key(reset: Any) -> bool:
+    """Whether `reset`, which failed with a stream key, succeeds with a key of JAX."""
+    try:
+        jax.eval_shape(lambda: reset(jax.random.key(0)))
+    except Exception:  # the user's code can raise anything
+        return False
+    return True
 
 
 def _import(path: str) -> Any:
     """The class that `package.module:Class` names."""
     module, _, name = path.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # a console script does not search the current folder
+    if problem := in_no_file(path):
+        raise TaskError(problem)
     try:
-        found = importlib.import_module(module)
+        found = import_own(path)
     except (ImportError, ValueError, TypeError) as error:  # the latter two if the name is no module name
         raise TaskError(
             f"{path}: cannot import {module} ({error}); start in the folder that contains it, or install it"

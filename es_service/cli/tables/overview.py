@@ -8,8 +8,8 @@ from pathlib import Path
 from rich.console import Console
 
 from es_service.cli.several import of_each
-from es_service.cli.tables.progress import short
 from es_service.errors import ServiceError
+from es_service.report.progress import short
 from es_service.runs.folders import output_of
 from es_service.runs.standing import Standing, look, state
 from es_service.runs.view import open_run

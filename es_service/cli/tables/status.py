@@ -7,7 +7,7 @@ import time
 from rich.console import Console
 
 from es_service.cli.commands import command, settings, way_command
-from es_service.cli.tables.progress import plain_line
+from es_service.report.progress import plain_line
 from es_service.runs.objectives import recent_objectives
 from es_service.runs.standing import Standing, is_waiting, look, more, population_size, state, way_on
 from es_service.runs.view import Run

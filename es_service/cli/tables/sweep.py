@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from es_service.cli.tables.progress import ShowNotice, print_notice, short
+from es_service.report.progress import ShowNotice, print_notice, short
 from es_service.runs.sweep import OnProgress, SweptRun
 
 STATES = ("running", "failed", "stopped", "waiting", "finished")

@@ -10,23 +10,21 @@ the driver.
 
 from __future__ import annotations
 
-import importlib
-import os
-import sys
 from collections.abc import Callable
 
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
+from es_service.protocol.own_code import import_own, in_no_file
 from es_service.search.algorithms.base import Algorithm
 
 
 def import_factory(path: str) -> Callable[[RunConfig], object]:
-    """Import the user's function. Raises ConfigError if this fails, or if there is no such function."""
+    """The user's function, from its module as it is now; raises ConfigError if there is none or the import fails."""
     module, _, name = path.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # a console script does not search its working folder
+    if problem := in_no_file(path):
+        raise ConfigError(problem)
     try:
-        found = getattr(importlib.import_module(module), name, None)
+        found = getattr(import_own(path), name, None)
     except Exception as error:  # the user's code can raise anything
         kind = type(error).__name__
         raise ConfigError(

@@ -1,14 +1,19 @@
-"""Progress of a run: a live table on a terminal; elsewhere, also with TERM=dumb, at most one plain line per second."""
+"""Progress of a run: a table that changes in place on a terminal and in a notebook; elsewhere, also with TERM=dumb, at
+most one plain line per second."""
 
 from __future__ import annotations
 
+import importlib
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 
-from rich.console import Console, Group
+from rich import get_console
+from rich.console import Console, Group, RenderableType
+from rich.jupyter import JupyterMixin
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -22,6 +27,8 @@ ROWS_AROUND = 9
 """Screen lines needed for the table's frame, its title and the line below it."""
 RATE_WINDOW = 20
 """Generations over which steps per second are averaged for display."""
+NOTEBOOK_S = 0.2
+"""Least time between two changes of the table in a notebook, in seconds."""
 _PARTS = ("rollout", "gradient", "evaluation", "driver", "store")
 
 
@@ -39,6 +46,45 @@ def show_progress(console: Console, errors: Console, title: str) -> Iterator[tup
             live.update(live_table(title, recent, console.width, console.height))
 
         yield show, partial(print_notice, live.console)  # notices appear above the table
+
+
+def in_notebook() -> bool:
+    """Whether this program is the kernel of a notebook."""
+    return Console().is_jupyter
+
+
+@contextmanager
+def show_in_notebook(title: str) -> Iterator[ShowRow]:
+    """Yield a function to call with every history row; it changes a table in the output of the notebook's cell."""
+    recent: deque[Row] = deque(maxlen=RATE_WINDOW)
+    waiting = _InNotebook(Text(f"{title}: starting workers"))
+    output, shown_s = importlib.import_module("IPython.display").display(waiting, display_id=True), -math.inf
+
+    def update() -> None:
+        table = live_table(title, recent, get_console().width, TABLE_ROWS + ROWS_AROUND) if recent else None
+        output.update(_InNotebook(table or Text(f"{title}: no generation was run")))
+
+    def show(row: Row) -> None:
+        nonlocal shown_s
+        recent.append(row)
+        if (now := time.monotonic()) - shown_s >= NOTEBOOK_S:
+            shown_s = now
+            update()
+
+    try:
+        yield show
+    finally:
+        update()
+
+
+class _InNotebook(JupyterMixin):
+    """Something that a notebook shows as HTML."""
+
+    def __init__(self, content: RenderableType) -> None:
+        self._content = content
+
+    def __rich__(self) -> RenderableType:
+        return self._content
 
 
 def print_notice(console: Console, notice: str) -> None:
