@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
@@ -18,7 +18,8 @@ from es_service.config.loading import Source
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
 from es_service.config.yaml_text import show
-from es_service.errors import ConfigError, StoreError, WayOut
+from es_service.dispatch import dispatch_log
+from es_service.errors import ConfigError, StartError, StoreError, WayOut
 from es_service.logs import in_run
 from es_service.loop.budget import REACHED, limits_of, raised
 from es_service.loop.history import Column, evaluated_columns, history_columns
@@ -27,7 +28,7 @@ from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.identity import require_unchanged
 from es_service.runs.lineage import fork_config, forked, started
-from es_service.runs.session import OnGeneration, OnNotice, Outcome, work
+from es_service.runs.session import OnGeneration, OnNotice, Outcome, require_cores, work
 from es_service.runs.standing import Standing, look
 from es_service.runs.view import open_run
 from es_service.store.beginning import Beginning
@@ -78,7 +79,8 @@ def run(
     parent, beginning = None, Beginning()
     if config.search.init_from is not None:
         parent, beginning = started(config, config.search.init_from, on_notice)
-    return _create_and_work(config, out, parent, beginning, on_generation, on_notice, hook)
+    again = WayOut("run", "", out=None if out is None else str(out))
+    return _create_and_work(config, out, parent, beginning, again, on_generation, on_notice, hook)
 
 
 def resume(
@@ -167,6 +169,7 @@ def _go_on(
             )
         if strict:
             require_unchanged(store, config)
+        require_cores(config, WayOut("resume", "", run=str(folder)))
         try:
             write_config(folder, config.resolved_yaml())
         except OSError as error:
@@ -218,7 +221,8 @@ def fork(
     """
     config = fork_config(parent, overrides)
     lineage, beginning = forked(open_run(parent), config, generation)
-    outcome = _create_and_work(config, out, lineage, beginning, on_generation, on_notice, hook)
+    again = WayOut("fork", "", run=str(parent))
+    outcome = _create_and_work(config, out, lineage, beginning, again, on_generation, on_notice, hook)
     if outcome.run.generation == (begun := lineage["generation"]):
         on_notice(
             f"no generation was run: {outcome.reason} already at generation {begun}, where this fork begins; resume it "
@@ -248,10 +252,17 @@ def _create_and_work(
     out: str | os.PathLike[str] | None,
     parent: dict[str, Any] | None,
     beginning: Beginning,
+    again: WayOut,
     on_generation: OnGeneration,
     on_notice: OnNotice,
     hook: Callable[[str], None],
 ) -> Outcome:
+    """Create a run and work on it. If its workers cannot be started, there is no run afterwards.
+
+    Args:
+        again: the call that was made, which ways out repeat with other settings.
+    """
+    require_cores(config, again)
     folder = Path(out) if out is not None else default_folder(config)
     task = task_of(config)
     columns, evaluation_columns = _columns(config, task)
@@ -266,4 +277,15 @@ def _create_and_work(
         parent=parent,
     )
     with RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=hook) as store, in_run(meta.run_id):
-        return work(config, store, on_generation, on_notice)
+        try:
+            return work(config, store, on_generation, on_notice)
+        except StartError as error:
+            (folder / dispatch_log.FILE).unlink(missing_ok=True)
+            store.discard()
+            error.run = None
+            error.ways_out = tuple(
+                replace(again, purpose=way.purpose, settings=way.settings) if way.action == "resume" else way
+                for way in error.ways_out
+                if way.action != "resume" or way.settings
+            )
+            raise

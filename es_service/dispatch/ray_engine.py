@@ -60,7 +60,7 @@ def ray_engine(
         on_refusal: as in `Actors`.
 
     Raises:
-        EvaluationError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
+        StartError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
         Interrupted: SIGTERM arrived during the call.
     """
     ray = connect(address, gpus=bool(gpus), cpus=limits.workers if most is None else cores())

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from es_service.config.compute import implied_by
 from es_service.config.model import RunConfig, policy_shape, worker_spec
 from es_service.config.parallel import chunks_at_once, parallel_sentence
 from es_service.config.tasks import task_of
@@ -17,7 +18,7 @@ from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log, no_lo
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.errors import EvaluationError, StoreError, WayOut
+from es_service.errors import ConfigError, EvaluationError, StoreError, WayOut
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.parts import moments_from_arrays
@@ -106,11 +107,11 @@ def work(
     code = code_of(config)
     tell_of_other_code(store, code, tell)
     in_generation(0 if store.generation is None else store.generation + 1)
-    compute, most = config.compute, chunks_at_once(config)
+    compute = config.compute
     _LOG.info("working on %s: engine %s, rollout %s", store.folder, compute.engine, compute.rollout)
     _LOG.info(parallel_sentence(config))
-    if compute.workers != "auto" and compute.workers > most:
-        tell(f"compute.workers: {compute.workers} workers start, but {parallel_sentence(config)}")
+    if compute.workers != "auto" and (count := worker_count(config)) < compute.workers:
+        tell(f"compute.workers: {count} workers start and not {compute.workers}, since {parallel_sentence(config)}")
     with (
         _naming_the_run(store.folder),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
@@ -235,8 +236,42 @@ def worker_count(config: RunConfig, most: int | None = None) -> int:
 
     Args:
         most: number of workers for which there is work; None: as in a generation of a run.
+
+    Raises ConfigError as `require_cores`.
     """
-    workers = config.compute.workers
-    if workers != "auto":
-        return workers
-    return max(1, min(cores(), chunks_at_once(config) if most is None else most))
+    compute, search = config.compute, config.search
+    require_cores(config)
+    if most is None:
+        most = chunks_at_once(config)
+    if compute.workers == "auto":
+        return max(1, min(cores(), most))
+    if ":" in search.algorithm:  # a search of the user's own may ask for any number of policies
+        return compute.workers
+    actor = 1 if compute.worker_resources.cpu == "auto" else compute.worker_resources.cpu
+    return min(compute.workers, -(-most // actor) * actor)
+
+
+def require_cores(config: RunConfig, again: WayOut | None = None) -> None:
+    """Raise ConfigError if all workers are on this machine and are more than its cores can be meant to run.
+
+    Args:
+        again: the call that asks for the workers, for the way out to a cluster.
+    """
+    compute, count = config.compute, cores()
+    if compute.workers == "auto" or compute.address is not None:
+        return
+    allowed = compute.max_workers_per_core * count
+    if compute.workers <= allowed:
+        return
+    here = f"this machine, which has {count} core{'s' if count > 1 else ''} for them"
+    cluster = implied_by(None, "HOST:PORT") | {"compute.address": "HOST:PORT", "compute.workers": compute.workers}
+    ways_out = [replace(again, purpose="use the cores of a Ray cluster", settings=cluster)] if again else []
+    raise ConfigError(
+        f"compute.workers: {compute.workers} workers would start on {here}; must be at most {allowed}, "
+        f"{compute.max_workers_per_core} for each core (compute.max_workers_per_core). auto starts one for each core",
+        field="compute.workers",
+        value=compute.workers,
+        allowed=f"at most {allowed}",
+        suggestion="auto",
+        ways_out=ways_out,
+    )

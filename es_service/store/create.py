@@ -112,6 +112,16 @@ def _clear(place: Path, beside: bool) -> None:
             place.rmdir()
 
 
+def remove_run_folder(folder: Path, *, whole: bool) -> None:
+    """Delete the files of a run, whose lock is held, and with `whole` also its folder, unless that has other files."""
+    with contextlib.suppress(OSError):
+        remove_database(folder / DATABASE)
+        for name in (COPY, CONFIG, LOCK):
+            (folder / name).unlink(missing_ok=True)
+        if whole:
+            folder.rmdir()
+
+
 def _refuse_taken(folder: Path) -> None:
     if not folder.exists():
         return
