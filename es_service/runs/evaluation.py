@@ -21,15 +21,20 @@ from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop.generation import evaluate_centres
 from es_service.loop.parts import BEST
-from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray
+from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, Moments
 from es_service.runs.checked_config import changed_config
 from es_service.runs.moment import Policy, make_policy
 from es_service.runs.session import dispatch_limits
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, is_no_elite
+from es_service.search.observation_statistics import merge_moments, moments_of
 
 CHUNKS_PER_WORKER = 16
 """Chunks per worker that are evaluated side by side: enough to keep all busy, few enough to show results soon."""
+EPISODES_AT_ONCE = 2**16
+"""Most episodes of a policy whose results are in memory at a time; a constant, since it affects the last bits of the
+statistics of more episodes."""
 FRESH_GENERATION = 2**40
 """Generation number in the random streams of fresh episodes with seed 0; no run reaches it."""
 
@@ -51,34 +56,41 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Fresh:
-    """Results of a candidate's E fresh episodes: fitness [E] and descriptors [E, B]."""
+    """Statistics of a candidate's fresh episodes, whose memory does not depend on the number of episodes."""
 
     candidate: Candidate
-    fitness_E: FloatArray
-    descriptor_E_B: FloatArray
+    fitness: Moments
+    """Count, mean and squared deviations of the fitness, without axes."""
+    descriptors: Moments
+    """The same of the descriptors, [B]."""
     cell: int | None
     """Cell of its mean fresh descriptor; None without a map, or if the descriptor is not finite."""
 
     @property
+    def episodes(self) -> int:
+        """Number of fresh episodes."""
+        return int(self.fitness.count)
+
+    @property
     def mean(self) -> float:
         """Mean fitness over the fresh episodes."""
-        return float(self.fitness_E.mean(dtype=np.float64))
+        return float(self.fitness.mean_O)
 
     @property
     def standard_error(self) -> float:
         """Standard error of `mean`: standard deviation (n - 1) divided by the square root of n; NaN for one episode."""
-        count = self.fitness_E.size
-        return float(self.fitness_E.std(dtype=np.float64, ddof=1) / sqrt(count)) if count > 1 else float("nan")
+        count = self.episodes
+        return sqrt(self.fitness.m2_O / (count - 1)) / sqrt(count) if count > 1 else float("nan")
 
     @property
     def descriptor(self) -> NDArray[np.float64]:
         """Mean descriptor over the fresh episodes, [B]."""
-        return self.descriptor_E_B.mean(axis=0, dtype=np.float64)
+        return self.descriptors.mean_O
 
     @property
     def descriptor_std(self) -> NDArray[np.float64]:
         """Standard deviation of the descriptor over the fresh episodes, [B]."""
-        return self.descriptor_E_B.std(axis=0, dtype=np.float64)
+        return np.sqrt(self.descriptors.m2_O / self.episodes)
 
 
 def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[int]], every: bool) -> list[Candidate]:
@@ -141,13 +153,27 @@ def evaluate(
         for first in range(0, len(chosen), together):
             group = chosen[first : first + together]
             centres = [_centre(candidate.policy, config.search.sigma, seed) for candidate in group]
-            results = evaluate_centres(engine, centres, episodes, resets="same")
-            for candidate, result in zip(group, results, strict=True):
-                mean_B = result.descriptor.mean(axis=0, dtype=np.float64)
+            for candidate, (fitness, descriptors) in zip(group, _moments(engine, centres, episodes), strict=True):
                 cell = None
-                if geometry is not None and np.isfinite(mean_B).all():
-                    cell = int(geometry.cells_of(mean_B[None])[0])
-                yield Fresh(candidate, result.fitness, result.descriptor, cell)
+                if geometry is not None and np.isfinite(descriptors.mean_O).all():
+                    cell = int(geometry.cells_of(descriptors.mean_O[None])[0])
+                yield Fresh(candidate, fitness, descriptors, cell)
+
+
+@np.errstate(invalid="ignore", over="ignore")  # a policy may have an infinite fitness
+def _moments(engine: Evaluator, centres: Sequence[Centre], episodes: int) -> list[tuple[Moments, ...]]:
+    """Moments of the fitness and of the descriptors of each centre, a limited number of episodes at a time."""
+    found: list[tuple[Moments, ...]] = []
+    for start in range(0, episodes, EPISODES_AT_ONCE):
+        count, first = min(EPISODES_AT_ONCE, episodes - start), start // EVALUATION_EPISODES_PER_CHUNK
+        results = evaluate_centres(engine, centres, count, resets="same", first=first)
+        parts = [(moments_of(result.fitness), moments_of(result.descriptor)) for result in results]
+        found = [tuple(map(_merged, *both)) for both in zip(found, parts, strict=True)] if found else parts
+    return found
+
+
+def _merged(total: Moments, part: Moments) -> Moments:
+    return merge_moments(total, [part])
 
 
 def _centre(policy: Policy, sigma: float, seed: int) -> Centre:

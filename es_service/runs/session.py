@@ -241,10 +241,9 @@ def worker_count(config: RunConfig, most: int | None = None) -> int:
     """
     compute, search = config.compute, config.search
     require_cores(config)
-    if most is None:
-        most = chunks_at_once(config)
+    most = max(1, chunks_at_once(config) if most is None else most)
     if compute.workers == "auto":
-        return max(1, min(cores(), most))
+        return min(cores(), most)
     if ":" in search.algorithm:  # a search of the user's own may ask for any number of policies
         return compute.workers
     actor = 1 if compute.worker_resources.cpu == "auto" else compute.worker_resources.cpu

@@ -99,7 +99,7 @@ def row_of(fresh: Fresh, names: list[str]) -> dict[str, Any]:
     return {
         "policy": one.name,
         "generation": one.generation,
-        "episodes": fresh.fitness_E.size,
+        "episodes": fresh.episodes,
         "stored_fitness": one.stored_fitness,
         "fresh_fitness": fresh.mean,
         "fresh_standard_error": fresh.standard_error,
