@@ -44,8 +44,8 @@ _KEPT_OF_A_TASK = ("observation_size", "action_size", "descriptor_names", "has_g
 """Fields of a task that the policies and the history of a run depend on."""
 
 
-def _ignore(row: Mapping[str, Any]) -> None:
-    """Do nothing; the default for `on_generation`."""
+def _ignore(told: object) -> None:
+    """Do nothing; the default for `on_generation` and `on_compile`."""
 
 
 def _warn(notice: str) -> None:
@@ -58,6 +58,7 @@ def run(
     *,
     on_generation: OnGeneration = _ignore,
     on_notice: OnNotice = _warn,
+    on_compile: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Start a run and continue it until its budget is spent.
@@ -68,6 +69,7 @@ def run(
             runs/<environment>_<algorithm>_seed<seed>_<time>-<process>.
         on_generation: called with the history row of each generation after it is committed.
         on_notice: called with each notice for the user; by default, notices are RuntimeWarnings.
+        on_compile: called with a sentence when the workers compile for more than two seconds.
         hook: called with the name of each point of the store that is passed; for tests that kill the process there.
 
     Raises:
@@ -80,7 +82,7 @@ def run(
     if config.search.init_from is not None:
         parent, beginning = started(config, config.search.init_from, on_notice)
     again = WayOut("run", "", out=None if out is None else str(out))
-    return _create_and_work(config, out, parent, beginning, again, on_generation, on_notice, hook)
+    return _create_and_work(config, out, parent, beginning, again, on_generation, on_notice, on_compile, hook)
 
 
 def resume(
@@ -90,6 +92,7 @@ def resume(
     strict: bool = False,
     on_generation: OnGeneration = _ignore,
     on_notice: OnNotice = _warn,
+    on_compile: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Continue a run from its last committed generation; its result has the same bits as without an interruption.
@@ -110,7 +113,7 @@ def resume(
         source = recorded if recorded.exists() else store.meta.config
         return changed_config(source, overrides)
 
-    return _go_on(Path(folder), changed, on_generation, on_notice, hook, strict=strict)
+    return _go_on(Path(folder), changed, on_generation, on_notice, on_compile, hook, strict=strict)
 
 
 def run_or_resume(
@@ -119,6 +122,7 @@ def run_or_resume(
     *,
     on_generation: OnGeneration = _ignore,
     on_notice: OnNotice = _warn,
+    on_compile: OnNotice = _ignore,
 ) -> Outcome:
     """Start a run, or resume it if the folder already holds it; the same call can be repeated after any interruption.
 
@@ -128,8 +132,8 @@ def run_or_resume(
     begun = holds_run(Path(out))
     wanted = config if isinstance(config, RunConfig) else load_config(config, new=not begun)
     if not begun:
-        return run(wanted, out, on_generation=on_generation, on_notice=on_notice)
-    return _go_on(Path(out), lambda store: wanted, on_generation, on_notice)
+        return run(wanted, out, on_generation=on_generation, on_notice=on_notice, on_compile=on_compile)
+    return _go_on(Path(out), lambda store: wanted, on_generation, on_notice, on_compile)
 
 
 def _go_on(
@@ -137,6 +141,7 @@ def _go_on(
     make_config: Callable[[RunStore], RunConfig],
     on_generation: OnGeneration,
     on_notice: OnNotice,
+    on_compile: OnNotice,
     hook: Callable[[str], None] = no_hook,
     *,
     strict: bool = False,
@@ -174,7 +179,7 @@ def _go_on(
             write_config(folder, config.resolved_yaml())
         except OSError as error:
             raise explained(error, folder, f"writing {CONFIG}") from error
-        return work(config, store, on_generation, on_notice, strict=strict)
+        return work(config, store, on_generation, on_notice, on_compile, strict=strict)
 
 
 def _budget_of_a_fork(config: RunConfig, standing: Standing) -> dict[str, Any]:
@@ -201,6 +206,7 @@ def fork(
     out: str | os.PathLike[str] | None = None,
     on_generation: OnGeneration = _ignore,
     on_notice: OnNotice = _warn,
+    on_compile: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Start a new run from another run's state, with changed settings.
@@ -222,7 +228,7 @@ def fork(
     config = fork_config(parent, overrides)
     lineage, beginning = forked(open_run(parent), config, generation)
     again = WayOut("fork", "", run=str(parent))
-    outcome = _create_and_work(config, out, lineage, beginning, again, on_generation, on_notice, hook)
+    outcome = _create_and_work(config, out, lineage, beginning, again, on_generation, on_notice, on_compile, hook)
     if outcome.run.generation == (begun := lineage["generation"]):
         on_notice(
             f"no generation was run: {outcome.reason} already at generation {begun}, where this fork begins; resume it "
@@ -255,6 +261,7 @@ def _create_and_work(
     again: WayOut,
     on_generation: OnGeneration,
     on_notice: OnNotice,
+    on_compile: OnNotice,
     hook: Callable[[str], None],
 ) -> Outcome:
     """Create a run and work on it. If its workers cannot be started, there is no run afterwards.
@@ -278,7 +285,7 @@ def _create_and_work(
     )
     with RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=hook) as store, in_run(meta.run_id):
         try:
-            return work(config, store, on_generation, on_notice)
+            return work(config, store, on_generation, on_notice, on_compile)
         except StartError as error:
             (folder / dispatch_log.FILE).unlink(missing_ok=True)
             store.discard()

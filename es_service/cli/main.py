@@ -46,7 +46,7 @@ from es_service.cli.options import (
 from es_service.cli.report import export, report
 from es_service.cli.show import config_, digest_, list_, status
 from es_service.cli.sweep import SeedsOption, run_seeds, sweep
-from es_service.cli.tables.progress import show_progress
+from es_service.cli.tables.progress import print_notice, show_progress
 from es_service.cli.tables.status import print_summary
 from es_service.cli.verify import verify
 from es_service.config.parallel import parallel_sentence
@@ -182,7 +182,8 @@ def evaluate(
         every=every,
     )
     with csv_file(out, print_note) as write:
-        results = evaluation.evaluate(found, chosen, episodes, workers, seed)
+        tell = partial(print_notice, errors)
+        results = evaluation.evaluate(found, chosen, episodes, workers, seed, on_compile=tell)
         if not as_json:
             print_evaluations(console, found, results, write, every=every)
             return
@@ -263,7 +264,11 @@ def _session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] 
             show_progress(console, errors, str(folder)) as (show, note),
             tracked(folder, log or (), partial(tell, note)) as send,
         ):
-            outcome = work(on_generation=partial(tell_generation, show), on_notice=partial(tell, note))
+            outcome = work(
+                on_generation=partial(tell_generation, show),
+                on_notice=partial(tell, note),
+                on_compile=partial(tell, note),
+            )
     except Interrupted:
         if began or holds_run(folder):
             print_note(f"interrupted; every finished generation is saved. Continue with: {command('resume', folder)}")

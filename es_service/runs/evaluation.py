@@ -7,7 +7,7 @@ same ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import sqrt
 
@@ -24,6 +24,7 @@ from es_service.loop.parts import BEST
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, Moments
 from es_service.runs.checked_config import changed_config
+from es_service.runs.compiling import compiling_sentence
 from es_service.runs.moment import Policy, make_policy
 from es_service.runs.session import dispatch_limits
 from es_service.runs.signals import stop_on_signals
@@ -129,7 +130,12 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
 
 
 def evaluate(
-    run: Run, chosen: Sequence[Candidate], episodes: int, workers: int | None = None, seed: int = 0
+    run: Run,
+    chosen: Sequence[Candidate],
+    episodes: int,
+    workers: int | None = None,
+    seed: int = 0,
+    on_compile: Callable[[str], None] = lambda sentence: None,
 ) -> Iterator[Fresh]:
     """Evaluate each candidate on fresh, noise-free episodes on this machine; yield the results in order.
 
@@ -137,6 +143,7 @@ def evaluate(
         episodes: number of episodes per candidate.
         workers: number of worker processes; None: one per core.
         seed: seed of the evaluation episodes, from 0 to 2**63 - 1.
+        on_compile: called with a sentence when the workers compile for more than two seconds.
 
     Raises EvaluationError if the rollouts cannot continue, and Interrupted after SIGINT or SIGTERM.
     """
@@ -144,10 +151,15 @@ def evaluate(
     config = changed_config(run.present_config, overrides)
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
-    limits = dispatch_limits(config, chunks * len(chosen))
+    limits, spec = dispatch_limits(config, chunks * len(chosen)), worker_spec(config, task_of(config))
+
+    def tell_compiling(kind: str) -> None:
+        if kind:
+            on_compile(compiling_sentence(spec, kind, here=True))
+
     with (
         stop_on_signals() as should_stop,
-        inline_engine(worker_spec(config, task_of(config)), limits, should_stop) as engine,
+        inline_engine(spec, limits, should_stop, on_compile=tell_compiling) as engine,
     ):
         together = max(1, CHUNKS_PER_WORKER * engine.counts.workers // chunks)
         for first in range(0, len(chosen), together):

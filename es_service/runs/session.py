@@ -24,6 +24,7 @@ from es_service.loop import driver
 from es_service.loop.parts import moments_from_arrays
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments
+from es_service.runs.compiling import compiling_sentence, note_compiled
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, open_run
@@ -65,12 +66,14 @@ def work(
     store: RunStore,
     on_generation: OnGeneration,
     on_notice: OnNotice,
+    on_compile: OnNotice,
     *,
     strict: bool = False,
 ) -> Outcome:
     """Run generations until the budget is spent.
 
     Args:
+        on_compile: called when workers compile and nothing has been heard of the run for some time.
         strict: whether workers on another platform than the run's are an error.
     """
     task = task_of(config)
@@ -94,6 +97,13 @@ def work(
         waits = f"no worker has a place in the cluster; the run waits {until}. {shortage}"
         tell(waits if shortage else "a worker has a place in the cluster; the run begins")
 
+    def tell_compiling(kind: str) -> None:
+        sentence = compiling_sentence(spec, kind, here=config.compute.address is None) if kind else ""
+        store.lock.say(doing=sentence)
+        if sentence:
+            _LOG.info(sentence)
+            on_compile(sentence)
+
     tell_notices()
     state = driver.stored_state(store, task)
     if state is not None and (reason := driver.spent(config.budget, state)) is not None:
@@ -107,7 +117,7 @@ def work(
     code = code_of(config)
     tell_of_other_code(store, code, tell)
     in_generation(0 if store.generation is None else store.generation + 1)
-    compute = config.compute
+    compute, spec, noted = config.compute, worker_spec(config, task), set[str]()
     _LOG.info("working on %s: engine %s, rollout %s", store.folder, compute.engine, compute.rollout)
     _LOG.info(parallel_sentence(config))
     if compute.workers != "auto" and (count := worker_count(config)) < compute.workers:
@@ -116,11 +126,15 @@ def work(
         _naming_the_run(store.folder),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
         stop_on_signals() as should_stop,
-        make_engine(config, should_stop, log, tell_wait, tell) as engine,
+        make_engine(config, should_stop, log, tell_wait, tell, tell_compiling) as engine,
     ):
 
         def after_generation(row: Mapping[str, Any]) -> None:
             log(Committed(row["generation"]))
+            if compute.address is None:
+                for kind in engine.computed - noted:
+                    note_compiled(spec, kind)
+                noted.update(engine.computed)
             tell_notices()
             if lost := row["lost_workers"]:
                 who = "a worker" if lost == 1 else f"{lost} workers"
@@ -177,13 +191,14 @@ def make_engine(
     log: Log = no_log,
     on_wait: Callable[[str], None] = lambda shortage: None,
     on_refusal: OnNotice = lambda refusal: None,
+    on_compile: Callable[[str], None] = lambda kind: None,
     *,
     at_once: int | None = None,
 ) -> Engine[Any]:
     """The configured engine, whose workers are starting.
 
     Args:
-        should_stop, log, on_wait: as in `Engine`.
+        should_stop, log, on_wait, on_compile: as in `Engine`.
         on_refusal: as in `ray_engine`.
         at_once: number of chunks that can be computed at the same time; None: as in a generation of a run.
     """
@@ -191,7 +206,8 @@ def make_engine(
     at_once = chunks_at_once(config) if at_once is None else at_once
     limits = dispatch_limits(config, at_once)
     if compute.engine == "inline":
-        return inline_engine(spec, limits, should_stop, threads=compute.inline_workers == "threads", log=log)
+        threads = compute.inline_workers == "threads"
+        return inline_engine(spec, limits, should_stop, threads=threads, log=log, on_compile=on_compile)
     from es_service.dispatch.ray_engine import ray_engine
 
     return ray_engine(
@@ -205,6 +221,7 @@ def make_engine(
         most=at_once if compute.workers == "auto" else None,
         log=log,
         on_wait=on_wait,
+        on_compile=on_compile,
         on_refusal=on_refusal,
     )
 

@@ -102,7 +102,8 @@ def test_an_evaluation_that_would_take_days_begins_at_once_and_ends_promptly(map
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=20)
     assert time.monotonic() - sent < 2.0
-    assert (process.returncode, errors) == (130, "")
+    assert process.returncode == 130
+    assert "Traceback" not in errors
 
 
 def test_fresh_episodes_differ_from_those_that_chose(tmp_path):
