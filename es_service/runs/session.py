@@ -283,7 +283,7 @@ def require_cores(config: RunConfig, again: WayOut | None = None) -> None:
     cluster = implied_by(None, "HOST:PORT") | {"compute.address": "HOST:PORT", "compute.workers": compute.workers}
     ways_out = [replace(again, purpose="use the cores of a Ray cluster", settings=cluster)] if again else []
     raise ConfigError(
-        f"compute.workers: {compute.workers} workers would start on {here}; must be at most {allowed}, "
+        f"compute.workers: {compute.workers} workers are too many for {here}; must be at most {allowed}, "
         f"{compute.max_workers_per_core} for each core (compute.max_workers_per_core). auto starts one for each core",
         field="compute.workers",
         value=compute.workers,

@@ -105,7 +105,7 @@ def test_more_workers_on_this_machine_than_its_cores_can_be_meant_to_run_are_ref
     assert worker_count(configured(20, engine=engine, max_workers_per_core=10), 1000) == 20
     assert worker_count(configured(5000, engine="ray", address="auto"), 1000) == 1000
     folder = tmp_path / "run"
-    with pytest.raises(ConfigError, match=r"5000 workers would start on this machine, which has 2 cores") as error:
+    with pytest.raises(ConfigError, match=r"5000 workers are too many for this machine, which has 2 cores") as error:
         api.run(configured(5000, engine=engine), folder)
     assert (error.value.field, error.value.value, error.value.allowed) == ("compute.workers", 5000, "at most 8")
     assert error_message(error.value).endswith(
