@@ -32,6 +32,7 @@ from es_service.runs.session import OnGeneration, OnNotice, Outcome, require_cor
 from es_service.runs.standing import Standing, look
 from es_service.runs.view import open_run
 from es_service.store.beginning import Beginning
+from es_service.store.create import remove_run_folder
 from es_service.store.folder import CONFIG, explained, holds_run, write_config
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook
@@ -271,7 +272,7 @@ def _create_and_work(
     """
     require_cores(config, again)
     folder = Path(out) if out is not None else default_folder(config)
-    task = task_of(config)
+    is_new, task = not folder.exists(), task_of(config)
     columns, evaluation_columns = _columns(config, task)
     meta = RunMeta(
         run_id=uuid4().hex,
@@ -287,8 +288,9 @@ def _create_and_work(
         try:
             return work(config, store, on_generation, on_notice, on_compile)
         except StartError as error:
+            store.close()
             (folder / dispatch_log.FILE).unlink(missing_ok=True)
-            store.discard()
+            remove_run_folder(folder, whole=is_new)
             error.run = None
             error.ways_out = tuple(
                 replace(again, purpose=way.purpose, settings=way.settings) if way.action == "resume" else way

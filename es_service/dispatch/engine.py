@@ -187,11 +187,6 @@ class Engine(Generic[AnyTransport]):
             retries=state.retries, lost_workers=state.lost_workers, workers=state.wanted * state.limits.cores
         )
 
-    @property
-    def computed(self) -> frozenset[str]:
-        """Kinds of chunks of which some have been computed."""
-        return frozenset(self._state.durations_s)
-
     def wait_for_place(self) -> None:
         """Return when a first worker has a place. Work may be given earlier, but then this wait is part of its time.
 

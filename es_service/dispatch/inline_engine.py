@@ -50,8 +50,7 @@ def inline_engine(
         spec: constants of the run.
         limits: number of workers, deadlines and numbers of attempts.
         should_stop: as in `Engine`.
-        threads: whether workers are threads of one child instead of a child each. They take less memory, but if one
-            worker is lost, all are lost.
+        threads: whether workers are threads of one child, which takes less memory; if one is lost, all are lost.
         log, on_compile: as in `Engine`.
     """
     return Engine(ChildProcesses(spec, threads=threads), limits, should_stop, log, on_compile=on_compile)

@@ -1,7 +1,7 @@
 """What a run says while its workers compile, and what workers of this machine have compiled before.
 
 Workers keep compiled code on disk, in caches whose keys only they can compute. So an empty file for each kind of chunk
-that was computed, named by all that the code depends on, stands beside these caches.
+that they have compiled for, named by all that the code depends on, stands beside these caches.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import hashlib
 from dataclasses import replace
 from pathlib import Path
 
+from es_service.dispatch.dispatch_log import Entry, Log
+from es_service.dispatch.events import Compiled
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import WorkerSpec
 from workers.simd.backend.cache import cache_folder
@@ -45,13 +47,13 @@ def compiling_sentence(spec: WorkerSpec, kind: str, *, here: bool) -> str:
 
 
 def was_compiled(spec: WorkerSpec, kind: str) -> bool:
-    """Whether workers of this machine have computed this kind of chunk with such code before."""
+    """Whether workers of this machine have compiled for this kind of chunk before."""
     file = _file(spec, kind)
     return file is not None and file.exists()
 
 
 def note_compiled(spec: WorkerSpec, kind: str) -> None:
-    """Remember that workers of this machine have computed this kind of chunk."""
+    """Remember that workers of this machine have compiled for this kind of chunk."""
     if (file := _file(spec, kind)) is None:
         return
     with contextlib.suppress(OSError):  # nothing but a sentence depends on it
@@ -59,6 +61,19 @@ def note_compiled(spec: WorkerSpec, kind: str) -> None:
         file.touch()
         for old in sorted(file.parent.iterdir(), key=lambda one: one.stat().st_mtime)[:-MOST_FILES]:
             old.unlink(missing_ok=True)
+
+
+def noting(log: Log, spec: WorkerSpec) -> Log:
+    """The dispatch log of workers on this machine, which also remembers for which kinds they have compiled."""
+    noted: set[str] = set()
+
+    def log_and_note(entry: Entry) -> None:
+        log(entry)
+        if isinstance(entry, Compiled) and entry.kind not in noted:
+            noted.add(entry.kind)
+            note_compiled(spec, entry.kind)
+
+    return log_and_note
 
 
 def _file(spec: WorkerSpec, kind: str) -> Path | None:

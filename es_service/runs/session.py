@@ -24,7 +24,7 @@ from es_service.loop import driver
 from es_service.loop.parts import moments_from_arrays
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments
-from es_service.runs.compiling import compiling_sentence, note_compiled
+from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, open_run
@@ -117,7 +117,7 @@ def work(
     code = code_of(config)
     tell_of_other_code(store, code, tell)
     in_generation(0 if store.generation is None else store.generation + 1)
-    compute, spec, noted = config.compute, worker_spec(config, task), set[str]()
+    compute, spec = config.compute, worker_spec(config, task)
     _LOG.info("working on %s: engine %s, rollout %s", store.folder, compute.engine, compute.rollout)
     _LOG.info(parallel_sentence(config))
     if compute.workers != "auto" and (count := worker_count(config)) < compute.workers:
@@ -126,15 +126,18 @@ def work(
         _naming_the_run(store.folder),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
         stop_on_signals() as should_stop,
-        make_engine(config, should_stop, log, tell_wait, tell, tell_compiling) as engine,
+        make_engine(
+            config,
+            should_stop,
+            noting(log, spec) if compute.address is None else log,
+            tell_wait,
+            tell,
+            tell_compiling,
+        ) as engine,
     ):
 
         def after_generation(row: Mapping[str, Any]) -> None:
             log(Committed(row["generation"]))
-            if compute.address is None:
-                for kind in engine.computed - noted:
-                    note_compiled(spec, kind)
-                noted.update(engine.computed)
             tell_notices()
             if lost := row["lost_workers"]:
                 who = "a worker" if lost == 1 else f"{lost} workers"

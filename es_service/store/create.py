@@ -113,13 +113,20 @@ def _clear(place: Path, beside: bool) -> None:
 
 
 def remove_run_folder(folder: Path, *, whole: bool) -> None:
-    """Delete the files of a run, whose lock is held, and with `whole` also its folder, unless that has other files."""
-    with contextlib.suppress(OSError):
-        remove_database(folder / DATABASE)
-        for name in (COPY, CONFIG, LOCK):
+    """Delete the files of a run that could not begin, and with `whole` also its folder, unless that has other files.
+
+    Raises:
+        RunLockedError: another process writes the run.
+    """
+    lock = acquire_lock(folder)
+    with contextlib.suppress(OSError):  # what remains is a run without a generation, which can be resumed
+        for name in (DATABASE, COPY):
+            remove_database(folder / name)
+        for name in (CONFIG, LOCK):
             (folder / name).unlink(missing_ok=True)
         if whole:
             folder.rmdir()
+    lock.release()
 
 
 def _refuse_taken(folder: Path) -> None:

@@ -32,7 +32,7 @@ from es_service.store.codec import (
     state_sum,
     table_bytes,
 )
-from es_service.store.create import create_run_folder, remove_run_folder
+from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.kept import earlier_states, outdated_rows
 from es_service.store.lock import RunLock, acquire_lock
@@ -64,8 +64,6 @@ class RunStore:
     keep_every: int | None = None
     """Generations whose number is a multiple of this keep their states; None keeps only the last two states. States of
     earlier generations that are kept when the run is opened remain."""
-    _is_ours: bool = False
-    """Whether `create` has made the folder."""
     start: Part | None
     """Arrays from which generation 0 starts; None if the run was created without them."""
 
@@ -117,11 +115,8 @@ class RunStore:
             StoreError: the folder is not empty or cannot be written, or the columns of `meta` cannot be stored.
         """
         folder = Path(folder)
-        was_there = folder.exists()
         lock = create_run_folder(folder, config_yaml, meta, beginning)
-        store = cls._holding(lock, folder, hook)
-        store._is_ours = not was_there
-        return store
+        return cls._holding(lock, folder, hook)
 
     @classmethod
     def open(cls, folder: Path, *, hook: Callable[[str], None] = no_hook) -> RunStore:
@@ -270,18 +265,6 @@ class RunStore:
             self.upkeep.finish()
         finally:
             self._connection.close()
-            self.lock.release()
-
-    def discard(self) -> None:
-        """Close the store and delete the run. Its folder remains if it was there before `create`, or has other files.
-
-        This is for a run that was created and could not begin, so that the same command can be repeated.
-        """
-        self._connection.close()
-        self._closed = True
-        try:
-            remove_run_folder(self.folder, whole=self._is_ours)
-        finally:
             self.lock.release()
 
     def __enter__(self) -> Self:
