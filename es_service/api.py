@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
@@ -19,7 +19,8 @@ from es_service.config.loading import Source
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
 from es_service.config.yaml_text import show
-from es_service.errors import ConfigError, StoreError, WayOut
+from es_service.dispatch import dispatch_log
+from es_service.errors import ConfigError, StartError, StoreError, WayOut
 from es_service.logs import in_run
 from es_service.loop.budget import REACHED, limits_of, raised
 from es_service.loop.history import Column, evaluated_columns, history_columns
@@ -30,10 +31,11 @@ from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.identity import require_unchanged
 from es_service.runs.lineage import fork_config, forked, started
-from es_service.runs.session import OnGeneration, OnNotice, Outcome, work
+from es_service.runs.session import OnGeneration, OnNotice, Outcome, require_cores, work
 from es_service.runs.standing import Standing, look
 from es_service.runs.view import open_run
 from es_service.store.beginning import Beginning
+from es_service.store.create import remove_run_folder
 from es_service.store.folder import CONFIG, explained, holds_run, write_config
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore, no_hook
@@ -46,21 +48,35 @@ _KEPT_OF_A_TASK = ("observation_size", "action_size", "descriptor_names", "has_g
 """Fields of a task that the policies and the history of a run depend on."""
 
 
-@contextmanager
-def _shown(folder: Path, on_generation: OnGeneration | None, progress: bool) -> Iterator[OnGeneration]:
-    """Yield what is to be called with each history row: `on_generation`, or if there is none, what shows the progress
-    in a notebook."""
-    if on_generation is not None:
-        yield on_generation
-    elif progress and in_notebook():
-        with show_in_notebook(str(folder)) as show:
-            yield show
-    else:
-        yield lambda row: None
-
-
 def _warn(notice: str) -> None:
     warnings.warn(notice, RuntimeWarning, stacklevel=2)
+
+
+def _ignore(sentence: str) -> None:
+    """Do nothing; the default for `on_compile`."""
+
+
+@dataclass(frozen=True)
+class _Listener:
+    """Functions that a session calls; `run` describes them."""
+
+    on_generation: OnGeneration | None
+    on_notice: OnNotice
+    on_compile: OnNotice
+    progress: bool
+    hook: Callable[[str], None] = no_hook
+
+    @contextmanager
+    def shown(self, folder: Path) -> Iterator[OnGeneration]:
+        """Yield what is to be called with each history row: `on_generation`, or if there is none, what shows the
+        progress in a notebook."""
+        if self.on_generation is not None:
+            yield self.on_generation
+        elif self.progress and in_notebook():
+            with show_in_notebook(str(folder)) as show:
+                yield show
+        else:
+            yield lambda row: None
 
 
 def run(
@@ -70,6 +86,7 @@ def run(
     on_generation: OnGeneration | None = None,
     on_notice: OnNotice = _warn,
     progress: bool = True,
+    on_compile: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Start a run and continue it until its budget is spent.
@@ -83,6 +100,7 @@ def run(
         on_notice: called with each notice for the user; by default, notices are RuntimeWarnings.
         progress: whether a notebook shows the progress of the run, if there is no `on_generation`. Other programs print
             nothing.
+        on_compile: called with a sentence when the workers compile for more than two seconds.
         hook: called with the name of each point of the store that is passed; for tests that kill the process there.
 
     Raises:
@@ -94,7 +112,9 @@ def run(
     parent, beginning = None, Beginning()
     if config.search.init_from is not None:
         parent, beginning = started(config, config.search.init_from, on_notice)
-    return _create_and_work(config, out, parent, beginning, on_generation, on_notice, progress, hook)
+    listener = _Listener(on_generation, on_notice, on_compile, progress, hook)
+    again = WayOut("run", "", out=None if out is None else str(out))
+    return _create_and_work(config, out, parent, beginning, again, listener)
 
 
 def resume(
@@ -105,6 +125,7 @@ def resume(
     on_generation: OnGeneration | None = None,
     on_notice: OnNotice = _warn,
     progress: bool = True,
+    on_compile: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Continue a run from its last committed generation; its result has the same bits as without an interruption.
@@ -125,7 +146,8 @@ def resume(
         source = recorded if recorded.exists() else store.meta.config
         return changed_config(source, overrides)
 
-    return _go_on(Path(folder), changed, on_generation, on_notice, progress, hook, strict=strict)
+    listener = _Listener(on_generation, on_notice, on_compile, progress, hook)
+    return _go_on(Path(folder), changed, listener, strict=strict)
 
 
 def run_or_resume(
@@ -135,6 +157,7 @@ def run_or_resume(
     on_generation: OnGeneration | None = None,
     on_notice: OnNotice = _warn,
     progress: bool = True,
+    on_compile: OnNotice = _ignore,
 ) -> Outcome:
     """Start a run, or resume it if the folder already holds it; the same call can be repeated after any interruption.
 
@@ -144,27 +167,27 @@ def run_or_resume(
     begun = holds_run(Path(out))
     wanted = config if isinstance(config, RunConfig) else load_config(config, new=not begun)
     if not begun:
-        return run(wanted, out, on_generation=on_generation, on_notice=on_notice, progress=progress)
-    return _go_on(Path(out), lambda store: wanted, on_generation, on_notice, progress)
+        return run(
+            wanted, out, on_generation=on_generation, on_notice=on_notice, progress=progress, on_compile=on_compile
+        )
+    return _go_on(Path(out), lambda store: wanted, _Listener(on_generation, on_notice, on_compile, progress))
 
 
 def _go_on(
     folder: Path,
     make_config: Callable[[RunStore], RunConfig],
-    on_generation: OnGeneration | None,
-    on_notice: OnNotice,
-    progress: bool,
-    hook: Callable[[str], None] = no_hook,
+    listener: _Listener,
     *,
     strict: bool = False,
 ) -> Outcome:
     """Open a run, check that the config of this session fits it, and continue it."""
-    with RunStore.open(folder, hook=hook) as store, in_run(store.meta.run_id):
+    with RunStore.open(folder, hook=listener.hook) as store, in_run(store.meta.run_id):
         # Repairs remain even if the config is refused below, so they are reported now; `work` reports later notices.
         for notice in store.notices:
-            on_notice(notice)
+            listener.on_notice(notice)
         store.notices.clear()
         config = make_config(store)
+        require_cores(config, WayOut("resume", "", run=str(folder)))
         if changes := changed_constants(store.meta.constants, config.constants()):
             besides = _budget_of_a_fork(config, look(open_run(folder)))
             raise refused_changes(folder, changes, besides)
@@ -190,8 +213,8 @@ def _go_on(
             write_config(folder, config.resolved_yaml())
         except OSError as error:
             raise explained(error, folder, f"writing {CONFIG}") from error
-        with _shown(folder, on_generation, progress) as told:
-            return work(config, store, told, on_notice, strict=strict)
+        with listener.shown(folder) as on_generation:
+            return work(config, store, on_generation, listener.on_notice, listener.on_compile, strict=strict)
 
 
 def _budget_of_a_fork(config: RunConfig, standing: Standing) -> dict[str, Any]:
@@ -219,6 +242,7 @@ def fork(
     on_generation: OnGeneration | None = None,
     on_notice: OnNotice = _warn,
     progress: bool = True,
+    on_compile: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
 ) -> Outcome:
     """Start a new run from another run's state, with changed settings.
@@ -239,7 +263,8 @@ def fork(
     """
     config = fork_config(parent, overrides)
     lineage, beginning = forked(open_run(parent), config, generation)
-    outcome = _create_and_work(config, out, lineage, beginning, on_generation, on_notice, progress, hook)
+    listener = _Listener(on_generation, on_notice, on_compile, progress, hook)
+    outcome = _create_and_work(config, out, lineage, beginning, WayOut("fork", "", run=str(parent)), listener)
     if outcome.run.generation == (begun := lineage["generation"]):
         on_notice(
             f"no generation was run: {outcome.reason} already at generation {begun}, where this fork begins; resume it "
@@ -277,13 +302,17 @@ def _create_and_work(
     out: str | os.PathLike[str] | None,
     parent: dict[str, Any] | None,
     beginning: Beginning,
-    on_generation: OnGeneration | None,
-    on_notice: OnNotice,
-    progress: bool,
-    hook: Callable[[str], None],
+    again: WayOut,
+    listener: _Listener,
 ) -> Outcome:
+    """Create a run and work on it. If its workers cannot be started, there is no run afterwards.
+
+    Args:
+        again: the call that was made, which ways out repeat with other settings.
+    """
+    require_cores(config, again)
     folder = Path(out) if out is not None else default_folder(config)
-    task = task_of(config)
+    is_new, task = not folder.exists(), task_of(config)
     columns, evaluation_columns = _columns(config, task)
     meta = RunMeta(
         run_id=uuid4().hex,
@@ -296,8 +325,20 @@ def _create_and_work(
         parent=parent,
     )
     with (
-        RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=hook) as store,
+        RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=listener.hook) as store,
         in_run(meta.run_id),
-        _shown(folder, on_generation, progress) as told,
+        listener.shown(folder) as on_generation,
     ):
-        return work(config, store, told, on_notice)
+        try:
+            return work(config, store, on_generation, listener.on_notice, listener.on_compile)
+        except StartError as error:
+            store.close()
+            (folder / dispatch_log.FILE).unlink(missing_ok=True)
+            remove_run_folder(folder, whole=is_new)
+            error.run = None
+            error.ways_out = tuple(
+                replace(again, purpose=way.purpose, settings=way.settings) if way.action == "resume" else way
+                for way in error.ways_out
+                if way.action != "resume" or way.settings
+            )
+            raise

@@ -144,6 +144,10 @@ class EvaluationError(ServiceError, RuntimeError):
     """Rollouts cannot continue: a chunk failed in every attempt, no worker is live, or too many members are invalid."""
 
 
+class StartError(EvaluationError):
+    """The workers of a session cannot be started at all, for example because no cluster is at the address given."""
+
+
 class StoreError(ServiceError, RuntimeError):
     """A run folder cannot be read, written or continued."""
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from es_service.config.compute import ENGINE_IMPLIES
+from es_service.config.compute import implied_by
 from es_service.config.yaml_text import in_line
 from es_service.errors import ServiceError, WayOut
 
@@ -28,11 +28,14 @@ def assignments(values: Mapping[str, Any]) -> list[str]:
 
 def settings(values: Mapping[str, Any]) -> list[str]:
     """Command-line options that set these keys."""
-    options, engine = [], values.get("compute.engine")
-    if engine in ENGINE_IMPLIES:  # --engine also sets the keys that it implies
-        options = ["--engine", engine]
-        implied = {"compute.engine": engine} | ENGINE_IMPLIES[engine]
-        values = {key: value for key, value in values.items() if key not in implied or implied[key] != value}
+    engine, address = values.get("compute.engine"), values.get("compute.address")
+    options, given = [], {}
+    if address is not None:
+        options, given = ["--address", address], {"compute.address": address} | implied_by(None, address)
+    elif engine is not None:
+        options, given = ["--engine", engine], {"compute.engine": engine} | implied_by(engine, None)
+    # An option also sets the keys that it implies.
+    values = {key: value for key, value in values.items() if key not in given or given[key] != value}
     return [*options, *(word for assignment in assignments(values) for word in ("--set", assignment))]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,9 +12,10 @@ import typer
 
 from es_service import api
 from es_service.cli.data import print_json
-from es_service.cli.options import JsonOption, LogLevelOption, console, place_of, print_note
+from es_service.cli.options import JsonOption, LogLevelOption, console, errors, place_of, print_note
 from es_service.cli.several import RunsArgument, is_single, read_each, started_runs
 from es_service.errors import ConfigError
+from es_service.report.progress import print_notice
 
 
 def evaluate(
@@ -48,7 +50,8 @@ def evaluate(
         if single and not as_json:
             print_header(console)
         results = []
-        for fresh in evaluation.evaluate(run, chosen, episodes, workers, seed):
+        tell = partial(print_notice, errors)
+        for fresh in evaluation.evaluate(run, chosen, episodes, workers, seed, on_compile=tell):
             results.append(fresh)
             row = row_of(fresh, run.descriptor_names, None if single else folder)
             if not as_json:

@@ -221,7 +221,11 @@ def _session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] 
             show_progress(console, errors, str(folder)) as (show, note),
             tracked(folder, log or (), partial(tell, note)) as send,
         ):
-            outcome = work(on_generation=partial(tell_generation, show), on_notice=partial(tell, note))
+            outcome = work(
+                on_generation=partial(tell_generation, show),
+                on_notice=partial(tell, note),
+                on_compile=partial(tell, note),
+            )
     except Interrupted:
         if began or holds_run(folder):
             print_note(f"interrupted; every finished generation is saved. Continue with: {command('resume', folder)}")

@@ -45,7 +45,13 @@ class ComputeConfig(Section):
     workers: Literal["auto"] | Count = Field(
         "auto",
         description="Number of workers, each of which is a core. auto: every core of the machine or cluster that has "
-        "work; with a number in worker_resources.cpu, it also asks the cluster for more. It never changes results.",
+        "work; with a number in worker_resources.cpu, it also asks the cluster for more. No more start than there is "
+        "work for. It never changes results.",
+    )
+    max_workers_per_core: Count = Field(
+        4,
+        description="Most workers for each core where all workers are on this machine; a larger number of workers is "
+        "refused. Raise it only for a task whose steps wait for something outside, such as another program.",
     )
     worker_resources: WorkerResources = Field(
         default_factory=lambda: WorkerResources(cpu="auto", gpu=0.0),

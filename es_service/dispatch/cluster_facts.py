@@ -19,7 +19,8 @@ from typing import Any
 from es_service.dispatch import node_probe
 from es_service.dispatch.ray_cluster import address_here, connect, disconnect
 from es_service.dispatch.ray_faults import error_text
-from es_service.dispatch.ray_ports import HEAD_CALL, NODE_CALL, open_ports, require_head, uses_tls
+from es_service.dispatch.ray_head import HEAD_CALL, uses_tls
+from es_service.dispatch.ray_ports import NODE_CALL, open_ports
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.sources import Sources
 
@@ -93,8 +94,8 @@ def cluster_facts(address: str, shared: Path | None = None) -> ClusterFacts:
         ConfigError: the folder does not exist, or this process cannot write there.
     """
     with _file_in(shared) as file:
-        require_head(address_here(address), is_auto=address == "auto")
         try:
+            address_here(address)
             ray = connect(address, gpus=False, cpus=1)
         except EvaluationError as error:  # its ways out are those of a run
             raise EvaluationError(" ".join(error.sentence.split()), field="cluster", value=address) from error

@@ -39,10 +39,11 @@ class Committed:
     generation: int
 
 
-Log = Callable[[Event | Command | Session | Committed], None]
+Entry = Event | Command | Session | Committed
+Log = Callable[[Entry], None]
 
 
-def no_log(entry: Event | Command | Session | Committed) -> None:
+def no_log(entry: Entry) -> None:
     """Log that keeps nothing."""
 
 
@@ -70,7 +71,7 @@ def dispatch_log(folder: Path, after_generation: int | None, *, enabled: bool) -
             except OSError as error:
                 raise explained(error, folder, f"writing {FILE}") from error
 
-        def write(entry: Event | Command | Session | Committed) -> None:
+        def write(entry: Entry) -> None:
             line = {"time": round(time.time(), 4), "is": type(entry).__name__, **vars(entry)}
             append(json.dumps(line, default=_plain).encode())
 

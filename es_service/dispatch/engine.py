@@ -25,6 +25,7 @@ from es_service.dispatch.scheduler_state import (
     usual_chunk_s,
     workers_with_place,
 )
+from es_service.dispatch.waits import Waits
 from es_service.errors import EvaluationError, Interrupted
 from es_service.logs import logger
 from es_service.protocol.evaluator import DispatchCounts
@@ -35,9 +36,6 @@ _RARE = (events.WorkerUp, events.WorkerLost, events.Compiled, events.Failure, ev
 """Events and commands that `logging` reports at level INFO."""
 POLL_S = 0.1
 """Longest time in seconds until a request to stop is noticed."""
-NOTICE_S = 5.0
-"""Seconds without a first place after which a run is said to wait. A cluster with room takes less to start a process.
-"""
 
 
 @dataclass(frozen=True)
@@ -145,6 +143,7 @@ class Engine(Generic[AnyTransport]):
         should_stop: Callable[[], int | None] = lambda: None,
         log: Log = no_log,
         on_wait: Callable[[str], None] = lambda shortage: None,
+        on_compile: Callable[[str], None] = lambda kind: None,
     ) -> None:
         """Start `limits.workers` workers. If this raises, which the log can cause, the transport is closed.
 
@@ -154,13 +153,12 @@ class Engine(Generic[AnyTransport]):
             should_stop: called at least every POLL_S seconds while waiting. If it returns a signal number, `evaluate`
                 raises Interrupted.
             log: called with every event and every command, in their order.
-            on_wait: called with `Transport.shortage` when work has waited for a first place for NOTICE_S seconds, and
-                with "" when that wait is over.
+            on_wait, on_compile: as in `Waits`.
         """
         self.transport = transport
         self._should_stop = should_stop
         self._log = log
-        self._on_wait, self._waits = on_wait, False
+        self._waits = Waits(on_wait, on_compile)
         self._state = initial_state(limits)
         self._phase = 0
         self._work: dict[Hashable, Sequence[Work]] = {}
@@ -214,6 +212,7 @@ class Engine(Generic[AnyTransport]):
             self._handle(message)
         self._phase += 1
         parts = self._parts(work)
+        self._waits.begin((item_id.kind for item_id, _ in parts), time.monotonic())
         self._work, self._results = dict(parts), {}
         self._step(events.Submit(tuple(events.WorkItem(item_id, item_id.kind, item_id.chunks) for item_id, _ in parts)))
         while pending(self._state):
@@ -259,11 +258,7 @@ class Engine(Generic[AnyTransport]):
             self._handle(message)
         else:  # check deadlines only if no message waits, or a late check would kill workers that have answered
             self._step(events.Tick(self.transport.silent()))
-        since_s = self._state.down_since_s if is_waiting(self._state) else None
-        waits = since_s is not None and time.monotonic() >= since_s + NOTICE_S
-        if waits != self._waits:
-            self._waits = waits
-            self._on_wait(self.transport.shortage() if waits else "")
+        self._waits.look(self._state, time.monotonic(), self.transport.shortage)
 
     def _handle(self, message: Message) -> None:
         if not isinstance(message, Answer):

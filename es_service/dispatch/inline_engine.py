@@ -43,6 +43,7 @@ def inline_engine(
     *,
     threads: bool = False,
     log: Log = no_log,
+    on_compile: Callable[[str], None] = lambda kind: None,
 ) -> Engine[ChildProcesses]:
     """Engine with `limits.workers` workers on this machine, which are starting.
 
@@ -50,11 +51,10 @@ def inline_engine(
         spec: constants of the run.
         limits: number of workers, deadlines and numbers of attempts.
         should_stop: as in `Engine`.
-        threads: whether workers are threads of one child instead of a child each. They take less memory, but if one
-            worker is lost, all are lost.
-        log: as in `Engine`.
+        threads: whether workers are threads of one child, which takes less memory; if one is lost, all are lost.
+        log, on_compile: as in `Engine`.
     """
-    return Engine(ChildProcesses(spec, threads=threads), limits, should_stop, log)
+    return Engine(ChildProcesses(spec, threads=threads), limits, should_stop, log, on_compile=on_compile)
 
 
 @dataclass(eq=False)

@@ -12,25 +12,24 @@ import platform
 import secrets
 import shutil
 import signal
-import socket
 import threading
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from es_service.config.compute import ENGINE_IMPLIES
+from es_service.dispatch.ray_head import require_head
 from es_service.dispatch.ray_nodes import OTHER_CLUSTER, Claim, Membership, cores_of_nodes, look
 from es_service.dispatch.ray_side_effects import environment_kept, signal_handlers_kept
-from es_service.errors import EvaluationError, Interrupted, WayOut
+from es_service.errors import EvaluationError, Interrupted, StartError, WayOut
 from es_service.logs import logger
 
 _LOG = logger(__name__)
 OBJECT_STORE_BYTES = 200 * 2**20
 """Shared memory of a local Ray, for a few centres and gradient blocks. Ray would take a third of the machine's memory.
 """
-CONNECT_S = 5.0
-"""Longest time in seconds to connect to the port of a cluster; Ray itself would try for more than a minute."""
 MEMBERSHIP_S = 1.0
 """Seconds between two queries for the nodes of a cluster."""
 SILENCE_S = 20.0
@@ -51,9 +50,11 @@ LOCAL_SETTINGS = {
 }
 """More environment variables for a Ray of our own. Without them, Ray's records take a tenth of a small generation."""
 WITHOUT_RAY = WayOut(
-    "resume", "continue on this machine without Ray", settings={"compute.engine": "inline", **ENGINE_IMPLIES["inline"]}
+    "resume",
+    "work on this machine without Ray",
+    settings={"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": "auto"},
 )
-"""Suggestion for errors of Ray."""
+"""Suggestion for errors of Ray. The number of workers was that of a cluster."""
 
 
 def connect(address: str | None, *, gpus: bool, cpus: int) -> ModuleType:
@@ -65,7 +66,7 @@ def connect(address: str | None, *, gpus: bool, cpus: int) -> ModuleType:
         cpus: number of CPUs of a new cluster.
 
     Raises:
-        EvaluationError: Ray is not installed, is used by this process already, or cannot be started, or the connection
+        StartError: Ray is not installed, is used by this process already, or cannot be started, or the connection
             to the cluster failed.
         Interrupted: SIGTERM arrived during the call.
     """
@@ -86,12 +87,16 @@ def connect(address: str | None, *, gpus: bool, cpus: int) -> ModuleType:
             import ray
         except ImportError as error:
             text = f"Ray cannot be imported ({error}); install the package `ray`"
-            raise EvaluationError(text, ways_out=ways_out) from error
+            raise StartError(text, ways_out=ways_out) from error
         if ray.is_initialized():
-            raise EvaluationError("this process already uses Ray; call ray.shutdown() first", ways_out=ways_out)
+            raise StartError("this process already uses Ray; call ray.shutdown() first", ways_out=ways_out)
+        if address is not None and find_spec("grpc"):  # without the extra `cluster`, Ray says it, after a minute
+            try:
+                require_head(address_here(address) if address == "auto" else address, is_auto=address == "auto")
+            except StartError as error:
+                error.ways_out = (*error.ways_out, *ways_out)
+                raise
         try:
-            if address not in (None, "auto"):
-                knock(address)
             ray.init(**options, logging_level=logging.ERROR, log_to_driver=False)
         except SystemExit as stop:  # Ray replaces the handler of SIGTERM by one that exits with the signal's number
             ray.shutdown()
@@ -100,12 +105,12 @@ def connect(address: str | None, *, gpus: bool, cpus: int) -> ModuleType:
             raise Interrupted(signal.SIGTERM) from stop
         except Exception as error:  # of many classes: ConnectionError, RuntimeError, ValueError, TimeoutError ...
             if address is None:
-                raise EvaluationError(f"could not start Ray on this machine: {error}", ways_out=ways_out) from error
+                raise StartError(f"could not start Ray on this machine: {error}", ways_out=ways_out) from error
             reason = str(error).rstrip(". ")
-            raise EvaluationError(
-                f"could not connect to a Ray cluster at {address}: {reason}. Check the address. Check also that "
-                "RAY_AUTH_TOKEN is the token of the cluster (with RAY_AUTH_MODE=token), and that the cluster uses the "
-                f"same versions of Ray ({ray.__version__}) and Python ({platform.python_version()})",
+            raise StartError(
+                f"could not connect to a Ray cluster at {address}: {reason}. Check that this host is a node of the "
+                f"cluster, and that the cluster uses the same versions of Ray ({ray.__version__}) and Python "
+                f"({platform.python_version()})",
                 field="compute.address",
                 value=address,
                 ways_out=ways_out,
@@ -140,37 +145,31 @@ def address_here(address: str) -> str:
     """HOST:PORT of a cluster that a process on this host may join; "auto" is resolved as Ray resolves it.
 
     Raises:
-        EvaluationError: Ray is not installed, or runs on no process of this host. There, `ray.init` would wait for a
+        StartError: Ray is not installed, or runs on no process of this host. There, `ray.init` would wait for a
             minute, and then say only that it failed.
     """
     with signal_handlers_kept(), environment_kept(SETTINGS):
         try:
             from ray._private import services
         except ImportError as error:
-            raise EvaluationError(f"Ray cannot be imported ({error}); install the package `ray`") from error
+            raise StartError(f"Ray cannot be imported ({error}); install the package `ray`") from error
         if not services.find_node_ids():
-            raise EvaluationError(
-                "no node of Ray runs on this host. Do this on a machine of the cluster, or start Ray "
-                "here first, with the address of its head"
+            raise StartError(
+                f"could not connect to a Ray cluster at {address}: no node of Ray runs on this host. Do this on a "
+                "machine of the cluster, or start Ray here first, with the address of its head",
+                field="compute.address",
+                value=address,
             )
         return services.canonicalize_bootstrap_address("auto") or address if address == "auto" else address
 
 
 def nodes_of_cluster(address: str) -> list[int]:
-    """Cores of each node of a cluster, which is joined for this question only. Raises EvaluationError as `connect`."""
+    """Cores of each node of a cluster, which is joined for this question only. Raises StartError as `connect`."""
     ray = connect(address, gpus=False, cpus=1)
     try:
         return cores_of_nodes(ray)
     finally:
         disconnect(ray)
-
-
-def knock(address: str) -> None:
-    """Raise ValueError if the address is not HOST:PORT, and OSError if nothing listens there."""
-    host, colon, port = address.rpartition(":")
-    if not colon or not port.isdigit():
-        raise ValueError(f"{address!r} is neither HOST:PORT nor auto")
-    socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
 
 
 class Watch:

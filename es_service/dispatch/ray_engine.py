@@ -42,6 +42,7 @@ def ray_engine(
     most: int | None = None,
     log: Log = no_log,
     on_wait: Callable[[str], None] = lambda shortage: None,
+    on_compile: Callable[[str], None] = lambda kind: None,
     on_refusal: Callable[[str], None] = lambda refusal: None,
 ) -> Engine[Actors]:
     """Engine whose workers are Ray actors, which are starting.
@@ -57,10 +58,11 @@ def ray_engine(
         most: use as many cores as there is room for, up to this number and also when the room changes, and ask for
             more if `cpus` is given, see `ASKED_AHEAD`; None: use the number in `limits`.
         on_wait: as in `Engine`; not called in a Ray of our own, which has room.
+        on_compile: as in `Engine`.
         on_refusal: as in `Actors`.
 
     Raises:
-        EvaluationError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
+        StartError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
         Interrupted: SIGTERM arrived during the call.
     """
     ray = connect(address, gpus=bool(gpus), cpus=limits.workers if most is None else cores())
@@ -68,7 +70,8 @@ def ray_engine(
         claim, limits, growth = layout(ray, limits, cpus, gpus, most, ours=address is None)
         watch = None if address is None else Watch(ray, claim)
         transport = Actors(ray, spec, actor, claim, watch, growth, limits.workers, on_refusal)
-        return Engine(transport, limits, should_stop, log, (lambda shortage: None) if watch is None else on_wait)
+        on_wait = (lambda shortage: None) if watch is None else on_wait
+        return Engine(transport, limits, should_stop, log, on_wait, on_compile)
     except BaseException:
         disconnect(ray)
         raise

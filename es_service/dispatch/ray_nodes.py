@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 
 from es_service.dispatch.events import Limits
-from es_service.errors import EvaluationError
+from es_service.errors import StartError
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def layout(
         ours: whether this Ray was started for the run and has this machine only.
 
     Raises:
-        EvaluationError: it is ours and has no room for a worker; there will never be any.
+        StartError: it is ours and has no room for a worker; there will never be any.
     """
     # An autoscaler starts a node for an actor of a size that was given. One core, which stands for a cluster without
     # nodes, would be no such size.
@@ -91,7 +91,7 @@ def layout(
     nodes = look(ray, claim)
     if ours and not nodes.room:
         text = f"this machine has no room for a worker. {demand(ray, claim)}. Lower compute.worker_resources."
-        raise EvaluationError(text)
+        raise StartError(text)
     if ours:  # it has room, so a worker without a place is one whose process does not start
         names = {**limits.names, "place_timeout_s": limits.name_of("no_worker_timeout_s")}
         limits = replace(limits, place_timeout_s=limits.no_worker_timeout_s, names=names)

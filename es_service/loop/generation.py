@@ -90,19 +90,21 @@ def evaluate_centres(
     episodes: int,
     *,
     resets: Literal["by_ask", "by_chunk", "same"] = "by_ask",
+    first: int = 0,
 ) -> list[EpisodesResult]:
     """Roll out each unperturbed centre: results with axis [E].
 
     Args:
         resets: which random streams the episodes start from. Each centre has its own, addressed by its ask or, in
             generation 0, by its chunk ids; or all have the same.
+        first: id of the first chunk.
     """
     asked = []
     for index, centre in enumerate(centres):
-        first, ask = 0, index if resets == "by_ask" else 0
+        start, ask = first, index if resets == "by_ask" else 0
         if resets == "by_chunk":
-            first = first_episode(index, episodes) // EVALUATION_EPISODES_PER_CHUNK
-        asked.append(around(centre, evaluation_chunks(centre.generation, episodes, first=first, ask=ask)))
+            start += first_episode(index, episodes) // EVALUATION_EPISODES_PER_CHUNK
+        asked.append(around(centre, evaluation_chunks(centre.generation, episodes, first=start, ask=ask)))
     return [_concatenate(results, episodes) for results in _evaluate(EpisodesResult, evaluator, asked)]
 
 

@@ -7,7 +7,7 @@ same ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import sqrt
 
@@ -21,15 +21,21 @@ from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop.generation import evaluate_centres
 from es_service.loop.parts import BEST
-from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray
+from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, Moments
 from es_service.runs.checked_config import changed_config
+from es_service.runs.compiling import compiling_sentence
 from es_service.runs.moment import Policy, make_policy
 from es_service.runs.session import dispatch_limits
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, is_no_elite
+from es_service.search.observation_statistics import merge_moments, moments_of
 
 CHUNKS_PER_WORKER = 16
 """Chunks per worker that are evaluated side by side: enough to keep all busy, few enough to show results soon."""
+EPISODES_AT_ONCE = 2**16
+"""Most episodes of a policy whose results are in memory at a time; a constant, since it affects the last bits of the
+statistics of more episodes."""
 FRESH_GENERATION = 2**40
 """Generation number in the random streams of fresh episodes with seed 0; no run reaches it."""
 
@@ -51,34 +57,41 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Fresh:
-    """Results of a candidate's E fresh episodes: fitness [E] and descriptors [E, B]."""
+    """Statistics of a candidate's fresh episodes, whose memory does not depend on the number of episodes."""
 
     candidate: Candidate
-    fitness_E: FloatArray
-    descriptor_E_B: FloatArray
+    fitness: Moments
+    """Count, mean and squared deviations of the fitness, without axes."""
+    descriptors: Moments
+    """The same of the descriptors, [B]."""
     cell: int | None
     """Cell of its mean fresh descriptor; None without a map, or if the descriptor is not finite."""
 
     @property
+    def episodes(self) -> int:
+        """Number of fresh episodes."""
+        return int(self.fitness.count)
+
+    @property
     def mean(self) -> float:
         """Mean fitness over the fresh episodes."""
-        return float(self.fitness_E.mean(dtype=np.float64))
+        return float(self.fitness.mean_O)
 
     @property
     def standard_error(self) -> float:
         """Standard error of `mean`: standard deviation (n - 1) divided by the square root of n; NaN for one episode."""
-        count = self.fitness_E.size
-        return float(self.fitness_E.std(dtype=np.float64, ddof=1) / sqrt(count)) if count > 1 else float("nan")
+        count = self.episodes
+        return sqrt(self.fitness.m2_O / (count - 1)) / sqrt(count) if count > 1 else float("nan")
 
     @property
     def descriptor(self) -> NDArray[np.float64]:
         """Mean descriptor over the fresh episodes, [B]."""
-        return self.descriptor_E_B.mean(axis=0, dtype=np.float64)
+        return self.descriptors.mean_O
 
     @property
     def descriptor_std(self) -> NDArray[np.float64]:
         """Standard deviation of the descriptor over the fresh episodes, [B]."""
-        return self.descriptor_E_B.std(axis=0, dtype=np.float64)
+        return np.sqrt(self.descriptors.m2_O / self.episodes)
 
 
 def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[int]], every: bool) -> list[Candidate]:
@@ -117,7 +130,12 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
 
 
 def evaluate(
-    run: Run, chosen: Sequence[Candidate], episodes: int, workers: int | None = None, seed: int = 0
+    run: Run,
+    chosen: Sequence[Candidate],
+    episodes: int,
+    workers: int | None = None,
+    seed: int = 0,
+    on_compile: Callable[[str], None] = lambda sentence: None,
 ) -> Iterator[Fresh]:
     """Evaluate each candidate on fresh, noise-free episodes on this machine; yield the results in order.
 
@@ -125,6 +143,7 @@ def evaluate(
         episodes: number of episodes per candidate.
         workers: number of worker processes; None: one per core.
         seed: seed of the evaluation episodes, from 0 to 2**63 - 1.
+        on_compile: called with a sentence when the workers compile for more than two seconds.
 
     Raises EvaluationError if the rollouts cannot continue, and Interrupted after SIGINT or SIGTERM.
     """
@@ -132,22 +151,41 @@ def evaluate(
     config = changed_config(run.present_config, overrides)
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
-    limits = dispatch_limits(config, chunks * len(chosen))
+    limits, spec = dispatch_limits(config, chunks * len(chosen)), worker_spec(config, task_of(config))
+
+    def tell_compiling(kind: str) -> None:
+        if kind:
+            on_compile(compiling_sentence(spec, kind, here=True))
+
     with (
         stop_on_signals() as should_stop,
-        inline_engine(worker_spec(config, task_of(config)), limits, should_stop) as engine,
+        inline_engine(spec, limits, should_stop, on_compile=tell_compiling) as engine,
     ):
         together = max(1, CHUNKS_PER_WORKER * engine.counts.workers // chunks)
         for first in range(0, len(chosen), together):
             group = chosen[first : first + together]
             centres = [_centre(candidate.policy, config.search.sigma, seed) for candidate in group]
-            results = evaluate_centres(engine, centres, episodes, resets="same")
-            for candidate, result in zip(group, results, strict=True):
-                mean_B = result.descriptor.mean(axis=0, dtype=np.float64)
+            for candidate, (fitness, descriptors) in zip(group, _moments(engine, centres, episodes), strict=True):
                 cell = None
-                if geometry is not None and np.isfinite(mean_B).all():
-                    cell = int(geometry.cells_of(mean_B[None])[0])
-                yield Fresh(candidate, result.fitness, result.descriptor, cell)
+                if geometry is not None and np.isfinite(descriptors.mean_O).all():
+                    cell = int(geometry.cells_of(descriptors.mean_O[None])[0])
+                yield Fresh(candidate, fitness, descriptors, cell)
+
+
+@np.errstate(invalid="ignore", over="ignore")  # a policy may have an infinite fitness
+def _moments(engine: Evaluator, centres: Sequence[Centre], episodes: int) -> list[tuple[Moments, ...]]:
+    """Moments of the fitness and of the descriptors of each centre, a limited number of episodes at a time."""
+    found: list[tuple[Moments, ...]] = []
+    for start in range(0, episodes, EPISODES_AT_ONCE):
+        count, first = min(EPISODES_AT_ONCE, episodes - start), start // EVALUATION_EPISODES_PER_CHUNK
+        results = evaluate_centres(engine, centres, count, resets="same", first=first)
+        parts = [(moments_of(result.fitness), moments_of(result.descriptor)) for result in results]
+        found = [tuple(map(_merged, *both)) for both in zip(found, parts, strict=True)] if found else parts
+    return found
+
+
+def _merged(total: Moments, part: Moments) -> Moments:
+    return merge_moments(total, [part])
 
 
 def _centre(policy: Policy, sigma: float, seed: int) -> Centre:

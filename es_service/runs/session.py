@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from es_service.config.compute import implied_by
 from es_service.config.model import RunConfig, policy_shape, worker_spec
 from es_service.config.parallel import chunks_at_once, parallel_sentence
 from es_service.config.tasks import task_of
@@ -17,12 +18,13 @@ from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log, no_lo
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.errors import EvaluationError, StoreError, WayOut
+from es_service.errors import ConfigError, EvaluationError, StoreError, WayOut
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.parts import moments_from_arrays
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments
+from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, open_run
@@ -64,12 +66,14 @@ def work(
     store: RunStore,
     on_generation: OnGeneration,
     on_notice: OnNotice,
+    on_compile: OnNotice,
     *,
     strict: bool = False,
 ) -> Outcome:
     """Run generations until the budget is spent or `on_generation` returns a `Stop`.
 
     Args:
+        on_compile: called when workers compile and nothing has been heard of the run for some time.
         strict: whether workers on another platform than the run's are an error.
     """
     task = task_of(config)
@@ -93,6 +97,13 @@ def work(
         waits = f"no worker has a place in the cluster; the run waits {until}. {shortage}"
         tell(waits if shortage else "a worker has a place in the cluster; the run begins")
 
+    def tell_compiling(kind: str) -> None:
+        sentence = compiling_sentence(spec, kind, here=config.compute.address is None) if kind else ""
+        store.lock.say(doing=sentence)
+        if sentence:
+            _LOG.info(sentence)
+            on_compile(sentence)
+
     tell_notices()
     state = driver.stored_state(store, task)
     if state is not None and (reason := driver.spent(config.budget, state)) is not None:
@@ -106,16 +117,23 @@ def work(
     code = code_of(config)
     tell_of_other_code(store, code, tell)
     in_generation(0 if store.generation is None else store.generation + 1)
-    compute, most = config.compute, chunks_at_once(config)
+    compute, spec = config.compute, worker_spec(config, task)
     _LOG.info("working on %s: engine %s, rollout %s", store.folder, compute.engine, compute.rollout)
     _LOG.info(parallel_sentence(config))
-    if compute.workers != "auto" and compute.workers > most:
-        tell(f"compute.workers: {compute.workers} workers start, but {parallel_sentence(config)}")
+    if compute.workers != "auto" and (count := worker_count(config)) < compute.workers:
+        tell(f"compute.workers: {count} workers start and not {compute.workers}, since {parallel_sentence(config)}")
     with (
         _naming_the_run(store.folder),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
         stop_on_signals() as should_stop,
-        make_engine(config, should_stop, log, tell_wait, tell) as engine,
+        make_engine(
+            config,
+            should_stop,
+            noting(log, spec) if compute.address is None else log,
+            tell_wait,
+            tell,
+            tell_compiling,
+        ) as engine,
     ):
 
         def after_generation(row: Mapping[str, Any]) -> object:
@@ -177,13 +195,14 @@ def make_engine(
     log: Log = no_log,
     on_wait: Callable[[str], None] = lambda shortage: None,
     on_refusal: OnNotice = lambda refusal: None,
+    on_compile: Callable[[str], None] = lambda kind: None,
     *,
     at_once: int | None = None,
 ) -> Engine[Any]:
     """The configured engine, whose workers are starting.
 
     Args:
-        should_stop, log, on_wait: as in `Engine`.
+        should_stop, log, on_wait, on_compile: as in `Engine`.
         on_refusal: as in `ray_engine`.
         at_once: number of chunks that can be computed at the same time; None: as in a generation of a run.
     """
@@ -191,7 +210,8 @@ def make_engine(
     at_once = chunks_at_once(config) if at_once is None else at_once
     limits = dispatch_limits(config, at_once)
     if compute.engine == "inline":
-        return inline_engine(spec, limits, should_stop, threads=compute.inline_workers == "threads", log=log)
+        threads = compute.inline_workers == "threads"
+        return inline_engine(spec, limits, should_stop, threads=threads, log=log, on_compile=on_compile)
     from es_service.dispatch.ray_engine import ray_engine
 
     return ray_engine(
@@ -205,6 +225,7 @@ def make_engine(
         most=at_once if compute.workers == "auto" else None,
         log=log,
         on_wait=on_wait,
+        on_compile=on_compile,
         on_refusal=on_refusal,
     )
 
@@ -236,8 +257,41 @@ def worker_count(config: RunConfig, most: int | None = None) -> int:
 
     Args:
         most: number of workers for which there is work; None: as in a generation of a run.
+
+    Raises ConfigError as `require_cores`.
     """
-    workers = config.compute.workers
-    if workers != "auto":
-        return workers
-    return max(1, min(cores(), chunks_at_once(config) if most is None else most))
+    compute, search = config.compute, config.search
+    require_cores(config)
+    most = max(1, chunks_at_once(config) if most is None else most)
+    if compute.workers == "auto":
+        return min(cores(), most)
+    if ":" in search.algorithm:  # a search of the user's own may ask for any number of policies
+        return compute.workers
+    actor = 1 if compute.worker_resources.cpu == "auto" else compute.worker_resources.cpu
+    return min(compute.workers, -(-most // actor) * actor)
+
+
+def require_cores(config: RunConfig, again: WayOut | None = None) -> None:
+    """Raise ConfigError if all workers are on this machine and are more than its cores can be meant to run.
+
+    Args:
+        again: the call that asks for the workers, for the way out to a cluster.
+    """
+    compute, count = config.compute, cores()
+    if compute.workers == "auto" or compute.address is not None:
+        return
+    allowed = compute.max_workers_per_core * count
+    if compute.workers <= allowed:
+        return
+    here = f"this machine, which has {count} core{'s' if count > 1 else ''} for them"
+    cluster = implied_by(None, "HOST:PORT") | {"compute.address": "HOST:PORT", "compute.workers": compute.workers}
+    ways_out = [replace(again, purpose="use the cores of a Ray cluster", settings=cluster)] if again else []
+    raise ConfigError(
+        f"compute.workers: {compute.workers} workers are too many for {here}; must be at most {allowed}, "
+        f"{compute.max_workers_per_core} for each core (compute.max_workers_per_core). auto starts one for each core",
+        field="compute.workers",
+        value=compute.workers,
+        allowed=f"at most {allowed}",
+        suggestion="auto",
+        ways_out=ways_out,
+    )

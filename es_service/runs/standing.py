@@ -75,14 +75,19 @@ def is_waiting(standing: Standing) -> bool:
     return standing.driver is not None and standing.driver["waiting_since"] is not None
 
 
+def doing(standing: Standing) -> str:
+    """What the driver is doing, in words, if that takes long and no generation shows it; else empty."""
+    return (standing.driver["doing"] or "") if standing.driver else ""
+
+
 def state(standing: Standing) -> str:
     """The state of a run in words: waiting, running, finished or stopped, with details."""
     if standing.driver:
         where = f"on {standing.driver['host']}, pid {standing.driver['pid']}"
         if is_waiting(standing):
             return f"waiting for a first place in the cluster since {standing.driver['waiting_since']}; driver {where}"
-        left, who = to_go(standing), f"running {where}"
-        return f"{who}; {left} left" if left else who
+        left = to_go(standing)
+        return "; ".join([f"running {where}", *([f"{left} left"] if left else []), *filter(None, [doing(standing)])])
     if standing.problem:
         return f"stopped, and its budget cannot be read: {standing.problem}"
     if standing.reasons:

@@ -11,6 +11,7 @@ from es_service.config.parallel import chunks_at_once
 from es_service.dispatch.cores import cores
 from es_service.dispatch.ray_cluster import nodes_of_cluster
 from es_service.errors import ConfigError
+from es_service.runs.session import require_cores
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,11 @@ def shared(configs: Sequence[RunConfig], parallel: int | None = None) -> Shares:
         parallel: number of runs at a time; None: as many as there are cores for, or one if they use GPUs.
 
     Raises:
-        ConfigError: `parallel` is below 1, or the cluster has no cores yet. EvaluationError: it cannot be reached.
+        ConfigError: `parallel` is below 1, the cluster has no cores yet, or a run has too many workers for here.
+        StartError: the cluster cannot be reached.
     """
+    for config in configs:
+        require_cores(config)
     if parallel is not None and parallel < 1:
         raise ConfigError(
             f"parallel: {parallel} is not allowed; must be a whole number, at least 1", field="parallel", value=parallel

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from es_service.protocol.messages import FloatArray, Moments
 
@@ -19,6 +21,12 @@ def no_observations(size: int) -> Moments:
         size: length of an observation.
     """
     return Moments(0.0, np.zeros(size), np.zeros(size))
+
+
+def moments_of(values_N_O: NDArray[Any]) -> Moments:
+    """Moments of N values along the first axis, computed in float64; they may have other axes, or none."""
+    mean_O = values_N_O.mean(axis=0, dtype=np.float64)
+    return Moments(float(len(values_N_O)), mean_O, np.square(values_N_O - mean_O).sum(axis=0, dtype=np.float64))
 
 
 def merge_moments(total: Moments, parts: Iterable[Moments]) -> Moments:

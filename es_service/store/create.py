@@ -112,6 +112,23 @@ def _clear(place: Path, beside: bool) -> None:
             place.rmdir()
 
 
+def remove_run_folder(folder: Path, *, whole: bool) -> None:
+    """Delete the files of a run that could not begin, and with `whole` also its folder, unless that has other files.
+
+    Raises:
+        RunLockedError: another process writes the run.
+    """
+    lock = acquire_lock(folder)
+    with contextlib.suppress(OSError):  # what remains is a run without a generation, which can be resumed
+        for name in (DATABASE, COPY):
+            remove_database(folder / name)
+        for name in (CONFIG, LOCK):
+            (folder / name).unlink(missing_ok=True)
+        if whole:
+            folder.rmdir()
+    lock.release()
+
+
 def _refuse_taken(folder: Path) -> None:
     if not folder.exists():
         return

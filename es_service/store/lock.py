@@ -33,12 +33,13 @@ class RunLock:
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
         self._identity = {"host": socket.gethostname(), "pid": os.getpid(), "since": _now()}
-        self.say(waiting=False)
+        self.say()
         _held.add(self)
 
-    def say(self, *, waiting: bool) -> None:
-        """Write who holds the lock into its file, and since when the run has been waiting for a worker, if it is."""
-        text = json.dumps(self._identity | {"waiting_since": _now() if waiting else None}).encode()
+    def say(self, *, waiting: bool = False, doing: str = "") -> None:
+        """Write who holds the lock into its file, since when the run has been waiting for a worker, if it is, and what
+        it is doing if that takes long and nothing else shows it."""
+        text = json.dumps(self._identity | {"waiting_since": _now() if waiting else None, "doing": doing}).encode()
         # The lock itself is enough; on a full disk its file does not name the writer.
         with contextlib.suppress(OSError):
             # Spaces, so that a reader at this moment finds no end of a longer text, and no empty file.
@@ -112,8 +113,8 @@ def lock_holder(folder: Path) -> dict[str, Any] | None:
     """The process that holds the lock of the run in `folder`; None if there is none.
 
     Returns:
-        "host", "pid" and "since" (ISO time, UTC), and "waiting_since" if the run waits for its first worker, else None.
-        All are None if the writer has not written them yet.
+        "host", "pid" and "since" (ISO time, UTC), "waiting_since" if the run waits for its first worker, else None, and
+        "doing", see `RunLock.say`. All are None if the writer has not written them yet.
     """
     try:
         descriptor = os.open(folder / LOCK, os.O_RDONLY | os.O_CLOEXEC)
@@ -137,7 +138,7 @@ def _identity(text: bytes) -> dict[str, Any]:
     except ValueError:
         found = None
     known = found if isinstance(found, dict) else {}
-    return {key: known.get(key) for key in ("host", "pid", "since", "waiting_since")}
+    return {key: known.get(key) for key in ("host", "pid", "since", "waiting_since", "doing")}
 
 
 def _locked(folder: Path) -> RunLockedError:

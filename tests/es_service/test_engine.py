@@ -80,6 +80,9 @@ class Scripted:
             self.inbox.append(Compiled(worker, item_id.kind, 0.0))
         self.on_send(self.sent[-1])
 
+    def shortage(self) -> str:
+        return ""
+
     def silent(self):
         return ()
 

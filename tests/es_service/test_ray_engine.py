@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from es_service.dispatch import engine as engine_module
+from es_service.dispatch import waits
 from es_service.dispatch.engine import Answer, Engine
 from es_service.dispatch.events import Compiled, Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_calls import IN_CALL_BYTES
@@ -274,7 +274,7 @@ def test_a_run_that_got_no_place_says_what_it_needs_and_what_there_is(watch, roo
 
 def test_the_wait_for_a_first_place_is_told_of_twice_and_can_be_stopped(monkeypatch):
     """When it has lasted for a while, and when it is over; work that is given meanwhile waits, too."""
-    monkeypatch.setattr(engine_module, "NOTICE_S", 0.0)
+    monkeypatch.setattr(waits, "NOTICE_S", 0.0)
     ray, told, calls = PretendedRay(room=0), [], []
 
     def should_stop() -> int | None:

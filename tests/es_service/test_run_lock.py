@@ -39,7 +39,9 @@ def test_the_holder_is_known_while_and_only_while_it_holds(tmp_path):
     assert waiting is not None
     assert waiting["waiting_since"].startswith("20")
     assert holder | {"waiting_since": waiting["waiting_since"]} == waiting
-    lock.say(waiting=False)
+    lock.say(doing="compiling")
+    assert lock_holder(tmp_path) == holder | {"doing": "compiling"}
+    lock.say()
     assert lock_holder(tmp_path) == holder
     lock.say(waiting=True)
     lock.release()
@@ -61,7 +63,13 @@ def test_what_a_dead_writer_left_in_the_file_means_nothing(tmp_path):
 def test_a_holder_that_has_not_yet_written_its_name(tmp_path):
     with (tmp_path / "run.lock").open("w") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
-        assert lock_holder(tmp_path) == {"host": None, "pid": None, "since": None, "waiting_since": None}
+        assert lock_holder(tmp_path) == {
+            "host": None,
+            "pid": None,
+            "since": None,
+            "waiting_since": None,
+            "doing": None,
+        }
         with pytest.raises(RunLockedError, match=r"process \(unknown\) on host \(unknown\)"):
             acquire_lock(tmp_path)
 

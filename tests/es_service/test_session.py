@@ -6,13 +6,17 @@ import re
 
 import pytest
 
+from es_service import api
 from es_service.api import load_config
+from es_service.cli.commands import error_message
 from es_service.config.compute import ComputeConfig
+from es_service.config.parallel import chunks_at_once
 from es_service.dispatch.events import Compiled, Result, StopWorker, Submit, Tick, WorkerLost, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state
-from es_service.errors import StoreError
-from es_service.runs.session import LIMIT_NAMES, dispatch_limits, initial_centres
+from es_service.errors import ConfigError, StoreError
+from es_service.runs import session
+from es_service.runs.session import LIMIT_NAMES, dispatch_limits, initial_centres, worker_count
 
 CONFIG = {
     "task": {"environment": "point_maze"},
@@ -69,3 +73,48 @@ def test_a_run_that_has_lost_its_start_does_not_start_anywhere_else(tmp_path):
     config = load_config(CONFIG | {"search": search}, new=False)
     with pytest.raises(StoreError, match="which it has lost"):
         initial_centres(config, None)
+
+
+def configured(workers: int, **compute: object):
+    return load_config(CONFIG | {"compute": {"workers": workers, **compute}})
+
+
+def test_no_more_workers_start_than_have_work(monkeypatch):
+    """Except for a search of the user's own, which may ask for any number of policies."""
+    monkeypatch.setattr(session, "cores", lambda: 16)
+    config = configured(40)
+    chunks = chunks_at_once(config)
+    assert chunks < 40
+    assert (worker_count(config), worker_count(configured(2)), worker_count(config, 39)) == (chunks, 2, 39)
+    cluster = {"engine": "ray", "address": "auto"}
+    assert worker_count(configured(5000, **cluster)) == chunks
+    actors = {"worker_resources": {"cpu": 10}, **cluster}
+    assert worker_count(configured(5000, **actors)) == -(-chunks // 10) * 10, "whole actors"
+    own = load_config(
+        CONFIG
+        | {"search": {"algorithm": "tests.examples.repelling_centres:repelling_centres"}, "compute": {"workers": 40}}
+    )
+    assert worker_count(own) == 40
+
+
+@pytest.mark.parametrize("engine", ["inline", "ray"])
+def test_more_workers_on_this_machine_than_its_cores_can_be_meant_to_run_are_refused(engine, monkeypatch, tmp_path):
+    """Before anything is written: the way out of a refused resume is not refused again."""
+    monkeypatch.setattr(session, "cores", lambda: 2)
+    assert worker_count(configured(8, engine=engine), 9) == 8
+    assert worker_count(configured(20, engine=engine, max_workers_per_core=10), 1000) == 20
+    assert worker_count(configured(5000, engine="ray", address="auto"), 1000) == 1000
+    folder = tmp_path / "run"
+    with pytest.raises(ConfigError, match=r"5000 workers are too many for this machine, which has 2 cores") as error:
+        api.run(configured(5000, engine=engine), folder)
+    assert (error.value.field, error.value.value, error.value.allowed) == ("compute.workers", 5000, "at most 8")
+    assert error_message(error.value).endswith(
+        f" run CONFIG --out {folder} --address HOST:PORT --set compute.workers=5000"
+    )
+    assert not folder.exists()
+    api.run(configured(1), folder)
+    before = (folder / "config.yaml").read_text()
+    with pytest.raises(ConfigError, match="must be at most 8") as error:
+        api.resume(folder, ["compute.workers=9", f"compute.engine={engine}"])
+    assert f" resume {folder} --address HOST:PORT" in error_message(error.value)
+    assert (folder / "config.yaml").read_text() == before

@@ -170,7 +170,10 @@ def test_stopped_and_running(run, console, capsys):
     print_status(console, run)
     assert "state              waiting for a first place in the cluster since 2" in (printed := capsys.readouterr().out)
     assert f"; driver on {socket.gethostname()}, pid {os.getpid()}\n" in printed
-    lock.say(waiting=False)
+    lock.say(doing="compiling for point_maze")
+    print_status(console, run)
+    assert re.search(r"state +running on .*; compiling for point_maze\n", capsys.readouterr().out)
+    lock.say()
     print_status(console, run)
     lock.release()
     assert "state              running on " in (printed := capsys.readouterr().out)
@@ -179,24 +182,26 @@ def test_stopped_and_running(run, console, capsys):
     config.write_text(text)
 
 
-def test_who_follows_a_run_is_told_once_that_it_waits(run, console, monkeypatch, capsys):
+def test_who_follows_a_run_is_told_once_that_it_waits_or_compiles(run, console, monkeypatch, capsys):
     lock = acquire_lock(run.folder)
-    seconds = iter((False, True, True, False, True, None))
+    waits, compiles, works = {"waiting": True}, {"doing": "compiling"}, {}
+    seconds = iter((works, waits, waits, compiles, compiles, works, waits, None))
 
     def a_second_later(_: float) -> None:
-        waits = next(seconds)
-        lock.release() if waits is None else lock.say(waiting=waits)
+        said = next(seconds)
+        lock.release() if said is None else lock.say(**said)
 
     monkeypatch.setattr(status, "time", SimpleNamespace(sleep=a_second_later))
     follow_status(console, run)
-    assert capsys.readouterr().out.count("waiting for a first place") == 2
+    printed = capsys.readouterr().out
+    assert (printed.count("waiting for a first place"), printed.count("; compiling\n")) == (2, 1)
 
 
 def test_time_to_go_is_that_of_the_budget_that_is_spent_first(run):
     row = {"generation": 100, "env_steps": 10**6, "wall_clock_s": 3600.0, "best_fitness": 0.0}
 
     def running(limits):
-        return state(Standing(run, {"host": "a", "pid": 1, "waiting_since": None}, row, limits))
+        return state(Standing(run, {"host": "a", "pid": 1, "waiting_since": None, "doing": ""}, row, limits))
 
     assert running({}) == running({"target_fitness": 1.0}) == "running on a, pid 1"
     assert running({"generations": 500}) == "running on a, pid 1; about 4 h left"

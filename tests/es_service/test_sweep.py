@@ -184,6 +184,8 @@ def test_a_cluster_is_asked_for_its_nodes_only_if_runs_share_it(monkeypatch):
     assert asked == ["head:6379"] * 2
     with pytest.raises(ConfigError, match="parallel: 0 is not allowed"):
         sweep_cores.shared([auto], 0)
+    with pytest.raises(ConfigError, match="50000 workers are too many for this machine"):
+        sweep_cores.shared([config(), config(workers=50_000)])
 
 
 @given(st.integers(1, 9), st.integers(1, 64), st.integers(1, 40))

@@ -21,6 +21,7 @@ LOWEST = ("protocol", "errors", "logs")
 ENTRIES = {"es_service.__init__": "api", "es_service.__main__": "cli"}
 """Module outside the layers -> the layer whose rules it follows."""
 JOINERS = {
+    "es_service.runs.compiling",
     "es_service.runs.moment",
     "es_service.runs.scaling",
     "es_service.runs.session",

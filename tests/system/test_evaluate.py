@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import signal
+import time
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -11,8 +14,9 @@ import pytest
 from es_service.cli.tables.evaluations import csv_file
 from es_service.errors import ConfigError, StoreError
 from tests.benchmarks import paper
-from tests.system.command_line import command
+from tests.system.command_line import PROGRAM, command
 from tests.system.me_es_runs import run
+from tests.system.processes import running, wait_until
 
 
 def test_evaluate_puts_fresh_values_beside_stored_ones(tmp_path, mapped):
@@ -85,6 +89,21 @@ def test_evaluate_replaces_a_file_when_it_has_all_rows(tmp_path, mapped):
         csv_file(tmp_path.rename(tmp_path.with_suffix(".csv")), print),
     ):
         pass
+
+
+def test_an_evaluation_that_would_take_days_begins_at_once_and_ends_promptly(mapped):
+    """tests/es_service/test_evaluation.py counts what is in memory."""
+    endless = ("evaluate", mapped.folder, "--episodes", 10**9, "--workers", 1)
+    with running(PROGRAM, *endless) as process:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        wait_until(process, lambda: children.read_text())  # the worker
+        time.sleep(1.0)
+        sent = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=20)
+    assert time.monotonic() - sent < 2.0
+    assert process.returncode == 130
+    assert "Traceback" not in errors
 
 
 def test_fresh_episodes_differ_from_those_that_chose(tmp_path):

@@ -18,7 +18,8 @@ def test_every_record_of_a_run_carries_its_id_and_its_generation(tmp_path, caplo
     with caplog.at_level(logging.DEBUG, "es_service"):
         outcome = api.run(SHORT, tmp_path / "run")
     assert {record.run for record in caplog.records} == {outcome.run.run_id}
-    generations = [record.generation for record in caplog.records if record.name == "es_service.runs.session"]
+    session = [record for record in caplog.records if record.name == "es_service.runs.session"]
+    generations = [record.generation for record in session if not record.getMessage().startswith("compiling ")]
     assert generations == [0, 0, 0, 1, 2, 3]  # twice at the beginning; generations 0 to 2; the end, before 3
     committed = [record for record in caplog.records if record.name == "es_service.store.writer"]
     assert [record.generation for record in committed] == [0, 1, 2]
@@ -35,14 +36,19 @@ def test_a_record_outside_a_run_belongs_to_none(caplog):
     assert (record.run, record.generation) == ("-", "-")
 
 
+def others(printed: str) -> list[str]:
+    """The lines that do not say that the run compiles, as it may on a busy machine."""
+    return [line for line in printed.splitlines() if not line.startswith("note: compiling ")]
+
+
 def test_the_command_line_is_quiet_unless_it_is_told_otherwise(config, tmp_path):
     quiet = command("run", config, "--set", "budget.generations=1", "--out", tmp_path / "quiet")
-    assert (quiet.returncode, quiet.stderr) == (0, "")
+    assert (quiet.returncode, others(quiet.stderr)) == (0, [])
     shown = command("resume", tmp_path / "quiet", "--set", "budget.generations=2", "--log-level", "info")
     assert shown.returncode == 0
     run_id = api.open_run(tmp_path / "quiet").run_id
     record = re.compile(rf"\S+ \S+ INFO es_service\.[\w.]+ run={run_id} generation=[23]: .+")
-    assert all(record.fullmatch(line) for line in shown.stderr.splitlines())
+    assert all(record.fullmatch(line) for line in others(shown.stderr))
     assert "generation=2: working on" in shown.stderr
     assert "generation=2: centre fitness" in shown.stderr
 

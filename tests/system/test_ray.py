@@ -17,7 +17,7 @@ from es_service.cli.commands import error_message
 from es_service.dispatch import ray_engine as module
 from es_service.dispatch.events import Limits
 from es_service.dispatch.ray_engine import Actors, ray_engine
-from es_service.errors import EvaluationError
+from es_service.errors import EvaluationError, StartError
 from es_service.protocol.messages import TrainingChunk, WorkerPlace, around
 from es_service.protocol.process_environment import worker_environment
 from es_service.store.digest import digest_parts
@@ -205,14 +205,39 @@ def test_a_cluster_without_room_is_named_with_what_it_has(monkeypatch):
 def test_a_wrong_address_is_named_with_the_way_out():
     with pytest.raises(EvaluationError, match=r"could not connect to a Ray cluster at 127\.0\.0\.1:1") as error:
         ray_engine(spec(), Limits(1), actor=WorkerActor, address="127.0.0.1:1")
-    assert error_message(error.value).endswith(" resume RUN --engine inline")
+    assert error_message(error.value).endswith(" resume RUN --engine inline --set compute.workers=auto")
+
+
+def test_a_run_that_cannot_begin_leaves_no_folder_behind(tmp_path):
+    """But a folder that was there, a run that is resumed and the parent of a fork are kept."""
+    nobody = {"engine": "ray", "address": "127.0.0.1:1"}
+    new, mine, old = tmp_path / "new", tmp_path / "mine", tmp_path / "old"
+    mine.mkdir()
+    for folder in (new, mine):
+        with pytest.raises(StartError, match="nobody answers there") as error:
+            run(folder, **nobody)
+        inline = f"run CONFIG --out {folder} --engine inline --set compute.workers=auto"
+        assert error_message(error.value).endswith(f"to work on this machine without Ray: es-service {inline}")
+    assert os.listdir(tmp_path) == ["mine"]
+    assert os.listdir(mine) == []
+    run(old, engine="inline", workers=1)
+    before, cluster = digest_parts(old), ["compute.engine=ray", "compute.address=127.0.0.1:1"]
+    more = "budget.generations=40"
+    with pytest.raises(StartError) as error:
+        api.fork(old, [*cluster, more], out=new)
+    assert f" fork {old} --engine inline" in error_message(error.value)
+    assert not new.exists()
+    with pytest.raises(StartError) as error:
+        api.resume(old, [*cluster, more])
+    assert f" resume {old} --engine inline" in error_message(error.value)
+    assert digest_parts(old) == before
 
 
 def test_without_ray_the_error_says_what_does_without(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(EvaluationError, match=r"Ray cannot be imported ") as error:
         ray_engine(spec(), Limits(1), actor=WorkerActor)
-    assert error_message(error.value).endswith(" resume RUN --engine inline")
+    assert error_message(error.value).endswith(" resume RUN --engine inline --set compute.workers=auto")
 
 
 def test_it_works_in_a_thread_where_signals_cannot_be_set(tmp_path, reference):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from es_service.dispatch.engine import NOTICE_S
+from es_service.dispatch.waits import NOTICE_S
 from es_service.runs.standing import is_waiting, look
 from es_service.runs.view import open_run
 from es_service.store.digest import digest_parts

@@ -9,7 +9,7 @@ from rich.console import Console
 from es_service.cli.commands import command, settings, way_command
 from es_service.report.progress import plain_line
 from es_service.runs.objectives import recent_objectives
-from es_service.runs.standing import Standing, is_waiting, look, more, population_size, state, way_on
+from es_service.runs.standing import Standing, doing, is_waiting, look, more, population_size, state, way_on
 from es_service.runs.view import Run
 
 FOLLOW_INTERVAL_S = 1.0
@@ -36,12 +36,13 @@ def print_status(console: Console, run: Run) -> None:
 
 def follow_status(console: Console, run: Run) -> None:
     """Print a line for the newest generation, at most one a second, until no driver is running; and one for a wait."""
-    next_generation, was_waiting = 0, False
+    next_generation, told = 0, ""
     while True:
         standing = look(run)
-        if (waits := is_waiting(standing)) and not was_waiting:
+        waits_for = "a place" if is_waiting(standing) else doing(standing)
+        if waits_for and waits_for != told:
             _print_line(console, state(standing))
-        was_waiting = waits
+        told = waits_for
         if standing.row and standing.row["generation"] >= next_generation:
             next_generation = standing.row["generation"] + 1
             console.print(plain_line(standing.row), highlight=False, soft_wrap=True)

@@ -1,0 +1,84 @@
+"""What a run says while its workers compile, and what workers of this machine have compiled before.
+
+Workers keep compiled code on disk, in caches whose keys only they can compute. So an empty file for each kind of chunk
+that they have compiled for, named by all that the code depends on, stands beside these caches.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+from es_service.dispatch.dispatch_log import Entry, Log
+from es_service.dispatch.events import Compiled
+from es_service.protocol.machine import platform_info, platform_text
+from es_service.protocol.messages import WorkerSpec
+from workers.simd.backend.cache import cache_folder
+
+SECONDS = {"simd": (10, 4), "xla": (15, 6)}
+"""Rollout -> about how many seconds a worker takes to start and to compile for a kind of chunk, the first time and with
+the code on disk, for tasks with physics (tests/benchmarks/README.md). Other tasks have compiled before it is said."""
+CONTENTS = {
+    "TrainingChunk": "training episodes",
+    "EvaluationChunk": "evaluation episodes",
+    "PolicyChunk": "episodes of policies",
+    "GradientChunk": "gradients",
+}
+"""Class name of a kind of chunk -> what it computes, in words."""
+MOST_FILES = 1000
+
+
+def compiling_sentence(spec: WorkerSpec, kind: str, *, here: bool) -> str:
+    """That workers compile for a kind of chunk, and about how long it takes.
+
+    Args:
+        here: whether they are on this machine; of others it is not known what they have on disk.
+    """
+    first_s, again_s = SECONDS[spec.rollout]
+    if not here:
+        how_long = f"about {first_s} s the first time"
+    elif was_compiled(spec, kind):
+        how_long = f"compiled before, about {again_s} s"
+    else:
+        how_long = f"first time, about {first_s} s"
+    return f"compiling for {spec.environment} ({CONTENTS[kind]}, {how_long})"
+
+
+def was_compiled(spec: WorkerSpec, kind: str) -> bool:
+    """Whether workers of this machine have compiled for this kind of chunk before."""
+    file = _file(spec, kind)
+    return file is not None and file.exists()
+
+
+def note_compiled(spec: WorkerSpec, kind: str) -> None:
+    """Remember that workers of this machine have compiled for this kind of chunk."""
+    if (file := _file(spec, kind)) is None:
+        return
+    with contextlib.suppress(OSError):  # nothing but a sentence depends on it
+        file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        file.touch()
+        for old in sorted(file.parent.iterdir(), key=lambda one: one.stat().st_mtime)[:-MOST_FILES]:
+            old.unlink(missing_ok=True)
+
+
+def noting(log: Log, spec: WorkerSpec) -> Log:
+    """The dispatch log of workers on this machine, which also remembers for which kinds they have compiled."""
+    noted: set[str] = set()
+
+    def log_and_note(entry: Entry) -> None:
+        log(entry)
+        if isinstance(entry, Compiled) and entry.kind not in noted:
+            noted.add(entry.kind)
+            note_compiled(spec, entry.kind)
+
+    return log_and_note
+
+
+def _file(spec: WorkerSpec, kind: str) -> Path | None:
+    kernels = cache_folder()
+    if kernels is None:
+        return None
+    text = f"{kind} {replace(spec, seed=0)} {platform_text(platform_info())}"
+    return kernels.with_name("compiled") / hashlib.sha256(text.encode()).hexdigest()
