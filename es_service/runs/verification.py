@@ -38,7 +38,7 @@ from es_service.store.codec import (
     state_sum,
     table_bytes,
 )
-from es_service.store.verify import KeptRows, rows_in_force
+from es_service.store.kept import KeptRows, rows_in_force
 
 
 @dataclass(frozen=True)
