@@ -19,6 +19,7 @@ import typer
 from es_service import api
 from es_service.cli.bench import bench
 from es_service.cli.commands import command
+from es_service.cli.console import console, errors, print_line
 from es_service.cli.data import print_json
 from es_service.cli.jobs import job_commands
 from es_service.cli.options import (
@@ -35,8 +36,6 @@ from es_service.cli.options import (
     SetOption,
     StrictOption,
     WorkersOption,
-    console,
-    errors,
     overrides,
     place_of,
     print_config_notes,
@@ -103,7 +102,7 @@ def run(
     loaded = api.load_config(config, wanted, new=not begun)
     print_config_notes(config, [(wanted, loaded)])
     with contextlib.suppress(SystemExit):  # rich's answer to a closed output
-        console.print(parallel_sentence(loaded), highlight=False, markup=False, soft_wrap=True)
+        print_line(console, parallel_sentence(loaded))
     folder = out if out is not None else api.default_folder(loaded)
     _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder), log)
 

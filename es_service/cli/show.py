@@ -8,8 +8,9 @@ from typing import Annotated, Any
 import typer
 
 from es_service import api
+from es_service.cli.console import console
 from es_service.cli.data import catalogue_data, print_json, standing_data
-from es_service.cli.options import JsonOption, RunArgument, console, print_note
+from es_service.cli.options import JsonOption, RunArgument, print_note
 from es_service.cli.tables.catalogue import print_catalogue
 from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.status import follow_status, print_status

@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 
 from es_service import api
+from es_service.cli.console import console, print_line
 from es_service.cli.data import print_json
-from es_service.cli.options import JsonOption, LogLevelOption, RunArgument, console, print_note
+from es_service.cli.options import JsonOption, LogLevelOption, RunArgument, print_note
 from es_service.runs.verification import Recomputed
 from es_service.runs.verification import verify as recompute
 
@@ -30,7 +31,7 @@ def verify(
     for one in recompute(run, generations, workers):
         found.append(one)
         if not as_json:
-            console.print(_line(one), highlight=False, markup=False, soft_wrap=True)
+            print_line(console, _line(one))
     equal = not any(one.differences for one in found)
     if as_json:
         print_json({"digest": digest, "equal": equal, "recomputed": [asdict(one) for one in found]})

@@ -12,6 +12,7 @@ from typing import Any
 
 from rich.console import Console
 
+from es_service.cli.console import print_line
 from es_service.errors import ConfigError, StoreError
 from es_service.runs.evaluation import Fresh
 from es_service.runs.view import Run
@@ -77,20 +78,22 @@ def print_evaluations(console: Console, run: Run, results: Iterable[Fresh], writ
     """Print a line per policy as results arrive, and `write` its row; with `every`, end with a summary of the map."""
     names = run.descriptor_names
     found: list[Fresh] = []
-    _line(console, f"{'policy':<10} {'generation':>10} {'stored':>10} {'fresh':>10} {'± s.e.':>8}  descriptor (± std)")
+    print_line(
+        console, f"{'policy':<10} {'generation':>10} {'stored':>10} {'fresh':>10} {'± s.e.':>8}  descriptor (± std)"
+    )
     for fresh in results:
         found.append(fresh)
         row = row_of(fresh, names)
         write(row)
         where = ", ".join(f"{name} {row[name]:.3g} ± {row[f'{name}_std']:.2g}" for name in names)
         one = fresh.candidate
-        _line(
+        print_line(
             console,
             f"{one.name:<10} {one.generation:>10} {one.stored_fitness:>10.2f} {fresh.mean:>10.2f} "
             f"{fresh.standard_error:>8.2f}  {where}",
         )
     if every:
-        _line(console, _about_elites(run, [fresh for fresh in found if fresh.candidate.cell is not None]))
+        print_line(console, _about_elites(run, [fresh for fresh in found if fresh.candidate.cell is not None]))
 
 
 def row_of(fresh: Fresh, names: list[str]) -> dict[str, Any]:
@@ -123,7 +126,3 @@ def _about_elites(run: Run, elites: list[Fresh]) -> str:
         f"fresh values has {len(best)} filled cells.\n"
         f"QD-score (offset {offset:g}): {stored:,.0f} stored, {again:,.0f} fresh"
     )
-
-
-def _line(console: Console, text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)

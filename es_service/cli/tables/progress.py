@@ -13,6 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from es_service.cli.console import print_line
 from es_service.loop.history import Row
 
 ShowRow = Callable[[Row], None]
@@ -43,7 +44,7 @@ def show_progress(console: Console, errors: Console, title: str) -> Iterator[tup
 
 def print_notice(console: Console, notice: str) -> None:
     """Print a notice on a line of its own."""
-    console.print(f"note: {notice}", highlight=False, markup=False, soft_wrap=True)
+    print_line(console, f"note: {notice}")
 
 
 def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group:
@@ -96,7 +97,7 @@ def _plain_lines(console: Console) -> ShowRow:
         now = time.monotonic()
         if now - last_s >= 1.0:
             faults = f"  workers replaced {lost}" if lost else ""
-            console.print(plain_line(row) + faults, highlight=False, soft_wrap=True)
+            print_line(console, plain_line(row) + faults)
             last_s, lost = now, 0
 
     return show

@@ -7,6 +7,7 @@ import time
 from rich.console import Console
 
 from es_service.cli.commands import command, settings, way_command
+from es_service.cli.console import print_line
 from es_service.cli.tables.progress import plain_line
 from es_service.runs.standing import Standing, is_waiting, look, more, population_size, state, way_on
 from es_service.runs.view import Run
@@ -39,14 +40,14 @@ def follow_status(console: Console, run: Run) -> None:
     while True:
         standing = look(run)
         if (waits := is_waiting(standing)) and not was_waiting:
-            _print_line(console, state(standing))
+            print_line(console, state(standing))
         was_waiting = waits
         if standing.row and standing.row["generation"] >= next_generation:
             next_generation = standing.row["generation"] + 1
-            console.print(plain_line(standing.row), highlight=False, soft_wrap=True)
+            print_line(console, plain_line(standing.row))
         if not standing.driver:
             way = way_command(way_on(standing))
-            _print_line(console, f"no driver is running: {state(standing)}; continue with: {way}")
+            print_line(console, f"no driver is running: {state(standing)}; continue with: {way}")
             return
         time.sleep(FOLLOW_INTERVAL_S)
 
@@ -56,9 +57,9 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
     standing, folder = look(run), run.folder
     sigma = "search.iso_sigma" if run.constants["search.algorithm"] == "map_elites" else "search.sigma"
     doubled = {sigma: float(f"{run.constants[sigma] * 2:g}")}
-    _print_line(console, f"\nDone: {reason}.")
+    print_line(console, f"\nDone: {reason}.")
     _print_fields(console, _progress(standing))
-    _print_line(console, f"\nThe run is in {folder}. Next:")
+    print_line(console, f"\nThe run is in {folder}. Next:")
     for words in (
         ("status", folder),
         ("report", folder),
@@ -67,7 +68,7 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
         ("resume", folder, *settings(more(standing))),
         ("fork", folder, *settings(doubled | more(standing))),
     ):
-        _print_line(console, f"  {command(*words)}")
+        print_line(console, f"  {command(*words)}")
 
 
 def _progress(standing: Standing) -> dict[str, str]:
@@ -106,9 +107,4 @@ def _progress(standing: Standing) -> dict[str, str]:
 
 def _print_fields(console: Console, fields: dict[str, str]) -> None:
     for name, value in fields.items():
-        _print_line(console, f"{name:<18} {value}")
-
-
-def _print_line(console: Console, text: str) -> None:
-    """Print a line without wrapping or cutting it, so that folders and commands can be copied."""
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
+        print_line(console, f"{name:<18} {value}")
