@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from textwrap import indent
 from typing import Any, Literal
 
 Action = Literal["run", "resume", "fork", "watch", "install"]
@@ -57,7 +58,7 @@ class Problem:
     """One thing that is wrong with a config."""
 
     sentence: str
-    """One line for the user; it begins with the field, if there is one."""
+    """A line for the user, which begins with the field, if there is one; frames of the user's code may follow it."""
     field: str | None = None
     """Dotted key of the config."""
     value: Any = None
@@ -125,7 +126,7 @@ class ConfigError(ServiceError, ValueError):
         ways_out: Sequence[WayOut] = (),
     ) -> ConfigError:
         """An error that lists one or more problems, each on a line, between a heading and a note."""
-        lines = [heading, *(f"  {problem.sentence}" for problem in problems), *([note] if note else [])]
+        lines = [heading, *(indent(problem.sentence, "  ") for problem in problems), *([note] if note else [])]
         first = problems[0]
         error = cls(
             "\n".join(lines),

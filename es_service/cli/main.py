@@ -49,12 +49,15 @@ from es_service.cli.tables.progress import show_progress
 from es_service.cli.tables.status import print_summary
 from es_service.cli.verify import verify
 from es_service.config.parallel import parallel_sentence
-from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError
+from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError, WayOut
+from es_service.logs import logger
 from es_service.loop.history import Row
 from es_service.protocol.machine import VERSION
+from es_service.protocol.raised import users_error
 from es_service.runs.tracking import tracked
 from es_service.store.folder import holds_run
 
+_LOG = logger(__name__)
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
@@ -229,15 +232,23 @@ def main() -> None:
         app()
     except Interrupted:
         raise
-    except (ConfigError, NotInRunError) as error:
-        print_error(error)
-        sys.exit(2)
-    except ServiceError as error:
-        print_error(error)
-        sys.exit(1)
     except MemoryError as error:
         print_error(f"not enough memory: {error}. Reduce policy.hidden or search.pairs.")
         sys.exit(1)
+    except Exception as error:
+        if (told := _told(error)) is None:
+            raise  # a bug, of which the traceback is all that is known
+        print_error(told)
+        _LOG.debug("the traceback of this error", exc_info=error)
+        sys.exit(2 if isinstance(told, ConfigError | NotInRunError) else 1)
+
+
+def _told(error: Exception, ways_out: Sequence[WayOut] = ()) -> ServiceError | None:
+    """An error for the user: one of this package, or what the user's code raised; None if it is a bug of ours."""
+    if isinstance(error, ServiceError):
+        return error
+    text = users_error(error)
+    return ServiceError(text, ways_out=ways_out) if text else None
 
 
 def _session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] | None) -> None:
@@ -269,5 +280,10 @@ def _session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] 
         else:
             print_note("interrupted before the run began; nothing was written")
         raise
+    except Exception as error:
+        goes_on = WayOut("resume", "continue from the last finished generation after the cause is fixed", str(folder))
+        if (told := _told(error, [goes_on] if holds_run(folder) else ())) in (None, error):
+            raise
+        raise told from error
     with contextlib.suppress(SystemExit):
         print_summary(console, outcome.run, outcome.reason)

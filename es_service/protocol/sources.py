@@ -26,7 +26,7 @@ WORKERS = ("workers", "es_service.protocol")
 """Packages with which workers compute."""
 DRIVER = ("es_service.loop", "es_service.search", "es_service.config")
 """Packages with which the driver computes besides."""
-_SHARED_FOLDERS = ("site-packages", "dist-packages")
+SHARED_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders in which the packages of several projects are installed side by side."""
 
 
@@ -114,7 +114,7 @@ def _module_sources(path: str) -> dict[str, str]:
     top = _find(name.partition(".")[0], None)
     if top is None or top.name in sys.stdlib_module_names or not (place := _place(top)):
         return {}
-    is_shared = os.path.basename(place) in _SHARED_FOLDERS
+    is_shared = os.path.basename(place) in SHARED_FOLDERS
     found: dict[str, str] = {}
     seen: set[str] = set()
     wanted = [name]

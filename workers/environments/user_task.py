@@ -44,6 +44,7 @@ import jax
 import jax.numpy as jnp
 
 from es_service.protocol.messages import TaskSpec
+from es_service.protocol.raised import raised, why_not_imported
 from workers.environments import Environment, TaskError
 
 METHODS = ("reset", "observe", "step", "descriptor")
@@ -187,7 +188,7 @@ def _check_shapes(path: str) -> None:
             "goal_distance": (jax.eval_shape(environment.goal_distance, state).shape, ()),
         }
     except Exception as error:  # the user's code can raise anything
-        raise TaskError(f"{path} cannot be traced by JAX: {type(error).__name__}: {error}") from error
+        raise TaskError(f"{path} cannot be traced by JAX: {raised(error, path)}") from error
     wrong = [f"{what} has the shape {is_}, not {should}" for what, (is_, should) in found.items() if is_ != should]
     arrays = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), one) for one in (state, after)]
     if jax.tree.structure(state) != jax.tree.structure(after) or arrays[0] != arrays[1]:
@@ -216,10 +217,8 @@ def _import(path: str) -> Any:
         sys.path.append(os.getcwd())  # a console script does not search the current folder
     try:
         found = importlib.import_module(module)
-    except (ImportError, ValueError, TypeError) as error:  # the latter two if the name is no module name
-        raise TaskError(
-            f"{path}: cannot import {module} ({error}); start in the folder that contains it, or install it"
-        ) from error
+    except Exception as error:  # the user's code can raise anything
+        raise TaskError(f"{path}: {why_not_imported(module, error)}") from error
     if not hasattr(found, name):
         raise TaskError(f"{path}: the module {module} has no class {name}")
     return getattr(found, name)
