@@ -1,7 +1,8 @@
 """The command line: `es-service run | resume | fork | sweep | status | digest | config | list | evaluate | export |
 report | verify | submit | jobs | logs | stop | bench | doctor`.
 
-Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by SIGINT or SIGTERM.
+Exit codes: 0 done, 1 failed, 2 bad usage or config, 3 cannot be checked now (`verify` of a running run), 130 or 143
+interrupted by SIGINT or SIGTERM.
 """
 
 from __future__ import annotations
