@@ -55,8 +55,8 @@ def comparison_page(runs: Sequence[RunData], keys: Sequence[str] = (), threshold
         tag("section", tag("p", _sentence(groups, threshold), class_="verdict"), *_problems(runs), id="what"),
         section(
             "Curves",
-            tag("p", f"Median over the seeds of a group ({_seeds(groups)}); a shaded region is its interval, explained "
-                "below the final values. A curve ends where the first of its runs ends.", class_="note"),
+            tag("p", "Median over the seeds of a group; a shaded region is its interval, explained below the final "
+                f"values. A curve ends where the first of its runs ends. {_seeds(groups)}.", class_="note"),
             axis_choice({axis: X_AXES[axis] for axis in compare.AXES}),
             tag("div", *figures, class_="charts"),
             id_="curves",
@@ -135,7 +135,7 @@ def _about_intervals(groups: Sequence[Group]) -> str:
 
 
 def _seeds(groups: Sequence[Group]) -> str:
-    return "; ".join(f"{group.name}: {_seeds_of(group)}" for group in groups)
+    return "; ".join(f"{group.name} has {facts.count(group.seeds, 'seed')}" for group in groups)
 
 
 def _seeds_of(group: Group) -> str:
