@@ -14,25 +14,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from textwrap import indent
 from typing import Any, Literal
 
-Action = Literal["run", "resume", "fork", "watch", "install"]
+Action = Literal["run", "resume", "fork", "watch", "report", "install"]
 
 
 @dataclass(frozen=True)
 class WayOut:
-    """A remedy for an error: a function of `es_service.api` and its arguments."""
+    """A remedy for an error: a function of this package and its arguments."""
 
     action: Action
-    """run, resume and fork are functions; watch stands for `open_run`; install, for an installation of an extra."""
+    """run, resume and fork are functions; watch stands for `open_run`, report for `write_report`, and install for an
+    installation of an extra."""
     purpose: str
     """What it achieves, as words that follow "to", such as "continue it"."""
     run: str | None = None
-    """Folder of the run to resume, fork or watch; None if it is not known where the error is raised."""
+    """Folder of the run that it is about; None if it is not known where the error is raised."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Keys of the config to set, and their values."""
     out: str | None = None
-    """Folder of the new run, for the action run."""
+    """Folder of the new run, for the action run; file to write, for report."""
     extra: str | None = None
     """Extra of this package that is needed, for the action install."""
 
@@ -48,6 +50,8 @@ class WayOut:
                 return f"run({config}, {self.out!r})" if self.out else f"run({config})"
             case "watch":
                 return f"open_run({self.run!r})"
+            case "report":
+                return f"write_report({self.run!r}, {self.out!r})"
         folder = repr(self.run) if self.run else "folder"
         return f"{self.action}({folder}{', ' if settings else ''}{settings})"
 
@@ -57,7 +61,7 @@ class Problem:
     """One thing that is wrong with a config."""
 
     sentence: str
-    """One line for the user; it begins with the field, if there is one."""
+    """A line for the user, which begins with the field, if there is one; frames of the user's code may follow it."""
     field: str | None = None
     """Dotted key of the config."""
     value: Any = None
@@ -125,7 +129,7 @@ class ConfigError(ServiceError, ValueError):
         ways_out: Sequence[WayOut] = (),
     ) -> ConfigError:
         """An error that lists one or more problems, each on a line, between a heading and a note."""
-        lines = [heading, *(f"  {problem.sentence}" for problem in problems), *([note] if note else [])]
+        lines = [heading, *(indent(problem.sentence, "  ") for problem in problems), *([note] if note else [])]
         first = problems[0]
         error = cls(
             "\n".join(lines),

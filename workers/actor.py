@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import Work, WorkerPlace
 from es_service.protocol.process_environment import worker_environment
+from es_service.protocol.raised import sendable
 from es_service.protocol.sources import OtherCodeError, why_refused
 from workers.xla_cache import xla_cache_settings
 
@@ -33,6 +34,7 @@ class WorkerActor:
             cores: number of cores that it may use at a time.
         """
         self._spec, self._index, self._gpus, self._cores = spec, index, gpus, cores
+        self._environment = ""
         self._run_chunks: Compilable | None = None
 
     def __repr__(self) -> str:
@@ -59,7 +61,9 @@ class WorkerActor:
         os.environ.update(environment | xla_cache_settings())
         from workers.cores import make_worker_with_cores
 
-        self._run_chunks = make_worker_with_cores(spec, self._cores)
+        self._environment = spec.environment
+        with sendable(self._environment):
+            self._run_chunks = make_worker_with_cores(spec, self._cores)
         if not self._gpus:
             return platform_text(platform_info())
         import jax
@@ -72,7 +76,8 @@ class WorkerActor:
         The engine calls this before the first call of `run` for each kind of chunk.
         """
         assert self._run_chunks is not None, "compile was called before build"
-        return self._run_chunks.seconds_to_compile(_unpacked(chunks, subjects))
+        with sendable(self._environment):
+            return self._run_chunks.seconds_to_compile(_unpacked(chunks, subjects))
 
     def run(self, chunks: bytes, *subjects: bytes) -> bytes:
         """Run chunks; returns the pickled results.
@@ -82,7 +87,8 @@ class WorkerActor:
             subjects: each one pickled.
         """
         assert self._run_chunks is not None, "run was called before build"
-        return pickle.dumps(self._run_chunks(_unpacked(chunks, subjects)), pickle.HIGHEST_PROTOCOL)
+        with sendable(self._environment):
+            return pickle.dumps(self._run_chunks(_unpacked(chunks, subjects)), pickle.HIGHEST_PROTOCOL)
 
 
 def _unpacked(chunks: bytes, subjects: tuple[bytes, ...]) -> list[Work]:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 from es_service.protocol.gradient_tree import with_neighbours_added
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec
 from es_service.protocol.parent import end_with
+from es_service.protocol.raised import sendable
 from workers.compilable import Compilable
 from workers.worker import make_worker
 
@@ -30,6 +31,8 @@ class _Child(NamedTuple):
     """What a child process has."""
 
     worker: Compilable
+    environment: str
+    """The name of the task."""
     barrier: Any
     """Barrier of all children of the worker."""
 
@@ -90,7 +93,7 @@ def _begin_child(spec: WorkerSpec, parent: int, barrier: Any) -> None:
     """Prepare a child process, which ends with its parent."""
     global _child
     end_with(parent)
-    _child = _Child(make_worker(spec), barrier)
+    _child = _Child(make_worker(spec), spec.environment, barrier)
 
 
 def _meet() -> None:
@@ -102,11 +105,13 @@ def _meet() -> None:
 def _compile_in_child(work: Sequence[Work]) -> None:
     assert _child is not None, "the pool initialises each child"
     try:
-        _child.worker.compile(work)
+        with sendable(_child.environment):
+            _child.worker.compile(work)
     finally:
         _meet()
 
 
 def _run_child(work: Sequence[Work]) -> list[ChunkResult]:
     assert _child is not None, "the pool initialises each child"
-    return _child.worker(work)
+    with sendable(_child.environment):
+        return _child.worker(work)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from es_service.protocol.messages import Subject, forget_oldest
 from es_service.protocol.parent import end_with
+from es_service.protocol.raised import RaisedError, raised
 from es_service.protocol.sources import why_refused
 from es_service.protocol.wire import framed, receive
 from workers.xla_cache import xla_cache_settings
@@ -29,16 +30,17 @@ def main(descriptor: int, parent: int) -> None:
 
     The parent sends over this socket the WorkerSpec, and then for each worker one byte with the descriptor of the
     worker's socket. A worker receives ("subject", number, Subject) and ("chunks", item, attempt, [(number, Chunk)]);
-    `item` names their work item, and `number` the subject of each. It sends ("broken", text), or
-    ("up",) and then for each work item ("results", item, attempt, [ChunkResult]) or ("failure", item, attempt, text).
-    Before it computes the first work item of a kind, it compiles for it and sends ("compiled", kind, seconds).
+    `item` names their work item, and `number` the subject of each. It sends ("broken", RaisedError), or ("up",) and
+    then for each work item ("results", item, attempt, [ChunkResult]) or ("failure", item, attempt, RaisedError). Before
+    it computes the first work item of a kind, it compiles for it and sends ("compiled", kind, seconds).
     """
     end_with(parent)
     with socket.socket(fileno=descriptor) as control:
         try:
-            run_chunks = _make_run_chunks(receive(control))
+            spec = receive(control)
+            run_chunks = _make_run_chunks(spec)
             while (given := _descriptor(control)) is not None:
-                threading.Thread(target=_work, args=(given, run_chunks), daemon=True).start()
+                threading.Thread(target=_work, args=(given, run_chunks, spec.environment), daemon=True).start()
         except Exception:
             traceback.print_exc()
     os._exit(0)  # do not wait for threads, which may be in the middle of a chunk
@@ -58,33 +60,33 @@ def _descriptor(control: socket.socket) -> int | None:
     return descriptors[0] if descriptors else None
 
 
-def _make_run_chunks(spec: Any) -> Compilable | str:
-    """Function that runs chunks, or the reason why there is none: other code, or the traceback of an error."""
+def _make_run_chunks(spec: Any) -> Compilable | RaisedError:
+    """Function that runs chunks, or the reason why there is none: other code, or an error."""
     if problem := why_refused(spec.sources, spec.environment):
-        return problem
+        return RaisedError(problem, "")
     os.environ.update(xla_cache_settings())
     try:
         from workers.worker import make_worker
 
         return make_worker(spec)
-    except Exception:
-        return traceback.format_exc()
+    except BaseException as error:  # also sys.exit in an environment
+        return raised(error, spec.environment)
 
 
-def _work(descriptor: int, run_chunks: Compilable | str) -> None:
+def _work(descriptor: int, run_chunks: Compilable | RaisedError, environment: str) -> None:
     """Run one worker until the parent closes its end. After any other end, the parent sees that and the reason."""
     with socket.socket(fileno=descriptor) as parent:
         try:
-            _serve(parent, run_chunks)
+            _serve(parent, run_chunks, environment)
         except (EOFError, ConnectionError):
             pass
         except Exception:
             traceback.print_exc()
 
 
-def _serve(parent: socket.socket, run_chunks: Compilable | str) -> None:
+def _serve(parent: socket.socket, run_chunks: Compilable | RaisedError, environment: str) -> None:
     """Receive chunks and send their results; does not return unless the worker is broken."""
-    if isinstance(run_chunks, str):
+    if isinstance(run_chunks, RaisedError):
         parent.sendall(framed(("broken", run_chunks)))
         return
     parent.sendall(framed(("up",)))
@@ -102,8 +104,8 @@ def _serve(parent: socket.socket, run_chunks: Compilable | str) -> None:
                         compiled.add(kind)
                         parent.sendall(framed(("compiled", kind, seconds)))
                     answer = ("results", item, attempt, run_chunks(work))
-                except BaseException:  # also sys.exit in an environment
-                    answer = ("failure", item, attempt, traceback.format_exc())
+                except BaseException as error:  # also sys.exit in an environment
+                    answer = ("failure", item, attempt, raised(error, environment))
                 parent.sendall(framed(answer))
                 forget_oldest(subjects, attrgetter("nbytes"))
 

@@ -47,6 +47,8 @@ def way_command(way: WayOut) -> str:
             return way.call()
         case "watch":
             return command("status", folder, "--follow")
+        case "report":
+            return command("report", folder, "--out", way.out)
         case "run":
             return command("run", "CONFIG", *(["--out", way.out] if way.out else []), *settings(way.settings))
     return command(way.action, folder, *settings(way.settings))

@@ -11,8 +11,9 @@ from typing import Annotated, Any
 import typer
 
 from es_service import api
+from es_service.cli.console import console, errors
 from es_service.cli.data import print_json
-from es_service.cli.options import JsonOption, LogLevelOption, console, errors, place_of, print_note
+from es_service.cli.options import JsonOption, LogLevelOption, place_of, print_note
 from es_service.cli.several import RunsArgument, is_single, read_each, started_runs
 from es_service.errors import ConfigError
 from es_service.report.progress import print_notice

@@ -1,7 +1,8 @@
 """The command line: `es-service run | resume | fork | sweep | status | digest | config | list | evaluate | export |
 report | verify | submit | jobs | logs | stop | bench | doctor`.
 
-Exit codes: 0 done, 1 failed, 2 bad usage or config, 130 or 143 interrupted by SIGINT or SIGTERM.
+Exit codes: 0 done, 1 failed, 2 bad usage or config, 3 cannot be checked now (`verify` of a running run), 130 or 143
+interrupted by SIGINT or SIGTERM.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import typer
 from es_service import api
 from es_service.cli.bench import bench
 from es_service.cli.commands import command
+from es_service.cli.console import console, errors, print_line
 from es_service.cli.evaluate import evaluate
 from es_service.cli.jobs import job_commands
 from es_service.cli.options import (
@@ -35,8 +37,6 @@ from es_service.cli.options import (
     SetOption,
     StrictOption,
     WorkersOption,
-    console,
-    errors,
     overrides,
     print_config_notes,
     print_error,
@@ -48,13 +48,16 @@ from es_service.cli.sweep import SeedsOption, run_seeds, sweep
 from es_service.cli.tables.status import print_summary
 from es_service.cli.verify import verify
 from es_service.config.parallel import parallel_sentence
-from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError
+from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError, WayOut
+from es_service.logs import logger
 from es_service.loop.history import Row
 from es_service.protocol.machine import VERSION
+from es_service.protocol.raised import users_error
 from es_service.report.progress import show_progress
 from es_service.runs.tracking import tracked
 from es_service.store.folder import holds_run
 
+_LOG = logger(__name__)
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
@@ -102,7 +105,7 @@ def run(
     loaded = api.load_config(config, wanted, new=not begun)
     print_config_notes(config, [(wanted, loaded)])
     with contextlib.suppress(SystemExit):  # rich's answer to a closed output
-        console.print(parallel_sentence(loaded), highlight=False, markup=False, soft_wrap=True)
+        print_line(console, parallel_sentence(loaded))
     folder = out if out is not None else api.default_folder(loaded)
     _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder), log)
 
@@ -188,15 +191,23 @@ def main() -> None:
         app()
     except Interrupted:
         raise
-    except (ConfigError, NotInRunError) as error:
-        print_error(error)
-        sys.exit(2)
-    except ServiceError as error:
-        print_error(error)
-        sys.exit(1)
     except MemoryError as error:
         print_error(f"not enough memory: {error}. Reduce policy.hidden or search.pairs.")
         sys.exit(1)
+    except Exception as error:
+        if (told := _told(error)) is None:
+            raise  # a bug, of which the traceback is all that is known
+        print_error(told)
+        _LOG.debug("the traceback of this error", exc_info=error)
+        sys.exit(2 if isinstance(told, ConfigError | NotInRunError) else 1)
+
+
+def _told(error: Exception, ways_out: Sequence[WayOut] = ()) -> ServiceError | None:
+    """An error for the user: one of this package, or what the user's code raised; None if it is a bug of ours."""
+    if isinstance(error, ServiceError):
+        return error
+    text = users_error(error)
+    return ServiceError(text, ways_out=ways_out) if text else None
 
 
 def _session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] | None) -> None:
@@ -232,5 +243,10 @@ def _session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] 
         else:
             print_note("interrupted before the run began; nothing was written")
         raise
+    except Exception as error:
+        goes_on = WayOut("resume", "continue from the last finished generation after the cause is fixed", str(folder))
+        if (told := _told(error, [goes_on] if holds_run(folder) else ())) in (None, error):
+            raise
+        raise told from error
     with contextlib.suppress(SystemExit):
         print_summary(console, outcome.run, outcome.reason)

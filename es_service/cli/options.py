@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
-from rich.console import Console
 
 from es_service.cli.commands import assignments, error_message
+from es_service.cli.console import console, errors, print_line
 from es_service.config.compute import implied_by
 from es_service.config.keys import Overrides
 from es_service.config.loading import left_out
@@ -20,9 +20,6 @@ from es_service.config.resolution import config_warnings
 from es_service.config.tasks import no_vectors, task_of
 from es_service.errors import ConfigError, ServiceError
 from es_service.logs import FORMAT
-
-console = Console()
-errors = Console(stderr=True)
 
 ConfigArgument = Annotated[Path, typer.Argument(help="YAML file, or the name of a shipped config.", show_default=False)]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a run.", show_default=False)]
@@ -106,14 +103,14 @@ def overrides(
 def print_note(message: str, style: str | None = None) -> None:
     """Print a line that is not a result to stderr. If stderr is closed, rich raises SystemExit, which is ignored."""
     with contextlib.suppress(SystemExit):
-        errors.print(message, style=style, highlight=False, markup=False, soft_wrap=True)
+        print_line(errors, message, style)
 
 
 def print_finding(level: str, text: str) -> None:
     """Print a finding of `doctor`, whose level is "ok", "note" or "FAIL", on stdout."""
     colour = {"ok": "green", "note": "yellow", "FAIL": "red"}[level]
-    console.print(f"[{colour}]{level:>4}[/]  ", end="")
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
+    console.print(f"{level:>4}", style=colour, end="  ")
+    print_line(console, text)
 
 
 def print_error(error: ServiceError | str) -> None:

@@ -9,8 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from es_service import api
+from es_service.cli.console import console
 from es_service.cli.data import catalogue_data, digest_data, print_json, standing_data
-from es_service.cli.options import JsonOption, console, print_note
+from es_service.cli.options import JsonOption, print_note
 from es_service.cli.several import RunsArgument, is_single, of_each, problem_data, read_each
 from es_service.cli.tables.catalogue import print_catalogue
 from es_service.cli.tables.overview import NOT_STARTED, print_overview

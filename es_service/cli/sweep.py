@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from es_service import api
+from es_service.cli.console import console, errors
 from es_service.cli.options import (
     AddressOption,
     ConfigArgument,
@@ -17,8 +19,6 @@ from es_service.cli.options import (
     LogLevelOption,
     LogOption,
     SetOption,
-    console,
-    errors,
     overrides,
     print_config_notes,
     print_error,
@@ -109,7 +109,7 @@ def run_sweep(
     except Interrupted:
         print_note(
             "interrupted; every finished generation of every run is saved. The same command again, with "
-            f"--out {out}, continues"
+            f"--out {shlex.quote(str(out))}, continues"
         )
         raise
     constants = {key for run in planned for key in run.config.constants()}

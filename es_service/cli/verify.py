@@ -8,8 +8,10 @@ from typing import Annotated
 import typer
 
 from es_service import api
+from es_service.cli.console import console, print_line
 from es_service.cli.data import print_json
-from es_service.cli.options import JsonOption, LogLevelOption, RunArgument, console, print_note
+from es_service.cli.options import JsonOption, LogLevelOption, RunArgument, print_error, print_note
+from es_service.errors import RunLockedError
 from es_service.runs.verification import Recomputed
 from es_service.runs.verification import verify as recompute
 
@@ -23,14 +25,20 @@ def verify(
     as_json: JsonOption = False,
     log_level: LogLevelOption = None,
 ) -> None:
-    """Compute generations of a run again on this machine and compare every bit; exit code 1 if one differs."""
+    """Compute generations of a run again on this machine and compare every bit; exit code 1 if one differs, 3 if the
+    run is running."""
     run = api.open_run(folder)
+    try:
+        recomputed = recompute(run, generations, workers)
+    except RunLockedError as error:
+        print_error(error)
+        raise typer.Exit(3) from None
     digest = run.digest()  # raises if stored data are damaged
     found: list[Recomputed] = []
-    for one in recompute(run, generations, workers):
+    for one in recomputed:
         found.append(one)
         if not as_json:
-            console.print(_line(one), highlight=False, markup=False, soft_wrap=True)
+            print_line(console, _line(one))
     equal = not any(one.differences for one in found)
     if as_json:
         print_json({"digest": digest, "equal": equal, "recomputed": [asdict(one) for one in found]})

@@ -19,6 +19,7 @@ from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import (
     initial_state,
     is_waiting,
+    loss_text,
     next_deadline,
     pending,
     told_last_words,
@@ -169,10 +170,9 @@ class Engine(Generic[AnyTransport]):
             self.close()
             raise
 
-    @property
-    def last_loss(self) -> str:
-        """Text that names the worker lost last, and the reason."""
-        return self._state.last_loss
+    def last_loss(self, what: str = "") -> str:
+        """See `loss_text`."""
+        return loss_text(self._state, what)
 
     @property
     def platforms(self) -> frozenset[str]:
@@ -289,6 +289,8 @@ class Engine(Generic[AnyTransport]):
         return accepted
 
     def _tell(self, entry: events.Event | events.Command) -> None:
-        """Write an event or a command to the dispatch log and to `logging`, faults and losses at level INFO."""
+        """Write an event or a command to the dispatch log and to `logging`, there also a traceback at level DEBUG."""
         self._log(entry)
         _LOG.log(logging.INFO if isinstance(entry, _RARE) else logging.DEBUG, "%s", entry)
+        if isinstance(entry, events.Failure | events.WorkerLost) and entry.traceback:
+            _LOG.debug("worker %d: %s", entry.worker, entry.traceback)

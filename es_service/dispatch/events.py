@@ -113,6 +113,8 @@ class WorkerLost:
     charged with the loss."""
     refused: bool = False
     """Whether its host must not work for this run, and gets no other worker. This is no fault."""
+    traceback: str = field(default="", repr=False)
+    """If the reason is an exception that it raised, the whole traceback."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +144,8 @@ class Failure:
     item_id: Hashable
     attempt: int
     message: str
+    traceback: str = field(default="", repr=False)
+    """The whole traceback, of which the message has what the user needs."""
 
 
 @dataclass(frozen=True)
@@ -215,6 +219,11 @@ class Fail:
 
 
 Command = StartWorker | StopWorker | Assign | Deliver | Fail
+
+
+def because(what: str, reason: str) -> str:
+    """What happened and the reason; one of several lines, such as an exception with its frames, comes first."""
+    return f"{reason}\n{what}" if "\n" in reason else f"{what}: {reason}"
 
 
 def with_last_words(reason: str, last_words: str) -> str:

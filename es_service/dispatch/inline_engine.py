@@ -14,7 +14,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import traceback
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import ExitStack
@@ -28,6 +27,7 @@ from es_service.errors import Interrupted
 from es_service.protocol.messages import Subject, Work, WorkerSpec, forget_oldest
 from es_service.protocol.parent import start_child
 from es_service.protocol.process_environment import child_environment
+from es_service.protocol.raised import RaisedError, raised
 from es_service.protocol.wire import BUFFER_BYTES, Channel, framed
 
 PIECE_S = 0.1
@@ -200,12 +200,12 @@ class ChildProcesses:
         if not events & ~select.POLLOUT:
             return False
         if (wrong := self._hear(number)) is not None:
-            self._lose(worker.child, wrong)
+            self._lose(worker.child, wrong.message, wrong.traceback)
             return False
         return worker.channel.is_halfway
 
-    def _hear(self, number: int) -> str | None:
-        """Read a worker's messages. Returns None, or if the worker is lost, the reason or "" if it is not known."""
+    def _hear(self, number: int) -> RaisedError | None:
+        """Read a worker's messages. Returns None, or if the worker is lost, the reason, empty if it is not known."""
         try:
             worker = self._workers[number]
             messages, is_open = worker.channel.receive()
@@ -218,18 +218,18 @@ class ChildProcesses:
                     case ("results", item_id, attempt, results):
                         worker.unanswered -= 1
                         self._ready.append(Answer(number, item_id, attempt, results))
-                    case ("failure", item_id, attempt, text):
+                    case ("failure", item_id, attempt, error):
                         worker.unanswered -= 1
-                        self._ready.append(Failure(number, item_id, attempt, text))
-                    case ("broken", text):
-                        return text
+                        self._ready.append(Failure(number, item_id, attempt, error.message, error.traceback))
+                    case ("broken", error):
+                        return error
                     case _:
-                        return f"it sent an unknown message: {said!r}"
+                        return RaisedError(f"it sent an unknown message: {said!r}", "")
         except Interrupted:  # a signal handler can raise this anywhere
             raise
-        except Exception:  # a damaged message can raise any exception when it is unpickled
-            return traceback.format_exc()
-        return None if is_open else ""
+        except Exception as error:  # a damaged message can raise any exception when it is unpickled
+            return raised(error)
+        return None if is_open else RaisedError("", "")
 
     def _forget(self, number: int) -> _Child:
         worker = self._workers.pop(number)
@@ -238,7 +238,7 @@ class ChildProcesses:
         worker.channel.close()
         return worker.child
 
-    def _lose(self, child: _Child, reason: str = "", *, bystanders: bool = False) -> str:
+    def _lose(self, child: _Child, reason: str = "", traceback: str = "", *, bystanders: bool = False) -> str:
         """Kill a child and report the loss of its remaining workers, after their messages; returns its last output.
 
         A worker that had no work item is a bystander: before the scheduler learns of its loss, it may send it a work
@@ -255,7 +255,8 @@ class ChildProcesses:
         elif bystanders:
             reason = with_last_words(reason, last_words)
         for number, worker in lost.items():
-            self._ready.append(WorkerLost(number, reason, bystander=bystanders or not worker.unanswered))
+            idle = not worker.unanswered
+            self._ready.append(WorkerLost(number, reason, bystander=bystanders or idle, traceback=traceback))
         return last_words
 
 

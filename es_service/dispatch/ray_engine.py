@@ -23,7 +23,7 @@ from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_calls import Arguments, Call, Calls
 from es_service.dispatch.ray_cluster import Watch, connect, disconnect
-from es_service.dispatch.ray_faults import error_text, fault_reason
+from es_service.dispatch.ray_faults import fault_reason, raised_in_actor
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage
 from es_service.dispatch.ray_refusals import Refusals
 from es_service.protocol.messages import Work, WorkerPlace, WorkerSpec
@@ -226,13 +226,14 @@ class Actors:
         except errors.RayTaskError as error:  # the call raised an exception, and the actor is alive
             if isinstance(error, OtherCodeError):
                 return self._refused(call.worker, str(getattr(error, "cause", error)))
+            said = raised_in_actor(error)
             if call.what not in ("compile", "run"):
-                return self._lost(call.worker, error_text(error))
+                return self._lost(call.worker, said.message, traceback=said.traceback)
             del self._calls[ref]
             if call.what == "compile":  # the call of `run` behind it raises the same
                 self._compiled[call.worker].discard(call.kind)
                 return None
-            return Failure(call.worker, call.item_id, call.attempt, error_text(error))
+            return Failure(call.worker, call.item_id, call.attempt, said.message, said.traceback)
         except errors.RayError as error:
             where = self._places.get(call.worker)
             return self._lost(call.worker, f"{where or 'before it had a place'}: {fault_reason(error)}")
@@ -294,7 +295,7 @@ class Actors:
     def _lose(self, worker: int, reason: str) -> None:
         self._inbox.append(self._lost(worker, reason))
 
-    def _lost(self, worker: int, reason: str, *, refused: bool = False) -> WorkerLost:
+    def _lost(self, worker: int, reason: str, *, refused: bool = False, traceback: str = "") -> WorkerLost:
         has_begun = self._calls.owed_first().get(worker) in ("compile", "run")
         self.kill(worker)
-        return WorkerLost(worker, reason, bystander=not has_begun, refused=refused)
+        return WorkerLost(worker, reason, bystander=not has_begun, refused=refused, traceback=traceback)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+from es_service.protocol.raised import RaisedError
+
 
 def fault_reason(error: Exception) -> str:
     """Cause of an actor's fault, on one line."""
@@ -15,6 +17,12 @@ def fault_reason(error: Exception) -> str:
     }
     kind = type(error).__name__
     return f"{known.get(kind, kind)}: {first}"
+
+
+def raised_in_actor(error: Exception) -> RaisedError:
+    """The exception of an actor's call, which `workers.actor` has turned into texts."""
+    cause = getattr(error, "cause", None)
+    return cause if isinstance(cause, RaisedError) else RaisedError(error_text(error), "")
 
 
 def error_text(error: Exception) -> str:

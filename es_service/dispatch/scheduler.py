@@ -54,6 +54,7 @@ from es_service.dispatch.events import (
     Tick,
     WorkerLost,
     WorkerUp,
+    because,
 )
 from es_service.dispatch.scheduler_changes import append_items, drop_item, pop_worker, put_worker, return_item
 from es_service.dispatch.scheduler_state import (
@@ -67,6 +68,7 @@ from es_service.dispatch.scheduler_state import (
     holds,
     is_down,
     late_workers,
+    loss_text,
     next_deadline,
     with_own_containers,
     without,
@@ -165,14 +167,15 @@ def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) 
     record = record._replace(slots=slots, failures_in_a_row=failures)
     _close_slot(s, out, worker, record, index, now)
     if worker in s.up and record.failures_in_a_row >= s.limits.max_failures_in_a_row:
-        reason = f"{record.failures_in_a_row} consecutive work items raised exceptions; the last: {event.message}"
+        what = f"the last of {record.failures_in_a_row} consecutive work items that raised exceptions"
+        reason = because(what, event.message)
         out.append(StopWorker(worker, reason))
         # The item that it has just begun is not charged.
         s = _lose(s, out, worker, reason, now, charge=False)
     if not holds(s, worker, item_id):
         return s._replace(duplicates=s.duplicates + 1)
     return_item(s, worker, item_id)
-    return _charge(s, out, item_id, f"it raised an exception on worker {worker}: {event.message}")
+    return _charge(s, out, item_id, f"it raised an exception on worker {worker}", event.message)
 
 
 def _close_slot(s: SchedulerState, out: list[Command], worker: int, record: Worker, index: int, now: float) -> None:
@@ -217,7 +220,7 @@ def _lose(
             return_item(s, worker, slot.item.id)
     if not fault:
         return s
-    s = s._replace(lost_workers=s.lost_workers + 1, last_lost=worker, last_loss=f"worker {worker}: {reason}")
+    s = s._replace(lost_workers=s.lost_workers + 1, last_lost=worker, last_loss=reason, last_words="")
     if s.up or s.draining:
         s = s._replace(start_failures=0)
     elif starting and worker >= s.tried:
@@ -227,18 +230,19 @@ def _lose(
         wait_s = min(s.limits.max_backoff_s, s.limits.restart_backoff_s * 2**doublings) if doublings >= 0 else 0.0
         s = s._replace(losses_in_a_row=s.losses_in_a_row + 1, start_at_s=now + wait_s)
     if starting and s.start_failures >= s.limits.max_start_failures and not s.up and not s.draining:
-        return _fail(s, out, f"no worker started in {s.start_failures} consecutive attempts; last loss: {s.last_loss}")
+        return _fail(s, out, loss_text(s, f"no worker started in {s.start_failures} consecutive attempts; last loss: "))
     if running is not None and charge:
-        return _charge(s, out, running, f"worker {worker} was lost while running it: {reason}")
+        return _charge(s, out, running, f"worker {worker} was lost while running it", reason)
     return s
 
 
-def _charge(s: SchedulerState, out: list[Command], item_id: Hashable, message: str) -> SchedulerState:
-    """Add a fault to a work item; if it now has `max_attempts` faults, the run fails."""
+def _charge(s: SchedulerState, out: list[Command], item_id: Hashable, what: str, reason: str) -> SchedulerState:
+    """Add a fault to a work item; if it now has `max_attempts` faults, the run fails, and says what happened last."""
     waiting = s.items[item_id] = s.items[item_id]._replace(faults=s.items[item_id].faults + 1)
     if waiting.faults < s.limits.max_attempts:
         return s
-    return _fail(s, out, f"work item {item_id} failed in {waiting.faults} attempts; the last time {message}")
+    what = f"work item {item_id} failed in {waiting.faults} attempts; the last time {what}"
+    return _fail(s, out, because(what, reason))
 
 
 def _fail(s: SchedulerState, out: list[Command], message: str) -> SchedulerState:
@@ -261,7 +265,7 @@ def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int
     if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + limit_s:
         for_s = f"for {plain(limit_s)} s ({s.limits.name_of(name)})"
         text = f"was up {for_s} while {len(s.items)} work items waited" if s.next_rank else f"got a place {for_s}"
-        return _fail(s, out, f"no worker {text}; last loss: {s.last_loss}")
+        return _fail(s, out, loss_text(s, f"no worker {text}; last loss: "))
     return s
 
 

@@ -11,7 +11,7 @@ from collections.abc import Hashable
 from typing import NamedTuple
 
 from es_service.dispatch.cheap_copies import Sorted, Table
-from es_service.dispatch.events import Limits, WorkItem, with_last_words
+from es_service.dispatch.events import Limits, WorkItem, because, with_last_words
 
 IN_TIME, LATE, NEW = range(3)
 """Values of `Worker.pace`, best first."""
@@ -110,8 +110,10 @@ class SchedulerState(NamedTuple):
     """Time since which `is_down`; None if this is not so."""
     last_lost: int | None = None
     """The worker that was lost last."""
-    last_loss: str = "no worker was lost"
-    """Text that names the worker lost last, and the reason."""
+    last_loss: str = ""
+    """The reason of this loss."""
+    last_words: str = ""
+    """The last output of this worker's process, if it was stopped for a fault and its output is available."""
     failed: str | None = None
     """Message of `Fail`, after which the state never changes; None before that."""
     retries: int = 0
@@ -263,14 +265,19 @@ def late_workers(state: SchedulerState, now: float) -> list[int]:
 
 
 def told_last_words(state: SchedulerState, worker: int, last_words: str) -> SchedulerState:
-    """State with the last output of a stopped worker's process added to the texts about its loss.
-
-    These are the text of the last loss, and the message of `Fail` if this loss made the run fail.
-    """
+    """State with the last output of a stopped worker's process, also in the message of `Fail` if its loss made the run
+    fail."""
     if worker != state.last_lost:
         return state
     failed = None if state.failed is None else with_last_words(state.failed, last_words)
-    return state._replace(last_loss=with_last_words(state.last_loss, last_words), failed=failed)
+    return state._replace(last_words=last_words, failed=failed)
+
+
+def loss_text(state: SchedulerState, what: str = "") -> str:
+    """Text that names the worker lost last and the reason, after what it is said for."""
+    if state.last_lost is None:
+        return f"{what}no worker was lost"
+    return with_last_words(because(f"{what}worker {state.last_lost}", state.last_loss), state.last_words)
 
 
 def find_slot(worker: Worker, item_id: Hashable, attempt: int) -> int | None:

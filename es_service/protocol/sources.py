@@ -27,7 +27,7 @@ WORKERS = ("workers", "es_service.protocol")
 """Packages with which workers compute."""
 DRIVER = ("es_service.loop", "es_service.search", "es_service.config")
 """Packages with which the driver computes besides."""
-_SHARED_FOLDERS = ("site-packages", "dist-packages")
+SHARED_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders in which the packages of several projects are installed side by side."""
 
 
@@ -138,7 +138,7 @@ def modules_of(path: str) -> Modules:
     top = _find(name.partition(".")[0], None)
     if top is None or top.name in sys.stdlib_module_names or not (place := _place(top)):
         return Modules({}, frozenset(), is_installed=False)
-    is_shared = os.path.basename(place) in _SHARED_FOLDERS
+    is_shared = os.path.basename(place) in SHARED_FOLDERS
     found: dict[str, OwnModule] = {}
     others: set[str] = set()
     seen: set[str] = set()

@@ -1,4 +1,4 @@
-"""Several runs of one task, grouped by their settings: medians and quartiles over seeds, as papers compare methods.
+"""Several runs of one task, grouped by their settings: medians over seeds with their intervals, and quartiles.
 
 Axes: R runs of a group, K points of a curve.
 """
@@ -16,6 +16,7 @@ from es_service.config.problems import did_you_mean, nearest
 from es_service.config.resolution import LEFT_OPEN
 from es_service.config.yaml_text import in_line
 from es_service.errors import ConfigError
+from es_service.report.bootstrap import median_interval
 from es_service.report.data import RunData
 from es_service.report.series import Chart, Line
 
@@ -46,6 +47,18 @@ class Group(NamedTuple):
     name: str
     runs: tuple[RunData, ...]
 
+    @property
+    def seeds(self) -> int:
+        """Number of different seeds among the runs."""
+        return len({run.constants["seed"] for run in self.runs})
+
+    def interval(self, y_R_K: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Interval of the median over the runs at each point, [2, K]; None if there are no two seeds.
+
+        It is also None if two runs have the same seed, since their results do not vary independently.
+        """
+        return median_interval(y_R_K) if 1 < self.seeds == len(self.runs) else None
+
 
 class Quartiles(NamedTuple):
     """Median and quartiles of one number over runs."""
@@ -61,6 +74,8 @@ class Summary(NamedTuple):
     group: Group
     values: Mapping[str, Quartiles]
     """History column -> its value at the end of each run."""
+    intervals: Mapping[str, tuple[float, float]]
+    """History column -> interval of the median of these values; empty if there is none, see `Group.interval`."""
     solved: int
     """Number of runs whose best fitness reached the threshold."""
     steps: Quartiles
@@ -139,17 +154,22 @@ def charts(groups: Sequence[Group], axis: str) -> tuple[list[Chart], NDArray[np.
             continue
         lines = []
         for group in groups:
-            low_K, median_K, high_K = quartiles_at(group, column, axis, x_K)
-            several = len(group.runs) > 1
-            lines.append(Line(group.name, column, median_K, (low_K, high_K) if several else None))
+            y_R_K = values_at(group, column, axis, x_K)
+            interval = group.interval(y_R_K)
+            range_K = None if interval is None else (interval[0], interval[1])
+            lines.append(Line(group.name, column, np.median(y_R_K, axis=0), range_K))
         found.append(Chart(title, note, tuple(lines), None, percent))
     return found, x_K
 
 
 def quartiles_at(group: Group, column: str, axis: str, x_K: NDArray[np.float64]) -> NDArray[np.float64]:
     """First quartile, median and third quartile over the runs of a group [3, K]; NaN where a run has no value."""
-    y_R_K = np.stack([at(run.history[axis], run.history[column], x_K) for run in group.runs])
-    return np.quantile(y_R_K, [0.25, 0.5, 0.75], axis=0)
+    return np.quantile(values_at(group, column, axis, x_K), [0.25, 0.5, 0.75], axis=0)
+
+
+def values_at(group: Group, column: str, axis: str, x_K: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values of the runs of a group at places of an axis [R, K]; NaN where a run has none."""
+    return np.stack([at(run.history[axis], run.history[column], x_K) for run in group.runs])
 
 
 def at(x_G: NDArray[np.float64], y_G: NDArray[np.float64], x_K: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -170,19 +190,27 @@ def summaries(groups: Sequence[Group], threshold: float | None) -> list[Summary]
     """The final values of each group; `threshold`: fitness from which a run counts as solved, None: no run does."""
     found = []
     for group in groups:
-        columns = (*COLUMNS, *AXES)
-        values = {
-            column: _quartiles([run.last(column) for run in group.runs])
-            for column in columns
+        last = {
+            column: np.array([[run.last(column)] for run in group.runs], float)
+            for column in (*COLUMNS, *AXES)
             if all(column in run.history for run in group.runs)
         }
+        intervals = {column: group.interval(y_R_1) for column, y_R_1 in last.items()}
         steps = []
         for run in group.runs:
             if threshold is None:
                 break
             reached = np.flatnonzero(run.history["best_fitness"] >= threshold)
             steps += [float(run.history["env_steps"][reached[0]])] if reached.size else []
-        found.append(Summary(group, values, len(steps), _quartiles(steps)))
+        found.append(
+            Summary(
+                group,
+                {column: _quartiles(y_R_1[:, 0].tolist()) for column, y_R_1 in last.items()},
+                {column: (float(x[0, 0]), float(x[1, 0])) for column, x in intervals.items() if x is not None},
+                len(steps),
+                _quartiles(steps),
+            )
+        )
     return found
 
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from es_service.errors import NotInRunError
 from es_service.report import compare, facts, maps
+from es_service.report.bootstrap import WHOLE_RANGE, coverage
 from es_service.report.colours import value_range
-from es_service.report.compare import Group, Quartiles
+from es_service.report.compare import Group, Quartiles, Summary
 from es_service.report.curves import draw, values_text
 from es_service.report.data import RunData
 from es_service.report.facts import number
@@ -57,8 +58,8 @@ def comparison_page(runs: Sequence[RunData], keys: Sequence[str] = (), threshold
         tag("section", tag("p", _sentence(groups, threshold), class_="verdict"), *_problems(runs), id="what"),
         section(
             "Curves",
-            tag("p", "Median over the runs of a group; the shaded region reaches from the first to the third quartile. "
-                "A curve ends where the first of its runs ends.", class_="note"),
+            tag("p", "Median over the seeds of a group; a shaded region is its interval, explained below the final "
+                f"values. A curve ends where the first of its runs ends. {_seeds(groups)}.", class_="note"),
             axis_choice({axis: X_AXES[axis] for axis in compare.AXES}),
             tag("div", *figures, class_="charts"),
             id_="curves",
@@ -75,11 +76,14 @@ def _sentence(groups: Sequence[Group], threshold: float | None) -> str:
     best = max(found, key=lambda one: one.values["best_fitness"].median)
     value = number(best.values["best_fitness"].median)
     runs = facts.count(len(best.group.runs), "run")
+    known = _interval(best, "best_fitness")
+    interval = f", {known}" if known else ""
     if len(groups) == 1:
-        sentence = f"{runs} of {best.group.name} end with a best fitness of {value} (median)"
+        sentence = f"{runs} of {best.group.name} end with a best fitness of {value} (median{interval})"
     else:
         sentence = (
-            f"Of {len(groups)} groups, {best.group.name} ends with the highest median of best fitness: {value} ({runs})"
+            f"Of {len(groups)} groups, {best.group.name} ends with the highest median of best fitness: {value} "
+            f"({runs}{interval})"
         )
     if threshold is not None:
         solved = sum(one.solved for one in found)
@@ -103,21 +107,60 @@ def _final(groups: Sequence[Group], threshold: float | None) -> Markup:
     rows = []
     for one in found:
         runs = len(one.group.runs)
-        cells = [_shown(one.values[column], column) for column in columns]
+        cells = [_shown(one.values[column], column, _interval(one, column)) for column in columns]
         reached = (
             (f"{one.solved} of {runs}", _shown(one.steps, "env_steps") if one.solved else "none") if solved else ()
         )
-        rows.append((one.group.name, f"{runs}", *reached, *cells))
-    heads = ("group", "runs", *solved, *(HEADS[column] for column in columns))
-    note = tag("p", "Median over the runs of a group; below it, first to third quartile.", class_="note")
-    return Markup(table(rows, heads, "numbers") + note)
+        rows.append((one.group.name, _seeds_of(one.group), *reached, *cells))
+    heads = ("group", "seeds", *solved, *(HEADS[column] for column in columns))
+    return Markup(table(rows, heads, "numbers") + tag("p", _about_intervals(groups), class_="note"))
 
 
-def _shown(values: Quartiles, column: str) -> Markup:
+def _about_intervals(groups: Sequence[Group]) -> str:
+    """What the numbers of the table are, and how far they can be trusted with so many seeds."""
+    said = ["Median over the seeds of a group; below it, its interval, and the first to the third quartile."]
+    few = sorted({group.seeds for group in groups if 1 < group.seeds <= WHOLE_RANGE})
+    if any(1 < group.seeds == len(group.runs) for group in groups):
+        said.append(
+            "The interval is the percentile bootstrap of the median: the middle 95 % of the medians of all ways to "
+            "draw the seeds anew, with repetitions. They are counted and not sampled, so nothing about it is random."
+        )
+    said += [
+        f"With {seeds} seeds, it reaches from the lowest to the highest value, which hold the median of all possible "
+        f"seeds between them with a probability of {100 * coverage(seeds):.0f} %, not 95 %."
+        for seeds in few
+    ]
+    if alone := [group.name for group in groups if group.seeds == 1]:
+        said.append(f"A group with one seed has no interval: {', '.join(alone)}.")
+    if repeated := [group.name for group in groups if 1 < group.seeds < len(group.runs)]:
+        said.append(f"Nor has a group in which several runs have the same seed: {', '.join(repeated)}.")
+    return " ".join(said)
+
+
+def _seeds(groups: Sequence[Group]) -> str:
+    return "; ".join(f"{group.name} has {facts.count(group.seeds, 'seed')}" for group in groups)
+
+
+def _seeds_of(group: Group) -> str:
+    """The number of seeds of a group, and that of its runs if some have the same."""
+    runs = len(group.runs)
+    return f"{group.seeds}" if group.seeds == runs else f"{group.seeds} in {runs} runs"
+
+
+def _interval(one: Summary, column: str) -> str:
+    """The interval of a median in words; empty if it has none, or no extent."""
+    if column not in one.intervals:
+        return ""
+    scale, _ = UNITS.get(column, (1.0, ""))
+    low, high = (number(scale * value) for value in one.intervals[column])
+    return "" if low == high else f"interval {low} to {high}"
+
+
+def _shown(values: Quartiles, column: str, interval: str = "") -> Markup:
     scale, unit = UNITS.get(column, (1.0, ""))
     median, low, high = (number(scale * value) for value in values)
-    range_ = None if low == high else tag("div", f"{low} to {high}", class_="note")
-    return tag("div", f"{median}{unit}", range_)
+    ranges = [interval, "" if low == high else f"quartiles {low} to {high}"]
+    return tag("div", f"{median}{unit}", *(tag("div", text, class_="note") for text in ranges if text))
 
 
 def _maps(groups: Sequence[Group]) -> list[Markup]:

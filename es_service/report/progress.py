@@ -1,5 +1,5 @@
 """Progress of a run: a table that changes in place on a terminal and in a notebook; elsewhere, also with TERM=dumb, at
-most one plain line per second."""
+most one plain line per second. The consoles are the caller's, and print text as it is."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class _InNotebook(JupyterMixin):
 
 def print_notice(console: Console, notice: str) -> None:
     """Print a notice on a line of its own."""
-    console.print(f"note: {notice}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"note: {notice}", soft_wrap=True)
 
 
 def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group:
@@ -142,7 +142,7 @@ def _plain_lines(console: Console) -> ShowRow:
         now = time.monotonic()
         if now - last_s >= 1.0:
             faults = f"  workers replaced {lost}" if lost else ""
-            console.print(plain_line(row) + faults, highlight=False, soft_wrap=True)
+            console.print(plain_line(row) + faults, soft_wrap=True)
             last_s, lost = now, 0
 
     return show

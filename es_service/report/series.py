@@ -38,7 +38,7 @@ class Line(NamedTuple):
     column: str
     y_K: NDArray[np.float64]
     range_K: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-    """(low [K], high [K]) of the region around the curve, such as quartiles over seeds."""
+    """(low [K], high [K]) of the region around the curve, such as the interval of a median."""
 
 
 class Chart(NamedTuple):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from es_service.errors import ConfigError, StoreError
+from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import RunData, read_run
 from es_service.report.figures import empty_figure, write_figures
@@ -65,7 +66,9 @@ def write_report(
     data = read_run(folder)
     found = bool(data.history["generation"].size) and (best or bool(cells))
     replays = replay_section(data, best=best, cells=cells, trusted=trusted) if found else None
-    page = write_page(run_page(data, evaluate or python_call(folder), replays), Path(out or folder / REPORT))
+    elsewhere = WayOut("report", "write it elsewhere", str(folder), out="FILE")
+    page = run_page(data, evaluate or python_call(folder), replays)
+    page = write_page(page, Path(out or folder / REPORT), [elsewhere])
     return [page, *(write_figures([data], Path(figures)) if figures is not None else [])]
 
 
@@ -110,8 +113,8 @@ def write_compared(
     return [page, *(write_figures(different, Path(figures), group_by, threshold) if figures is not None else [])]
 
 
-def write_page(page: str, file: Path) -> Path:
-    """Write a page so that a reader never sees half of it."""
+def write_page(page: str, file: Path, ways_out: Sequence[WayOut] = ()) -> Path:
+    """Write a page so that a reader never sees half of it. Raises StoreError, with the ways out, if this fails."""
     half = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -119,6 +122,8 @@ def write_page(page: str, file: Path) -> Path:
         half.write_text(page, encoding="utf-8", errors="replace")
         half.replace(file)
     except OSError as error:
-        half.unlink(missing_ok=True)
-        raise StoreError(f"cannot write {file}: {error.strerror or error}; choose another file") from error
+        with contextlib.suppress(OSError):  # where no file can be written, none can be removed
+            half.unlink()
+        what = f"cannot write {file}: {error.strerror or error}; choose another file"
+        raise StoreError(what, field="out", value=str(file), ways_out=ways_out) from error
     return file

@@ -141,7 +141,7 @@ def work(
             tell_notices()
             if lost := row["lost_workers"]:
                 who = "a worker" if lost == 1 else f"{lost} workers"
-                tell(f"generation {row['generation']}: lost {who}; {engine.last_loss}")
+                tell(engine.last_loss(f"generation {row['generation']}: lost {who}; "))
             answer = on_generation(row)
             _LOG.info(
                 "centre fitness %.6g, best %.6g, env steps %d, steps/s %.3g",

@@ -38,7 +38,8 @@ from es_service.store.codec import (
     state_sum,
     table_bytes,
 )
-from es_service.store.verify import KeptRows, rows_in_force
+from es_service.store.kept import KeptRows, rows_in_force
+from es_service.store.lock import require_unlocked
 
 
 @dataclass(frozen=True)
@@ -65,10 +66,16 @@ def verify(run: Run, generations: int = 1, workers: int | None = None) -> Iterat
         workers: number of worker processes; None: one per core.
 
     Raises:
+        RunLockedError: a driver is writing to the run, and so deletes states. This is raised at once, all others later.
         NotInRunError: the run has no generation that can be computed again.
         EvaluationError: the rollouts cannot continue.
         Interrupted: SIGINT or SIGTERM arrived.
     """
+    require_unlocked(run.folder)
+    return _verify(run, generations, workers)
+
+
+def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recomputed]:
     overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": workers or "auto"}
     config = changed_config(run.present_config, overrides)
     task, code, platforms = task_of(config), code_of(config), reader.read_platforms(run.folder)

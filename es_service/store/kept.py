@@ -7,17 +7,17 @@ until the next row of the part; it is deleted when none of these states is to be
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 from es_service.store.codec import changed_sum, state_sha256
 
-Rows = Mapping[str, Mapping[int, str]]
+KeptRows = dict[str, dict[int, str]]
 """Stored state rows: part -> generation -> SHA-256."""
 
 
-def kept_rows(connection: sqlite3.Connection) -> dict[str, dict[int, str]]:
+def kept_rows(connection: sqlite3.Connection) -> KeptRows:
     """Stored state rows, without their payloads. Those that damage has given values of other types are left out."""
-    kept: dict[str, dict[int, str]] = {}
+    kept: KeptRows = {}
     typed = "typeof(part) = 'text' AND typeof(generation) = 'integer' AND typeof(sha256) = 'text'"
     for part, at, sha256 in connection.execute(f"SELECT part, generation, sha256 FROM state WHERE {typed}"):
         kept.setdefault(part, {})[at] = sha256
@@ -31,7 +31,7 @@ def newest_state(connection: sqlite3.Connection) -> int | None:
 
 
 def outdated_rows(
-    kept: Rows, replaced: Iterable[str], keep_every: int | None, earlier: Sequence[int]
+    kept: KeptRows, replaced: Iterable[str], keep_every: int | None, earlier: Sequence[int]
 ) -> list[tuple[str, int]]:
     """(part, generation) of the rows that the next commit deletes.
 
@@ -50,12 +50,12 @@ def outdated_rows(
     return found
 
 
-def earlier_states(connection: sqlite3.Connection, kept: Rows, newest: int | None) -> list[int]:
+def earlier_states(connection: sqlite3.Connection, kept: KeptRows, newest: int | None) -> list[int]:
     """Generations before the last two whose whole state is stored; they stay, whatever is kept from now on."""
     return [] if newest is None else [at for at in whole_states(connection, kept) if at < newest - 1]
 
 
-def whole_states(connection: sqlite3.Connection, kept: Rows) -> list[int]:
+def whole_states(connection: sqlite3.Connection, kept: KeptRows) -> list[int]:
     """Generations whose whole state is stored, in order. Only their hashes are compared."""
     newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
     if newest is None:
@@ -74,3 +74,9 @@ def whole_states(connection: sqlite3.Connection, kept: Rows) -> list[int]:
         if in_force and state is not None and state[0] == state_sha256(total):
             whole.append(generation)
     return whole
+
+
+def rows_in_force(kept: KeptRows, generation: int) -> dict[str, tuple[int, str]]:
+    """Rows that make up the state at a generation: part -> (generation, sha256) of its newest row up to then."""
+    newest = {part: max((at for at in rows if at <= generation), default=None) for part, rows in kept.items()}
+    return {part: (at, kept[part][at]) for part, at in newest.items() if at is not None}

@@ -132,6 +132,12 @@ def lock_holder(folder: Path) -> dict[str, Any] | None:
         os.close(descriptor)
 
 
+def require_unlocked(folder: Path) -> None:
+    """Raise RunLockedError if a process is writing to the run in `folder`."""
+    if lock_holder(folder) is not None:
+        raise _locked(folder)
+
+
 def _identity(text: bytes) -> dict[str, Any]:
     try:
         found = json.loads(text)

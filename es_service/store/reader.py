@@ -19,10 +19,10 @@ from es_service.store.beginning import load_start
 from es_service.store.codec import Row, column_bytes, decode_part, part_sha256, row_dict, table_rows
 from es_service.store.columns import Columns, Table
 from es_service.store.connection import reading
-from es_service.store.kept import kept_rows, newest_state, whole_states
+from es_service.store.kept import KeptRows, kept_rows, newest_state, rows_in_force, whole_states
 from es_service.store.platforms import sound_platforms
 from es_service.store.schema import Damaged, RunMeta, history_select
-from es_service.store.verify import KeptRows, row_is_sound, rows_in_force
+from es_service.store.verify import row_is_sound
 
 GENERATION = Column("generation", "INTEGER", True, "generation that evaluated the centre")
 """The column before those of the evaluated centres."""

@@ -12,6 +12,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 from es_service.errors import StoreError
+from es_service.store.connection import connected_to
 from es_service.store.folder import COPY, DAMAGED, DATABASE, explained, remove_database, sync_file, sync_folder
 from es_service.store.schema import GENERATION_TABLES, Damaged, history_shared, load_meta
 from es_service.store.verify import Verdict, check_header, verify
@@ -38,7 +39,7 @@ def open_sound(folder: Path, notices: list[str]) -> tuple[sqlite3.Connection, Ve
     file = folder / DATABASE
     try:
         try:
-            return _open_made_sound(file, notices)
+            return _open_made_sound(file, notices, copy=folder / COPY)
         except Damaged as damage:
             _restore_copy(folder, str(damage), notices)
             return _open_made_sound(file, notices)
@@ -48,31 +49,35 @@ def open_sound(folder: Path, notices: list[str]) -> tuple[sqlite3.Connection, Ve
         raise explained(error, folder, f"opening {DATABASE}") from error
 
 
-def _open_made_sound(file: Path, notices: list[str]) -> tuple[sqlite3.Connection, Verdict]:
+def _open_made_sound(file: Path, notices: list[str], copy: Path | None = None) -> tuple[sqlite3.Connection, Verdict]:
     if not file.exists():
         raise Damaged("it is missing")
     check_header(file)
     connection = connect(file)
     try:
-        return connection, _made_sound(connection, file, notices)
+        return connection, _made_sound(connection, file, notices, copy)
     except BaseException:
         connection.close()
         raise
 
 
-def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str]) -> Verdict:
-    """Verify a database and delete damaged rows; returns the new result. Raises Damaged if no generation is intact."""
+def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], copy: Path | None) -> Verdict:
+    """Verify a database and delete damaged rows and what is newer than the newest intact state; returns the new result.
+
+    Raises:
+        Damaged: no generation is intact, or fewer generations are lost with `copy`.
+    """
     verdict = verify(connection, file)
     if not verdict.problems:
         return verdict
-    if verdict.good is None:
-        raise Damaged(verdict.damage)
+    found = verdict.damage
+    if verdict.good is None or (copy is not None and _reach(copy) > verdict.good):
+        raise Damaged(found)
     connection.execute("BEGIN IMMEDIATE")
     for table in GENERATION_TABLES:
         connection.execute(f"DELETE FROM {table} WHERE generation > ?", (verdict.good,))
     connection.executemany("DELETE FROM state WHERE part IS ? AND generation IS ?", verdict.bad_rows)
     connection.execute("COMMIT")
-    found = verdict.damage
     if verdict.good == verdict.newest:
         notices.append(
             f"{file}: {found}. The newest generation, {verdict.good}, is intact; the damaged rows were deleted"
@@ -80,12 +85,22 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str]) 
     else:
         notices.append(
             f"{file}: the state or the history of the newest generation, {verdict.newest}, is damaged ({found}); "
-            f"the run fell back to generation {verdict.good}"
+            f"the run fell back to generation {verdict.good}, the newest whose state is stored and intact"
         )
     again = verify(connection, file)
     if again.problems:
         raise Damaged(again.damage)
     return again
+
+
+def _reach(copy: Path) -> int:
+    """The newest intact generation of a copy; -1 if there is none, or if the copy cannot be read."""
+    with suppress(sqlite3.Error, OSError, Damaged, StoreError):
+        check_header(copy)
+        with closing(connected_to(copy)[0]) as connection:
+            good = verify(connection, copy).good
+        return -1 if good is None else good
+    return -1
 
 
 def _restore_copy(folder: Path, damage: str, notices: list[str]) -> None:

@@ -20,10 +20,10 @@ from es_service.store.codec import Row, column_bytes, decode_part, part_sha256, 
 from es_service.store.columns import Columns, Table
 from es_service.store.connection import connected_to, reading
 from es_service.store.folder import COPY
-from es_service.store.kept import kept_rows, newest_state, whole_states
+from es_service.store.kept import kept_rows, newest_state, rows_in_force, whole_states
 from es_service.store.reader import GENERATION, platforms, state_payload
 from es_service.store.schema import Damaged, RunMeta, history_select
-from es_service.store.verify import row_is_sound, rows_in_force
+from es_service.store.verify import row_is_sound
 
 Arrays = dict[str, NDArray[Any]]
 Kept = Callable[[str, Arrays], Arrays | None]

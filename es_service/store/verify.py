@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from es_service.store.codec import (
-    column_bytes,
-    decode_part,
-    part_sha256,
-    row_sha256,
-    state_sha256,
-    state_sum,
-)
+from es_service.store.codec import column_bytes, decode_part, part_sha256, row_sha256
 from es_service.store.folder import is_disk_full
+from es_service.store.kept import KeptRows, whole_states
 from es_service.store.platforms import sound_platforms
 from es_service.store.schema import Damaged, RunMeta, history_select, load_meta, table_statements
 
@@ -32,8 +25,6 @@ _NOT_DAMAGE = {
 """SQLite errors that do not mean that the file is damaged, so the file must not be replaced because of them."""
 MOST_NAMED = 8
 """Most problems that a message names."""
-KeptRows = dict[str, dict[int, str]]
-"""Stored state rows: part -> generation -> SHA-256."""
 
 
 @dataclass(frozen=True)
@@ -117,50 +108,37 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
         raise Damaged("it has a history row of a negative generation")
 
     problems: list[str] = []
-    count, sound, states = _history(connection, meta, first, problems)
+    count, sound = _history(connection, meta, first, problems)
     kept, bad_rows = _state(connection, problems)
     newest = count - 1 if count else None
     unfinished = sorted((part, at) for part, rows in kept.items() for at in rows if at >= count)
     problems += [f"state of {part!r} at generation {at} has no history row" for part, at in unfinished]
-    good = None
-    if newest is not None:
-        # The states of older generations are not stored.
-        for generation in (newest, newest - 1):
-            in_force = rows_in_force(kept, generation) if 0 <= generation < sound else {}
-            # A fork has the whole history of its parent, but only the newest of the parent's states.
-            if in_force and states.get(generation) == state_sha256(state_sum(in_force)):
-                good = generation
-                break
-        else:
-            problems.append(f"neither generation {newest} nor the one before it is complete and intact")
-        if good == newest - 1:
-            problems.append(f"generation {newest} is not complete and intact")
+    good = max((at for at in whole_states(connection, kept) if at < sound), default=None)
+    if newest is not None and good != newest:
+        lost = 0 if good is None else good + 1
+        which = f"generation {newest} is" if lost == newest else f"generations {lost} to {newest} are"
+        problems.append(f"{which} not complete and intact")
     return Verdict(meta, newest, good, kept, tuple(bad_rows), tuple(problems))
 
 
-def _history(
-    connection: sqlite3.Connection, meta: RunMeta, first: int, problems: list[str]
-) -> tuple[int, int, dict[int, str]]:
-    """The number of history rows, the number of those before the first damaged one, and the `state_sha256` of the last
-    two generations. The rows of generations before `first` are taken for sound."""
+def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems: list[str]) -> tuple[int, int]:
+    """The number of history rows, and the number of those before the first damaged one. The rows of generations before
+    `first` are taken for sound."""
     columns = column_bytes(meta.columns)
     at = [column.name for column in meta.columns].index("generation")
-    states: dict[int, str] = {}
     count, bad = first, []
     query = history_select(meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation"
     for *values, evaluations, state, sha256 in connection.execute(query, (first,)):
         row = tuple(values)
         generation, count = count, count + 1
         if row[at] == generation and row_is_sound(columns, row, evaluations, state, sha256):
-            states[generation] = state
-            states.pop(generation - 2, None)
             continue
         bad.append(generation)
         if row[at] != generation:
             problems.append(f"history row of generation {generation} is missing")
             break
         problems.append(f"history row of generation {generation} does not match its SHA-256")
-    return count, min([*bad, count]), states
+    return count, min([*bad, count])
 
 
 def row_is_sound(columns: bytes, row: tuple, evaluations: object, state: object, sha256: object) -> bool:
@@ -188,9 +166,3 @@ def _state(connection: sqlite3.Connection, problems: list[str]) -> tuple[KeptRow
             problems.append(f"state of {part!r} at generation {generation} does not match its SHA-256")
             bad_rows.append((part, generation))
     return kept, bad_rows
-
-
-def rows_in_force(kept: Mapping[str, Mapping[int, str]], generation: int) -> dict[str, tuple[int, str]]:
-    """Rows that make up the state at a generation: part -> (generation, sha256) of its newest row up to then."""
-    newest = {part: max((at for at in rows if at <= generation), default=None) for part, rows in kept.items()}
-    return {part: (at, kept[part][at]) for part, at in newest.items() if at is not None}

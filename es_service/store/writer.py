@@ -34,13 +34,12 @@ from es_service.store.codec import (
 )
 from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
-from es_service.store.kept import earlier_states, outdated_rows
+from es_service.store.kept import earlier_states, outdated_rows, rows_in_force
 from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.platforms import newest_before, record, store_list
 from es_service.store.repair import open_sound
 from es_service.store.schema import PAGE_BYTES, RunMeta, history_insert, history_select
 from es_service.store.upkeep import Upkeep
-from es_service.store.verify import rows_in_force
 
 Values = Mapping[str, int | float | None]
 """One history row: column name -> value; NaN or None stands for no value."""

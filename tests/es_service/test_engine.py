@@ -348,4 +348,4 @@ def test_what_a_hung_worker_had_written_is_told_with_its_loss(monkeypatch, is_la
                 engine.evaluate(around(FIRST, CHUNKS))
         else:
             engine.evaluate(around(FIRST, CHUNKS))
-        assert re.search(r"^worker 0: no answer .* output of its process:\nno licence; retrying$", engine.last_loss)
+        assert re.search(r"^worker 0: no answer .* output of its process:\nno licence; retrying$", engine.last_loss())

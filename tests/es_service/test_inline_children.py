@@ -142,7 +142,7 @@ def test_an_error_says_in_which_of_the_chunks_that_travelled_together_it_was():
     broken = [*CHUNKS[:3], TrainingChunk(3, "four")]
     with inline_engine(SPEC, Limits(workers=1, item_s=60.0, restart_backoff_s=0.0)) as engine:
         engine.evaluate(around(FIRST, CHUNKS))
-        with pytest.raises(EvaluationError, match=r"(?s)item TrainingChunk 0 and 3 more of.*in TrainingChunk four of"):
+        with pytest.raises(EvaluationError, match=r"(?s)in TrainingChunk four of.*item TrainingChunk 0 and 3 more of"):
             engine.evaluate(around(FIRST, broken))
 
 

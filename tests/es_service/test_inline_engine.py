@@ -24,6 +24,7 @@ from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import messages
 from es_service.protocol.messages import KEPT_CENTRES, TrainingChunk, Work, around, forget_oldest
+from es_service.protocol.raised import RaisedError
 from es_service.protocol.wire import framed, receive
 from tests.helpers import SPEC, centre, random_parameters, spec
 
@@ -211,7 +212,7 @@ class Unreadable:
 @pytest.mark.parametrize(
     ("said", "reason"),
     [
-        (("broken", "no jax here"), "^no jax here$"),
+        (("broken", RaisedError("no jax here", "")), "^no jax here$"),
         (("results", "key", 1, Unreadable()), r"(?s)Traceback.*invalid literal for int"),
         (("something", "else"), "it sent an unknown message"),
     ],

@@ -250,7 +250,7 @@ def test_an_actor_that_is_given_no_place_is_not_lost():
         assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert len(ray.actors) > 8
         assert engine.counts.lost_workers == 1
-        assert "no answer to work item" in engine.last_loss
+        assert "no answer to work item" in engine.last_loss()
 
 
 @pytest.mark.parametrize(
@@ -436,7 +436,7 @@ def test_a_node_that_dies_under_idle_workers_takes_none_of_the_others_along():
         watch.now = Membership({"new": 2}, {}, frozenset(), frozenset({"new"}))
         assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         assert (engine.counts.lost_workers, engine.counts.workers, engine.counts.retries) == (2, 2, 0)
-        assert "its node died" in engine.last_loss
+        assert "its node died" in engine.last_loss()
         assert [actor.state for actor in ray.actors[:4]] == ["dead", "dead", "alive", "alive"]
 
 

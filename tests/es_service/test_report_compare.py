@@ -1,5 +1,6 @@
 """Comparisons of runs, with numbers worked out by hand, and figures."""
 
+import html
 import re
 import sqlite3
 import sys
@@ -13,6 +14,7 @@ from es_service.errors import ConfigError, NotInRunError
 from es_service.report import compare
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import read_run
+from es_service.report.facts import number
 from es_service.report.figures import empty_figure, write_figures
 from es_service.report.overview import draw_overview
 from es_service.report.write import write_comparison, write_report
@@ -82,7 +84,7 @@ def test_curves_are_medians_of_all_runs_of_a_group_and_end_with_the_first(runs):
     k = int(np.searchsorted(x_K, 15_500))
     values = [run.history["best_fitness"][int(x_K[k] // 1000) - 1] for run in groups[0].runs]
     assert line.y_K[k] == np.median(values)
-    assert line.range_K[0][k] == np.quantile(values, 0.25)
+    assert (line.range_K[0][k], line.range_K[1][k]) == (min(values), max(values))  # as always with three seeds
     assert np.isnan(line.y_K[x_K > 21_000]).all()
     assert np.isfinite(line.y_K[(x_K >= 1000) & (x_K <= 21_000)]).all()
 
@@ -107,6 +109,7 @@ def test_solved_runs_are_counted_with_their_steps(runs):
     first = int(np.argmax(solved.history["best_fitness"] >= threshold))
     assert (one.solved, one.steps.median) == (1, solved.history["env_steps"][first])
     assert one.values["best_fitness"] == (ends[1], (ends[0] + ends[1]) / 2, (ends[1] + ends[2]) / 2)
+    assert one.intervals["best_fitness"] == (ends[0], ends[2])
     assert compare.median_run(groups[0]).history["best_fitness"][-1] == ends[1]
     assert compare.summaries(groups, None)[0].solved == 0
 
@@ -121,6 +124,44 @@ def test_a_comparison_shows_groups_maps_and_runs(runs):
         assert str(run.folder) in page
     texts = found.scripts["data-charts"][0]["texts"]
     assert re.match(r"\S+ environment steps: me_es -?\S+ \(\S+ to \S+\); es ", texts["env_steps"][100])
+
+
+def words(page):
+    """The text of a page, without its script and its style."""
+    body = re.sub(r"<(script|style).*?</\1>", "", page, flags=re.DOTALL)
+    return " ".join(html.unescape(re.sub("<.*?>", " ", body)).split())
+
+
+def test_a_page_says_how_many_seeds_there_are_and_what_its_intervals_are_worth(runs):
+    ends = sorted(run.last("best_fitness") for run in runs[3:])
+    said = words(comparison_page(runs))
+    assert "me_es has 3 seeds; es has 3 seeds." in said
+    assert f"interval {number(ends[0])} to {number(ends[2])} quartiles " in said
+    assert "percentile bootstrap of the median" in said
+    assert "With 3 seeds, it reaches from the lowest to the highest value" in said
+    assert "with a probability of 75 %, not 95 %" in said
+    assert "no interval" not in said
+
+
+def test_one_seed_has_no_interval_and_the_page_says_so(runs):
+    said = words(comparison_page([runs[0], runs[3]]))
+    assert "me_es has 1 seed; es has 1 seed." in said
+    assert "A group with one seed has no interval: me_es, es." in said
+    assert not re.search(r"interval -?\d", said)
+    assert "bootstrap" not in said
+    charts, _ = compare.charts(compare.grouped([runs[0], runs[3]]), "env_steps")
+    assert all(line.range_K is None for chart in charts for line in chart.lines)
+    said = words(comparison_page([*runs[:3], runs[3]]))
+    assert "A group with one seed has no interval: es." in said
+    assert len(re.findall(r"interval -?\d", said)) > 3
+
+
+def test_runs_with_the_same_seed_are_not_taken_for_several_seeds(runs, tmp_path):
+    wide = read_run(write_run(tmp_path / "wide", {"search.algorithm": "me_es", "search.sigma": 0.5, "seed": 0}))
+    said = words(comparison_page([*runs[:3], wide], ["search.algorithm"]))
+    assert "3 in 4 runs" in said
+    assert "Nor has a group in which several runs have the same seed: me_es." in said
+    assert not re.search(r"interval -?\d", said)
 
 
 def test_a_common_target_is_the_threshold(tmp_path):

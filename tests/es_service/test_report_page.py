@@ -4,13 +4,18 @@ import base64
 import json
 import os
 import re
+import shlex
 import sqlite3
+import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from es_service.cli.commands import error_message
+from es_service.errors import StoreError
 from es_service.report import maps
 from es_service.report.colours import LEVELS, SCALE, level
 from es_service.report.data import read_run
@@ -203,6 +208,31 @@ def test_a_report_is_written_into_the_folder_or_elsewhere(tmp_path):
     assert write_report(folder, elsewhere, best=False) == [elsewhere]
     assert elsewhere.read_text() == (folder / "report.html").read_text()
     assert [path.name for path in elsewhere.parent.iterdir()] == ["page.html"]
+
+
+def test_a_place_that_cannot_be_written_is_one_sentence_with_the_way_out(tmp_path):
+    """Also for root: below a file, and on a file system that is read-only (`/proc`, or one that is mounted so)."""
+    folder = write_run(tmp_path / "run")
+    for file, why in (
+        (folder / "config.yaml" / "page.html", "File exists"),
+        (Path("/proc/page.html"), "No such file or directory"),
+        (Path("/sys/page.html"), "(Permission denied|Read-only file system)"),
+    ):
+        with pytest.raises(StoreError, match=f"^cannot write {file}: {why}; choose another file") as caught:
+            write_report(folder, file, best=False)
+        assert (caught.value.field, caught.value.value) == ("out", str(file))
+        printed = error_message(caught.value).splitlines()
+        assert len(printed) == 2
+        assert shlex.split(printed[1])[-4:] == ["report", str(folder), "--out", "FILE"]
+
+
+def test_a_run_in_a_read_only_folder_has_its_report_elsewhere(small_disk, tmp_path):
+    subprocess.run(["mount", "-o", "remount,size=50m", str(small_disk)], check=True)
+    folder = write_run(small_disk / "run")
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    with pytest.raises(StoreError, match=r"cannot write .*report\.html: Read-only file system; choose another file"):
+        write_report(folder, best=False)
+    assert write_report(folder, tmp_path / "page.html", best=False) == [tmp_path / "page.html"]
 
 
 def test_a_folder_whose_name_is_no_utf_8_has_a_page(tmp_path):

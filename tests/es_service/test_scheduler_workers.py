@@ -137,7 +137,7 @@ def test_a_worker_without_a_place_is_started_anew_and_nobody_hears_of_it():
         state, commands = step(state, Tick(silent=(number,)), 50.0 * number)
         reason = "did not come up within 50 s (start_deadline_s)"
         assert commands == [StopWorker(number, reason), StartWorker(number + 1)]
-    assert (state.lost_workers, state.last_loss, state.start_failures) == (0, "no worker was lost", 0)
+    assert (state.lost_workers, state.last_lost, state.start_failures) == (0, None, 0)
     state, _ = play(state, (251.0, WorkerLost(0, "killed")), (252.0, WorkerLost(6, "no memory")))
     assert (state.failed, state.lost_workers) == (None, 2)
 

@@ -9,11 +9,11 @@ import socket
 from types import SimpleNamespace
 
 import pytest
-from rich.console import Console
 from typer.testing import CliRunner
 
 from es_service import api
 from es_service.cli.commands import settings
+from es_service.cli.console import text_console
 from es_service.cli.main import app
 from es_service.cli.tables import status
 from es_service.cli.tables.overview import print_overview
@@ -35,7 +35,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture
 def console():
-    return Console(width=40)
+    return text_console(width=40)
 
 
 def test_of_a_long_history_only_the_newest_row_is_read(run, console, monkeypatch, capsys):

@@ -18,6 +18,7 @@ from es_service.store.reader import (
     read_evaluations,
     read_generation,
     read_history,
+    read_kept,
     read_parts,
     read_platforms,
 )
@@ -160,6 +161,78 @@ def behind_the_stores_back(folder, *statements):
     with contextlib.closing(sqlite3.connect(folder / "run.db")) as connection, connection:
         for statement in statements:
             connection.execute(statement)
+
+
+def kept_run(folder, last, every=4):
+    """A run that keeps states, and ended cleanly."""
+    with create(folder) as run:
+        run.keep_every = every
+        advance(run, last)
+    return folder
+
+
+def damage_states(folder, generations):
+    """Make the newest states unusable: a part that changes in every generation."""
+    behind_the_stores_back(
+        folder, f"UPDATE state SET payload = x'00' WHERE part = 'observations' AND generation IN {(*generations, -1)}"
+    )
+
+
+def test_with_the_last_two_states_damaged_the_run_falls_back_to_the_newest_kept_one(tmp_path):
+    folder = kept_run(tmp_path / "run", 11)
+    uninterrupted, intact = digest(folder), (folder / "run.db").read_bytes()
+    for damaged, reached in (((10, 11), 8), ((8, 10, 11), 4), ((0, 4, 10, 11), 8)):
+        (folder / "run.db").write_bytes(intact)
+        damage_states(folder, damaged)
+        with RunStore.open(folder) as run:
+            (notice,) = run.notices
+            assert "'observations' at generation 11 does not match" in notice
+            assert f"generations {reached + 1} to 11 are not complete and intact" in notice
+            assert f"fell back to generation {reached}, the newest whose state is stored and intact" in notice
+            assert run.generation == reached
+            assert_same_state(run.load(), state_at(reached))
+            run.keep_every = 4
+            assert_same_history(read_history(folder), reached + 1)
+            advance(run, 11)
+        assert_sound(folder, 11)
+        assert digest(folder) == uninterrupted
+    assert read_kept(folder)[1] == [8, 10, 11]  # 0 and 4 were damaged
+
+
+def test_a_damaged_history_row_falls_back_to_the_newest_kept_state_before_it(tmp_path):
+    folder = kept_run(tmp_path / "run", 11)
+    uninterrupted = digest(folder)
+    behind_the_stores_back(folder, "UPDATE history SET env_steps = 1 WHERE generation = 6")
+    with RunStore.open(folder) as run:
+        assert "fell back to generation 4" in run.notices[0]
+        run.keep_every = 4
+        advance(run, 11)
+    assert digest(folder) == uninterrupted
+
+
+def test_what_loses_fewer_generations_is_taken_a_kept_state_or_the_copy(tmp_path, monkeypatch):
+    """Also the copy instead of one generation less; and never a copy that is damaged itself."""
+    for copied, damaged, reached in ((6, (10, 11), 8), (9, (10, 11), 9), (8, (10, 11), 8), (11, (11,), 11)):
+        folder = tmp_path / f"{copied} {len(damaged)}"
+        with create(folder) as run, monkeypatch.context() as patch:
+            copy_at_every_commit(patch)
+            run.keep_every, run.upkeep.copy_interval_s = 4, 0.0
+            advance(run, copied)
+            run.upkeep.copy_interval_s = 1000.0
+            advance(run, 11)
+        uninterrupted = digest(folder)
+        damage_states(folder, damaged)
+        shutil.copytree(folder, tmp_path / "other")
+        with RunStore.open(folder) as run:
+            assert run.generation == reached
+            assert ("Restored run.db.copy" in run.notices[0]) == (copied > 8)
+            advance(run, 11)
+        assert_sound(folder, 11)
+        assert digest(folder) == uninterrupted
+        flip_bit(tmp_path / "other" / "run.db.copy", 39)
+        with RunStore.open(tmp_path / "other") as run:
+            assert run.generation == (10 if damaged == (11,) else 8)
+        shutil.rmtree(tmp_path / "other")
 
 
 def test_a_history_row_that_vanished_is_noticed(tmp_path):

@@ -12,10 +12,11 @@ import typer
 from es_service import api
 from es_service.cli import verify as command
 from es_service.config.model import worker_spec
-from es_service.errors import NotInRunError
+from es_service.errors import NotInRunError, RunLockedError
 from es_service.protocol.messages import EpisodesResult, GradientResult
 from es_service.runs import session, verification
 from es_service.runs.verification import verify
+from es_service.store.lock import acquire_lock
 from tests.helpers import DirectEvaluator
 from workers.environments import SHIPPED
 
@@ -145,6 +146,22 @@ def test_a_fork_is_computed_from_what_it_keeps_and_a_run_from_a_policy_from_its_
         idle = api.fork(parent.folder, out=tmp_path / "idle").run
     with pytest.raises(NotInRunError, match="no generation that can be computed again"):
         list(verify(idle))
+
+
+def test_a_run_that_is_being_written_cannot_be_verified_now(tmp_path, capsys):
+    """Its driver deletes the states that verification needs. The exit code says neither equal nor different."""
+    run = computed(tmp_path / "run", "budget.generations=1")
+    lock = acquire_lock(run.folder)
+    with pytest.raises(RunLockedError, match="is being written by process"):
+        verify(run)
+    with pytest.raises(typer.Exit) as ended:
+        command.verify(run.folder)
+    lock.release()
+    assert ended.value.exit_code == 3
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "is being written by process" in printed.err
+    assert len(list(verify(run))) == 2
 
 
 @pytest.mark.parametrize("as_json", [False, True])

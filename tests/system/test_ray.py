@@ -176,7 +176,7 @@ def test_a_run_that_began_inline_goes_on_with_ray_where_home_cannot_be_written(t
 
 def test_workers_that_raise_while_starting_stop_the_run_with_their_error():
     with (
-        pytest.raises(EvaluationError, match=r"no worker started in 3 consecutive attempts(.|\n)*no_such_task"),
+        pytest.raises(EvaluationError, match=r"no_such_task(.|\n)*no worker started in 3 consecutive attempts"),
         ray_engine(spec(environment="no_such_task"), Limits(1, restart_backoff_s=0.0), actor=WorkerActor) as engine,
     ):
         engine.evaluate(around(centre(random_parameters()), [TrainingChunk(1, 0)]))
@@ -185,7 +185,7 @@ def test_workers_that_raise_while_starting_stop_the_run_with_their_error():
 def test_a_chunk_that_raises_everywhere_stops_the_run_with_its_error():
     wrong = random_parameters(size=3)  # parameters of another network
     with (
-        pytest.raises(EvaluationError, match=r"TrainingChunk 0 of generation 1 failed in 2 attempts(.|\n)*TypeError"),
+        pytest.raises(EvaluationError, match=r"TypeError(.|\n)*TrainingChunk 0 of generation 1 failed in 2 attempts"),
         ray_engine(spec(), Limits(1, max_attempts=2), actor=WorkerActor) as engine,
     ):
         engine.evaluate(around(centre(wrong), [TrainingChunk(1, 0)]))

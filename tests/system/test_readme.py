@@ -113,6 +113,22 @@ def test_make_targets_exist():
     assert "make test" in (ROOT / ".ci" / "run").read_text()
 
 
+def test_the_guides_agree_on_how_long_all_tests_take():
+    said = {guide: re.findall(r"all tests: (\d+ minutes on .*? cores)", text) for guide, text in TEXT.items()}
+    assert {*map(tuple, filter(None, said.values()))} == {tuple(said["README.md"])}
+    assert len(said["README.md"]) == len(said["CONTRIBUTING.md"]) == 1
+
+
+def test_every_attribute_that_a_task_may_have_is_explained():
+    source = (ROOT / "workers" / "environments" / "user_task.py").read_text()
+    _, docstring, code = source.split('"""', 2)
+    known = {*re.findall(r'(?:getattr|hasattr)\(task, "(\w+)"', code)}
+    table = TEXT["workers/README.md"].partition("A class may also have:")[2].partition("\n\n`")[0]
+    rows = {name for row in table.splitlines() for name in re.findall(r"`(\w+)[^`]*`", row.partition(" | ")[0])}
+    assert known == rows
+    assert known <= {*re.findall(r"`(\w+)[^`]*`", docstring)}
+
+
 def test_preset_table_is_the_code_s():
     shown = TEXT["configs/README.md"].split("<!-- presets -->")[1].split("<!-- /presets -->")[0].strip()
     rows = [

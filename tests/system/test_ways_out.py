@@ -12,11 +12,11 @@ import sys
 import time
 
 import pytest
-from rich.console import Console
 
 from es_service import api
 from es_service.cli import commands
 from es_service.cli.commands import error_message
+from es_service.cli.console import text_console
 from es_service.cli.tables.status import follow_status, print_summary
 from es_service.config.changes import refused_changes
 from es_service.errors import ConfigError, NotInRunError, StoreError
@@ -44,7 +44,7 @@ def next_line(output) -> str:
 
 def test_a_folder_with_spaces_is_one_word_of_every_command(tmp_path, capsys):
     folder = tmp_path / "it's a run"
-    console = Console(width=40)
+    console = text_console(width=40)
     outcome = api.run(SMALL | {"budget": {"generations": 1}}, folder)
     print_summary(console, outcome.run, outcome.reason)
     follow_status(console, outcome.run)

@@ -154,7 +154,7 @@ run(load_config({config!r}), {str(tmp_path / "run")!r})
 
 
 def test_a_chunk_that_fails_everywhere_ends_the_run_with_its_error(tmp_path, monkeypatch):
-    """A poison chunk: the message names it and carries the worker's own traceback; what is committed stays."""
+    """A poison chunk: the message begins with the worker's own traceback and names it; what is committed stays."""
     evaluate = Engine.evaluate
 
     def poisoned(self, work):
@@ -165,7 +165,7 @@ def test_a_chunk_that_fails_everywhere_ends_the_run_with_its_error(tmp_path, mon
 
     monkeypatch.setattr(Engine, "evaluate", poisoned)
     with pytest.raises(
-        EvaluationError, match=r"(?s)TrainingChunk .*3 failed in 4 attempts.*ufunc.*in TrainingChunk two of"
+        EvaluationError, match=r"(?s)ufunc.*in TrainingChunk two of.*TrainingChunk .*3 failed in 4 attempts"
     ):
         run(tmp_path / "run")
     assert api.open_run(tmp_path / "run").generation == 2

@@ -44,6 +44,7 @@ import jax.numpy as jnp
 
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.own_code import import_own, in_no_file
+from es_service.protocol.raised import raised, why_not_imported
 from workers.environments import Environment, TaskError
 
 METHODS = ("reset", "observe", "step", "descriptor")
@@ -193,7 +194,7 @@ def _check_shapes(path: str) -> None:
     except TaskError as error:
         raise TaskError(f"{path}: {error}") from error.__cause__
     except Exception as error:  # the user's code can raise anything
-        raise TaskError(f"{path} cannot be traced by JAX: {type(error).__name__}: {error}") from error
+        raise TaskError(f"{path} cannot be traced by JAX: {raised(error, path)}") from error
     wrong = [f"{what} has the shape {is_}, not {should}" for what, (is_, should) in found.items() if is_ != should]
     arrays = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), one) for one in (state, after)]
     if jax.tree.structure(state) != jax.tree.structure(after) or arrays[0] != arrays[1]:
@@ -239,10 +240,8 @@ def _import(path: str) -> Any:
         raise TaskError(problem)
     try:
         found = import_own(path)
-    except (ImportError, ValueError, TypeError) as error:  # the latter two if the name is no module name
-        raise TaskError(
-            f"{path}: cannot import {module} ({error}); start in the folder that contains it, or install it"
-        ) from error
+    except Exception as error:  # the user's code can raise anything
+        raise TaskError(f"{path}: {why_not_imported(module, error)}") from error
     if not hasattr(found, name):
         raise TaskError(f"{path}: the module {module} has no class {name}")
     return getattr(found, name)

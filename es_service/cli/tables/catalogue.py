@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from es_service.config.presets import PRESETS, preset_table
@@ -60,7 +59,7 @@ def _about(task: TaskSpec) -> str:
         "descriptor: " + ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in bounds),
         *(f"option {name}: {' | '.join(values)}" for name, values in task.options.items()),
     ]
-    return escape("\n".join(lines))
+    return "\n".join(lines)
 
 
 def _value(value: object) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 
 from rich.console import Console
 
+from es_service.cli.console import print_line
 from es_service.errors import ConfigError, StoreError
 from es_service.runs.evaluation import Fresh
 from es_service.runs.view import Run
@@ -83,7 +84,7 @@ def print_header(console: Console, run_width: int | None = None) -> None:
     """Print the names of the columns. `run_width`: width of the column with the run; None: there is none."""
     run = "" if run_width is None else f"{'run':<{run_width}}  "
     head = f"{'policy':<10} {'generation':>10} {'stored':>10} {'fresh':>10} {'± s.e.':>8}  descriptor (± std)"
-    _line(console, run + head)
+    print_line(console, run + head)
 
 
 def print_row(console: Console, row: Mapping[str, Any], names: list[str], run_width: int | None = None) -> None:
@@ -91,7 +92,7 @@ def print_row(console: Console, row: Mapping[str, Any], names: list[str], run_wi
     run = "" if run_width is None else f"{row['run']:<{run_width}}  "
     values = f"{row['stored_fitness']:>10.2f} {row['fresh_fitness']:>10.2f} {row['fresh_standard_error']:>8.2f}"
     where = ", ".join(f"{name} {row[name]:.3g} ± {row[f'{name}_std']:.2g}" for name in names)
-    _line(console, f"{run}{row['policy']:<10} {row['generation']:>10} {values}  {where}")
+    print_line(console, f"{run}{row['policy']:<10} {row['generation']:>10} {values}  {where}")
 
 
 def row_of(fresh: Fresh, names: list[str], run: Path | None = None) -> dict[str, Any]:
@@ -126,13 +127,9 @@ def print_map_summary(console: Console, run: Run, results: list[Fresh]) -> None:
             best[fresh.cell] = max(best.get(fresh.cell, -math.inf), fresh.mean)
     stored = math.fsum(fresh.candidate.stored_fitness - offset for fresh in elites)
     again = math.fsum(fitness - offset for fitness in best.values())
-    _line(
+    print_line(
         console,
         f"{len(elites)} elites: the mean descriptor of {stayed} still lies in their cell; a new map built from the "
         f"fresh values has {len(best)} filled cells.\n"
         f"QD-score (offset {offset:g}): {stored:,.0f} stored, {again:,.0f} fresh",
     )
-
-
-def _line(console: Console, text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)

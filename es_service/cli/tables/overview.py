@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from es_service.cli.console import print_line
 from es_service.cli.several import of_each
 from es_service.errors import ServiceError
 from es_service.report.progress import short
@@ -38,7 +39,7 @@ def print_overview(console: Console, folders: Sequence[Path]) -> bool:
     widths = [max(map(len, column)) for column in zip(_COLUMNS, *rows, strict=True)]
     for row in (_COLUMNS, *rows):
         line = "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-        console.print(line, highlight=False, markup=False, soft_wrap=True)  # not wrapped, so that folders can be copied
+        print_line(console, line)
     return not problems
 
 

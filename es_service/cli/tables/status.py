@@ -7,6 +7,7 @@ import time
 from rich.console import Console
 
 from es_service.cli.commands import command, settings, way_command
+from es_service.cli.console import print_line
 from es_service.report.progress import plain_line
 from es_service.runs.objectives import recent_objectives
 from es_service.runs.standing import Standing, doing, is_waiting, look, more, population_size, state, way_on
@@ -41,14 +42,14 @@ def follow_status(console: Console, run: Run) -> None:
         standing = look(run)
         waits_for = "a place" if is_waiting(standing) else doing(standing)
         if waits_for and waits_for != told:
-            _print_line(console, state(standing))
+            print_line(console, state(standing))
         told = waits_for
         if standing.row and standing.row["generation"] >= next_generation:
             next_generation = standing.row["generation"] + 1
-            console.print(plain_line(standing.row), highlight=False, soft_wrap=True)
+            print_line(console, plain_line(standing.row))
         if not standing.driver:
             way = way_command(way_on(standing))
-            _print_line(console, f"no driver is running: {state(standing)}; continue with: {way}")
+            print_line(console, f"no driver is running: {state(standing)}; continue with: {way}")
             return
         time.sleep(FOLLOW_INTERVAL_S)
 
@@ -58,9 +59,9 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
     standing, folder = look(run), run.folder
     sigma = "search.iso_sigma" if run.constants["search.algorithm"] == "map_elites" else "search.sigma"
     doubled = {sigma: float(f"{run.constants[sigma] * 2:g}")}
-    _print_line(console, f"\nDone: {reason}.")
+    print_line(console, f"\nDone: {reason}.")
     _print_fields(console, _progress(standing))
-    _print_line(console, f"\nThe run is in {folder}. Next:")
+    print_line(console, f"\nThe run is in {folder}. Next:")
     for words in (
         ("status", folder),
         ("report", folder),
@@ -69,7 +70,7 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
         ("resume", folder, *settings(more(standing))),
         ("fork", folder, *settings(doubled | more(standing))),
     ):
-        _print_line(console, f"  {command(*words)}")
+        print_line(console, f"  {command(*words)}")
 
 
 def _progress(standing: Standing) -> dict[str, str]:
@@ -121,9 +122,4 @@ def _objectives(run: Run, generation: int) -> dict[str, str]:
 
 def _print_fields(console: Console, fields: dict[str, str]) -> None:
     for name, value in fields.items():
-        _print_line(console, f"{name:<18} {value}")
-
-
-def _print_line(console: Console, text: str) -> None:
-    """Print a line without wrapping or cutting it, so that folders and commands can be copied."""
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
+        print_line(console, f"{name:<18} {value}")

@@ -12,6 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from es_service.cli.console import print_line
 from es_service.report.progress import ShowNotice, print_notice, short
 from es_service.runs.sweep import OnProgress, SweptRun
 
@@ -87,4 +88,4 @@ def _print_changes(console: Console, before: dict[str, str], runs: Sequence[Swep
         lines.append(count_line(runs))
     for line in lines:
         with suppress(SystemExit):  # rich's answer to a closed output
-            console.print(line, highlight=False, markup=False, soft_wrap=True)
+            print_line(console, line)

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
 from es_service.protocol.own_code import import_own, in_no_file
+from es_service.protocol.raised import raised, why_not_imported
 from es_service.search.algorithms.base import Algorithm
 
 
@@ -26,10 +27,7 @@ def import_factory(path: str) -> Callable[[RunConfig], object]:
     try:
         found = getattr(import_own(path), name, None)
     except Exception as error:  # the user's code can raise anything
-        kind = type(error).__name__
-        raise ConfigError(
-            f"cannot import {module} ({kind}: {error}); start in the folder that contains the module, or install it"
-        ) from error
+        raise ConfigError(why_not_imported(module, error)) from error
     if not callable(found):
         needed = "es_service/search/algorithms/own.py describes the function that is needed"
         raise ConfigError(f"{module} has no function {name!r}; {needed}")
@@ -42,7 +40,7 @@ def make_own(path: str, config: RunConfig) -> Algorithm:
     try:
         made = factory(config)
     except Exception as error:  # the user's code can raise anything
-        raise ConfigError(f"search.algorithm: {path} raised {type(error).__name__}: {error}") from error
+        raise ConfigError(f"search.algorithm: {path} raised {raised(error, path)}") from error
     if not isinstance(made, Algorithm):
         raise ConfigError(
             f"search.algorithm: {path} returned {made!r}; it must return an es_service.search.algorithms.base.Algorithm"
