@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from es_service.config.fields import Count, Fraction, NotNegative, Positive, Section, Switch, Text
+from es_service.config.fields import Count, Fraction, NotNegative, Options, Positive, Section, Switch, Text
 
 
 class SearchConfig(Section):
@@ -131,4 +131,8 @@ class SearchConfig(Section):
         None,
         description="Policy of another run from which this run starts: RUN (its folder) for the centre updated last, "
         "RUN:best for the best centre, or RUN:3,17 for a cell's elite; null for random weights.",
+    )
+    options: Options = Field(
+        default_factory=dict,
+        description="Settings of a search of your own, which declares them; the shipped methods have none.",
     )

@@ -138,7 +138,7 @@ def test_every_key_of_a_config_is_explained_with_its_default():
     tables = TEXT["configs/README.md"].split("\n## Every key\n")[1].split("\n## ")[0]
     shown = re.findall(r"^\| `([\w.]+)` \| (.+?) \| \S.* \|$", tables, re.MULTILINE)
     assert len(shown) == len(dict(shown))
-    options = {"task.options.NAME": "the first value"}
+    options = {"task.options.NAME": "the task's", "search.options.NAME": "the search's"}
     assert dict(shown) == {key: default(key) for key in FIELDS} | options
 
 
