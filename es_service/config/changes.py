@@ -8,6 +8,7 @@ from typing import Any
 
 from es_service.config.fields import SEARCH_OPTIONS, TASK_OPTIONS
 from es_service.config.keys import FIELDS
+from es_service.config.method_keys import keys_without_effect
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, Problem, WayOut
 
@@ -74,7 +75,10 @@ def does_not_fit(name: str, old: Any, new: Any) -> bool:
 
 
 def foreign_keys(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
-    """Keys of the options of a config's own task and search, if `wanted` chooses another one."""
+    """Keys that go with the task or the algorithm of a config, if `wanted` chooses another one that does not use them.
+
+    These are the options of the config's own task and search, and keys without effect with the other algorithm.
+    """
 
     def is_replaced(key: str) -> bool:
         return key in wanted and wanted[key] != values.get(key)
@@ -83,7 +87,8 @@ def foreign_keys(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[s
     if is_replaced("task.environment"):
         found += [key for key in values if key.startswith(TASK_OPTIONS)]
     if is_replaced("search.algorithm"):
-        found += [key for key in values if key.startswith(SEARCH_OPTIONS)]
+        idle = keys_without_effect(wanted["search.algorithm"])
+        found += [key for key in values if key.startswith(SEARCH_OPTIONS) or key in idle]
     return [key for key in found if key not in wanted]
 
 
@@ -92,14 +97,18 @@ def changed_constants(
 ) -> list[tuple[str, Any, Any]]:
     """Differences between two results of `constants()`: (dotted key, old value, new value), ABSENT if missing.
 
-    A key that only `new` has may be younger than the run. It counts as its default, which is what the run has done.
+    A key that only `new` has may be younger than the run. It counts as its default, which is what the run has done. A
+    key without effect with both algorithms makes no difference.
 
     Args:
         defaults: those of the options that the task and the search of `new` declare, by key.
     """
+    idle = keys_without_effect(old.get("search.algorithm")) & keys_without_effect(new.get("search.algorithm"))
     before = {name: _default(name) for name in new} | dict(defaults) | dict(old)
     return [
-        (name, before[name], new.get(name, ABSENT)) for name in {**old, **new} if before[name] != new.get(name, ABSENT)
+        (name, before[name], new.get(name, ABSENT))
+        for name in {**old, **new}
+        if before[name] != new.get(name, ABSENT) and name not in idle
     ]
 
 

@@ -1,6 +1,6 @@
 """Turns YAML and overrides into a `RunConfig`, or raises one error that lists everything that is wrong with them.
 
-The steps are: read, sort keys into sections, apply overrides, fill in the preset, check
+The steps are: read, sort keys into sections, apply overrides, set keys without effect aside, fill in the preset, check
 each value alone, check names and options, resolve what is left open, check the sections against each other. A value
 that fails a step is reported once and removed, so that the later steps still check everything else.
 """
@@ -18,6 +18,7 @@ from es_service.config.changes import foreign_keys, without_followers
 from es_service.config.fields import OPTION_GROUPS, SEARCH_OPTIONS, TASK_OPTIONS
 from es_service.config.keys import BUDGET, FIELDS, SECTIONS, Overrides, parse_overrides, sort_keys
 from es_service.config.map_rules import map_problems
+from es_service.config.method_keys import keys_without_effect, no_effect
 from es_service.config.method_rules import method_problems
 from es_service.config.model import RunConfig
 from es_service.config.options import read_options
@@ -90,7 +91,8 @@ def changed_config(
 
     Values that are derived from the changed keys, by a preset or from the task, are resolved again. The caller checks
     whether the run may change in this way. Arguments are as for `load_config`; `source` is a resolved config, such as
-    the run's own `config.yaml`. The run that `search.init_from` names need not exist any more.
+    the run's own `config.yaml`. The run that `search.init_from` names need not exist any more. A key without effect is
+    refused only if an override changes it, since versions up to 0.11 recorded any value.
 
     Raises:
         ConfigError: as for `load_config`.
@@ -120,7 +122,12 @@ def _load(
         values = without_followers(values, wanted)
     foreign = foreign_keys(values, wanted)
     values = {key: value for key, value in values.items() if key not in foreign}
+    recorded = values if resolved else {}
     values = values | wanted
+    without_effect = keys_without_effect(values.get("search.algorithm"))
+    idle = {key: value for key, value in values.items() if key in without_effect}
+    values = {key: value for key, value in values.items() if key not in idle}
+    values |= {key: recorded[key] for key in idle if key in recorded}  # their values stay what they were
 
     left_open = {key for key, ask in LEFT_OPEN.items() if _asks(values.get(key, ask), ask)}
     values = {key: value for key, value in values.items() if key not in left_open}
@@ -159,6 +166,7 @@ def _load(
     if task is not None:
         problems += task_problems(values, task) + policy_problems(values, task)
         problems += map_problems(values, task) + rollout_problems(values, task)
+    problems += _idle_problems(idle, values)
     problems += method_problems(values) + shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):
@@ -172,6 +180,23 @@ def _load(
 def _asks(value: object, ask: str | None) -> bool:
     """Whether a value asks for its key to be resolved. A plain `==` would fail for an array in a Python mapping."""
     return value is None if ask is None else isinstance(value, str) and value == ask
+
+
+def _idle_problems(idle: Mapping[str, Any], values: Mapping[str, Any]) -> list[Problem]:
+    """Problems of values of keys without effect. A value that the key has anyway is none, so that a resolved config can
+    be loaded like any other.
+
+    Args:
+        idle: keys without effect with the algorithm, and the values given for them.
+        values: resolved values, without those of `idle`.
+    """
+    known = {key: field.default for key, field in FIELDS.items() if not field.is_required()} | dict(values)
+    return [
+        no_effect(key, value, values["search.algorithm"], known[key])
+        for key, value in idle.items()
+        if key in known and not (key in LEFT_OPEN and _asks(value, LEFT_OPEN[key]))
+        if not (isinstance(value, int | float | str | None) and value == known[key])
+    ]
 
 
 def _preset_values(values: Mapping[str, Any]) -> dict[str, Any]:

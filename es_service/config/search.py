@@ -46,8 +46,8 @@ class SearchConfig(Section):
     )
     centre_choice: Literal["novelty", "round_robin", "uniform"] = Field(
         "novelty",
-        description="How the centre to update is chosen. novelty: with probability proportional to its novelty. "
-        "round_robin: in turn. uniform: all with the same probability.",
+        description="ns_es, nsr_es, nsra_es: how the centre to update is chosen. novelty: with probability "
+        "proportional to its novelty. round_robin: in turn. uniform: all with the same probability.",
     )
     top_pairs: Count | None = Field(
         None,

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from es_service.config.fields import SEARCH_OPTIONS, TASK_OPTIONS
 from es_service.config.loading import load_config
+from es_service.config.method_keys import keys_without_effect
 from es_service.config.model import flat
 from es_service.config.options import options_of
 from es_service.config.resolution import LEFT_OPEN
@@ -54,8 +55,9 @@ def _defaults(config: Mapping[str, Any], values: Mapping[str, Any], task: TaskSp
         "search": {"algorithm": algorithm, "preset": values.get(PRESET, "literature")},
         "budget": config["budget"],
     }
-    # Options of a search of the user are declared in its code.
-    following = {key: values[key] for key in values if key not in LEFT_OPEN and not key.startswith(SEARCH_OPTIONS)}
+    # A run of version 0.11 may have any value of a key without effect; options of its search are declared in its code.
+    others = {*LEFT_OPEN, *keys_without_effect(algorithm)}
+    following = {key: values[key] for key in values if key not in others and not key.startswith(SEARCH_OPTIONS)}
     try:
         known: dict[str, Any] = {"tasks": {environment: task}, "algorithms": {algorithm: None}, "new": False}
         plain, followed = (

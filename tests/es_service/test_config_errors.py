@@ -96,8 +96,6 @@ def problems(source=MINIMAL, *overrides: str) -> list[str]:
         ("map.cells=[9999, 9999]", "[9999, 9999] makes 99,980,001 cells; must be at most 10,000,000; with many dim"),
         ("map.qd_offset=low", "low ... must be auto or a number"),
         ("compute.rollout_block_pairs=24", "24 does not divide compute.chunk_pairs (64); try 16 or 32"),
-        ("search.top_pairs=513", "513 is more than search.pairs (512); try 512, or null for all"),
-        ("search.top_pairs=0", "0 ... must be a whole number, at least 1 or null"),
         ("compute.gradient_block_pairs=513", "513 is more than search.pairs (512); try 512"),
     ],
 )  # fmt: skip
