@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from es_service.config.changes import changed_constants, refused_changes
+from es_service.config.changes import refused_changes
 from es_service.config.keys import Overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
@@ -27,7 +27,7 @@ from es_service.loop.history import Column, evaluated_columns, history_columns
 from es_service.loop.interfaces import Stop as Stop
 from es_service.protocol.messages import TaskSpec
 from es_service.report.progress import in_notebook, show_in_notebook
-from es_service.runs.checked_config import changed_config, load_config
+from es_service.runs.checked_config import changed_config, changes_from, load_config
 from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.identity import require_unchanged
 from es_service.runs.lineage import fork_config, forked, started
@@ -188,7 +188,7 @@ def _go_on(
         store.notices.clear()
         config = make_config(store)
         require_cores(config, WayOut("resume", "", run=str(folder)))
-        if changes := changed_constants(store.meta.constants, config.constants()):
+        if changes := changes_from(store.meta.constants, config):
             besides = _budget_of_a_fork(config, look(open_run(folder)))
             raise refused_changes(folder, changes, besides)
         task = task_of(config)

@@ -13,6 +13,7 @@ import typer
 from es_service.cli.commands import assignments, error_message
 from es_service.cli.console import console, errors, print_line
 from es_service.config.compute import implied_by
+from es_service.config.fields import TASK_OPTIONS
 from es_service.config.keys import Overrides
 from es_service.config.loading import left_out
 from es_service.config.model import RunConfig
@@ -124,9 +125,13 @@ def print_config_notes(source: Path, configs: Sequence[tuple[Overrides, RunConfi
     ignored keys, and settings that are probably not intended. What several configs have in common is printed once."""
     notes: dict[str, None] = {}
     for wanted, config in configs:
-        if foreign := left_out(source, wanted):
-            task = config.task.environment
-            notes[f"ignored {', '.join(foreign)} of {source}, since {task} replaces its task (default options)"] = None
+        foreign = left_out(source, wanted)
+        for kind, chosen, keys in (
+            ("task", config.task.environment, [key for key in foreign if key.startswith(TASK_OPTIONS)]),
+            ("algorithm", config.search.algorithm, [key for key in foreign if not key.startswith(TASK_OPTIONS)]),
+        ):
+            if keys:
+                notes[f"ignored {', '.join(keys)} of {source}, since {chosen} replaces its {kind}"] = None
         notes |= dict.fromkeys(config_warnings(config, task_of(config), no_vectors()))
     for note in notes:
         print_note(f"note: {note}")

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from es_service.config.fields import OPTIONS
+from es_service.config.fields import SEARCH_OPTIONS, TASK_OPTIONS
 from es_service.config.keys import FIELDS
+from es_service.config.method_keys import keys_without_effect
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, Problem, WayOut
 
@@ -31,10 +32,10 @@ START_KEYS = ("search.preset", "search.init_from", "policy.init", "search.fitnes
 _SHAPES = ("compute.chunk_pairs", "compute.rollout_block_pairs", "compute.gradient_block_pairs")
 _MAP = ("map.kind", "map.bounds", "map.cells")
 _FOLLOWERS = {
-    "task.environment": (OPTIONS, "task.episode_steps", *_MAP, "map.qd_offset"),
+    "task.environment": ("task.episode_steps", *_MAP, "map.qd_offset"),
     "task.episode_steps": ("map.qd_offset",),
     "task.fitness": ("map.qd_offset",),
-    f"{OPTIONS}descriptor": _MAP,
+    f"{TASK_OPTIONS}descriptor": _MAP,
     "map.kind": ("map.cells",),
     "policy.observation_normalization": ("policy.observation_clip",),
     "search.algorithm": ("search.centres",),
@@ -73,27 +74,46 @@ def does_not_fit(name: str, old: Any, new: Any) -> bool:
     return name in STATE_KEYS and not are_alike(name, old, new)
 
 
-def foreign_options(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
-    """Keys of the options that belong to the config's own task, if `wanted` chooses another task; else none."""
-    task = "task.environment"
-    if task not in wanted or wanted[task] == values.get(task):
-        return []
-    return [key for key in values if key.startswith(OPTIONS) and key not in wanted]
+def foreign_keys(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
+    """Keys that go with the task or the algorithm of a config, if `wanted` chooses another one that does not use them.
+
+    These are the options of the config's own task and search, and keys without effect with the other algorithm.
+    """
+
+    def is_replaced(key: str) -> bool:
+        return key in wanted and wanted[key] != values.get(key)
+
+    found: list[str] = []
+    if is_replaced("task.environment"):
+        found += [key for key in values if key.startswith(TASK_OPTIONS)]
+    if is_replaced("search.algorithm"):
+        idle = keys_without_effect(wanted["search.algorithm"])
+        found += [key for key in values if key.startswith(SEARCH_OPTIONS) or key in idle]
+    return [key for key in found if key not in wanted]
 
 
-def changed_constants(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+def changed_constants(
+    old: Mapping[str, Any], new: Mapping[str, Any], defaults: Mapping[str, Any] = MappingProxyType({})
+) -> list[tuple[str, Any, Any]]:
     """Differences between two results of `constants()`: (dotted key, old value, new value), ABSENT if missing.
 
-    A key that only `new` has may be younger than the run. It counts as its default, which is what the run has done.
+    A key that only `new` has may be younger than the run. It counts as its default, which is what the run has done. A
+    key without effect with both algorithms makes no difference.
+
+    Args:
+        defaults: those of the options that the task and the search of `new` declare, by key.
     """
-    before = {name: _default(name) for name in new} | dict(old)
+    idle = keys_without_effect(old.get("search.algorithm")) & keys_without_effect(new.get("search.algorithm"))
+    before = {name: _default(name) for name in new} | dict(defaults) | dict(old)
     return [
-        (name, before[name], new.get(name, ABSENT)) for name in {**old, **new} if before[name] != new.get(name, ABSENT)
+        (name, before[name], new.get(name, ABSENT))
+        for name in {**old, **new}
+        if before[name] != new.get(name, ABSENT) and name not in idle
     ]
 
 
 def _default(name: str) -> Any:
-    """The default of a key; ABSENT for one without a default, such as a task option."""
+    """The default of a key; ABSENT for one without a default."""
     return FIELDS[name].default if name in FIELDS and not FIELDS[name].is_required() else ABSENT
 
 

@@ -8,9 +8,12 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from es_service.protocol.messages import Bounds
 
-OPTIONS = "task.options."
+TASK_OPTIONS = "task.options."
+SEARCH_OPTIONS = "search.options."
 RESOURCES = "compute.worker_resources."
-"""Prefixes of the keys in the two groups that are inside a section."""
+"""Prefixes of the keys in the three groups that are inside a section."""
+OPTION_GROUPS = (TASK_OPTIONS, SEARCH_OPTIONS)
+"""The groups whose keys the task and the search declare."""
 
 
 def _tuple(value: Any) -> Any:
@@ -38,6 +41,8 @@ Fraction = Annotated[float, Field(ge=0, le=1), "a number from 0 to 1"]
 Seed = Annotated[int, Field(ge=0, lt=2**63), "a whole number, at least 0 and below 2**63"]
 Switch = Annotated[bool, "true or false"]
 Text = Annotated[str, Field(min_length=1), "text"]
+Options = dict[Text, bool | int | float | str]
+"""Values of options by name; `config/options.py` checks them against what is declared."""
 Widths = Annotated[
     tuple[Count, ...],
     BeforeValidator(_tuple),

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from es_service.config.compute import WorkerResources
-from es_service.config.fields import OPTIONS, RESOURCES
+from es_service.config.fields import OPTION_GROUPS, RESOURCES
 from es_service.config.model import RunConfig
 from es_service.config.problems import nearest, unfit
 from es_service.config.yaml_text import in_line, parse_value, show
@@ -25,10 +25,10 @@ FIELDS = {name: field for name, field in RunConfig.model_fields.items() if name 
     f"{section}.{name}": field
     for section, model in {**SECTIONS, RESOURCES.removesuffix("."): WorkerResources}.items()
     for name, field in model.model_fields.items()
-    if f"{section}.{name}." not in (OPTIONS, RESOURCES)
+    if f"{section}.{name}." not in (*OPTION_GROUPS, RESOURCES)
 }
-"""Dotted key -> its field in the model. Task options are not included, since each task defines its own."""
-GROUPS = (*SECTIONS, OPTIONS.removesuffix("."), RESOURCES.removesuffix("."))
+"""Dotted key -> its field in the model. Options are not included, since tasks and searches declare them."""
+GROUPS = (*SECTIONS, *(group.removesuffix(".") for group in (*OPTION_GROUPS, RESOURCES)))
 """Names of sections and of groups inside sections, which hold keys and have no value."""
 ALIASES = {
     "population": "search.pairs",
@@ -65,7 +65,7 @@ def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, An
             unusable.add(name)
             hint = f"indent its keys below `{_leaf(name)}:`, or delete the line to use the defaults"
             problems.append(unfit(name, value, f"{show(value)} is not a mapping of keys; {hint}"))
-        elif name in FIELDS or group == OPTIONS:
+        elif name in FIELDS or group in OPTION_GROUPS:
             values[name] = value
         else:
             problems.append(_unknown_key(name, (*GROUPS, *FIELDS) if isinstance(value, Mapping) else FIELDS, value))
@@ -94,18 +94,14 @@ def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]
             hint = "the value is missing; write null for no value" if name and equals else example
             problems.append(Problem(f"{where}: {hint}"))
         elif name in GROUPS:
-            keys = [key for key in FIELDS if key.startswith(f"{name}.")] or [f"{OPTIONS}start"]
+            keys = [key for key in FIELDS if key.startswith(f"{name}.")] or [f"{name}.NAME"]
             what = f"{where}: {name} is a section; set its keys one by one, such as {keys[0]}=..."
             problems.append(Problem(what, name, text, suggestion=keys[0]))
         elif name in FIELDS or _is_option(name):
             try:
-                value = parse_value(text)
+                values[name] = parse_value(text)
             except ValueError as error:
                 problems.append(Problem(f"{where}: {error}", name, text))
-                continue
-            # YAML reads off as a bool and 10 as a number, but the value of an option is text.
-            is_word = _is_option(name) and isinstance(value, bool | int | float)
-            values[name] = text if is_word else value
         else:
             problem = _unknown_key(name, FIELDS, text)
             problems.append(replace(problem, sentence=f"{where}: {problem.sentence}"))
@@ -113,9 +109,9 @@ def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]
 
 
 def _is_option(name: str) -> bool:
-    """Whether a key has the form of a task option, for any task."""
-    option = name.removeprefix(OPTIONS)
-    return option not in ("", name) and "." not in option
+    """Whether a key has the form of an option, of any task or search."""
+    group, dot, option = name.rpartition(".")
+    return option != "" and f"{group}{dot}" in OPTION_GROUPS
 
 
 def _unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:

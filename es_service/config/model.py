@@ -18,6 +18,7 @@ from es_service.config.fields import (
     Count,
     NotNegative,
     Number,
+    Options,
     Positive,
     Section,
     Seed,
@@ -46,9 +47,8 @@ class TaskConfig(Section):
     episodes_per_member: Count = Field(
         1, description="Training episodes of each member of the population; its fitness is their mean."
     )
-    options: dict[Text, Text] = Field(
-        default_factory=dict,
-        description="Settings of the task, such as `start`; the default of each is its first allowed value.",
+    options: Options = Field(
+        default_factory=dict, description="Settings of the task, such as `start`, which the task declares."
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from difflib import get_close_matches
 from typing import Any
 
-from es_service.config.yaml_text import show
+from es_service.config.yaml_text import parse_value, show
 from es_service.errors import ConfigError, Problem
 
 
@@ -22,10 +22,10 @@ def did_you_mean(name: object, candidates: Collection[str]) -> str:
     return f"; did you mean {near}?" if near else ""
 
 
-def one_of(names: Collection[str]) -> str:
-    """Join names for a sentence: "a", "a or b", "a, b or c"."""
+def one_of(names: Collection[str], word: str = "or") -> str:
+    """Join names for a sentence: "a", "a or b", "a, b or c"; or with another word."""
     *first, last = map(str, names)
-    return f"{', '.join(first)} or {last}" if first else last
+    return f"{', '.join(first)} {word} {last}" if first else last
 
 
 def not_allowed(
@@ -42,6 +42,33 @@ def not_allowed(
     return Problem(
         f"{field}: {show(value)} is not allowed{why}; must be {allowed}{ending}", field, value, allowed, suggestion
     )
+
+
+def wrong_value(field: str, value: Any, allowed: str, choices: Collection[Any] = ()) -> Problem:
+    """The problem of a value that is invalid by itself, with how to write what was probably meant.
+
+    Args:
+        choices: the allowed values, if they are few.
+    """
+    hint, meant = "", None
+    if value is None:
+        hint = "; leave the key out to use its default"
+    elif isinstance(value, str) and "number" in allowed and _is_number(value):
+        hint, meant = f"; remove the quotes around {value}", parse_value(value)
+    elif isinstance(value, float) and "whole number" in allowed and value.is_integer() and 1 <= value < 2**53:
+        hint, meant = f"; write {int(value)}", int(value)
+    elif isinstance(value, bool | int | float) and allowed == "text":
+        hint = "; write it in quotes"
+    elif isinstance(value, str):
+        meant = nearest(value, [one for one in choices if isinstance(one, str)])
+    return not_allowed(field, value, allowed, hint=hint, suggestion=meant)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return type(parse_value(text)) in (int, float)
+    except ValueError:
+        return False
 
 
 def unfit(field: str, value: Any, what: str, *, suggestion: Any = None, allowed: str | None = None) -> Problem:

@@ -12,12 +12,13 @@ import os
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from es_service.config.fields import OPTIONS, RESOURCES
+from es_service.config.fields import RESOURCES, TASK_OPTIONS
 from es_service.config.keys import FIELDS
-from es_service.config.map_rules import default_cells, default_kind, default_qd_offset, options_of
+from es_service.config.map_rules import default_cells, default_kind, default_qd_offset
 from es_service.config.method_rules import default_centres
 from es_service.config.model import RunConfig
-from es_service.config.problems import nearest, not_allowed, one_of, unfit
+from es_service.config.options import options_of
+from es_service.config.problems import not_allowed, unfit
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
 from es_service.protocol.messages import PolicyShape, TaskSpec, with_options
@@ -100,9 +101,7 @@ def resolve(
     if task is not None:
         if "task.episode_steps" in left_open:
             values["task.episode_steps"] = task.episode_steps
-        for option, allowed in task.options.items():
-            values.setdefault(f"{OPTIONS}{option}", allowed[0])
-        chosen = with_options(task, options_of(values))
+        chosen = with_options(task, options_of(values, TASK_OPTIONS))
         if "map.kind" in left_open:
             values["map.kind"] = default_kind(len(chosen.descriptor_names))
         kind = values.get("map.kind")
@@ -137,25 +136,11 @@ def resolve(
 
 
 def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
-    """Problems of settings that the task does not support."""
-    problems = []
-    if values.get("task.fitness") == "final" and not task.final_fitness:
-        why = f" for {task.name}, whose last reward says little about the episode"
-        problems.append(not_allowed("task.fitness", "final", "sum", why=why))
-    for key in values:
-        option = key.removeprefix(OPTIONS)
-        if not key.startswith(OPTIONS):
-            continue
-        if option not in task.options:
-            known = f"{task.name} has {one_of(task.options)}" if task.options else f"{task.name} has none"
-            meant = nearest(option, task.options)
-            hint = f"; did you mean {meant}?" if meant else ""
-            problems.append(unfit(key, values[key], f"unknown option; {known}{hint}", suggestion=meant))
-        elif values[key] not in task.options[option]:
-            allowed = task.options[option]
-            meant = nearest(values[key], allowed)
-            problems.append(not_allowed(key, values[key], one_of(allowed), suggestion=meant))
-    return problems
+    """The problem of a fitness that the task does not support."""
+    if values.get("task.fitness") != "final" or task.final_fitness:
+        return []
+    why = f" for {task.name}, whose last reward says little about the episode"
+    return [not_allowed("task.fitness", "final", "sum", why=why)]
 
 
 def policy_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:

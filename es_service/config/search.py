@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from es_service.config.fields import Count, Fraction, NotNegative, Positive, Section, Switch, Text
+from es_service.config.fields import Count, Fraction, NotNegative, Options, Positive, Section, Switch, Text
 
 
 class SearchConfig(Section):
@@ -46,8 +46,8 @@ class SearchConfig(Section):
     )
     centre_choice: Literal["novelty", "round_robin", "uniform"] = Field(
         "novelty",
-        description="How the centre to update is chosen. novelty: with probability proportional to its novelty. "
-        "round_robin: in turn. uniform: all with the same probability.",
+        description="ns_es, nsr_es, nsra_es: how the centre to update is chosen. novelty: with probability "
+        "proportional to its novelty. round_robin: in turn. uniform: all with the same probability.",
     )
     top_pairs: Count | None = Field(
         None,
@@ -131,4 +131,8 @@ class SearchConfig(Section):
         None,
         description="Policy of another run from which this run starts: RUN (its folder) for the centre updated last, "
         "RUN:best for the best centre, or RUN:3,17 for a cell's elite; null for random weights.",
+    )
+    options: Options = Field(
+        default_factory=dict,
+        description="Settings of a search of your own, which declares them; the shipped methods have none.",
     )

@@ -18,6 +18,7 @@ from es_service.config.model import RunConfig
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError
 from es_service.protocol.messages import TaskSpec, with_options
+from es_service.protocol.options import Option, choice
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.sources import own_sources
 from workers import environments
@@ -111,6 +112,11 @@ def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
     def bounds(pairs: list) -> tuple[tuple[float, float], ...]:
         return tuple((float(low), float(high)) for low, high in pairs)
 
+    def option(found: Mapping[str, Any] | list) -> Option:
+        if isinstance(found, list):  # as versions up to 0.11 stored the allowed values
+            return choice(*found)
+        return Option(**{**found, "choices": tuple(found["choices"])})
+
     return TaskSpec(
         **dict(fields)
         | {
@@ -118,7 +124,7 @@ def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
             "descriptor_bounds": bounds(fields["descriptor_bounds"]),
             "walls": None if fields["walls"] is None else tuple(bounds(wall) for wall in fields["walls"]),
             "goal": None if fields.get("goal") is None else tuple(fields["goal"]),
-            "options": {name: tuple(values) for name, values in fields["options"].items()},
+            "options": {name: option(found) for name, found in fields["options"].items()},
             "descriptors": {
                 name: (tuple(names), bounds(pairs)) for name, (names, pairs) in fields["descriptors"].items()
             },

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.protocol.options import Option, OptionValue
 from es_service.protocol.policies import Policies, PolicyChunk
 
 FloatArray = NDArray[np.float32]
@@ -43,8 +44,8 @@ class TaskSpec:
     """Whether the task allows `task.fitness: final` (the reward of the last valid step)."""
     has_goal: bool
     """Whether the task has a goal; if it has, the history has columns for the distance to the goal."""
-    options: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """Options of the task that a config can set: name -> allowed values, the first of which is the default."""
+    options: dict[str, Option] = field(default_factory=dict)
+    """Options of the task that a config can set, by name."""
     summary: str = ""
     """One line about the task, which `es-service list` shows."""
     descriptors: dict[str, tuple[tuple[str, ...], Bounds]] = field(default_factory=dict)
@@ -64,10 +65,10 @@ class TaskSpec:
     """Reason why simd cannot compile episodes of this task; empty if it can."""
 
 
-def with_options(task: TaskSpec, options: Mapping[str, str]) -> TaskSpec:
+def with_options(task: TaskSpec, options: Mapping[str, OptionValue]) -> TaskSpec:
     """The task with the descriptor that its option `descriptor` chooses; unchanged if `options` choose none."""
     chosen = options.get("descriptor")
-    if chosen not in task.descriptors:
+    if not isinstance(chosen, str) or chosen not in task.descriptors:
         return task
     names, bounds = task.descriptors[chosen]
     return replace(task, descriptor_names=names, descriptor_bounds=bounds)
@@ -97,7 +98,7 @@ class WorkerSpec:
 
     seed: int
     environment: str
-    environment_options: dict[str, str]
+    environment_options: dict[str, OptionValue]
     policy: PolicyShape
     episode_steps: int
     fitness: Literal["sum", "final"]

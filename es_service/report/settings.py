@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from es_service.config.fields import OPTIONS
+from es_service.config.fields import SEARCH_OPTIONS, TASK_OPTIONS
 from es_service.config.loading import load_config
+from es_service.config.method_keys import keys_without_effect
 from es_service.config.model import flat
+from es_service.config.options import options_of
 from es_service.config.resolution import LEFT_OPEN
 from es_service.config.yaml_text import in_line
 from es_service.errors import ConfigError
@@ -48,13 +50,14 @@ def changed_settings(config: Mapping[str, Any], task: TaskSpec) -> list[Setting]
 
 def _defaults(config: Mapping[str, Any], values: Mapping[str, Any], task: TaskSpec) -> dict[str, Any]:
     environment, algorithm = values["task.environment"], values["search.algorithm"]
-    options = {key.removeprefix(OPTIONS): value for key, value in values.items() if key.startswith(OPTIONS)}
     least = {
-        "task": {"environment": environment, "options": options},
+        "task": {"environment": environment, "options": options_of(values, TASK_OPTIONS)},
         "search": {"algorithm": algorithm, "preset": values.get(PRESET, "literature")},
         "budget": config["budget"],
     }
-    following = {key: value for key, value in values.items() if key not in LEFT_OPEN}
+    # A run of version 0.11 may have any value of a key without effect; options of its search are declared in its code.
+    others = {*LEFT_OPEN, *keys_without_effect(algorithm)}
+    following = {key: values[key] for key in values if key not in others and not key.startswith(SEARCH_OPTIONS)}
     try:
         known: dict[str, Any] = {"tasks": {environment: task}, "algorithms": {algorithm: None}, "new": False}
         plain, followed = (
@@ -63,7 +66,7 @@ def _defaults(config: Mapping[str, Any], values: Mapping[str, Any], task: TaskSp
         )
     except ConfigError:
         return {}
-    first = {OPTIONS + name: allowed[0] for name, allowed in task.options.items() if allowed}
+    first = {TASK_OPTIONS + name: option.default for name, option in task.options.items()}
     return plain | {key: followed[key] for key in LEFT_OPEN} | first | {PRESET: "literature"}
 
 

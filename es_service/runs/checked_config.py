@@ -5,7 +5,12 @@ A config that its search refuses fails here, before a folder is created or a wor
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from es_service.config import loading
+from es_service.config.changes import changed_constants
+from es_service.config.fields import SEARCH_OPTIONS, TASK_OPTIONS
 from es_service.config.keys import Overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
@@ -45,6 +50,14 @@ def changed_config(source: Source, overrides: Overrides = ()) -> RunConfig:
     return _accepted(
         loading.changed_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, no_vectors=no_vectors())
     )
+
+
+def changes_from(constants: Mapping[str, Any], config: RunConfig) -> list[tuple[str, Any, Any]]:
+    """What a config would change of the constants of a run, as `changed_constants` returns it."""
+    task, search = TASKS[config.task.environment], ALGORITHMS[config.search.algorithm]
+    declared = {TASK_OPTIONS: task.options, SEARCH_OPTIONS: getattr(search, "options", {})}
+    defaults = {f"{group}{name}": one.default for group, options in declared.items() for name, one in options.items()}
+    return changed_constants(constants, config.constants(), defaults)
 
 
 def _accepted(config: RunConfig) -> RunConfig:

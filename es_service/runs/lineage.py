@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from es_service.config.changes import START_KEYS, changed_constants, does_not_fit, start_afresh
+from es_service.config.changes import START_KEYS, does_not_fit, start_afresh
 from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.model import RunConfig, policy_shape
 from es_service.config.start import start_of
@@ -30,7 +30,7 @@ from es_service.loop.parts import (
     weight_to_arrays,
 )
 from es_service.protocol.messages import Moments
-from es_service.runs.checked_config import changed_config
+from es_service.runs.checked_config import changed_config, changes_from
 from es_service.runs.view import Run, is_no_elite, open_run
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import NO_CELL, FitnessWeight
@@ -71,7 +71,7 @@ def fork_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> Ru
     present = origin.present_config
     mapping = present | {"search": present["search"] | {"init_from": None}}  # a fork has the parent's state instead
     config = changed_config(mapping, overrides)
-    changes = changed_constants(origin.constants, config.constants())
+    changes = changes_from(origin.constants, config)
     unfit = [_unfit(name, old, new, name) for name, old, new in changes if does_not_fit(name, old, new)]
     names = task_of(config).descriptor_names
     if not unfit and list(names) != origin.descriptor_names:  # a task of the user that was edited
@@ -102,7 +102,7 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
         StoreError: the state of that generation is not kept.
     """
     at, parts = origin.parts(generation)
-    changed = {name for name, _, _ in changed_constants(origin.constants, config.constants())}
+    changed = {name for name, _, _ in changes_from(origin.constants, config)}
     if any(name in OBSERVED or name.startswith("task.") for name in changed.difference(LUCK)):
         parts = _without_fitness(parts)
     elif changed.intersection(LUCK):

@@ -10,13 +10,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from es_service.config.changes import changed_constants
 from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
 from es_service.config.yaml_text import in_line, show
 from es_service.errors import ConfigError, Problem, StoreError
-from es_service.runs.checked_config import load_config
+from es_service.runs.checked_config import changes_from, load_config
 from es_service.runs.view import open_run
 from es_service.store.folder import holds_run
 
@@ -133,7 +132,7 @@ def _require_same_constants(run: PlannedRun) -> None:
         there = open_run(run.folder).constants
     except StoreError:
         return  # it may be repaired when the run is resumed, which also compares the constants
-    if changes := changed_constants(there, run.config.constants()):
+    if changes := changes_from(there, run.config):
         problems = [
             Problem(f"{key}: {show(old)} -> {show(new)}", key, new, show(old), old) for key, old, new in changes
         ]

@@ -229,9 +229,9 @@ def test_an_adapted_sigma_is_the_one_that_is_asked_for():
 REPELLING = "tests.examples.repelling_centres:repelling_centres"
 
 
-def test_repelling_centres_end_apart_where_others_meet(tmp_path, monkeypatch):
-    def distances(name):
-        run = started(tmp_path / name, REPELLING, **{"search.centres": 2, "budget.generations": 30})
+def test_repelling_centres_end_apart_where_others_meet(tmp_path):
+    def distances(name, **options):
+        run = started(tmp_path / name, REPELLING, **{"search.centres": 2, "budget.generations": 30, **options})
         assert run.evaluations["centre"].tolist() == [0, 1] * 31
         assert run.evaluations["generation"].tolist() == np.repeat(np.arange(31), 2).tolist()
         place_C_G_2 = [run.evaluations.query(f"centre == {centre}")[["x", "y"]].to_numpy() for centre in (0, 1)]
@@ -240,8 +240,7 @@ def test_repelling_centres_end_apart_where_others_meet(tmp_path, monkeypatch):
     apart = distances("apart")
     assert apart[0] < 0.01
     assert apart[10:].min() > 0.5
-    monkeypatch.setattr("tests.examples.repelling_centres.REACH", 0.0)
-    assert distances("together")[10:].max() < 0.1
+    assert distances("together", **{"search.options.reach": 0})[10:].max() < 0.1
 
 
 def test_repelling_centres_go_on_where_they_were_with_the_same_bits(tmp_path):

@@ -11,6 +11,7 @@ import pytest
 
 from es_service import open_run, plots
 from es_service.errors import ConfigError, NotInRunError
+from es_service.protocol.options import choice
 from es_service.report import compare
 from es_service.report.compare_page import comparison_page
 from es_service.report.data import read_run
@@ -203,7 +204,7 @@ def test_figures_without_matplotlib_are_refused_before_anything_is_recorded(fold
 
 def named_runs(top, name, value):
     """Two runs whose dimensions and folders have a name, and which differ in the value of an option."""
-    made = task_with(2, options={"way": ("a", value)})
+    made = task_with(2, options={"way": choice("a", value)})
     task = replace(made, name=f"made:{name}", descriptor_names=(f"x{name}", f"y{name}"))
     folders = [top / f"{number}{name.replace('/', '')}" for number in range(2)]
     return [

@@ -16,6 +16,7 @@ import pytest
 
 from es_service.cli.commands import error_message
 from es_service.errors import StoreError
+from es_service.protocol.options import choice
 from es_service.report import maps
 from es_service.report.colours import LEVELS, SCALE, level
 from es_service.report.data import read_run
@@ -88,12 +89,12 @@ def test_a_page_is_whole_and_needs_no_network(tmp_path):
 
 def test_all_text_of_a_user_is_escaped(tmp_path):
     """Names of the folder, the task, options, dimensions, and a setting; the page has no element but its own."""
-    plain = task_with(2, summary="plain", options={"way": ("a", "b")})
+    plain = task_with(2, summary="plain", options={"way": choice("a", "b")})
     evil = replace(
         plain,
         name=f"made:{EVIL}",
         descriptor_names=(f"x{EVIL}", f"y{EVIL}"),
-        options={OPTION: (f"first{EVIL}", f"other{EVIL}")},
+        options={OPTION: choice(f"first{EVIL}", f"other{EVIL}")},
         summary=EVIL,
     )
     harmless = write_run(tmp_path / "run", {"task.options.way": "b", "search.init_from": str(tmp_path)}, task=plain)

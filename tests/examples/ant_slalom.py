@@ -7,6 +7,7 @@ All methods are pure functions of one ant's state that JAX can trace; they are b
 
 import jax.numpy as jnp
 
+from es_service.protocol.options import Option
 from workers.environments.ant import ant_viewer, make_ant, observe
 
 # Axes of the walls, in metres; each is thickened by half a metre and cannot be climbed.
@@ -14,7 +15,6 @@ GATES = (
     ((6.0, -10.0), (6.0, 1.0)),  # pass on the left,
     ((14.0, -1.0), (14.0, 10.0)),  # then on the right
 )
-FINISH_X = 20.0
 
 
 class AntSlalom:
@@ -26,10 +26,11 @@ class AntSlalom:
     # What tells two behaviours apart: where the ant is when the episode ends.
     descriptor_names = ("x", "y")
     descriptor_bounds = ((-5.0, 25.0), (-12.0, 12.0))
-    # Settings by name, each with its allowed values, the first being the default: task.options in the config.
-    options = {"walls": ("both", "first")}  # noqa: RUF012
+    # Settings by name, task.options in the config: allowed values, of which the first is the default; or any number.
+    options = {"walls": ("both", "first"), "finish": Option(20.0, low=1.0)}  # noqa: RUF012
 
-    def __init__(self, walls: str = "both") -> None:
+    def __init__(self, walls: str = "both", finish: float = 20.0) -> None:
+        self.finish = finish
         self.ant = make_ant(GATES if walls == "both" else GATES[:1])
 
     def reset(self, key):
@@ -45,7 +46,7 @@ class AntSlalom:
         new = self.ant.step(state, action)
         reward = new.q[0] - state.q[0]
         fallen = (new.q[2] < 0.2) | (new.q[2] > 1.0)
-        return new, reward, fallen | (new.q[0] > FINISH_X)
+        return new, reward, fallen | (new.q[0] > self.finish)
 
     def descriptor(self, state):
         return state.q[:2]

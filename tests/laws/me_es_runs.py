@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 
 from es_service.api import load_config
+from es_service.config.method_keys import keys_without_effect
 from es_service.config.model import worker_spec
 from es_service.loop import driver
 from es_service.protocol.messages import EvaluationChunk, PolicyShape
@@ -25,6 +26,11 @@ PRESETS = {
 
 
 def config_of(preset="literature", generations=30, seed=0, neighbours=3, cells=CELLS, **search):
+    idle = keys_without_effect(search.get("algorithm", "me_es"))
+    of_blocks = {
+        "block_generations": BLOCK,
+        "parent_statistics": "elite" if preset == "literature" else "global",  # both, and one for each preset
+    }
     return load_config(
         {
             "task": {"environment": "point_maze"},
@@ -36,8 +42,7 @@ def config_of(preset="literature", generations=30, seed=0, neighbours=3, cells=C
                 "sigma": 0.2,
                 "learning_rate": 0.2,
                 "evaluation_episodes": 20,
-                "block_generations": BLOCK,
-                "parent_statistics": "elite" if preset == "literature" else "global",  # both, and one for each preset
+                **{key: value for key, value in of_blocks.items() if f"search.{key}" not in idle},
                 **search,
             },
             "novelty": {"neighbours": neighbours},

@@ -43,7 +43,7 @@ def config_of(algorithm, distance="euclidean", **search):
                 "sigma": 0.1,
                 "learning_rate": 0.05,
                 "evaluation_episodes": 20,
-                **RULE,
+                **(RULE if algorithm == "nsra_es" else {}),
                 **search,
             },
             "novelty": {"neighbours": 3, "distance": distance},

@@ -129,7 +129,8 @@ def test_the_novelty_of_a_centre_is_measured_against_the_newest_entries_by_hand(
 
 @pytest.mark.parametrize(("algorithm", "weight"), [("ns_es", 0.0), ("nsr_es", 0.5), ("nsra_es", 0.5)])
 def test_every_centre_at_once_equals_the_twin(algorithm, weight):
-    config = config_of(generations=14, algorithm=algorithm, centres=3, update="all", learning_rate=0.05, **NSRA)
+    rule = NSRA if algorithm == "nsra_es" else {}
+    config = config_of(generations=14, algorithm=algorithm, centres=3, update="all", learning_rate=0.05, **rule)
     state, store, evaluator = run_in_memory(config)
     other = novelty_twin.NoveltySearch(
         first_centres(config),

@@ -20,6 +20,7 @@ from es_service.config import tasks
 from es_service.config.changes import START_KEYS, start_afresh
 from es_service.errors import ConfigError, NotInRunError
 from es_service.loop.parts import CELL_PREFIX
+from es_service.protocol.options import choice
 from es_service.runs import checked_config, evaluation, lineage
 from es_service.runs.session import dispatch_limits
 from es_service.runs.standing import look, more
@@ -105,7 +106,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
     bounds = SHIPPED["point_maze"].descriptor_bounds
     told = replace(
         SHIPPED["point_maze"],
-        options={"descriptor": ("place", "speed", "height")},
+        options={"descriptor": choice("place", "speed", "height")},
         descriptors={
             "place": (("x", "y"), bounds), "speed": (("u", "v"), bounds), "height": (("h",), bounds[:1])
         },

@@ -22,7 +22,7 @@ GENERATIONS = 14
 
 def config_of(**compute):
     budget = {"generations": GENERATIONS}
-    return SMALL | {"search": SEARCH, "budget": budget, "compute": SMALL["compute"] | compute}
+    return SMALL | {"search": SEARCH, "budget": budget, "compute": {"engine": "inline", "workers": 1} | compute}
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from es_service.config.keys import FIELDS
+from es_service.config.method_keys import SOME_METHODS, methods_with
 from es_service.config.presets import preset_table
 from es_service.config.resolution import LEFT_OPEN
 from es_service.config.yaml_text import show
@@ -154,8 +155,27 @@ def test_every_key_of_a_config_is_explained_with_its_default():
     tables = TEXT["configs/README.md"].split("\n## Every key\n")[1].split("\n## ")[0]
     shown = re.findall(r"^\| `([\w.]+)` \| (.+?) \| \S.* \|$", tables, re.MULTILINE)
     assert len(shown) == len(dict(shown))
-    options = {"task.options.NAME": "the first value"}
+    options = {"task.options.NAME": "the task's", "search.options.NAME": "the search's"}
     assert dict(shown) == {key: default(key) for key in FIELDS} | options
+
+
+def test_the_table_of_keys_of_methods_is_the_code_s():
+    shown = TEXT["configs/README.md"].split("<!-- keys of methods -->")[1].split("<!-- /keys of methods -->")[0]
+    found: dict[str, tuple[str, ...]] = {}
+    for keys, methods in re.findall(r"^\| (`.*`) \| (.*`) \|$", shown, re.MULTILINE):
+        named = re.findall(r"`(\w+)`", methods)
+        uses = [name for name in OURS if (name in named) != methods.startswith("all but ")]
+        found |= dict.fromkeys(re.findall(r"`([\w.]+)`", keys), tuple(uses))
+    assert found == {key: methods_with(key) for key in SOME_METHODS}
+
+
+def test_keys_of_a_few_methods_begin_with_their_names():
+    tables = TEXT["configs/README.md"].split("\n## Every key\n")[1]
+    for key in SOME_METHODS:
+        if len(methods := methods_with(key)) <= 3:
+            (text,) = re.findall(rf"^\| `{key}` \| .*? \| (.*) \|$", tables, re.MULTILINE)
+            assert {name for name in OURS if re.search(rf"\b{name}\b", text)} >= set(methods), key
+            assert re.match(rf"(\w+, )*{methods[0]}\b.*?: ", text), key
 
 
 @pytest.mark.parametrize("name", [*OURS, "module:function"])

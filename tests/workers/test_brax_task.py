@@ -11,6 +11,7 @@ from es_service.config.tasks import TASKS
 from es_service.errors import ConfigError
 from es_service.protocol.messages import PolicyShape, with_options
 from es_service.protocol.noise import Domain, stream_keys
+from es_service.protocol.options import Option
 from tests.examples.ant_slalom import AntSlalom
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import TaskError, brax_parts, brax_task, describe_environment, make_environment, user_task
@@ -62,7 +63,7 @@ def test_what_each_environment_can_tell_of_an_episode():
     assert tuple(brax_task.describe("ant").descriptors) == ("final_xy", "final_x", "feet_contact", "final_joints")
     assert tuple(brax_task.describe("halfcheetah").descriptors) == ("final_x", "feet_contact", "final_joints")
     assert tuple(brax_task.describe("reacher").descriptors) == ("final_joints",)
-    assert brax_task.describe("swimmer").options["backend"] == ("generalized",)
+    assert brax_task.describe("swimmer").options["backend"].choices == ("generalized",)
     for name in ("ant", "halfcheetah", "reacher"):
         for names, _ in brax_task.describe(name).descriptors.values():
             assert not user_task.clashes(names)
@@ -132,7 +133,10 @@ def test_a_class_with_contradictions_is_refused(monkeypatch):
         ("goal", (1.0, None), r"goal = \(1.0, None\) is not a place"),
         ("goal_distance", lambda self, state: jnp.zeros(2), r"goal_distance has the shape \(2,\), not \(\)"),
         ("goal_distance", None, r"cannot be traced by JAX: "),
-        ("options", {"walls": "both"}, r"option walls = 'both' is not a tuple of strings"),
+        ("options", {"walls": "both"}, r"option 'walls' = 'both' is neither an Option nor a tuple"),
+        ("options", {"walls": ("both", 1)}, r"option 'walls' = Option\(.*\) has values that are not all of one type"),
+        ("options", {"size": Option(2.0, low=3.0)}, r"option 'size' = Option\(.*\) has a number outside its bounds"),
+        ("options", ("walls",), r"options = \('walls',\) is not a mapping from names to options"),
         (
             "step",
             lambda self, state, action: (0, jnp.zeros(2), True),

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from es_service.protocol.messages import TaskSpec
+from es_service.protocol.options import choice
 from workers.viewer import Viewer
 
 
@@ -31,7 +32,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
         descriptor_bounds=((-1.0, 1.0), (-1.0, 1.0)),
         final_fitness=True,
         has_goal=True,
-        options={"start": ("default", "corner")},
+        options={"start": choice("default", "corner")},
         walls=(((-0.5, -0.495), (1.0, -0.495)), ((-1.0, 0.205), (0.5, 0.205))),
         goal=(-0.5, 0.8),
         least_reward=-2.3431,  # from the corner (1, -1)
@@ -99,7 +100,7 @@ class Environment:
     """What a replay in three dimensions needs; None if the task has no bodies."""
 
 
-def make_environment(name: str, options: Mapping[str, str]) -> Environment:
+def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
     """Functions of a task; imports its module, and with it JAX and the physics engine that it needs.
 
     Args:

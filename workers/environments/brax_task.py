@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from es_service.protocol.messages import Bounds, TaskSpec
+from es_service.protocol.options import choice
 from workers.environments import Environment, TaskError
 from workers.environments.brax_parts import Transform, brax_contact, quietly
 from workers.viewer import Viewer
@@ -66,7 +67,7 @@ def describe(name: str) -> TaskSpec:
         descriptor_bounds=bounds,
         final_fitness=False,
         has_goal=False,
-        options={"descriptor": tuple(descriptors), "backend": backends},
+        options={"descriptor": choice(*descriptors), "backend": choice(*backends)},
         descriptors=descriptors,
         summary=f"{type(environment).__name__} of Brax",
     )

@@ -16,7 +16,8 @@ It may also have:
 
 - `goal_distance(self, state)`: the distance to a goal;
 - `final_fitness = True`, if the last reward measures the whole episode;
-- `options = {"name": ("default", "other")}`: keyword arguments of the constructor, which must not change any size;
+- `options`, keyword arguments of the constructor, which must not change any size: by name, `("default", "other")` for a
+  few allowed values, or a default with bounds, such as `Option(0.5, low=0.0)`; see `es_service/protocol/options.py`;
 - if the descriptor is a place in the plane, `walls`, a tuple of segments ((x, y), (x, y)), and `wall_clearance`, the
   least distance of a descriptor from a wall. The behaviour map's coverage is then relative to the reachable cells;
   and `goal`, a place (x, y). Reports draw both;
@@ -43,6 +44,7 @@ import jax
 import jax.numpy as jnp
 
 from es_service.protocol.messages import TaskSpec
+from es_service.protocol.options import OptionValue, declared_options
 from es_service.protocol.own_code import import_own, in_no_file
 from es_service.protocol.raised import raised, why_not_imported
 from workers.environments import Environment, TaskError
@@ -92,10 +94,8 @@ def describe(path: str) -> TaskSpec:
         for name, type_ in ATTRIBUTES.items()
         if not isinstance(getattr(task, name), type_)
     ]
-    options = getattr(task, "options", {})
-    for name, values in options.items() if isinstance(options, dict) else [("options", options)]:
-        if not isinstance(values, tuple) or not values or not all(isinstance(value, str) for value in values):
-            wrong.append(f"option {name} = {values!r} is not a tuple of strings, the default first")
+    options, wrong_options = declared_options(task)
+    wrong += wrong_options
     if not wrong:
         names, bounds = len(task.descriptor_names), len(task.descriptor_bounds)
         if names != bounds or not names:
@@ -117,7 +117,7 @@ def describe(path: str) -> TaskSpec:
         wrong += [f"{name} = {size} is not positive" for name, size in sizes.items() if size < 1]
     if wrong:
         raise TaskError(f"{path}: {'; '.join(wrong)}")
-    _check_shapes(path)
+    _check_shapes(path, {name: option.default for name, option in options.items()})
     return TaskSpec(
         name=path,
         observation_size=task.observation_size,
@@ -127,7 +127,7 @@ def describe(path: str) -> TaskSpec:
         descriptor_bounds=tuple((float(low), float(high)) for low, high in task.descriptor_bounds),
         final_fitness=bool(getattr(task, "final_fitness", False)),
         has_goal=hasattr(task, "goal_distance"),
-        options={name: tuple(values) for name, values in getattr(task, "options", {}).items()},
+        options=options,
         summary=(task.__doc__ or "").strip().partition("\n")[0],
         walls=getattr(task, "walls", None),
         wall_clearance=float(getattr(task, "wall_clearance", 0.0)),
@@ -176,11 +176,11 @@ def _are_finite(numbers: Any) -> bool:
     return isinstance(numbers, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in numbers)
 
 
-def _check_shapes(path: str) -> None:
+def _check_shapes(path: str, options: Mapping[str, OptionValue]) -> None:
     """Raise TaskError if methods return shapes other than the class declares, or cannot be traced."""
     task = _import(path)
     try:
-        environment = make(path, {name: values[0] for name, values in getattr(task, "options", {}).items()})
+        environment = make(path, options)
         state = jax.eval_shape(environment.reset, jax.ShapeDtypeStruct((4,), jnp.uint32))
         action = jax.ShapeDtypeStruct((task.action_size,), jnp.float32)
         after, reward, done = jax.eval_shape(environment.step, state, action)
@@ -203,7 +203,7 @@ def _check_shapes(path: str) -> None:
         raise TaskError(f"{path}: {'; '.join(wrong)}")
 
 
-def make(path: str, options: Mapping[str, str]) -> Environment:
+def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
     """Functions of a user's class, constructed with the task's options."""
     task = _import(path)(**options)
     goal_distance = getattr(task, "goal_distance", lambda state: jnp.float32(jnp.nan))

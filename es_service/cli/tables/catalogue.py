@@ -7,10 +7,12 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.table import Table
 
+from es_service.config.options import allowed_text
 from es_service.config.presets import PRESETS, preset_table
 from es_service.config.shipped import shipped_configs
 from es_service.config.yaml_text import show
 from es_service.protocol.messages import TaskSpec
+from es_service.protocol.options import Option
 from es_service.search.algorithms import ALGORITHMS
 
 
@@ -57,9 +59,16 @@ def _about(task: TaskSpec) -> str:
         task.summary,
         f"observation {task.observation_size}, action {task.action_size}, steps {task.episode_steps}",
         "descriptor: " + ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in bounds),
-        *(f"option {name}: {' | '.join(values)}" for name, values in task.options.items()),
+        *(f"option {name}: {_option(option)}" for name, option in task.options.items()),
     ]
     return "\n".join(lines)
+
+
+def _option(option: Option) -> str:
+    """What a config may set, the default first."""
+    if option.choices:
+        return " | ".join(map(show, option.choices))
+    return f"{show(option.default)} ({allowed_text(option)})"
 
 
 def _value(value: object) -> str:

@@ -9,7 +9,6 @@ new centre is (`step`), and tells it the evaluations of the new centres and of t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 
 from es_service.config.model import RunConfig
 from es_service.search.algorithms.ars import ars
@@ -21,7 +20,7 @@ from es_service.search.algorithms.memes import memes
 from es_service.search.algorithms.ns_es import ns_es
 from es_service.search.algorithms.nsr_es import nsr_es
 from es_service.search.algorithms.nsra_es import nsra_es
-from es_service.search.algorithms.own import import_factory, make_own
+from es_service.search.algorithms.own import own_factory
 
 Factory = Callable[[RunConfig], Algorithm]
 OURS: dict[str, Factory] = {
@@ -40,11 +39,8 @@ class Algorithms(Mapping[str, Factory]):
     """Algorithms by name. Iteration yields the shipped ones; lookup also finds `package.module:function`."""
 
     def __getitem__(self, name: str) -> Factory:
-        """Raises KeyError for a plain name that is not shipped, ConfigError for a function that cannot be imported."""
-        if ":" not in name:
-            return OURS[name]
-        import_factory(name)
-        return partial(make_own, name)
+        """Raises KeyError for a plain name that is not shipped, ConfigError for a function that cannot be used."""
+        return own_factory(name) if ":" in name else OURS[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(OURS)

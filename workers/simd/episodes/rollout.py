@@ -37,7 +37,7 @@ def why_not(task: TaskSpec) -> str:
     contain nothing else that may be unsupported. A reset is never a reason, because JAX computes those that simd cannot
     compile.
     """
-    options = {name: values[0] for name, values in task.options.items()}
+    options = {name: option.default for name, option in task.options.items()}
     spec = WorkerSpec(
         seed=0,
         environment=task.name,

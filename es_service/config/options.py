@@ -1,0 +1,69 @@
+"""Options in a config: their values, below `task.options` and `search.options`, against what is declared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from es_service.config.problems import nearest, one_of, unfit, wrong_value
+from es_service.config.yaml_text import in_line, show
+from es_service.errors import Problem
+from es_service.protocol.options import Option, OptionValue, is_within
+
+
+def options_of(values: Mapping[str, Any], group: str) -> dict[str, Any]:
+    """The options in a group, such as "task.options.", among flat values: name -> value."""
+    return {key.removeprefix(group): value for key, value in values.items() if key.startswith(group)}
+
+
+def read_options(
+    values: Mapping[str, Any], group: str, owner: str, declared: Mapping[str, Option]
+) -> tuple[dict[str, OptionValue], list[Problem]]:
+    """Value of every declared option by its key, and the problems of the given values.
+
+    Args:
+        values: flat values of a config; those in the group are read.
+        group: "task.options." or "search.options.".
+        owner: name of the task or of the search.
+        declared: its options.
+    """
+    found: dict[str, OptionValue] = {f"{group}{name}": option.default for name, option in declared.items()}
+    problems = []
+    for name, value in options_of(values, group).items():
+        key = f"{group}{name}"
+        if name not in declared:
+            known = f"{owner} has {one_of(declared)}" if declared else f"{owner} has none"
+            meant = nearest(name, declared)
+            hint = f"; did you mean {meant}?" if meant else ""
+            problems.append(unfit(key, value, f"unknown option; {known}{hint}", suggestion=meant))
+        elif (read := _read(declared[name], value)) is None:
+            problems.append(wrong_value(key, value, allowed_text(declared[name]), declared[name].choices))
+        else:
+            found[key] = read
+    return found, problems
+
+
+def allowed_text(option: Option) -> str:
+    """What an option allows, in words."""
+    if option.choices:
+        return one_of([show(value) for value in option.choices])
+    if isinstance(option.default, bool | str):
+        return "true or false" if isinstance(option.default, bool) else "text"
+    number = "a whole number" if isinstance(option.default, int) else "a number"
+    low, high = option.low, option.high
+    if low is not None and high is not None:
+        return f"{number} from {show(low)} to {show(high)}"
+    bounds = [f"at {word} {show(bound)}" for word, bound in (("least", low), ("most", high)) if bound is not None]
+    return ", ".join([number, *bounds])
+
+
+def _read(option: Option, value: Any) -> OptionValue | None:
+    """A value of a config as a value of the option; None if it is not allowed."""
+    kind = type(option.default)
+    if kind is float and type(value) is int and abs(value) < 2**1000:
+        value = float(value)
+    if kind is str and option.choices and type(value) in (bool, int, float):
+        value = in_line(value)  # YAML reads a choice such as 10 as a number
+    if type(value) is not kind or (option.choices and value not in option.choices):
+        return None
+    return value if is_within(option, value) else None

@@ -1,0 +1,86 @@
+"""Options: settings that a task or a search declares, with a default and what is allowed.
+
+    options = {
+        "start": ("default", "corner"),    # one of these values, the first of which is the default
+        "reach": Option(0.5, low=0.0),     # a number of the type of the default, here within a bound
+    }
+
+A task has `options` as an attribute of its class. A search, which is a function, gets the same attribute from the
+decorator `has_options`. A config sets them below `task.options` and `search.options`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+OptionValue = bool | int | float | str
+Owner = TypeVar("Owner", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class Option:
+    """A setting whose values have the type of its default: bool, int, float or str."""
+
+    default: OptionValue
+    low: float | None = None
+    high: float | None = None
+    """Least and greatest value of a number, both allowed; None for no bound."""
+    choices: tuple[OptionValue, ...] = ()
+    """The only allowed values; empty if there are others."""
+
+
+def choice(*values: OptionValue) -> Option:
+    """An option with a few allowed values, the first of which is the default."""
+    return Option(values[0], choices=values)
+
+
+def has_options(**options: Option | tuple[OptionValue, ...]) -> Callable[[Owner], Owner]:
+    """Decorator that declares the options of a function that makes a search."""
+
+    def declare(owner: Owner) -> Owner:
+        owner.options = options  # pyright: ignore[reportFunctionMemberAccess]
+        return owner
+
+    return declare
+
+
+def declared_options(owner: object) -> tuple[dict[str, Option], list[str]]:
+    """The options that a class or a function declares in its attribute `options`, and what is wrong with them."""
+    given: Any = getattr(owner, "options", {})
+    if not isinstance(given, Mapping):
+        return {}, [f"options = {given!r} is not a mapping from names to options"]
+    found: dict[str, Any] = {
+        name: choice(*one) if isinstance(one, tuple) and one else one for name, one in given.items()
+    }
+    wrong = [f"option {name!r} {problem}" for name, one in found.items() if (problem := _problem(name, one))]
+    return ({}, wrong) if wrong else (found, [])
+
+
+def _problem(name: object, option: object) -> str:
+    """What is wrong with a declared option; empty if nothing is."""
+    if not isinstance(name, str) or not name.isidentifier():
+        return "has a name that no argument can have"
+    if not isinstance(option, Option):
+        return f"= {option!r} is neither an Option nor a tuple of allowed values, the default first"
+    values, kind = (option.default, *option.choices), type(option.default)
+    bounds = [bound for bound in (option.low, option.high) if bound is not None]
+    if kind not in (bool, int, float, str) or any(type(value) is not kind for value in values):
+        return f"= {option!r} has values that are not all of one type among bool, int, float and str"
+    if option.choices and (option.default not in option.choices or bounds):
+        return f"= {option!r} has choices, so its default must be one of them, and it needs no bounds"
+    if bounds and (kind not in (int, float) or not all(type(bound) in (int, float) for bound in bounds)):
+        return f"= {option!r} has bounds that are not numbers, or a default that is none"
+    if not all(is_within(option, value) for value in values):
+        return f"= {option!r} has a number outside its bounds, or one that is not finite"
+    return ""
+
+
+def is_within(option: Option, value: OptionValue) -> bool:
+    """Whether a value is within the bounds of an option and, if it is a number, finite."""
+    if isinstance(value, str):
+        return True
+    low, high = -math.inf if option.low is None else option.low, math.inf if option.high is None else option.high
+    return low <= value <= high and abs(value) != math.inf

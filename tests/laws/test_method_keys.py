@@ -1,0 +1,208 @@
+"""The table of keys that only some methods use, against what runs do: each key is changed with each method."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cache, reduce
+
+import pytest
+
+from es_service.config.loading import changed_config, load_config
+from es_service.config.method_keys import keys_without_effect
+from es_service.config.model import policy_shape, worker_spec
+from es_service.config.tasks import TASKS
+from es_service.loop import driver
+from es_service.loop.history import history_columns
+from es_service.search.algorithms import ALGORITHMS, OURS
+from es_service.search.observation_statistics import no_observations
+from es_service.store.digest import arrays_sha256
+from tests.helpers import DirectEvaluator
+from tests.laws.me_es_runs import Remembering
+from workers.environments import SHIPPED
+from workers.policy import initial_parameters
+
+TASK = SHIPPED["point_maze"]
+KNOWN = {"tasks": TASKS, "algorithms": ALGORITHMS}
+COMMON = {
+    "task.environment": "point_maze",
+    "task.episode_steps": 20,
+    "policy.hidden": [8, 8],
+    "search.evaluation_episodes": 3,
+    "novelty.neighbours": 3,
+    "map.cells": [9, 8],
+    "budget.generations": 5,
+}
+WITH_POPULATIONS = {
+    "search.pairs": 32,
+    "search.sigma": 0.2,
+    "search.learning_rate": 0.2,
+    "policy.observation_normalization": True,
+    "policy.action_noise": 0.01,
+    "compute.chunk_pairs": 16,
+    "compute.gradient_block_pairs": 16,
+}
+BASES = {
+    "ns_es": [{}, {"search.update": "all"}],
+    "nsra_es": [{"search.update": update, "search.fitness_weight_patience": 2} for update in ("one", "all")],
+    "me_es": [{"search.block_generations": 2, "search.emitters": 2}],
+    "memes": [{"search.emitters": 2, "search.stagnation_generations": 2, "budget.generations": 8}],
+    "map_elites": [{"search.batch": 16, "search.centres": 8, "search.iso_sigma": 0.2}],
+}
+"""Method -> settings of runs, besides those of all; a key has an effect if it changes one of these runs."""
+OTHER = {
+    "task.episode_steps": 15,
+    "task.fitness": "final",
+    "task.episodes_per_member": 2,
+    "task.options.start": "corner",
+    "policy.hidden": [6],
+    "policy.init": "small_columns",
+    "policy.observation_normalization": False,
+    "policy.observation_clip": 0.3,
+    "policy.action_noise": 0.2,
+    "search.pairs": 64,
+    "search.sigma": 0.3,
+    "search.learning_rate": 0.3,
+    "search.l2": 0.1,
+    "search.shaping": "signs",
+    "search.centres": 4,
+    "search.update": "all",
+    "search.centre_choice": "round_robin",
+    "search.top_pairs": 4,
+    "search.emitters": 3,
+    "search.fitness_weight_start": 0.25,
+    "search.fitness_weight_step": 0.25,
+    "search.fitness_weight_patience": 1,
+    "search.fitness_weight_min_gain": 9.0,
+    "search.mode": "exploit",
+    "search.alternation": "coin",
+    "search.first_block": "exploit",
+    "search.block_generations": 3,
+    "search.cell_sampling": "score",
+    "search.stagnation_generations": 1,
+    "search.parent_statistics": "elite",
+    "search.batch": 32,
+    "search.iso_sigma": 0.3,
+    "search.line_sigma": 0.3,
+    "search.evaluation_episodes": 4,
+    "search.common_random_numbers": False,
+    "novelty.neighbours": 2,
+    "novelty.distance": "squared_euclidean",
+    "novelty.newest": 2,
+    "map.enabled": False,
+    "map.kind": "cvt",
+    "map.bounds": [[-2, 1], [-1, 1]],
+    "map.cells": [7, 7],
+    "map.qd_offset": -3.0,
+    "compute.chunk_pairs": 32,
+    "compute.gradient_block_pairs": 32,
+    "seed": 1,
+}
+"""Key -> a value that none of the runs has."""
+NOT_MEASURED = {
+    "task.environment": "the runs are in PointMaze",
+    "search.algorithm": "the table is about it",
+    "search.preset": "chooses values of other keys",
+    "search.init_from": "names a folder, of which the functions of a search know nothing",
+    "search.max_invalid_fraction": "stops a run, which `test_es.py` and `test_policies.py` check",
+    "compute.rollout": "the other one is XLA",
+    "compute.rollout_block_pairs": "only XLA uses it",
+}
+ONE_VALUE = {
+    "search.centres": ("es", "ars", "me_es", "memes"),
+    "policy.observation_normalization": ("map_elites",),
+    "map.enabled": ("me_es", "memes", "map_elites"),
+}
+"""Key -> methods that allow only one value of it, so that no other can be measured."""
+
+
+def base_settings(method):
+    populations = {} if method == "map_elites" else WITH_POPULATIONS
+    return [COMMON | populations | {"search.algorithm": method} | more for more in BASES.get(method, [{}])]
+
+
+def changed_settings(settings, key):
+    """Settings with another value of a key, and of what must fit it."""
+    fits = {"map.cells": [12]} if key == "map.kind" else {}
+    return {**settings, **fits, key: OTHER[key]}
+
+
+def load(settings):
+    mapping: dict = {"task": {"options": {}}}
+    for key, value in settings.items():
+        *path, leaf = key.split(".")
+        reduce(lambda group, name: group.setdefault(name, {}), path, mapping)[leaf] = value
+    return load_config(mapping, **KNOWN)
+
+
+EVALUATORS: dict[str, DirectEvaluator] = {}
+"""Evaluators by what their workers know, so that equal workers are compiled once."""
+
+
+def evaluator(config):
+    spec = worker_spec(config, TASK)
+    if repr(spec) not in EVALUATORS:
+        EVALUATORS[repr(spec)] = DirectEvaluator(spec)
+    EVALUATORS[repr(spec)].recorded.clear()
+    return EVALUATORS[repr(spec)]
+
+
+def digest(config):
+    """SHA-256 of all that the digest of a run is made of, after each of its generations."""
+    shape, store = policy_shape(config, TASK), Remembering()
+    first = [initial_parameters(shape, config.policy.init, config.seed, i) for i in range(config.search.centres)]
+    algorithm = ALGORITHMS[config.search.algorithm](config)
+    search = driver.Search(config, algorithm, lambda: (first, no_observations(2)), TASK)
+    driver.run(search, evaluator(config), store, None, lambda row: None)
+    total = hashlib.sha256()
+    for parts in store.after:
+        for name in sorted(parts):
+            total.update(f"{name} {arrays_sha256(parts[name])}\n".encode())
+    columns = [one.name for one in history_columns(TASK, config.map.enabled) if one.deterministic]
+    for row, evaluated in zip(store.rows, store.evaluated, strict=True):
+        total.update(repr([row.get(column) for column in columns]).encode())
+        total.update(repr([sorted(one.items()) for one in evaluated]).encode())
+    return total.hexdigest()
+
+
+@cache
+def base_digest(method, which):
+    return digest(load(base_settings(method)[which]))
+
+
+def has_effect(method, key, make):
+    """Whether another value of a key changes one of a method's runs."""
+    settings = base_settings(method)
+    return any(
+        digest(make(one, changed_settings(one, key))) != base_digest(method, which)
+        for which, one in enumerate(settings)
+        if one.get(key) != OTHER[key]
+    )
+
+
+def as_given(settings, changed):
+    """The config of a new run with a value that its user gave."""
+    return load(changed)
+
+
+def as_recorded(settings, changed):
+    """The config of a run that exists and has recorded a value of a key without effect."""
+    mapping = load(settings).model_dump(mode="json")
+    for key in changed.keys() - settings.keys():
+        section, leaf = key.split(".")
+        mapping[section][leaf] = changed[key]
+    if "search.pairs" in changed and "search.pairs" not in settings:  # what followed from them
+        mapping["compute"] |= {"chunk_pairs": 16, "rollout_block_pairs": 16, "gradient_block_pairs": 64}
+    return changed_config(mapping, **KNOWN)
+
+
+def test_every_constant_is_measured_or_there_is_a_reason():
+    known = {key for method in OURS for key in load(base_settings(method)[0]).constants()}
+    assert known == OTHER.keys() | NOT_MEASURED.keys()
+
+
+@pytest.mark.parametrize("method", OURS)
+def test_the_table_says_which_keys_have_an_effect(method):
+    idle = keys_without_effect(method)
+    measured = [key for key in OTHER if method not in ONE_VALUE.get(key, ())]
+    found = {key: has_effect(method, key, as_recorded if key in idle else as_given) for key in measured}
+    assert found == {key: key not in idle for key in measured}
