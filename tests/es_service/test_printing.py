@@ -17,11 +17,14 @@ from es_service import api
 from es_service.cli import options
 from es_service.cli.commands import command
 from es_service.cli.console import print_line, text_console
-from es_service.cli.tables import progress, sweep
+from es_service.cli.tables import sweep
 from es_service.cli.tables.catalogue import print_catalogue
 from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.status import print_status, print_summary
+from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, StoreError
+from es_service.protocol.options import choice
+from es_service.report import progress
 from es_service.runs.sweep import SweptRun
 from tests.es_service.test_progress import ROW
 from tests.system.command_line import command as run_command
@@ -52,7 +55,7 @@ def test_names_and_values_of_a_user_are_printed_as_they_are(console, tmp_path, m
     print_summary(console, outcome.run, outcome.reason)
     print_status(console, outcome.run)
     print_overview(console, [folder, tmp_path / ":smile:"])
-    task = replace(SHIPPED["point_maze"], name="my:T", summary=STRANGE, options={"[red]": (":V:", "[/]")})
+    task = replace(SHIPPED["point_maze"], name="my:T", summary=STRANGE, options={"[red]": choice(":V:", "[/]")})
     print_catalogue(console, {"my:T": task})
     runs = [SweptRun(STRANGE, folder, {}, "failed", None, STRANGE)]
     console.print(sweep.live_table(STRANGE, runs, 200, 40))
@@ -64,7 +67,7 @@ def test_names_and_values_of_a_user_are_printed_as_they_are(console, tmp_path, m
     printed = console.file.getvalue()
     assert printed.count(folder.name) >= 5
     assert printed.count(STRANGE) == 6
-    assert "option [red]: :V: | [/]" in printed
+    assert f"option [red]: {show(':V:')} | {show('[/]')}" in printed
     assert not re.search("[\u2600-\U0010ffff]", printed.replace("●", ""))
 
 

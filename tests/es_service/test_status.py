@@ -75,8 +75,9 @@ def test_the_faults_of_the_newest_generations_are_counted(console, tmp_path, mon
 )
 def test_what_the_centres_climb_is_told_of_all_and_not_of_the_fittest(search, expected, console, tmp_path, capsys):
     config = {"search": {"pairs": 16, "evaluation_episodes": 1} | search, "budget": {"generations": 3}}
-    if "batch" in search:
+    if "batch" in search:  # no populations, so neither pairs nor chunks of them
         del config["search"]["pairs"]
+        config["compute"] = {"engine": "inline", "workers": 1}
     run = api.run(SMALL | config, tmp_path / "run").run
     print_status(console, run)
     assert re.findall("\n((?:centres|weight of fitness) .*)", capsys.readouterr().out) == expected

@@ -90,8 +90,9 @@ def test_task_table_tells_the_truth(name):
     """The driver plans with the table and never sees the module; a wrong size would only show in a worker."""
     task = SHIPPED[name]
     takes = inspect.signature(importlib.import_module(f"workers.environments.{name}").make).parameters
-    assert {option: values[0] for option, values in task.options.items()} == {x.name: x.default for x in takes.values()}
-    environment = make_environment(name, {option: values[0] for option, values in task.options.items()})
+    defaults = {option: declared.default for option, declared in task.options.items()}
+    assert defaults == {x.name: x.default for x in takes.values()}
+    environment = make_environment(name, defaults)
     state = environment.reset(stream_keys(0, Domain.TRAINING_RESET, 0))
     assert np.isfinite(environment.goal_distance(state)) == task.has_goal
     assert environment.observe(state).shape == (task.observation_size,)
