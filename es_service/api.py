@@ -27,7 +27,7 @@ from es_service.loop.history import Column, evaluated_columns, history_columns
 from es_service.loop.interfaces import Stop as Stop
 from es_service.protocol.messages import TaskSpec
 from es_service.report.progress import in_notebook, show_in_notebook
-from es_service.runs.checked_config import changed_config, changes_from, load_config
+from es_service.runs.checked_config import accepted, changed_config, changes_from, load_config
 from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.identity import require_unchanged
 from es_service.runs.lineage import fork_config, forked, started
@@ -312,7 +312,7 @@ def _create_and_work(
     """
     require_cores(config, again)
     folder = Path(out) if out is not None else default_folder(config)
-    is_new, task = not folder.exists(), task_of(config)
+    is_new, task = not folder.exists(), task_of(accepted(config))
     columns, evaluation_columns = _columns(config, task)
     meta = RunMeta(
         run_id=uuid4().hex,
@@ -329,9 +329,12 @@ def _create_and_work(
         in_run(meta.run_id),
         listener.shown(folder) as on_generation,
     ):
+        begun = store.generation
         try:
             return work(config, store, on_generation, listener.on_notice, listener.on_compile)
         except StartError as error:
+            if store.generation != begun:
+                raise  # of something else that the caller started in a callback: this run has computed generations
             store.close()
             (folder / dispatch_log.FILE).unlink(missing_ok=True)
             remove_run_folder(folder, whole=is_new)

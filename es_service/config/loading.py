@@ -182,7 +182,7 @@ def _load(
         count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
         raise ConfigError.listing(f"{name}: {count}", problems)
     config = RunConfig.model_validate(_nested(values))
-    return config if task is None else config.with_task(task)
+    return config.made_for(task, declared.get(SEARCH_OPTIONS, ("", {}))[1])
 
 
 def _asks(value: object, ask: str | None) -> bool:

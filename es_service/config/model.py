@@ -29,6 +29,7 @@ from es_service.config.fields import (
 from es_service.config.search import SearchConfig
 from es_service.config.yaml_text import dump_yaml
 from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
+from es_service.protocol.options import Option
 from es_service.protocol.sources import worker_sources
 
 
@@ -145,17 +146,23 @@ class RunConfig(Section):
     store: StoreConfig
     seed: Seed = Field(0, description="Seed of all random numbers of the run.")
     _task: TaskSpec | None = PrivateAttr(None)
+    _search_options: Mapping[str, Option] | None = PrivateAttr(None)
 
-    def with_task(self, task: TaskSpec) -> RunConfig:
-        """The same config, which knows the task from which its values were resolved."""
+    def made_for(self, task: TaskSpec | None, search_options: Mapping[str, Option]) -> RunConfig:
+        """The same config, which knows the task and the options of the search from which its values were resolved."""
         config = self.model_copy()
-        config._task = task
+        config._task, config._search_options = task, dict(search_options)
         return config
 
     @property
     def resolved_with(self) -> TaskSpec | None:
         """The task from which values that were left open were resolved; None if it is not known."""
         return self._task
+
+    @property
+    def resolved_search_options(self) -> Mapping[str, Option] | None:
+        """The options that the search declared when the config was loaded; None if this is not known."""
+        return self._search_options
 
     def resolved_yaml(self) -> str:
         """The text of the run folder's `config.yaml`, with every value. Loading it gives an equal config."""

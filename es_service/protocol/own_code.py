@@ -80,6 +80,8 @@ def _restore(name: str, module: ModuleType) -> None:
 def _outdated(found: Mapping[str, OwnModule]) -> set[str]:
     """Names of the imported modules that have changed since, and of those that need one of them."""
     outdated = {name for name, own in found.items() if name in sys.modules and not _is_same(sys.modules[name], own)}
+    needed = {name for own in found.values() for name in own.needs}
+    outdated |= {name for name in needed & sys.modules.keys() - found.keys() if _is_gone(sys.modules[name])}
     more = outdated
     while more:
         more = {name for name in found.keys() & sys.modules.keys() - outdated if found[name].needs & outdated}
@@ -94,6 +96,12 @@ def _is_same(module: ModuleType, own: OwnModule) -> bool:
     if isinstance(loader, _Loader):
         return loader.sha256 == own.sha256
     return own.file.stat().st_ctime < _process_start_s()
+
+
+def _is_gone(module: ModuleType) -> bool:
+    """Whether a module of the user was imported from a file that does not exist any more."""
+    loader = getattr(module, "__loader__", None)
+    return isinstance(loader, _Loader) and not os.path.exists(loader.path)
 
 
 def _process_start_s() -> float:

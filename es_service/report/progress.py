@@ -105,7 +105,7 @@ def live_table(title: str, recent: deque[Row], width: int, height: int) -> Group
         "invalid": lambda row: str(row["invalid_members"]),
     }
     shown = [name for name, least in zip(columns, (0, 0, 45, 60, 75, 100, 108, 118), strict=True) if width >= least]
-    table = Table(title=title, title_justify="left", header_style="bold")
+    table = Table(title=Text(title), title_justify="left", header_style="bold")  # a Text is shown as it is
     for name in shown:
         table.add_column(name, justify="right", no_wrap=True)
     for row in list(recent)[-max(1, min(TABLE_ROWS, height - ROWS_AROUND)) :]:

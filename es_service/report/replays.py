@@ -80,10 +80,12 @@ def _notes(one: Replay, hidden: str | None) -> Markup:
     seen = f"{one.recording.returns_T.size - 1:,} steps, fitness {shown}"
     mean = f"(mean of all its evaluation episodes: {number(one.candidate.stored_fitness)})"
     if stored is None:
-        text = (
-            "The run does not have the address of this policy's evaluation episodes, as runs of versions before 0.12, "
-            f"so this is another episode of the policy: {seen} {mean}."
-        )
+        if np.isfinite(one.candidate.stored_fitness):
+            text = "The run does not have the address of this policy's evaluation episodes, as runs of versions before "
+            text += f"0.12, so this is another episode of the policy: {seen} {mean}."
+        else:
+            text = "This run is a fork whose settings have changed the meaning of fitness, so earlier evaluations of "
+            text += f"the policy do not count. This is an episode with the settings of this run: {seen}."
         return tag("p", text, class_="note episode", hidden=hidden)
     text = f"First evaluation episode of the policy, of generation {one.candidate.generation:,}: {seen} {mean}."
     if one.is_the_stored:
@@ -93,7 +95,7 @@ def _notes(one: Replay, hidden: str | None) -> Markup:
         return tag("p", f"{text} {same}", class_="note episode", hidden=hidden)
     other = f"This is not the stored episode, whose fitness is {stored.fitness!r} instead of {one.recording.fitness!r}."
     if stored.changes:
-        why = f"It was computed with {'; '.join(stored.changes)} (then -> now), which may give other bits."
+        why = f"What has changed since it was computed may give other bits: {'; '.join(stored.changes)}."
         return tag("p", f"{text} {other} {why}", class_="note episode", hidden=hidden)
     why = "Packages, processor and code are those that computed it, so this is an error; please report it."
     return tag("p", f"{text} {other} {why}", class_="problem episode", hidden=hidden)

@@ -28,7 +28,7 @@ def load_config(source: Source, overrides: Overrides = (), *, new: bool = True, 
     Raises:
         ConfigError: lists every problem found.
     """
-    return _accepted(
+    return accepted(
         loading.load_config(
             source,
             overrides,
@@ -47,7 +47,7 @@ def changed_config(source: Source, overrides: Overrides = ()) -> RunConfig:
     Raises:
         ConfigError: lists every problem found.
     """
-    return _accepted(
+    return accepted(
         loading.changed_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, no_vectors=no_vectors())
     )
 
@@ -60,7 +60,7 @@ def changes_from(constants: Mapping[str, Any], config: RunConfig) -> list[tuple[
     return changed_constants(constants, config.constants(), defaults)
 
 
-def _accepted(config: RunConfig) -> RunConfig:
-    """Return the config if its search accepts it; otherwise raise the error of the search."""
+def accepted(config: RunConfig) -> RunConfig:
+    """Return the config if its search accepts it; otherwise raise the ConfigError of the search."""
     ALGORITHMS[config.search.algorithm](config)
     return config

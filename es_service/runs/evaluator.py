@@ -23,7 +23,7 @@ from es_service.errors import ConfigError, EvaluationError
 from es_service.logs import logger
 from es_service.loop.checks import valid_members
 from es_service.loop.policies import no_statistics, policy_episodes, policy_work
-from es_service.protocol.messages import EpisodesResult, FloatArray
+from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.session import initial_policy, make_engine
 
@@ -53,9 +53,9 @@ class PolicyEvaluations:
 class PolicyEvaluator:
     """Callable that evaluates policies; `evaluator` makes one. It may be called from one thread at a time."""
 
-    def __init__(self, config: RunConfig, engine: Engine[Any]) -> None:
+    def __init__(self, config: RunConfig, task: TaskSpec, engine: Engine[Any]) -> None:
         self.config = config
-        self.task = task_of(config)
+        self.task = task
         """The task, with `descriptor_names` and `descriptor_bounds`."""
         self.parameters = policy_shape(config, self.task).parameters
         """Number of parameters of a policy, D."""
@@ -188,7 +188,9 @@ def evaluator(
     elif overrides:
         task_of(config)  # refuses a task that has changed, which `changed_config` would take as it is now
         config = changed_config(config.model_dump(mode="json"), overrides)
-    made = PolicyEvaluator(config, make_engine(config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER))
+    task = task_of(config)  # before the workers start, since it may raise
+    started = make_engine(config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER)
+    made = PolicyEvaluator(config, task, started)
     try:
         yield made
     finally:

@@ -37,6 +37,22 @@ def code_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
     return other_files(before[CODE], now[CODE]) if CODE in before and CODE in now else []
 
 
+def changes_since(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """What has changed since generations were computed, in words; for workers on other platforms than their driver, of
+    each of them.
+
+    Args:
+        then: the recorded platform.
+        now: `platform_info` and `code_of` of this process.
+    """
+    *workers, driver_then = [*then.get("workers", ()), {**then, "workers": None}]
+    changes = platform_changes(driver_then, {**now, "workers": None})
+    changes += [f"worker's {change}" for worker in workers for change in platform_changes(worker, now)]
+    if CODE not in then:
+        return [*changes, "the code of that time was not recorded"]
+    return changes + [f"other code in {file}" for file in code_changes(then, now)]
+
+
 def tell_of_other_code(store: RunStore, code: Sources, on_notice: Callable[[str], None]) -> None:
     """Give a notice if the run continues with other code than that of its newest generation."""
     before, generation = _newest(store)

@@ -214,8 +214,11 @@ def _seen_otherwise(origin: Run, config: RunConfig) -> str:
 
 
 def _lineage(origin: Run, generation: int) -> dict[str, Any]:
-    """The parent record: a run and its generation. Its digest is None if a driver has replaced that state meanwhile."""
+    """The parent record: a run and its generation, and the rollouts that have computed its generations so far. Its
+    digest is None if a driver has replaced that state meanwhile."""
+    earlier = (origin.meta.parent or {}).get("rollouts", ())
     return {
+        "rollouts": sorted({*earlier, origin.constants["compute.rollout"]}),
         "run_id": origin.run_id,
         "folder": str(origin.folder.absolute()),
         "generation": generation,

@@ -29,7 +29,7 @@ from es_service.protocol.process_environment import child_environment
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from es_service.runs.checked_config import changed_config
 from es_service.runs.evaluation import Candidate, candidates
-from es_service.runs.identity import code_changes, code_of, platform_changes
+from es_service.runs.identity import changes_since, code_of
 from es_service.runs.view import Run
 from es_service.store import reader
 
@@ -44,8 +44,8 @@ class Replay:
     candidate: Candidate
     recording: Recording
     stored: StoredEpisode | None
-    """What the run has stored of the episode; None if it has stored no address, as versions before 0.12: the recording
-    is then of another episode of the policy."""
+    """What the run has stored of the episode; None if it has nothing: the recording is then of another episode of the
+    policy, and `candidate.stored_fitness` is not finite if a fork has discarded the evaluation."""
 
     @property
     def is_the_stored(self) -> bool:
@@ -111,8 +111,11 @@ def _stored(run: Run, one: Candidate, now: Mapping[str, Any]) -> StoredEpisode |
         return None
     resets = Resets(int(seed), int(episode), int(ask), None if np.isnan(policy) else int(policy))
     then = next((at for first, at in reversed(reader.read_platforms(run.folder)) if first <= one.generation), {})
-    changes = platform_changes({**then, "workers": None}, {**now, "workers": None})
-    changes += [f"code of {file}" for file in code_changes(then, now)]
+    changes = changes_since(then, now)
+    parent, rollout = run.meta.parent, run.constants["compute.rollout"]
+    if parent is not None and one.generation <= parent["generation"] and reader.read_start(run.folder) is None:
+        rollouts = parent.get("rollouts", ["unknown"])  # this run is a fork, and its parent has computed the episode
+        changes += [f"rollout {' or '.join(rollouts)} -> {rollout}"] if rollouts != [rollout] else []
     return StoredEpisode(resets, row["fitness_first"], trace_T_B, tuple(changes))
 
 

@@ -22,7 +22,7 @@ from es_service.loop.parts import Arrays
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info
 from es_service.runs.checked_config import changed_config
-from es_service.runs.identity import code_changes, code_of, platform_changes
+from es_service.runs.identity import changes_since, code_of
 from es_service.runs.session import dispatch_limits, initial_centres
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run
@@ -95,7 +95,7 @@ def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recompu
             reached, differences = _recompute(run, search, engine, begin, last)
             then = next((platform for first, platform in reversed(platforms) if first <= reached), {})
             now = {**platform_info(), CODE: code}
-            yield Recomputed(0 if begin is None else begin + 1, reached, differences, tuple(_changes(then, now)))
+            yield Recomputed(0 if begin is None else begin + 1, reached, differences, tuple(changes_since(then, now)))
 
 
 def _plan(run: Run, generations: int) -> list[tuple[int | None, int]]:
@@ -114,16 +114,6 @@ def _plan(run: Run, generations: int) -> list[tuple[int | None, int]]:
     ends = [*(at for at in begins[1:] if at is not None), newest]
     lasts = [min(end, (-1 if begin is None else begin) + generations) for begin, end in zip(begins, ends, strict=True)]
     return [(begin, last) for begin, last in zip(begins, lasts, strict=True) if begin is None or last > begin]
-
-
-def _changes(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """What has changed since, in words; for workers on other platforms than their driver, of each of them."""
-    *workers, driver_then = [*then.get("workers", ()), {**then, "workers": None}]
-    changes = platform_changes(driver_then, {**now, "workers": None})
-    changes += [f"worker's {change}" for worker in workers for change in platform_changes(worker, now)]
-    if CODE not in then:
-        return [*changes, "the code of that time was not recorded"]
-    return changes + [f"other code in {file}" for file in code_changes(then, now)]
 
 
 def _recompute(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict, replace
 
 import pytest
@@ -216,3 +217,19 @@ def test_a_run_keeps_its_options_and_a_run_from_before_them_goes_on(tmp_path):
     assert changes_from(older, api.load_config(SMALL, ["search.options.reach=0.25"])) == [
         ("search.options.reach", 0.5, 0.25)
     ]
+
+
+def test_a_search_whose_options_have_changed_since_the_config_was_loaded_is_refused(tmp_path, monkeypatch):
+    """Otherwise the run would have values of options that its search does not have."""
+    text = "from es_service.protocol.options import Option, has_options\n"
+    text += "from es_service.search.algorithms.es import es\n\n\n"
+    text += "@has_options(reach=Option(0.5))\ndef search(config):\n    return es(config)\n"
+    (tmp_path / "renamed_option.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    config = api.load_config("point_maze_es", ["search.algorithm=renamed_option:search"])
+    assert config.search.options == {"reach": 0.5}
+    (tmp_path / "renamed_option.py").write_text(text.replace("reach", "range_"))
+    with pytest.raises(ConfigError, match="the options of the search renamed_option:search have changed since this"):
+        api.run(config, tmp_path / "run")
+    assert not (tmp_path / "run").exists()

@@ -80,6 +80,16 @@ def test_an_import_that_fails_leaves_the_old_modules_and_the_next_one_succeeds(f
     assert import_own("mine:Kind").SAID == 7
 
 
+def test_a_helper_that_is_gone_is_missed(folder):
+    """Workers would miss it, too."""
+    import_own("mine:Kind")
+    (folder / "later.py").unlink()
+    with pytest.raises(ModuleNotFoundError, match="later"):
+        import_own("mine:Kind")
+    (folder / "later.py").write_text("LATE = 3\n")
+    assert import_own("mine:Kind").SAID == 3
+
+
 def test_submodules_and_packages_that_have_changed_are_new_for_those_that_need_them(folder):
     (folder / "others/plain.py").write_text("x = 1\n")
     first = import_own("others.inside:x")

@@ -9,6 +9,7 @@ from jupyter_client.manager import start_new_kernel
 
 import es_service
 from es_service import Stop
+from es_service.errors import StartError
 from tests.examples import optuna_pruning
 from tests.system.session import SMALL
 
@@ -59,6 +60,18 @@ def test_stop_ends_forks_and_runs_that_start_or_continue(tmp_path):
         tmp_path / "run", {"search.sigma": 0.1}, out=Path(tmp_path, "fork"), on_generation=on_generation
     )
     assert (outcome.reason, outcome.run.generation, seen) == ("enough", 4, [4])
+
+
+def test_an_error_of_another_start_in_a_callback_leaves_what_the_run_has_computed(tmp_path):
+    """Workers that cannot start take a run along only if it has not begun."""
+
+    def start_another(row):
+        if row["generation"] == 2:
+            raise StartError("another cluster cannot be joined")
+
+    with pytest.raises(StartError, match="another cluster"):
+        es_service.run(SMALL, tmp_path / "run", on_generation=start_another)
+    assert es_service.open_run(tmp_path / "run").generation == 2
 
 
 @pytest.mark.parametrize("answer", [True, "enough", False, Stop])

@@ -57,7 +57,18 @@ def own_factory(path: str) -> Callable[[RunConfig], Algorithm]:
 
 
 def _make(path: str, function: Callable[[RunConfig], object], config: RunConfig) -> Algorithm:
-    """Call the user's function for a run. Raises ConfigError if this fails or does not return an `Algorithm`."""
+    """Call the user's function for a run.
+
+    Raises ConfigError if this fails or does not return an `Algorithm`, or if the function declares other options than
+    when the config was loaded, which has values of those.
+    """
+    before, now = config.resolved_search_options, declared_options(function)[0]
+    if before is not None and dict(before) != now:
+        raise ConfigError(
+            f"the options of the search {path} have changed since this config was loaded; load the config again",
+            field="search.options",
+            value=path,
+        )
     try:
         made = function(config)
     except Exception as error:  # the user's code can raise anything

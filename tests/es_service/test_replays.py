@@ -1,0 +1,75 @@
+"""What a page says of a replay: that it is the stored episode, or why it is not. The bits: laws/test_readers.py."""
+
+from __future__ import annotations
+
+import pytest
+
+from es_service import api
+from es_service.loop import evaluated
+from es_service.report.write import write_report
+from es_service.runs.replay import record
+
+CONFIG = {
+    "task": {"environment": "point_maze", "episode_steps": 30},
+    "policy": {"hidden": [8]},
+    "search": {"algorithm": "map_elites", "batch": 20, "centres": 3, "iso_sigma": 0.2},
+    "map": {"cells": [8, 8]},
+    "budget": {"generations": 2},
+    "compute": {"engine": "inline", "workers": 1, "inline_workers": "threads"},
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return api.run(CONFIG, tmp_path_factory.mktemp("run") / "run").run
+
+
+def page_of(run):
+    [page] = write_report(run.folder)
+    return page.read_text()
+
+
+def replays_of(run):
+    """Those of the best policy and of three elites that are older than a fork of the run."""
+    old = run.map.query("generation <= 2")[["cell_x", "cell_y"]].head(3)
+    return record(run, best=True, cells=list(old.itertuples(index=False, name=None)))[0]
+
+
+def test_a_fork_with_another_seed_replays_what_its_parent_has_evaluated(run, tmp_path):
+    fork = api.fork(run.folder, {"seed": 7, "budget.generations": 3}, out=tmp_path / "fork").run
+    assert set(fork.evaluations["reset_seed"]) == {0, 7}
+    assert [one.is_the_stored for one in replays_of(fork)] == [True] * 4
+
+
+def test_a_fork_with_another_rollout_says_that_bits_may_differ(run, tmp_path):
+    settings = {"compute.rollout": "xla", "compute.inline_workers": "processes", "budget.generations": 3}
+    fork = api.fork(run.folder, settings, out=tmp_path / "fork").run
+    _, *of_parent = replays_of(fork)
+    assert [one.stored.changes for one in of_parent] == [("rollout simd -> xla",)] * 3
+    again = api.fork(fork.folder, {"compute.rollout": "simd", "budget.generations": 4}, out=tmp_path / "again").run
+    _, *of_both = replays_of(again)
+    assert [one.stored.changes for one in of_both] == [("rollout simd or xla -> simd",)] * 3
+
+
+def test_a_fork_in_which_fitness_means_something_else_has_no_stored_episode_of_the_best(run, tmp_path):
+    fork = api.fork(run.folder, {"task.fitness": "final", "budget.generations": 3}, out=tmp_path / "fork").run
+    stored = record(fork, best=True, cells=[])[0][0]
+    assert (stored.stored is None) == (stored.candidate.generation < 3)
+    ended = api.fork(run.folder, {"task.fitness": "final"}, out=tmp_path / "ended", on_notice=print).run
+    page = page_of(ended)
+    assert "have changed the meaning of fitness" in page
+    assert 'class="problem' not in page
+
+
+def test_a_replay_that_is_not_the_stored_episode_is_an_error_in_the_page(tmp_path, monkeypatch):
+    row_of = evaluated.evaluated_row
+
+    def wrong(*arguments, **named):
+        row = row_of(*arguments, **named)
+        return row | {"fitness_first": row["fitness_first"] + 1.0}
+
+    monkeypatch.setattr(evaluated, "evaluated_row", wrong)
+    page = page_of(api.run(CONFIG, tmp_path / "run").run)
+    assert 'class="problem episode"' in page
+    assert "This is not the stored episode, whose fitness is" in page
+    assert "so this is an error; please report it" in page
