@@ -38,7 +38,7 @@ from es_service.config.start import folder_problems
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, Problem
 from es_service.protocol.messages import TaskSpec
-from es_service.protocol.own_code import in_no_file
+from es_service.protocol.user_code import in_no_file
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
 """Where a config comes from: the path of a YAML file, the name of a shipped one, or the content of one."""

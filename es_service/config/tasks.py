@@ -20,7 +20,7 @@ from es_service.errors import ConfigError
 from es_service.protocol.messages import TaskSpec, with_options
 from es_service.protocol.options import Option, choice
 from es_service.protocol.process_environment import child_environment
-from es_service.protocol.sources import own_sources
+from es_service.protocol.sources import user_sources
 from workers import environments
 from workers.simd.backend.target import NoVectorsError, host_target
 
@@ -33,7 +33,7 @@ class Tasks(Mapping[str, TaskSpec]):
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is not shipped, ConfigError for another that cannot be described."""
-        return _described(name, tuple(own_sources(name).items())) if ":" in name else environments.SHIPPED[name]
+        return _described(name, tuple(user_sources(name).items())) if ":" in name else environments.SHIPPED[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(environments.SHIPPED)

@@ -40,22 +40,22 @@ def worker_sources(environment: str) -> dict[str, str]:
     Args:
         environment: the value of `task.environment`.
     """
-    return _package_sources(*WORKERS) | own_sources(environment)
+    return _package_sources(*WORKERS) | user_sources(environment)
 
 
 def driver_sources(algorithm: str) -> dict[str, str]:
     """Sources with which the driver computes besides those of the workers. Those of a user's search are read anew,
-    because each run imports what has changed of them (`own_code.import_own`).
+    because each run imports what has changed of them (`user_code.import_user_module`).
 
     Args:
         algorithm: the value of `search.algorithm`.
     """
-    return _package_sources(*DRIVER) | own_sources(algorithm)
+    return _package_sources(*DRIVER) | user_sources(algorithm)
 
 
-def own_sources(path: str) -> dict[str, str]:
+def user_sources(path: str) -> dict[str, str]:
     """Sources of a task or an algorithm of a user, as they are now; empty if the name is none of a user."""
-    return {own.source: own.sha256 for own in modules_of(path).own.values()} if is_own(path) else {}
+    return {own.source: own.sha256 for own in modules_of(path).user.values()} if is_own(path) else {}
 
 
 def other_files(ours: Sources, theirs: Sources) -> list[str]:
@@ -105,7 +105,7 @@ def _package_sources(*packages: str) -> dict[str, str]:
     return found
 
 
-class OwnModule(NamedTuple):
+class UserModule(NamedTuple):
     """A module of a user, as its file is now."""
 
     file: Path
@@ -119,7 +119,7 @@ class OwnModule(NamedTuple):
 class Modules(NamedTuple):
     """The modules of a user's task or search."""
 
-    own: Mapping[str, OwnModule]
+    user: Mapping[str, UserModule]
     """Name of a module whose file counts as code -> the module."""
     others: frozenset[str]
     """Top packages outside the standard library that these files import from other places."""
@@ -139,7 +139,7 @@ def modules_of(path: str) -> Modules:
     if top is None or top.name in sys.stdlib_module_names or not (place := _place(top)):
         return Modules({}, frozenset(), is_installed=False)
     is_shared = os.path.basename(place) in SHARED_FOLDERS
-    found: dict[str, OwnModule] = {}
+    found: dict[str, UserModule] = {}
     others: set[str] = set()
     seen: set[str] = set()
     wanted = [name]
@@ -161,7 +161,7 @@ def modules_of(path: str) -> Modules:
             wanted += needs
             above = spec.name.split(".")[:-1]
             needs += [".".join(above[:count]) for count in range(1, len(above) + 1)]
-            found[spec.name] = OwnModule(file, source, sha256(content), frozenset(needs))
+            found[spec.name] = UserModule(file, source, sha256(content), frozenset(needs))
     return Modules(found, frozenset(others - sys.stdlib_module_names), is_shared)
 
 

@@ -92,7 +92,7 @@ def _package(command: Sequence[str], out: str, text: str, configs: Sequence[RunC
         if found.is_installed:
             expected.add(path.partition(":")[0].partition(".")[0])
         else:
-            files |= {one.source: one.file for one in found.own.values()}
+            files |= {one.source: one.file for one in found.user.values()}
             expected |= found.others
     return JobPackage(
         (*command, "--out", out), out, text, dict(sorted(files.items())), tuple(sorted(expected - set(PACKAGES)))

@@ -168,7 +168,7 @@ def test_a_child_with_other_code_is_refused(threads):
     assert "workers/gone.py, workers/policy.py" in str(caught.value)
 
 
-def test_other_code_makes_a_run_mixed_and_unknown_code_does_not():
+def test_other_code_makes_a_run_mixed_and_unknuser_code_does_not():
     old, new, unknown = {"cpu": "a", CODE: {"f": "1"}}, {"cpu": "a", CODE: {"f": "2"}}, {"cpu": "a"}
     assert is_mixed([old, new])
     assert is_mixed([old, unknown, new])

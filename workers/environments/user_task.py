@@ -45,8 +45,8 @@ import jax.numpy as jnp
 
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import OptionValue, declared_options
-from es_service.protocol.own_code import import_own, in_no_file
 from es_service.protocol.raised import raised, why_not_imported
+from es_service.protocol.user_code import import_user_module, in_no_file
 from workers.environments import Environment, TaskError
 
 METHODS = ("reset", "observe", "step", "descriptor")
@@ -239,7 +239,7 @@ def _import(path: str) -> Any:
     if problem := in_no_file(path):
         raise TaskError(problem)
     try:
-        found = import_own(path)
+        found = import_user_module(path)
     except Exception as error:  # the user's code can raise anything
         raise TaskError(f"{path}: {why_not_imported(module, error)}") from error
     if not hasattr(found, name):

@@ -21,8 +21,8 @@ from functools import partial
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
 from es_service.protocol.options import declared_options
-from es_service.protocol.own_code import import_own, in_no_file
 from es_service.protocol.raised import raised, why_not_imported
+from es_service.protocol.user_code import import_user_module, in_no_file
 from es_service.search.algorithms.base import Algorithm
 
 
@@ -32,7 +32,7 @@ def import_factory(path: str) -> Callable[[RunConfig], object]:
     if problem := in_no_file(path):
         raise ConfigError(problem)
     try:
-        found = getattr(import_own(path), name, None)
+        found = getattr(import_user_module(path), name, None)
     except Exception as error:  # the user's code can raise anything
         raise ConfigError(why_not_imported(module, error)) from error
     if not callable(found):

@@ -19,12 +19,12 @@ from pathlib import Path
 from threading import RLock
 from types import ModuleType
 
-from es_service.protocol.sources import OwnModule, modules_of, sha256
+from es_service.protocol.sources import UserModule, modules_of, sha256
 
 _ONE_AT_A_TIME = RLock()
 
 
-def import_own(path: str) -> ModuleType:
+def import_user_module(path: str) -> ModuleType:
     """The module of `package.module:name`, as it and what it needs are now; it may be in the current folder.
 
     Raises whatever its import raises; then `sys.modules` has the old modules again.
@@ -34,7 +34,7 @@ def import_own(path: str) -> ModuleType:
         sys.path.append(os.getcwd())  # a console script does not search its working folder
     with _ONE_AT_A_TIME:
         importlib.invalidate_caches()  # a file may be newer than what Python knows of its folder
-        found = modules_of(path).own
+        found = modules_of(path).user
         old = {name: sys.modules[name] for name in _outdated(found)}
         for outdated in old:
             _remove(outdated)
@@ -77,7 +77,7 @@ def _restore(name: str, module: ModuleType) -> None:
         setattr(sys.modules[package], child, module)
 
 
-def _outdated(found: Mapping[str, OwnModule]) -> set[str]:
+def _outdated(found: Mapping[str, UserModule]) -> set[str]:
     """Names of the imported modules that have changed since, and of those that need one of them."""
     outdated = {name for name, own in found.items() if name in sys.modules and not _is_same(sys.modules[name], own)}
     needed = {name for own in found.values() for name in own.needs}
@@ -89,7 +89,7 @@ def _outdated(found: Mapping[str, OwnModule]) -> set[str]:
     return outdated
 
 
-def _is_same(module: ModuleType, own: OwnModule) -> bool:
+def _is_same(module: ModuleType, own: UserModule) -> bool:
     """Whether a module was imported from its file as it is now. If the program has imported it itself, nobody knows
     from which version; then the file must not have changed since this process started."""
     loader = getattr(module, "__loader__", None)
@@ -113,7 +113,7 @@ def _process_start_s() -> float:
 class _Finder:
     """Finds a user's modules, and has them loaded with `_Loader`."""
 
-    def __init__(self, found: Mapping[str, OwnModule]) -> None:
+    def __init__(self, found: Mapping[str, UserModule]) -> None:
         self._files = {name: own.file for name, own in found.items() if own.file.suffix == ".py"}
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:

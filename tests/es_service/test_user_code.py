@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from es_service.protocol.own_code import import_own
-from es_service.protocol.sources import driver_sources, own_sources, sha256
+from es_service.protocol.sources import driver_sources, sha256, user_sources
+from es_service.protocol.user_code import import_user_module
 
 FILES = {
     "mine.py": "from helper import value\nimport others.plain\n\nclass Kind:\n    pass\n\nSAID = value()\n",
@@ -35,22 +35,22 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_what_has_not_changed_stays_the_same_object(folder):
-    first = import_own("mine:Kind")
-    assert import_own("mine:Kind") is first
+    first = import_user_module("mine:Kind")
+    assert import_user_module("mine:Kind") is first
     os.utime(folder / "mine.py")
-    assert import_own("mine:Kind") is first
+    assert import_user_module("mine:Kind") is first
 
 
 @pytest.mark.parametrize("edited", ["mine.py", "helper.py", "later.py"])
 def test_an_edited_module_is_new_with_all_that_need_it_and_no_others(folder, edited):
     """Within a second and of the same size, so that Python takes its own compiled file for current."""
-    first, names = import_own("mine:Kind"), ("mine", "helper", "later", "others", "others.plain")
+    first, names = import_user_module("mine:Kind"), ("mine", "helper", "later", "others", "others.plain")
     before = {name: sys.modules[name] for name in names}
     time = (folder / edited).stat().st_mtime_ns
     new = FILES[edited].replace("+ 0", "+ 1").replace("LATE = 1", "LATE = 2").replace("= value()", "= 2222222")
     (folder / edited).write_text(new)
     os.utime(folder / edited, ns=(time, time))
-    second = import_own("mine:Kind")
+    second = import_user_module("mine:Kind")
     assert (first.SAID, second.SAID) in ((1, 2), (1, 2222222))
     assert isinstance(first.Kind(), first.Kind)
     assert second.Kind is not first.Kind
@@ -64,49 +64,49 @@ def test_modules_that_the_program_imported_itself_are_imported_anew_only_if_they
     sys.path.append(str(folder))
     program = importlib.import_module("mine")
     (folder / "mine.py").write_text(f"{FILES['mine.py']}SAID = 5\n")
-    assert import_own("mine:Kind").SAID == 5
+    assert import_user_module("mine:Kind").SAID == 5
     assert program.SAID == 1
     ours = sys.modules[__name__]
-    assert import_own(f"{__name__}:FILES") is ours
+    assert import_user_module(f"{__name__}:FILES") is ours
 
 
 def test_an_import_that_fails_leaves_the_old_modules_and_the_next_one_succeeds(folder):
-    first = import_own("mine:Kind")
+    first = import_user_module("mine:Kind")
     (folder / "helper.py").write_text("def value(:\n")
     with pytest.raises(SyntaxError):
-        import_own("mine:Kind")
+        import_user_module("mine:Kind")
     assert sys.modules["mine"] is first
     (folder / "helper.py").write_text("def value():\n    return 7\n")
-    assert import_own("mine:Kind").SAID == 7
+    assert import_user_module("mine:Kind").SAID == 7
 
 
 def test_a_helper_that_is_gone_is_missed(folder):
     """Workers would miss it, too."""
-    import_own("mine:Kind")
+    import_user_module("mine:Kind")
     (folder / "later.py").unlink()
     with pytest.raises(ModuleNotFoundError, match="later"):
-        import_own("mine:Kind")
+        import_user_module("mine:Kind")
     (folder / "later.py").write_text("LATE = 3\n")
-    assert import_own("mine:Kind").SAID == 3
+    assert import_user_module("mine:Kind").SAID == 3
 
 
 def test_submodules_and_packages_that_have_changed_are_new_for_those_that_need_them(folder):
     (folder / "others/plain.py").write_text("x = 1\n")
-    first = import_own("others.inside:x")
+    first = import_user_module("others.inside:x")
     plain = sys.modules["others.plain"]
     (folder / "others/plain.py").write_text("x = 2\n")
-    second = import_own("others.inside:x")
+    second = import_user_module("others.inside:x")
     assert (first.x, second.x, second.plain.x) == (1, 2, 2)
     assert sys.modules["others.plain"] is not plain
     (folder / "others/__init__.py").write_text("# new\n")
-    assert import_own("others.inside:x") is not second
+    assert import_user_module("others.inside:x") is not second
 
 
 def test_the_hashes_are_those_of_what_was_imported(folder):
     for text in ("LATE = 3\n", "LATE = 4\n"):
         (folder / "later.py").write_text(text)
-        import_own("mine:Kind")
+        import_user_module("mine:Kind")
         loaded = {sys.modules[name].__loader__.sha256 for name in ("mine", "helper", "later")}
         assert sha256(text.encode()) in loaded
-        assert loaded <= set(own_sources("mine:Kind").values())
-        assert own_sources("mine:Kind").items() <= driver_sources("mine:Kind").items()
+        assert loaded <= set(user_sources("mine:Kind").values())
+        assert user_sources("mine:Kind").items() <= driver_sources("mine:Kind").items()
