@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from es_service.config.changes import again_with
 from es_service.config.compute import implied_by
 from es_service.config.model import RunConfig, policy_shape, worker_spec
 from es_service.config.parallel import chunks_at_once, parallel_sentence
@@ -280,7 +281,7 @@ def require_cores(config: RunConfig, again: WayOut | None = None) -> None:
     """Raise ConfigError if all workers are on this machine and are more than its cores can be meant to run.
 
     Args:
-        again: the call that asks for the workers, for the way out to a cluster.
+        again: the call that asks for the workers, which ways out repeat with other settings.
     """
     compute, count = config.compute, cores()
     if compute.workers == "auto" or compute.address is not None:
@@ -290,7 +291,14 @@ def require_cores(config: RunConfig, again: WayOut | None = None) -> None:
         return
     here = f"this machine, which has {count} core{'s' if count > 1 else ''} for them"
     cluster = implied_by(None, "HOST:PORT") | {"compute.address": "HOST:PORT", "compute.workers": compute.workers}
-    ways_out = [replace(again, purpose="use the cores of a Ray cluster", settings=cluster)] if again else []
+    ways_out = (
+        []
+        if again is None
+        else [
+            again_with(again, "start one worker for each core", {"compute.workers": "auto"}),
+            again_with(again, "use the cores of a Ray cluster", cluster),
+        ]
+    )
     raise ConfigError(
         f"compute.workers: {compute.workers} workers are too many for {here}; must be at most {allowed}, "
         f"{compute.max_workers_per_core} for each core (compute.max_workers_per_core). auto starts one for each core",

@@ -132,13 +132,16 @@ def test_more_workers_on_this_machine_than_its_cores_can_be_meant_to_run_are_ref
     with pytest.raises(ConfigError, match=r"5000 workers are too many for this machine, which has 2 cores") as error:
         api.run(configured(5000, engine=engine), folder)
     assert (error.value.field, error.value.value, error.value.allowed) == ("compute.workers", 5000, "at most 8")
-    assert error_message(error.value).endswith(
-        f" run CONFIG --out {folder} --address HOST:PORT --set compute.workers=5000"
-    )
+    again = f"es-service run CONFIG --out {folder}"
+    assert error_message(error.value).splitlines()[1:] == [
+        f"  to start one worker for each core: {again} --set compute.workers=auto",
+        f"  to use the cores of a Ray cluster: {again} --address HOST:PORT --set compute.workers=5000",
+    ]
     assert not folder.exists()
     api.run(configured(1), folder)
     before = (folder / "config.yaml").read_text()
     with pytest.raises(ConfigError, match="must be at most 8") as error:
         api.resume(folder, ["compute.workers=9", f"compute.engine={engine}"])
-    assert f" resume {folder} --address HOST:PORT" in error_message(error.value)
+    assert f" resume {folder} --engine {engine} --set compute.workers=auto\n" in error_message(error.value)
+    assert error_message(error.value).endswith(f" resume {folder} --address HOST:PORT --set compute.workers=9")
     assert (folder / "config.yaml").read_text() == before
