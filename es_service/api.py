@@ -6,15 +6,16 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 from uuid import uuid4
 
-from es_service.config.changes import refused_changes
-from es_service.config.keys import Overrides
+from es_service.config.changes import again_with, refused_changes
+from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
@@ -107,13 +108,14 @@ def run(
         ConfigError: the config is wrong. StoreError: the folder cannot be used. EvaluationError: the rollouts cannot
             continue. Interrupted: SIGINT or SIGTERM arrived. Committed generations are safe in every case.
     """
+    named = os.fspath(config) if isinstance(config, str | os.PathLike) else None
+    again = WayOut("run", "", config=named, out=_text(out))
     if not isinstance(config, RunConfig):
         config = load_config(config)
     parent, beginning = None, Beginning()
     if config.search.init_from is not None:
         parent, beginning = started(config, config.search.init_from, on_notice)
     listener = _Listener(on_generation, on_notice, on_compile, progress, hook)
-    again = WayOut("run", "", out=None if out is None else str(out))
     return _create_and_work(config, out, parent, beginning, again, listener)
 
 
@@ -146,8 +148,9 @@ def resume(
         source = recorded if recorded.exists() else store.meta.config
         return changed_config(source, overrides)
 
+    overrides, asked = _with_values(overrides)
     listener = _Listener(on_generation, on_notice, on_compile, progress, hook)
-    return _go_on(Path(folder), changed, listener, strict=strict)
+    return _go_on(Path(folder), changed, listener, asked, strict=strict)
 
 
 def run_or_resume(
@@ -177,17 +180,22 @@ def _go_on(
     folder: Path,
     make_config: Callable[[RunStore], RunConfig],
     listener: _Listener,
+    asked: Mapping[str, Any] = MappingProxyType({}),
     *,
     strict: bool = False,
 ) -> Outcome:
-    """Open a run, check that the config of this session fits it, and continue it."""
+    """Open a run, check that the config of this session fits it, and continue it.
+
+    Args:
+        asked: settings of the call, which ways out repeat.
+    """
     with RunStore.open(folder, hook=listener.hook) as store, in_run(store.meta.run_id):
         # Repairs remain even if the config is refused below, so they are reported now; `work` reports later notices.
         for notice in store.notices:
             listener.on_notice(notice)
         store.notices.clear()
         config = make_config(store)
-        require_cores(config, WayOut("resume", "", run=str(folder)))
+        require_cores(config, WayOut("resume", "", str(folder), asked))
         if changes := changes_from(store.meta.constants, config):
             besides = _budget_of_a_fork(config, look(open_run(folder)))
             raise refused_changes(folder, changes, besides)
@@ -261,16 +269,28 @@ def fork(
         ConfigError: the state does not fit a change (another task, descriptor, network, algorithm or map), or a key
             would have no effect. StoreError: the generation is not kept. Otherwise as `run`.
     """
+    overrides, asked = _with_values(overrides)
+    again = WayOut("fork", "", os.fspath(parent), asked, generation=generation, out=_text(out))
     config = fork_config(parent, overrides)
     lineage, beginning = forked(open_run(parent), config, generation)
     listener = _Listener(on_generation, on_notice, on_compile, progress, hook)
-    outcome = _create_and_work(config, out, lineage, beginning, WayOut("fork", "", run=str(parent)), listener)
+    outcome = _create_and_work(config, out, lineage, beginning, again, listener)
     if outcome.run.generation == (begun := lineage["generation"]):
         on_notice(
             f"no generation was run: {outcome.reason} already at generation {begun}, where this fork begins; resume it "
             "with a larger budget"
         )
     return outcome
+
+
+def _with_values(overrides: Overrides) -> tuple[Overrides, dict[str, Any]]:
+    """The overrides, which may be an iterator, and their values by key as far as they are valid."""
+    overrides = overrides if isinstance(overrides, str | Mapping) else tuple(overrides)
+    return overrides, parse_overrides(overrides)[0]
+
+
+def _text(path: str | os.PathLike[str] | None) -> str | None:
+    return None if path is None else os.fspath(path)
 
 
 def default_folder(config: RunConfig, which: str = "") -> Path:
@@ -340,7 +360,7 @@ def _create_and_work(
             remove_run_folder(folder, whole=is_new)
             error.run = None
             error.ways_out = tuple(
-                replace(again, purpose=way.purpose, settings=way.settings) if way.action == "resume" else way
+                again_with(again, way.purpose, way.settings) if way.action == "resume" else way
                 for way in error.ways_out
                 if way.action != "resume" or way.settings
             )

@@ -33,8 +33,12 @@ class WayOut:
     """Folder of the run that it is about; None if it is not known where the error is raised."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Keys of the config to set, and their values."""
+    config: str | None = None
+    """For the action run: file or name of the config; None if it is not known where the error is raised."""
+    generation: int | None = None
+    """For the action fork: the generation whose state it continues from; None: the newest."""
     out: str | None = None
-    """Folder of the new run, for the action run; file to write, for report."""
+    """Folder of the new run, for the actions run and fork; file to write, for report."""
     extra: str | None = None
     """Extra of this package that is needed, for the action install."""
 
@@ -46,14 +50,17 @@ class WayOut:
                 # es-service is on no package index, so a clone is needed.
                 return f"in a clone of es-service: pip install -c constraints.txt -e '.[{self.extra}]'"
             case "run":
-                config = f"load_config(config, {settings})" if settings else "config"
+                config = repr(self.config) if self.config else "config"
+                config = f"load_config({config}, {settings})" if settings else config
                 return f"run({config}, {self.out!r})" if self.out else f"run({config})"
             case "watch":
                 return f"open_run({self.run!r})"
             case "report":
                 return f"write_report({self.run!r}, {self.out!r})"
-        folder = repr(self.run) if self.run else "folder"
-        return f"{self.action}({folder}{', ' if settings else ''}{settings})"
+        options = {"generation": self.generation, "out": self.out}
+        named = [f"{name}={value!r}" for name, value in options.items() if value is not None]
+        words = [repr(self.run) if self.run else "folder", *([settings] if settings else []), *named]
+        return f"{self.action}({', '.join(words)})"
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ def settings(values: Mapping[str, Any]) -> list[str]:
 
 def way_command(way: WayOut) -> str:
     """The shell command of a way out."""
-    folder = way.run or "RUN"
+    folder, out = way.run or "RUN", ["--out", way.out] if way.out else []
     match way.action:
         case "install":
             return way.call()
@@ -50,8 +50,9 @@ def way_command(way: WayOut) -> str:
         case "report":
             return command("report", folder, "--out", way.out)
         case "run":
-            return command("run", "CONFIG", *(["--out", way.out] if way.out else []), *settings(way.settings))
-    return command(way.action, folder, *settings(way.settings))
+            return command("run", way.config or "CONFIG", *out, *settings(way.settings))
+    generation = [] if way.generation is None else ["--generation", way.generation]
+    return command(way.action, folder, *generation, *out, *settings(way.settings))
 
 
 def error_message(error: ServiceError) -> str:

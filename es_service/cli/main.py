@@ -10,7 +10,8 @@ from __future__ import annotations
 import contextlib
 import io
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -47,6 +48,8 @@ from es_service.cli.show import config_, digest_, list_, status
 from es_service.cli.sweep import SeedsOption, run_seeds, sweep
 from es_service.cli.tables.status import print_summary
 from es_service.cli.verify import verify
+from es_service.config.changes import again_with
+from es_service.config.keys import parse_overrides
 from es_service.config.parallel import parallel_sentence
 from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError, WayOut
 from es_service.logs import logger
@@ -107,7 +110,8 @@ def run(
     with contextlib.suppress(SystemExit):  # rich's answer to a closed output
         print_line(console, parallel_sentence(loaded))
     folder = out if out is not None else api.default_folder(loaded)
-    _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder), log)
+    with _naming(config, wanted):
+        _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder), log)
 
 
 @app.command()
@@ -208,6 +212,21 @@ def _told(error: Exception, ways_out: Sequence[WayOut] = ()) -> ServiceError | N
         return error
     text = users_error(error)
     return ServiceError(text, ways_out=ways_out) if text else None
+
+
+@contextlib.contextmanager
+def _naming(config: Path, wanted: Sequence[str]) -> Iterator[None]:
+    """Add the config and the settings of this command to the ways out of an error that start a run: the call that they
+    repeat has them in one `RunConfig`."""
+    try:
+        yield
+    except ServiceError as error:
+        call = WayOut("run", "", settings=parse_overrides(wanted)[0], config=str(config))
+        error.ways_out = tuple(
+            again_with(replace(call, out=way.out), way.purpose, way.settings) if way.action == "run" else way
+            for way in error.ways_out
+        )
+        raise
 
 
 def _session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] | None) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
+from es_service.config.compute import implied_by
 from es_service.config.fields import SEARCH_OPTIONS, TASK_OPTIONS
 from es_service.config.keys import FIELDS
 from es_service.config.method_keys import keys_without_effect
@@ -143,6 +145,18 @@ def refused_changes(
         ways.append(start_afresh(run))
     note = f"a fork cannot change {', '.join(fixed)} either" if fixed else ""
     return ConfigError.listing(heading, problems, note, run=run, ways_out=ways)
+
+
+def again_with(call: WayOut, purpose: str, settings: Mapping[str, Any]) -> WayOut:
+    """A way out that repeats a call with further settings.
+
+    What the call's engine or cluster implied is left out where the settings choose another.
+    """
+    implied = {}
+    if not settings.keys().isdisjoint(("compute.engine", "compute.address")):
+        implied = implied_by(call.settings.get("compute.engine"), call.settings.get("compute.address"))
+    asked = {key: value for key, value in call.settings.items() if key not in implied or implied[key] != value}
+    return replace(call, purpose=purpose, settings={**asked, **settings})
 
 
 def start_afresh(run: object) -> WayOut:

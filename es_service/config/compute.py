@@ -46,7 +46,7 @@ class ComputeConfig(Section):
         "auto",
         description="Number of workers, each of which is a core. auto: every core of the machine or cluster that has "
         "work; with a number in worker_resources.cpu, it also asks the cluster for more. No more start than there is "
-        "work for. It never changes results.",
+        "work for, in whole actors. It never changes results.",
     )
     max_workers_per_core: Count = Field(
         4,

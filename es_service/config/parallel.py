@@ -8,6 +8,8 @@ from es_service.protocol.policies import chunks_of
 
 WITH_EMITTERS = ("me_es", "memes")
 """Methods with a population for each of `search.emitters`."""
+ANY_NUMBER = 2**20
+"""Chunks of work at a time where it is not known how many there will be: enough for every core."""
 
 
 def populations(config: RunConfig) -> int:
@@ -22,36 +24,53 @@ def populations(config: RunConfig) -> int:
     return search.centres if several else 1
 
 
-def chunks_at_once(config: RunConfig) -> int:
-    """Number of chunks that can be computed at the same time, in the larger of rollout and evaluation.
+def chunks_of_phases(config: RunConfig) -> dict[str, int]:
+    """Number of chunks of each phase of a generation, all of which can be computed at the same time."""
+    search, sizes, several = config.search, config.compute, populations(config)
+    if not several:
+        return {"rollout": chunks_of(search.batch, search.evaluation_episodes)}
+    return {
+        "rollout": several * (search.pairs // sizes.chunk_pairs),
+        "gradient": several * -(-search.pairs // sizes.gradient_block_pairs),
+        "evaluation": several * -(-search.evaluation_episodes // EVALUATION_EPISODES_PER_CHUNK),
+    }
 
-    More workers than that have nothing to do.
+
+def chunks_at_once(config: RunConfig) -> int:
+    """Number of chunks of the largest phase of a generation.
+
+    More workers than that have nothing to do, except perhaps while the initial centres are evaluated.
     """
-    search = config.search
-    if search.algorithm == "map_elites":
-        return chunks_of(search.batch, search.evaluation_episodes)
-    evaluation = -(-search.evaluation_episodes // EVALUATION_EPISODES_PER_CHUNK)
-    return populations(config) * max(search.pairs // config.compute.chunk_pairs, evaluation)
+    return max(chunks_of_phases(config).values())
 
 
 def parallel_sentence(config: RunConfig) -> str:
-    """How much work there is at a time, and the two keys that change it."""
-    chunks, several = chunks_at_once(config), populations(config)
-    work = f"{config.search.pairs} pairs around {'one centre' if several == 1 else f'{several} centres'}"
+    """How much work there is at a time, and the keys that change it."""
+    chunks, several, keys = chunks_at_once(config), populations(config), _keys(config)
+    count, unit = config.search.pairs, "pairs"
+    if keys[0] == "search.evaluation_episodes":
+        count, unit = config.search.evaluation_episodes, "evaluation episodes"
+    work = f"{count} {unit} around {'one centre' if several == 1 else f'{several} centres'}"
     if not several:
         work = f"{config.search.batch} policies"
     return (
         f"a generation has {chunks} chunks of work at a time ({work}), enough for {chunks} workers; "
-        f"{' and '.join(_keys(config))} change that"
+        f"{' and '.join(keys)} change{'s' if len(keys) == 1 else ''} that"
     )
 
 
-def _keys(config: RunConfig) -> tuple[str, str]:
+def _keys(config: RunConfig) -> tuple[str, ...]:
+    """The keys on which the number of chunks of the largest phase depends, the most useful first."""
     algorithm = config.search.algorithm
     if algorithm == "map_elites":
         return "search.batch", "search.evaluation_episodes"
+    phases = chunks_of_phases(config)
+    largest = max(phases, key=phases.__getitem__)  # the first of equal ones
+    size = {"rollout": "search.pairs", "gradient": "search.pairs", "evaluation": "search.evaluation_episodes"}[largest]
     if algorithm in WITH_EMITTERS:
-        return "search.pairs", "search.emitters"
+        return size, "search.emitters"
+    if largest == "gradient":
+        return size, "compute.gradient_block_pairs"
     if algorithm in ("es", "ars") or ":" in algorithm:
-        return "search.pairs", "compute.chunk_pairs"
-    return "search.pairs", "search.centres" if config.search.update == "all" else "search.update"
+        return (size, "compute.chunk_pairs") if largest == "rollout" else (size,)
+    return size, "search.centres" if config.search.update == "all" else "search.update"

@@ -17,6 +17,7 @@ from collections.abc import Callable, Hashable, Sequence
 from types import ModuleType
 from typing import Any
 
+from es_service.config.parallel import ANY_NUMBER
 from es_service.dispatch.cores import cores
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
@@ -24,7 +25,7 @@ from es_service.dispatch.events import Compiled, Drain, Failure, Limits, Placed,
 from es_service.dispatch.ray_calls import Arguments, Call, Calls
 from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_faults import fault_reason, raised_in_actor
-from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage
+from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
 from es_service.dispatch.ray_refusals import Refusals
 from es_service.protocol.messages import Work, WorkerPlace, WorkerSpec
 from es_service.protocol.sources import OtherCodeError
@@ -39,7 +40,8 @@ def ray_engine(
     address: str | None = None,
     cpus: int | None = 1,
     gpus: float = 0.0,
-    most: int | None = None,
+    most: int = ANY_NUMBER,
+    grows: bool = False,
     log: Log = no_log,
     on_wait: Callable[[str], None] = lambda shortage: None,
     on_compile: Callable[[str], None] = lambda kind: None,
@@ -55,8 +57,9 @@ def ray_engine(
         cpus: cores of each worker, which must divide the number of cores in `limits`; None: in a cluster that is
             joined as many as each node has, see `actor_cores`, else 1.
         gpus: GPUs of each worker, or the share of one.
-        most: use as many cores as there is room for, up to this number and also when the room changes, and ask for
-            more if `cpus` is given, see `ASKED_AHEAD`; None: use the number in `limits`.
+        most: number of cores that have work; no more start, except that an actor has all of its cores.
+        grows: whether to use as many cores as there is room for, also when the room changes, and to ask for more if
+            `cpus` is given, see `ASKED_AHEAD`; if not, use the number in `limits`.
         on_wait: as in `Engine`; not called in a Ray of our own, which has room.
         on_compile: as in `Engine`.
         on_refusal: as in `Actors`.
@@ -65,9 +68,11 @@ def ray_engine(
         StartError: Ray is missing or does not start, there is no room for a worker, or the connection failed.
         Interrupted: SIGTERM arrived during the call.
     """
-    ray = connect(address, gpus=bool(gpus), cpus=limits.workers if most is None else cores())
+    each = cpus or 1
+    ours = cores() if grows else with_work(limits.workers, each, most) * each
+    ray = connect(address, gpus=bool(gpus), cpus=ours)
     try:
-        claim, limits, growth = layout(ray, limits, cpus, gpus, most, ours=address is None)
+        claim, limits, growth = layout(ray, limits, cpus, gpus, most, grows=grows, ours=address is None)
         watch = None if address is None else Watch(ray, claim)
         transport = Actors(ray, spec, actor, claim, watch, growth, limits.workers, on_refusal)
         on_wait = (lambda shortage: None) if watch is None else on_wait

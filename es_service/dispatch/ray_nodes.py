@@ -69,13 +69,13 @@ class Growth:
 
 
 def layout(
-    ray: ModuleType, limits: Limits, cpus: int | None, gpus: float, most: int | None, *, ours: bool
+    ray: ModuleType, limits: Limits, cpus: int | None, gpus: float, most: int, *, grows: bool, ours: bool
 ) -> tuple[Claim, Limits, Growth | None]:
     """What each worker claims, the limits with the number of workers and their cores, and how that number changes.
 
     Args:
         limits: with the number of cores of all workers together as the number of workers.
-        cpus, gpus, most: as in `ray_engine`.
+        cpus, gpus, most, grows: as in `ray_engine`.
         ours: whether this Ray was started for the run and has this machine only.
 
     Raises:
@@ -86,7 +86,7 @@ def layout(
     ahead = 0 if ours or cpus is None else ASKED_AHEAD
     if cpus is None:  # on one machine, actors with one core were measured to be as fast or faster
         nodes = [] if ours or gpus else cores_of_nodes(ray)
-        cpus = actor_cores(nodes, limits.workers if most is None else None, most)
+        cpus = actor_cores(nodes, None, most) if grows else actor_cores(nodes, limits.workers, None)
     claim = Claim(cpus, gpus)
     nodes = look(ray, claim)
     if ours and not nodes.room:
@@ -95,8 +95,8 @@ def layout(
     if ours:  # it has room, so a worker without a place is one whose process does not start
         names = {**limits.names, "place_timeout_s": limits.name_of("no_worker_timeout_s")}
         limits = replace(limits, place_timeout_s=limits.no_worker_timeout_s, names=names)
-    growth = None if most is None else Growth(-(-most // cpus), ahead)
-    workers = limits.workers // cpus if growth is None else growth.wanted(nodes, before=1)
+    growth = Growth(-(-most // cpus), ahead) if grows else None
+    workers = with_work(limits.workers, cpus, most) if growth is None else growth.wanted(nodes, before=1)
     return claim, replace(limits, workers=workers, cores=cpus), growth
 
 
@@ -116,6 +116,17 @@ def actor_cores(nodes: Sequence[int], workers: int | None, most: int | None) -> 
     if workers is None:
         return size
     return max(cores for cores in range(1, min(size, workers) + 1) if workers % cores == 0)
+
+
+def with_work(cores: int, cpus: int, most: int) -> int:
+    """Number of actors with `cpus` cores each, on `cores` cores, as far as there is work for them.
+
+    So where there is too little work, fewer actors start, and not smaller ones, which would need more messages.
+
+    Args:
+        most: number of cores that have work.
+    """
+    return min(cores // cpus, -(-most // cpus))
 
 
 def cores_of_nodes(ray: ModuleType) -> list[int]:

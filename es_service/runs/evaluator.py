@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from es_service.config.compute import implied_by
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig, policy_shape
+from es_service.config.parallel import ANY_NUMBER
 from es_service.config.tasks import task_of
 from es_service.dispatch.engine import Engine
 from es_service.errors import ConfigError, EvaluationError
@@ -28,8 +29,6 @@ from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.session import initial_policy, make_engine
 
 _LOG = logger(__name__)
-ANY_NUMBER = 2**20
-"""Chunks of work at a time, for `workers: auto`: the evaluator cannot know how many policies it will be given."""
 LARGEST = 2**63 - 1
 """Largest seed and generation."""
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from es_service.config.model import RunConfig, worker_spec
-from es_service.config.parallel import populations
+from es_service.config.parallel import chunks_of_phases, populations
 from es_service.config.tasks import task_of
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
@@ -29,7 +29,6 @@ from es_service.loop.history import evaluated_columns, history_columns
 from es_service.protocol.evaluator import DispatchCounts, Evaluator
 from es_service.protocol.machine import platform_text
 from es_service.protocol.messages import (
-    EVALUATION_EPISODES_PER_CHUNK,
     NO_CENTRE,
     Centre,
     Chunk,
@@ -104,14 +103,8 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
 
 def _phases(config: RunConfig) -> list[Phase]:
     """The chunks of a generation."""
-    search, sizes, several = config.search, config.compute, populations(config)
-    evaluation = -(-search.evaluation_episodes // EVALUATION_EPISODES_PER_CHUNK)
-    blocks = -(-search.pairs // sizes.gradient_block_pairs)
-    return [
-        Phase("rollout", "TrainingChunk", several * (search.pairs // sizes.chunk_pairs)),
-        Phase("gradient", "GradientChunk", several * blocks),
-        Phase("evaluation", "EvaluationChunk", several * evaluation),
-    ]
+    kinds = {"rollout": "TrainingChunk", "gradient": "GradientChunk", "evaluation": "EvaluationChunk"}
+    return [Phase(name, kinds[name], chunks) for name, chunks in chunks_of_phases(config).items()]
 
 
 def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec, evaluation_episodes: int) -> list[Work]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from es_service.config.changes import again_with
 from es_service.config.compute import implied_by
 from es_service.config.model import RunConfig, policy_shape, worker_spec
 from es_service.config.parallel import chunks_at_once, parallel_sentence
@@ -120,8 +121,6 @@ def work(
     compute, spec = config.compute, worker_spec(config, task)
     _LOG.info("working on %s: engine %s, rollout %s", store.folder, compute.engine, compute.rollout)
     _LOG.info(parallel_sentence(config))
-    if compute.workers != "auto" and (count := worker_count(config)) < compute.workers:
-        tell(f"compute.workers: {count} workers start and not {compute.workers}, since {parallel_sentence(config)}")
     with (
         _naming_the_run(store.folder),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
@@ -153,6 +152,8 @@ def work(
             in_generation(row["generation"] + 1)
             return answer
 
+        if compute.workers != "auto" and (count := engine.counts.workers) < compute.workers:
+            tell(f"compute.workers: {count} workers start and not {compute.workers}, since {parallel_sentence(config)}")
         engine.wait_for_place()  # before the loop, whose time is that of the run and of its budget
         recorder = Recorder(store, engine, platform_info(), code, tell, strict=strict)
         _, reason = driver.run(search, engine, recorder, state, after_generation)
@@ -207,8 +208,8 @@ def make_engine(
         at_once: number of chunks that can be computed at the same time; None: as in a generation of a run.
     """
     spec, compute = worker_spec(config, task_of(config)), config.compute
-    at_once = chunks_at_once(config) if at_once is None else at_once
-    limits = dispatch_limits(config, at_once)
+    most = work_at_once(config) if at_once is None else at_once
+    limits = dispatch_limits(config, most)
     if compute.engine == "inline":
         threads = compute.inline_workers == "threads"
         return inline_engine(spec, limits, should_stop, threads=threads, log=log, on_compile=on_compile)
@@ -222,7 +223,8 @@ def make_engine(
         address=compute.address,
         cpus=None if compute.worker_resources.cpu == "auto" else compute.worker_resources.cpu,
         gpus=compute.worker_resources.gpu,
-        most=at_once if compute.workers == "auto" else None,
+        most=most,
+        grows=compute.workers == "auto",
         log=log,
         on_wait=on_wait,
         on_compile=on_compile,
@@ -253,29 +255,33 @@ def initial_policy(config: RunConfig, centre: int) -> FloatArray:
 
 
 def worker_count(config: RunConfig, most: int | None = None) -> int:
-    """Number of workers: as configured, or one per core that this process may use, as far as there is work for them.
+    """Number of workers, as configured or one per core that this process may use: for the engine inline as far as there
+    is work for them, which the engine ray sees to itself, since it depends on the cores of each actor.
 
     Args:
         most: number of workers for which there is work; None: as in a generation of a run.
 
     Raises ConfigError as `require_cores`.
     """
-    compute, search = config.compute, config.search
     require_cores(config)
-    most = max(1, chunks_at_once(config) if most is None else most)
-    if compute.workers == "auto":
-        return min(cores(), most)
-    if ":" in search.algorithm:  # a search of the user's own may ask for any number of policies
-        return compute.workers
-    actor = 1 if compute.worker_resources.cpu == "auto" else compute.worker_resources.cpu
-    return min(compute.workers, -(-most // actor) * actor)
+    workers = cores() if config.compute.workers == "auto" else config.compute.workers
+    if config.compute.engine == "ray":
+        return workers
+    return min(workers, max(1, work_at_once(config) if most is None else most))
+
+
+def work_at_once(config: RunConfig) -> int:
+    """Number of workers for which a generation of a run has work. A search of the user's own may ask for any number of
+    policies, so as many as are configured have work."""
+    workers = config.compute.workers
+    return workers if ":" in config.search.algorithm and workers != "auto" else chunks_at_once(config)
 
 
 def require_cores(config: RunConfig, again: WayOut | None = None) -> None:
     """Raise ConfigError if all workers are on this machine and are more than its cores can be meant to run.
 
     Args:
-        again: the call that asks for the workers, for the way out to a cluster.
+        again: the call that asks for the workers, which ways out repeat with other settings.
     """
     compute, count = config.compute, cores()
     if compute.workers == "auto" or compute.address is not None:
@@ -285,7 +291,14 @@ def require_cores(config: RunConfig, again: WayOut | None = None) -> None:
         return
     here = f"this machine, which has {count} core{'s' if count > 1 else ''} for them"
     cluster = implied_by(None, "HOST:PORT") | {"compute.address": "HOST:PORT", "compute.workers": compute.workers}
-    ways_out = [replace(again, purpose="use the cores of a Ray cluster", settings=cluster)] if again else []
+    ways_out = (
+        []
+        if again is None
+        else [
+            again_with(again, "start one worker for each core", {"compute.workers": "auto"}),
+            again_with(again, "use the cores of a Ray cluster", cluster),
+        ]
+    )
     raise ConfigError(
         f"compute.workers: {compute.workers} workers are too many for {here}; must be at most {allowed}, "
         f"{compute.max_workers_per_core} for each core (compute.max_workers_per_core). auto starts one for each core",

@@ -10,6 +10,7 @@ from es_service.config.model import RunConfig
 from es_service.config.parallel import chunks_at_once
 from es_service.dispatch.cores import cores
 from es_service.dispatch.ray_cluster import nodes_of_cluster
+from es_service.dispatch.ray_nodes import actor_cores, with_work
 from es_service.errors import ConfigError
 from es_service.runs.session import require_cores
 
@@ -74,9 +75,10 @@ def _workers(config: RunConfig, at_once: int, nodes: Sequence[int]) -> int | Lit
     compute = config.compute
     if compute.workers != "auto" or at_once == 1 or compute.worker_resources.gpu:
         return compute.workers
-    actor = 1 if compute.worker_resources.cpu == "auto" else compute.worker_resources.cpu
-    actors = min(share(nodes, at_once) // actor, -(-chunks_at_once(config) // actor))
-    return max(1, actors) * actor
+    each, cpus = share(nodes, at_once), compute.worker_resources.cpu
+    if cpus == "auto":
+        cpus = 1 if compute.address is None else actor_cores(nodes, each, None)
+    return max(1, with_work(each, cpus, chunks_at_once(config))) * cpus
 
 
 def share(nodes: Sequence[int], at_once: int) -> int:

@@ -24,6 +24,16 @@ WAYS = (
         "run(load_config(config, {'search.init_from': 'runs/a'}))",
         "run CONFIG --set search.init_from=runs/a",
     ),
+    (
+        WayOut("run", "x", settings={"seed": 1}, config="a b.yaml", out="runs/b"),
+        "run(load_config('a b.yaml', {'seed': 1}), 'runs/b')",
+        "run 'a b.yaml' --out runs/b --set seed=1",
+    ),
+    (
+        WayOut("fork", "x", "runs/a", {"seed": 1}, generation=0, out="runs/b"),
+        "fork('runs/a', {'seed': 1}, generation=0, out='runs/b')",
+        "fork runs/a --generation 0 --out runs/b --set seed=1",
+    ),
     (WayOut("watch", "x", "runs/a"), "open_run('runs/a')", "status runs/a --follow"),
     (
         WayOut("resume", "x", "runs/a", {"compute.engine": "inline", "compute.address": None, "compute.workers": 2}),

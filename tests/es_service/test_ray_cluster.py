@@ -11,7 +11,9 @@ from types import SimpleNamespace
 import pytest
 from test.support import catch_unraisable_exception
 
+from es_service.config.parallel import ANY_NUMBER
 from es_service.dispatch import ray_cluster, ray_nodes, ray_side_effects
+from es_service.dispatch.events import Limits
 from es_service.errors import EvaluationError, Interrupted
 from tests.system.processes import wait_for
 
@@ -109,6 +111,36 @@ def test_a_session_is_forgotten_with_the_link_to_it_and_with_no_other(tmp_path, 
 )
 def test_an_actor_owns_a_whole_node_where_nodes_are_equal(nodes, workers, most, cores):
     assert ray_nodes.actor_cores(nodes, workers, most) == cores
+
+
+@pytest.mark.parametrize(
+    ("nodes", "workers", "cpus", "most", "actors", "cores"),
+    [
+        ([8] * 8, 64, None, 64, 8, 8),
+        ([8] * 8, 64, None, 37, 5, 8),
+        ([8] * 8, 64, None, 38, 5, 8),
+        ([8] * 8, 64, None, 3, 1, 8),
+        ([8] * 8, 64, None, ANY_NUMBER, 8, 8),
+        ([64, 64], 96, None, 49, 2, 48),
+        ([8, 4], 12, None, 5, 5, 1),
+        ([8, 8], 5000, 10, 8, 1, 10),
+        ([8] * 8, None, None, 37, 5, 8),
+        ([64, 64], None, None, 24, 1, 24),
+    ],
+)
+def test_too_little_work_makes_fewer_actors_and_not_smaller_ones(nodes, workers, cpus, most, actors, cores):
+    """Messages are counted by actor. Without a number of workers, one node can be too large for all the work."""
+    alive = [{"NodeID": str(node), "Resources": {"CPU": float(cpu)}, "Alive": True} for node, cpu in enumerate(nodes)]
+    _, limits, _ = ray_nodes.layout(
+        SimpleNamespace(nodes=lambda: alive),  # pyright: ignore[reportArgumentType]
+        Limits(workers or 1),
+        cpus,
+        0.0,
+        most,
+        grows=workers is None,
+        ours=False,
+    )
+    assert (limits.workers, limits.cores) == (actors, cores)
 
 
 def test_nodes_without_cores_and_dead_ones_do_not_count():

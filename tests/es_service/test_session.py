@@ -10,7 +10,7 @@ from es_service import api
 from es_service.api import load_config
 from es_service.cli.commands import error_message
 from es_service.config.compute import ComputeConfig
-from es_service.config.parallel import chunks_at_once
+from es_service.config.parallel import chunks_at_once, chunks_of_phases, parallel_sentence
 from es_service.dispatch.events import Compiled, Result, StopWorker, Submit, Tick, WorkerLost, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state
@@ -86,15 +86,39 @@ def test_no_more_workers_start_than_have_work(monkeypatch):
     chunks = chunks_at_once(config)
     assert chunks < 40
     assert (worker_count(config), worker_count(configured(2)), worker_count(config, 39)) == (chunks, 2, 39)
-    cluster = {"engine": "ray", "address": "auto"}
-    assert worker_count(configured(5000, **cluster)) == chunks
-    actors = {"worker_resources": {"cpu": 10}, **cluster}
-    assert worker_count(configured(5000, **actors)) == -(-chunks // 10) * 10, "whole actors"
+    assert worker_count(configured(5000, engine="ray", address="auto")) == 5000, "the engine cuts, to whole actors"
     own = load_config(
         CONFIG
         | {"search": {"algorithm": "tests.examples.repelling_centres:repelling_centres"}, "compute": {"workers": 40}}
     )
     assert worker_count(own) == 40
+
+
+def test_a_note_says_how_many_workers_start_where_not_all_have_work(tmp_path):
+    notices: list[str] = []
+    few = {"search.pairs": 16, "search.evaluation_episodes": 20, "compute.max_workers_per_core": 4}
+    api.run(load_config(CONFIG, {**few, "compute.workers": 3}), tmp_path / "run", on_notice=notices.append)
+    assert [notice.partition(",")[0] for notice in notices] == ["compute.workers: 2 workers start and not 3"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "chunks", "keys"),
+    [
+        ({"search.pairs": 512}, 8, "search.pairs and compute.chunk_pairs change that"),
+        (
+            {"search.pairs": 512, "compute.gradient_block_pairs": 8},
+            64,
+            "search.pairs and compute.gradient_block_pairs change that",
+        ),
+        ({"search.pairs": 16, "search.evaluation_episodes": 60}, 4, "search.evaluation_episodes changes that"),
+    ],
+)
+def test_the_largest_phase_of_a_generation_says_how_many_workers_have_work(settings, chunks, keys):
+    config = load_config(CONFIG, settings)
+    assert chunks_at_once(config) == max(chunks_of_phases(config).values()) == chunks
+    sentence = parallel_sentence(config)
+    assert f"has {chunks} chunks of work at a time" in sentence
+    assert sentence.endswith(f"; {keys}")
 
 
 @pytest.mark.parametrize("engine", ["inline", "ray"])
@@ -103,18 +127,21 @@ def test_more_workers_on_this_machine_than_its_cores_can_be_meant_to_run_are_ref
     monkeypatch.setattr(session, "cores", lambda: 2)
     assert worker_count(configured(8, engine=engine), 9) == 8
     assert worker_count(configured(20, engine=engine, max_workers_per_core=10), 1000) == 20
-    assert worker_count(configured(5000, engine="ray", address="auto"), 1000) == 1000
+    assert worker_count(configured(5000, engine="ray", address="auto"), 1000) == 5000
     folder = tmp_path / "run"
     with pytest.raises(ConfigError, match=r"5000 workers are too many for this machine, which has 2 cores") as error:
         api.run(configured(5000, engine=engine), folder)
     assert (error.value.field, error.value.value, error.value.allowed) == ("compute.workers", 5000, "at most 8")
-    assert error_message(error.value).endswith(
-        f" run CONFIG --out {folder} --address HOST:PORT --set compute.workers=5000"
-    )
+    again = f"es-service run CONFIG --out {folder}"
+    assert error_message(error.value).splitlines()[1:] == [
+        f"  to start one worker for each core: {again} --set compute.workers=auto",
+        f"  to use the cores of a Ray cluster: {again} --address HOST:PORT --set compute.workers=5000",
+    ]
     assert not folder.exists()
     api.run(configured(1), folder)
     before = (folder / "config.yaml").read_text()
     with pytest.raises(ConfigError, match="must be at most 8") as error:
         api.resume(folder, ["compute.workers=9", f"compute.engine={engine}"])
-    assert f" resume {folder} --address HOST:PORT" in error_message(error.value)
+    assert f" resume {folder} --engine {engine} --set compute.workers=auto\n" in error_message(error.value)
+    assert error_message(error.value).endswith(f" resume {folder} --address HOST:PORT --set compute.workers=9")
     assert (folder / "config.yaml").read_text() == before

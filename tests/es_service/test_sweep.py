@@ -182,6 +182,10 @@ def test_a_cluster_is_asked_for_its_nodes_only_if_runs_share_it(monkeypatch):
     nodes += [4, 4, 4, 4]
     assert sweep_cores.shared([auto] * 3, 3).workers == (4, 4, 4)
     assert asked == ["head:6379"] * 2
+    nodes[:] = [8, 8, 8, 8]
+    small = config(engine="ray", address="head:6379", chunk_pairs=16)
+    few = small.model_copy(update={"search": small.search.model_copy(update={"pairs": 9 * 16})})
+    assert sweep_cores.shared([few] * 2, 2).workers == (16, 16), "two actors of a node, not nine of one core"
     with pytest.raises(ConfigError, match="parallel: 0 is not allowed"):
         sweep_cores.shared([auto], 0)
     with pytest.raises(ConfigError, match="50000 workers are too many for this machine"):

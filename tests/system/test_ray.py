@@ -224,8 +224,10 @@ def test_a_run_that_cannot_begin_leaves_no_folder_behind(tmp_path):
     before, cluster = digest_parts(old), ["compute.engine=ray", "compute.address=127.0.0.1:1"]
     more = "budget.generations=40"
     with pytest.raises(StartError) as error:
-        api.fork(old, [*cluster, more], out=new)
-    assert f" fork {old} --engine inline" in error_message(error.value)
+        api.fork(old, [*cluster, more], out=new, generation=29)
+    assert error_message(error.value).endswith(
+        f" fork {old} --generation 29 --out {new} --engine inline --set {more} --set compute.workers=auto"
+    )
     assert not new.exists()
     with pytest.raises(StartError) as error:
         api.resume(old, [*cluster, more])

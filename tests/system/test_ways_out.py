@@ -15,11 +15,12 @@ import pytest
 
 from es_service import api
 from es_service.cli import commands
-from es_service.cli.commands import error_message
+from es_service.cli.commands import error_message, way_command
 from es_service.cli.console import text_console
 from es_service.cli.tables.status import follow_status, print_summary
-from es_service.config.changes import refused_changes
-from es_service.errors import ConfigError, NotInRunError, StoreError
+from es_service.config.changes import again_with, refused_changes
+from es_service.config.compute import implied_by
+from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
 from es_service.runs.evaluation import candidates
 from es_service.store.lock import acquire_lock
 from es_service.store.reader import read_generation
@@ -99,6 +100,49 @@ def test_the_fork_that_a_refused_resume_names_goes_on(tmp_path):
     assert way is not None
     assert way.run == str(folder)
     assert (api.fork(way.run, way.settings, out=tmp_path / "fork").run.generation or 0) > 2
+
+
+def test_a_call_with_too_many_workers_is_repeated_whole_by_its_way_out(config, tmp_path):
+    """Of a new run, of a fork, and of a run that had the workers of a cluster: each with the settings asked for."""
+    run, fork = tmp_path / "a run", tmp_path / "a fork"
+    asked = ["search.sigma=0.3", "budget.generations=2"]
+    options = [word for setting in asked for word in ("--set", setting)]
+    refused = command("run", config, "--out", run, *options, "--workers", 10**6, "--engine", "inline")
+    assert (refused.returncode, run.exists()) == (2, False)
+    assert command("run", *words_after(refused.stderr, "run")).returncode == 0
+    with pytest.raises(ConfigError) as error:
+        api.fork(run, (*asked, "search.sigma=0.4", "compute.workers=1000000"), generation=1, out=fork)
+    words = words_after(error_message(error.value), "fork")
+    options[1] = "search.sigma=0.4"
+    assert words == [str(run), "--generation", "1", "--out", str(fork), *options, "--set", "compute.workers=auto"]
+    assert command("fork", *words).returncode == 0
+    for folder, sigma in ((run, 0.3), (fork, 0.4)):
+        made = api.open_run(folder)
+        assert (made.config["search"]["sigma"], made.config["compute"]["workers"]) == (sigma, "auto")
+        assert made.generation == 2
+    assert (api.open_run(fork).meta.parent or {})["generation"] == 1
+    recorded = run / "config.yaml"
+    recorded.write_text(recorded.read_text().replace("workers: auto", "workers: 1000000"))
+    with pytest.raises(ConfigError) as error:
+        api.resume(run, {"compute.engine": "inline", "budget.generations": 3})
+    way = error.value.way_out
+    assert way is not None
+    assert words_after(error_message(error.value), "resume") == [
+        *[str(run), "--engine", "inline"],
+        *["--set", "budget.generations=3", "--set", "compute.workers=auto"],
+    ]
+    assert api.resume(run, way.settings).run.generation == 3
+
+
+def test_a_way_out_to_another_engine_takes_nothing_from_the_one_that_was_asked_for():
+    asked = {"search.sigma": 0.3, "compute.address": "a:1", **implied_by(None, "a:1"), "compute.dispatch_log": True}
+    inline = {"compute.engine": "inline", **implied_by("inline", None), "compute.workers": "auto"}
+    way = again_with(WayOut("fork", "", "r", asked, generation=3), "go on here", inline)
+    assert way.settings == {"search.sigma": 0.3, "compute.dispatch_log": True, **inline}
+    assert way_command(way).endswith(
+        " fork r --generation 3 --engine inline --set search.sigma=0.3 --set compute.dispatch_log=true"
+        " --set compute.workers=auto"
+    )
 
 
 def test_commands_start_what_is_there(tmp_path, monkeypatch):
