@@ -39,6 +39,10 @@ _MODULES = {
 """Name -> its module, if that is not `es_service.api`."""
 
 
+def __dir__() -> list[str]:
+    return sorted(__all__)  # for completion, which would otherwise see only what has been used
+
+
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -160,6 +160,7 @@ def again_with(call: WayOut, purpose: str, settings: Mapping[str, Any]) -> WayOu
 
 
 def start_afresh(run: object) -> WayOut:
-    """The way out if the wanted settings cannot use the run's state: a new run that starts from its centre."""
-    purpose = "start a new run from its centre (same task and network)"
-    return WayOut("run", purpose, settings={"search.init_from": str(run)})
+    """The way out if the wanted settings cannot use the run's state: a new run that starts from its best policy. Not
+    every run has a newest centre."""
+    purpose = "start a new run from its best policy (same task and network)"
+    return WayOut("run", purpose, settings={"search.init_from": f"{run}:best"})

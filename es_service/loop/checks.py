@@ -44,6 +44,15 @@ def require_asks(asks: object, state: SearchState, chunk_pairs: int, observation
         raise EvaluationError(f"generation {generation}: {problem}", field="search.algorithm")
 
 
+def require_state(state: object, function: str, generation: int) -> None:
+    """Raise an EvaluationError if a function of a search, a user's perhaps, has not returned a state."""
+    if not isinstance(state, SearchState):
+        raise EvaluationError(
+            f"generation {generation}: `{function}` returned {type(state).__name__}; it must return a SearchState",
+            field="search.algorithm",
+        )
+
+
 def require_weights(weights_P: object, asked: Ask, generation: int) -> None:
     """Raise an EvaluationError if the weights that a search, a user's perhaps, gives to noise make no gradient."""
     problem = _not_floats(weights_P, (int(asked.pairs),))

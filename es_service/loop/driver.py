@@ -20,6 +20,7 @@ from es_service.loop.checks import (
     require_asks,
     require_finite,
     require_some_finite,
+    require_state,
     require_weights,
 )
 from es_service.loop.clock import Clock
@@ -216,6 +217,7 @@ def _next_generation(
     moved = begun
     for ask, gradient_D in zip(asks, gradients, strict=True):
         moved = algorithm.step(moved, ask, gradient_D)
+        require_state(moved, "step", generation)
     # New centres are evaluated with the observation statistics of the generation's start.
     new_centres = [
         replace(centre, parameters_D=moved.centres[ask.centre].centre_D)

@@ -14,7 +14,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from es_service.config.model import RunConfig
-from es_service.loop.checks import valid_members
+from es_service.loop.checks import require_state, valid_members
 from es_service.loop.policies import PolicyWork, policy_episodes
 from es_service.loop.state import Best, statistics_in_force
 from es_service.protocol.evaluator import Evaluator
@@ -168,7 +168,9 @@ def centre_evaluation(
 
 def tell(algorithm: Algorithm, state: SearchState, told: tuple[CentreEvaluation, ...]) -> SearchState:
     """The state after the search is told a generation's evaluations; its arrays are read-only from now on."""
-    return frozen(algorithm.tell(state, told))
+    after = algorithm.tell(state, told)
+    require_state(after, "tell", told[0].generation)
+    return frozen(after)
 
 
 def fittest(told: Sequence[CentreEvaluation]) -> int:

@@ -7,9 +7,10 @@ E episodes, D policy parameters, O observation, B descriptor dimensions.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal
+from types import TracebackType
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -154,14 +155,32 @@ class PolicyEvaluator:
         return found[0], found[1]
 
 
-@contextmanager
+class Evaluating(AbstractContextManager[PolicyEvaluator]):
+    """What `evaluator` returns: a context manager of a PolicyEvaluator."""
+
+    def __init__(self, started: AbstractContextManager[PolicyEvaluator]) -> None:
+        self._started = started
+
+    def __enter__(self) -> PolicyEvaluator:
+        return self._started.__enter__()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool | None:
+        return self._started.__exit__(kind, error, trace)
+
+    def __call__(self, *arguments: object, **named: object) -> NoReturn:
+        """Say how it is meant."""
+        raise TypeError("workers start in a with block: `with evaluator(...) as evaluate: evaluate(parameters)`")
+
+
 def evaluator(
     config: RunConfig | Source,
     *,
     workers: int | Literal["auto"] | None = None,
     engine: Literal["inline", "ray"] | None = None,
     address: str | None = None,
-) -> Iterator[PolicyEvaluator]:
+) -> Evaluating:
     """Start the workers of a config and evaluate policies with them; at the end of the block, the workers end.
 
         with evaluator("point_maze_es.yaml") as evaluate:
@@ -180,6 +199,14 @@ def evaluator(
     Raises:
         ConfigError: the config is wrong. EvaluationError: the workers cannot be started.
     """
+    return Evaluating(_started(config, workers, engine, address))
+
+
+@contextmanager
+def _started(
+    config: RunConfig | Source, workers: int | str | None, engine: str | None, address: str | None
+) -> Iterator[PolicyEvaluator]:
+    """See `evaluator`."""
     given = {"compute.workers": workers, "compute.engine": engine, "compute.address": address}
     overrides = implied_by(engine, address) | {key: value for key, value in given.items() if value is not None}
     if not isinstance(config, RunConfig):

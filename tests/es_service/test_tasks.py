@@ -14,6 +14,7 @@ from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError
 from es_service.protocol.messages import TrainingChunk, around
+from es_service.protocol.noise import uniforms
 from es_service.search.algorithms import ALGORITHMS
 from tests.helpers import SPEC, centre, random_parameters
 from workers.environments import TaskError, describe_environment, make_environment
@@ -53,11 +54,18 @@ class MakesOne(Still):
         return jax.random.uniform(jax.random.wrap_key_data(key[:2]), (2,))
 
 
+class UsesItTwice(Still):
+    """its key is passed to jax.random and to our generator"""
+
+    def reset(self, key):
+        return jnp.stack([jax.random.uniform(key), uniforms(key, jnp.uint32(0))])
+
+
 class FailsAnyway(Still):
     """its reset has another fault"""
 
     def reset(self, key):
-        return jax.random.uniform(key, (2,)) + jnp.zeros(3)
+        return uniforms(key, jnp.arange(2, dtype=jnp.uint32)) + jnp.zeros(3)
 
 
 def test_a_current_folder_with_modules_of_our_names_is_nobody_s_business(tmp_path, monkeypatch):
@@ -83,6 +91,8 @@ def test_a_reset_that_takes_its_key_for_one_of_jax_is_told_how_to_make_one():
     keys_2_4 = np.arange(8, dtype=np.uint32).reshape(2, 4)
     with pytest.raises(TaskError, match=sentence):
         jax.jit(jax.vmap(make_environment(f"{HERE}:TakesItForJax", {}).reset))(keys_2_4)
+    with pytest.raises(TaskError, match=f"UsesItTwice: .*{sentence}"):
+        describe_environment(f"{HERE}:UsesItTwice")
     with pytest.raises(TaskError, match="FailsAnyway cannot be traced by JAX: TypeError"):
         describe_environment(f"{HERE}:FailsAnyway")
     states_2_2 = jax.vmap(make_environment(f"{HERE}:MakesOne", {}).reset)(keys_2_4)

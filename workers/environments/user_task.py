@@ -37,6 +37,7 @@ deviations from 0.
 from __future__ import annotations
 
 import math
+import traceback
 from collections.abc import Mapping
 from typing import Any
 
@@ -216,7 +217,7 @@ def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
         try:
             return task.reset(key)
         except Exception as error:
-            if _takes_jax_key(task.reset):
+            if _wants_jax_key(error):
                 raise TaskError(JAX_KEY_WANTED) from error
             raise
 
@@ -224,13 +225,13 @@ def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
     return Environment(reset, task.observe, step, task.descriptor, goal_distance, viewer)
 
 
-def _takes_jax_key(reset: Any) -> bool:
-    """Whether `reset`, which failed with a stream key, succeeds with a key of JAX."""
-    try:
-        jax.eval_shape(lambda: reset(jax.random.key(0)))
-    except Exception:  # the user's code can raise anything
-        return False
-    return True
+def _wants_jax_key(error: Exception) -> bool:
+    """Whether a function of `jax.random` has refused its key."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return any(
+        frame.f_code.co_name == "_check_prng_key" and str(frame.f_globals.get("__name__")).startswith("jax.")
+        for frame in frames
+    )
 
 
 def _import(path: str) -> Any:
