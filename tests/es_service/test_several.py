@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import sqlite3
 from pathlib import Path
 
@@ -14,7 +15,8 @@ from es_service import open_run
 from es_service.cli.main import app
 from es_service.cli.tables.evaluations import csv_file
 from es_service.errors import ConfigError, NotInRunError, StoreError
-from es_service.runs.folders import runs_of
+from es_service.runs.folders import holds_runs, runs_of
+from es_service.runs.standing import newest_runs
 from es_service.runs.sweep import INSIDE
 from es_service.store.lock import acquire_lock
 from tests.run_examples import write_run
@@ -54,6 +56,18 @@ def test_a_folder_stands_for_its_runs_in_the_order_of_their_numbers(tmp_path):
     (tmp_path / "notes").mkdir()
     assert runs_of(tmp_path) == [tmp_path / name for name in names], "without the folder .sweep, too"
     assert runs_of(tmp_path / names[0]) == [tmp_path / names[0]]
+
+
+def test_what_an_interrupted_creation_left_is_no_run(tmp_path):
+    """`run` creates a run beside its place, under a hidden name, and then renames it."""
+    run = write_run(tmp_path / "seed=0")
+    shutil.copytree(run, tmp_path / ".seed=1.creating")
+    assert runs_of(tmp_path) == newest_runs(tmp_path) == [run]
+    shutil.rmtree(run)
+    assert not holds_runs(tmp_path)
+    assert newest_runs(tmp_path) == []
+    with pytest.raises(StoreError, match="and no run folders, as a sweep does"):
+        es("status", tmp_path)
 
 
 def test_status_of_a_sweep_is_a_line_for_each_run(sweep):
