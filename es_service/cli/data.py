@@ -11,7 +11,7 @@ from typing import Any
 from es_service.config.presets import preset_table
 from es_service.config.shipped import shipped_configs
 from es_service.protocol.messages import TaskSpec
-from es_service.runs.objectives import recent_objectives
+from es_service.runs.recent import Recent, read_recent
 from es_service.runs.standing import Standing, state
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store.digest import digest_of
@@ -24,9 +24,9 @@ def print_json(value: object) -> None:
 
 def standing_data(standing: Standing) -> dict[str, Any]:
     """What `status` shows of a run: `newest` is the newest row of its history, `objectives` says what the centres of
-    that generation climb, and those of recent ones."""
+    that generation climb, and those of recent ones, or in `problem` why that is not known."""
     run, row = standing.run, standing.row
-    newest, recent = recent_objectives(run, row["generation"]) if row else (None, None)
+    recent = read_recent(run, row["generation"]) if row else Recent()
     return {
         "run": str(run.folder),
         "run_id": run.run_id,
@@ -38,8 +38,9 @@ def standing_data(standing: Standing) -> dict[str, Any]:
         "limits": standing.limits,
         "newest": row,
         "objectives": {
-            "newest": newest and newest._asdict(),
-            "recent": recent and recent._asdict(),
+            "newest": recent.newest and recent.newest._asdict(),
+            "recent": recent.objectives and recent.objectives._asdict(),
+            "problem": recent.problem,
         },
     }
 

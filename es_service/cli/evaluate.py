@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +13,7 @@ from es_service import api
 from es_service.cli.console import console, errors
 from es_service.cli.data import print_json
 from es_service.cli.options import JsonOption, LogLevelOption, place_of, print_note
-from es_service.cli.several import RunsArgument, is_single, read_each, started_runs
+from es_service.cli.several import RunsArgument, is_single, items_of_each, of_each, readable, started_runs
 from es_service.errors import ConfigError
 from es_service.report.progress import print_notice
 
@@ -41,6 +40,10 @@ def evaluate(
     if every and cell:
         raise ConfigError("--all and --cell cannot be combined: --all includes every cell; give one of them")
     cells = list(dict.fromkeys(place_of(text) for text in cell or ()))
+    if workers is not None:  # before the first run, since the other runs would have the same problem
+        for _, found in of_each(folders, lambda folder: evaluation.evaluation_config(api.open_run(folder), workers)):
+            if isinstance(found, ConfigError) and found.field == "compute.workers":
+                raise found
     single = is_single(folders)
     width = None if single else max(map(len, map(str, started_runs(folders))), default=0)
 
@@ -65,12 +68,12 @@ def evaluate(
     problems: list[dict[str, str]] = []
     with csv_file(out, print_note) as write:
         if single:
-            found = ([row] for row in rows_of(folders[0]))
+            found = rows_of(folders[0])
         else:
             if not as_json:
                 print_header(console, width)
-            found = (rows for _, rows in read_each(folders, lambda folder: list(rows_of(folder)), problems))
-        for row in chain.from_iterable(found):
+            found = (row for _, row in readable(items_of_each(folders, rows_of), problems))
+        for row in found:
             rows.append(row)
             write(row)
     if as_json:

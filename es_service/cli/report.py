@@ -11,7 +11,7 @@ import typer
 from es_service import api
 from es_service.cli.commands import command
 from es_service.cli.options import RunArgument, place_of, print_note
-from es_service.cli.several import RunsArgument, is_single, read_each
+from es_service.cli.several import RunsArgument, is_single, of_each, readable
 from es_service.errors import ConfigError
 
 if TYPE_CHECKING:  # importing it takes time that other commands need not spend
@@ -87,7 +87,7 @@ def _compare(
     problems: list[dict[str, str]] = []
 
     def comparable() -> Iterator[RunData]:
-        for folder, data in read_each(folders, read_compared, problems):
+        for folder, data in readable(of_each(folders, read_compared), problems):
             if data.history["generation"].size:
                 yield data
             else:

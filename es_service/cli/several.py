@@ -3,7 +3,7 @@ is damaged hides no other."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -34,6 +34,13 @@ def started_runs(folders: Sequence[Path]) -> list[Path]:
 def of_each(folders: Sequence[Path], read: Callable[[Path], T]) -> Iterator[tuple[Path, T | ServiceError | None]]:
     """What is read of each run in some folders: (its folder, the result). The result is the error if a run cannot be
     read, and None if it is one that its sweep has not started."""
+    return items_of_each(folders, lambda run: [read(run)])
+
+
+def items_of_each(
+    folders: Sequence[Path], read: Callable[[Path], Iterable[T]]
+) -> Iterator[tuple[Path, T | ServiceError | None]]:
+    """The same for several results of each run, each of which is passed on before the next is read."""
     for folder in folders:
         try:
             runs = runs_of(folder)
@@ -43,22 +50,24 @@ def of_each(folders: Sequence[Path], read: Callable[[Path], T]) -> Iterator[tupl
         for run in runs:
             try:
                 waits = run != folder and not holds_run(run)
-                yield run, None if waits else read(run)
+                for found in [None] if waits else read(run):
+                    yield run, found
             except Interrupted:
                 raise
             except ServiceError as error:
                 yield run, error
 
 
-def read_each(
-    folders: Sequence[Path], read: Callable[[Path], T], problems: list[dict[str, str]]
+def readable(
+    each: Iterable[tuple[Path, T | ServiceError | None]], problems: list[dict[str, str]]
 ) -> Iterator[tuple[Path, T]]:
-    """The same for the runs that can be read. The others are named on stderr at once.
+    """The results of the runs that can be read. The others are named on stderr at once.
 
     Args:
+        each: what `of_each` or `items_of_each` returns.
         problems: gets what `--json` prints of each run that cannot be read.
     """
-    for folder, found in of_each(folders, read):
+    for folder, found in each:
         if found is None:
             print_note(f"note: {folder} has not started")
         elif isinstance(found, ServiceError):

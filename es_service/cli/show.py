@@ -12,7 +12,7 @@ from es_service import api
 from es_service.cli.console import console
 from es_service.cli.data import catalogue_data, digest_data, print_json, standing_data
 from es_service.cli.options import JsonOption, print_note
-from es_service.cli.several import RunsArgument, is_single, of_each, problem_data, read_each
+from es_service.cli.several import RunsArgument, is_single, of_each, problem_data, readable
 from es_service.cli.tables.catalogue import print_catalogue
 from es_service.cli.tables.overview import NOT_STARTED, print_overview
 from es_service.cli.tables.status import follow_status, print_status
@@ -90,7 +90,7 @@ def digest_(
         return {"run": str(folder), **digest_data(found, mixed=mixed)}
 
     problems: list[dict[str, str]] = []
-    results = [data for _, data in read_each(folders, show, problems)]
+    results = [data for _, data in readable(of_each(folders, show), problems)]
     if as_json:
         print_json([*results, *problems])
     if problems:

@@ -17,9 +17,9 @@ from types import ModuleType
 from typing import Any
 
 from es_service.dispatch import node_probe
-from es_service.dispatch.ray_cluster import address_here, connect, disconnect
+from es_service.dispatch.ray_cluster import connect, disconnect, require_node
 from es_service.dispatch.ray_faults import error_text
-from es_service.dispatch.ray_head import HEAD_CALL, uses_tls
+from es_service.dispatch.ray_head import HEAD_CALL, grpc_module, uses_tls
 from es_service.dispatch.ray_ports import NODE_CALL, open_ports
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.sources import Sources
@@ -93,9 +93,10 @@ def cluster_facts(address: str, shared: Path | None = None) -> ClusterFacts:
         EvaluationError: the connection failed, or a package is missing.
         ConfigError: the folder does not exist, or this process cannot write there.
     """
+    grpc_module()  # needed for the ports; `connect` works without it, but may wait for a minute
     with _file_in(shared) as file:
         try:
-            address_here(address)
+            require_node(address)
             ray = connect(address, gpus=False, cpus=1)
         except EvaluationError as error:  # its ways out are those of a run
             raise EvaluationError(" ".join(error.sentence.split()), field="cluster", value=address) from error

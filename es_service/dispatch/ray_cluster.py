@@ -92,7 +92,7 @@ def connect(address: str | None, *, gpus: bool, cpus: int) -> ModuleType:
             raise StartError("this process already uses Ray; call ray.shutdown() first", ways_out=ways_out)
         if address is not None and find_spec("grpc"):  # without the extra `cluster`, Ray says it, after a minute
             try:
-                require_head(address_here(address) if address == "auto" else address, is_auto=address == "auto")
+                require_head(address_here() if address == "auto" else address, is_auto=address == "auto")
             except StartError as error:
                 error.ways_out = (*error.ways_out, *ways_out)
                 raise
@@ -141,12 +141,10 @@ def disconnect(ray: ModuleType, *, forget: bool = False) -> None:
                 latest.unlink()
 
 
-def address_here(address: str) -> str:
-    """HOST:PORT of a cluster that a process on this host may join; "auto" is resolved as Ray resolves it.
+def require_node(address: str) -> None:
+    """Raise StartError if Ray is not installed, or if no node of Ray runs on this host, from which to join a cluster.
 
-    Raises:
-        StartError: Ray is not installed, or runs on no process of this host. There, `ray.init` would wait for a
-            minute, and then say only that it failed.
+    Without one, `ray.init` would wait for a minute, and then say only that it failed.
     """
     with signal_handlers_kept(), environment_kept(SETTINGS):
         try:
@@ -160,7 +158,15 @@ def address_here(address: str) -> str:
                 field="compute.address",
                 value=address,
             )
-        return services.canonicalize_bootstrap_address("auto") or address if address == "auto" else address
+
+
+def address_here() -> str:
+    """HOST:PORT of the cluster on this machine, as Ray finds it for "auto". Raises StartError as `require_node`."""
+    require_node("auto")
+    with signal_handlers_kept(), environment_kept(SETTINGS):
+        from ray._private import services
+
+        return services.canonicalize_bootstrap_address("auto") or "auto"
 
 
 def nodes_of_cluster(address: str) -> list[int]:

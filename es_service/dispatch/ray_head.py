@@ -68,8 +68,8 @@ def _why_no_connection(grpc: Any, address: str) -> str:
         socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
     except (OSError, OverflowError) as error:  # a port above 65535 overflows
         return (
-            f"nobody answers there ({getattr(error, 'strerror', None) or error}). Give the address of its head, "
-            "HOST:PORT (usually port 6379), or auto on a machine of the cluster"
+            f"nothing listens at that address ({getattr(error, 'strerror', None) or error}). Give the address of "
+            "its head, HOST:PORT (usually port 6379), or auto on a machine of the cluster"
         )
     with _channel(grpc, address) as channel:
         try:

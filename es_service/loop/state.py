@@ -87,9 +87,11 @@ def _malformed(map_: BehaviourMap) -> str:
 
 
 def _unkept(first: SearchState) -> str:
-    """Why the store cannot keep the arrays of a search's own; empty if it can."""
+    """Why the store cannot keep the first state as it is: its map, or the arrays of a search's own; empty if it can."""
     wrong = [name for name, array in first.own.items() if getattr(array, "dtype", np.dtype(object)).kind not in "biuf"]
-    return f"its own array {wrong[0]!r} is no NumPy array of bool, integers or floats" if wrong else ""
+    if wrong:
+        return f"its own array {wrong[0]!r} is no NumPy array of bool, integers or floats"
+    return _malformed(first.map) if first.map is not None else ""
 
 
 def _kinds(state: SearchState) -> dict[str, str]:

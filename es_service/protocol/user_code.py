@@ -90,8 +90,8 @@ def _outdated(found: Mapping[str, UserModule]) -> set[str]:
 
 
 def _is_same(module: ModuleType, own: UserModule) -> bool:
-    """Whether a module was imported from its file as it is now. If the program has imported it itself, nobody knows
-    from which version; then the file must not have changed since this process started."""
+    """Whether a module was imported from its file as it is now. If the program has imported it itself, the
+    version that was imported is unknown; then the file must not have changed since this process started."""
     loader = getattr(module, "__loader__", None)
     if isinstance(loader, _Loader):
         return loader.sha256 == own.sha256

@@ -133,7 +133,7 @@ def _about_intervals(groups: Sequence[Group]) -> str:
     if alone := [group.name for group in groups if group.seeds == 1]:
         said.append(f"A group with one seed has no interval: {', '.join(alone)}.")
     if repeated := [group.name for group in groups if 1 < group.seeds < len(group.runs)]:
-        said.append(f"Nor has a group in which several runs have the same seed: {', '.join(repeated)}.")
+        said.append(f"A group in which several runs have the same seed has no interval: {', '.join(repeated)}.")
     return " ".join(said)
 
 

@@ -108,8 +108,8 @@ def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
     together = series.groups(generations)[0]
     grouped = None
     if together > 1:
-        text = f"Each point summarises {together} neighbouring generations: what is said to be so far, coverage and "
-        text += "QD-score by their last value, everything else by the mean."
+        text = f"Each point summarises {together} neighbouring generations: values 'so far', coverage and QD-score "
+        text += "are those of the last of these generations, and all other values are means."
         grouped = tag("p", text, class_="note")
     return section(
         "Curves",

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.config.compute import ENGINE_IMPLIES
-from es_service.config.model import worker_spec
+from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
@@ -26,7 +26,7 @@ from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, 
 from es_service.runs.checked_config import changed_config
 from es_service.runs.compiling import compiling_sentence
 from es_service.runs.moment import Policy, make_policy
-from es_service.runs.session import dispatch_limits
+from es_service.runs.session import dispatch_limits, require_cores
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, is_no_elite
 from es_service.search.observation_statistics import merge_moments, moments_of
@@ -129,6 +129,17 @@ def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[i
     return found
 
 
+def evaluation_config(run: Run, workers: int | None = None) -> RunConfig:
+    """The config of a run as its policies are evaluated: on this machine, with this number of workers.
+
+    Raises ConfigError if these are too many for its cores, or if the run's own config cannot be read.
+    """
+    overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": workers or "auto"}
+    config = changed_config(run.present_config, overrides)
+    require_cores(config)
+    return config
+
+
 def evaluate(
     run: Run,
     chosen: Sequence[Candidate],
@@ -145,10 +156,10 @@ def evaluate(
         seed: seed of the evaluation episodes, from 0 to 2**63 - 1.
         on_compile: called with a sentence when the workers compile for more than two seconds.
 
-    Raises EvaluationError if the rollouts cannot continue, and Interrupted after SIGINT or SIGTERM.
+    Raises EvaluationError if the rollouts cannot continue, and Interrupted after SIGINT or SIGTERM; ConfigError as
+    `evaluation_config`.
     """
-    overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": workers or "auto"}
-    config = changed_config(run.present_config, overrides)
+    config = evaluation_config(run, workers)
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
     limits, spec = dispatch_limits(config, chunks * len(chosen)), worker_spec(config, task_of(config))

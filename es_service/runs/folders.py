@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from es_service.runs.sweep import INSIDE
-from es_service.store.folder import COPY, DATABASE, holds_run
+from es_service.store.folder import holds_run, runs_inside
 
 
 def holds_runs(folder: Path) -> bool:
@@ -33,8 +33,7 @@ def output_of(run: Path) -> Path | None:
 
 def _inside(folder: Path) -> set[Path]:
     """Folders of the runs directly inside a folder, and those for which a sweep has a config."""
-    runs = {file.parent for name in (DATABASE, COPY) for file in folder.glob(f"*/{name}")}
-    return runs | {folder / file.stem for file in (folder / INSIDE).glob("*.yaml")}
+    return runs_inside(folder) | {folder / file.stem for file in (folder / INSIDE).glob("*.yaml")}
 
 
 def _in_order(name: str) -> list[str | float]:

@@ -14,12 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.runs.view import Run
-from es_service.store.reader import read_evaluations
-
-RECENT = 1000
-"""About so many centres, of whole generations, are the recent ones."""
-
 
 class Objectives(NamedTuple):
     """What some centres climb."""
@@ -52,18 +46,3 @@ def weights(centres: Mapping[str, NDArray[np.float64]]) -> tuple[NDArray[np.floa
     """
     moved_N = np.isfinite(centres["update_norm"])
     return centres["generation"][moved_N], centres["fitness_weight"][moved_N]
-
-
-def recent_objectives(run: Run, generation: int) -> tuple[Objectives, Objectives]:
-    """What the centres of a generation climb, and those of recent generations, this one included.
-
-    Raises StoreError if one of their rows is damaged.
-    """
-    [newest] = read_evaluations(run.folder, generation, 1) or [[]]  # a driver that falls back may have deleted it
-    count = min(generation + 1, max(1, RECENT // max(1, len(newest))))
-    recent = read_evaluations(run.folder, generation + 1 - count, count)
-    of_generation, of_all = (
-        np.array([one["fitness_weight"] for one in centres if np.isfinite(one["update_norm"])])
-        for centres in (newest, [one for each in recent for one in each])
-    )
-    return objectives(of_generation), objectives(of_all)

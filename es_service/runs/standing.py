@@ -14,7 +14,7 @@ from es_service.errors import ConfigError, WayOut
 from es_service.loop.budget import REACHED, limits_of, raised, spent
 from es_service.loop.history import Row
 from es_service.runs.view import Run
-from es_service.store.folder import CONFIG, DATABASE
+from es_service.store.folder import CONFIG, DATABASE, runs_inside
 from es_service.store.lock import lock_holder
 from es_service.store.reader import read_newest
 
@@ -48,7 +48,8 @@ def population_size(constants: Mapping[str, Any]) -> str:
 
 def newest_runs(folder: Path, most: int = 10) -> list[Path]:
     """The runs directly below a folder that were written last, newest first; empty if the folder does not exist."""
-    written = {path.parent: path.stat().st_mtime for path in folder.glob(f"*/{DATABASE}")}
+    databases = {run: run / DATABASE for run in runs_inside(folder)}
+    written = {run: file.stat().st_mtime for run, file in databases.items() if file.exists()}
     return sorted(written, key=lambda run: written[run], reverse=True)[:most]
 
 

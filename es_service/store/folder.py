@@ -108,6 +108,12 @@ def holds_run(folder: Path) -> bool:
         raise explained(error, folder, "looking for a run", "try again") from error
 
 
+def runs_inside(folder: Path) -> set[Path]:
+    """The run folders directly inside a folder, except hidden ones: these are runs whose creation was interrupted."""
+    found = {file.parent for name in (DATABASE, COPY) for file in folder.glob(f"*/{name}")}
+    return {run for run in found if not run.name.startswith(".")}
+
+
 def require_run_folder(folder: Path) -> None:
     """Raise StoreError unless a folder contains a run."""
     if not folder.is_dir():
@@ -118,7 +124,7 @@ def require_run_folder(folder: Path) -> None:
             ways_out=[WayOut("run", "start a run there", out=str(folder))],
         )
     if not holds_run(folder):
-        inside = sorted(path.parent for path in folder.glob(f"*/{DATABASE}"))
+        inside = sorted(runs_inside(folder))
         if inside:
             runs = (
                 f"{len(inside)} run folders, such as {inside[-1]}" if len(inside) > 1 else f"the run folder {inside[0]}"

@@ -8,7 +8,8 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
-from contextlib import closing, suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from es_service.errors import StoreError
@@ -64,6 +65,9 @@ def _open_made_sound(file: Path, notices: list[str], copy: Path | None = None) -
 def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], copy: Path | None) -> Verdict:
     """Verify a database and delete damaged rows and what is newer than the newest intact state; returns the new result.
 
+    If more than one generation is deleted, the database as it was is kept under another name. Otherwise little is lost,
+    and the state before the newest is the one that a run always stores for this purpose.
+
     Raises:
         Damaged: no generation is intact, or fewer generations are lost with `copy`.
     """
@@ -73,6 +77,12 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
     found = verdict.damage
     if verdict.good is None or (copy is not None and _reach(copy) > verdict.good):
         raise Damaged(found)
+    kept = ""
+    if verdict.newest is not None and verdict.good < verdict.newest - 1:
+        old = file.with_name(f"{file.name}.damaged")  # DAMAGED, except for a damaged copy that is being restored
+        remove_database(old)
+        with _new_copy(connection, old):
+            kept = f"; the damaged database, with all generations, is kept as {old.name}"
     connection.execute("BEGIN IMMEDIATE")
     for table in GENERATION_TABLES:
         connection.execute(f"DELETE FROM {table} WHERE generation > ?", (verdict.good,))
@@ -85,7 +95,7 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
     else:
         notices.append(
             f"{file}: the state or the history of the newest generation, {verdict.newest}, is damaged ({found}); "
-            f"the run fell back to generation {verdict.good}, the newest whose state is stored and intact"
+            f"the run fell back to generation {verdict.good}, the newest whose state is stored and intact{kept}"
         )
     again = verify(connection, file)
     if again.problems:
@@ -158,20 +168,30 @@ def make_copy(connection: sqlite3.Connection, folder: Path) -> None:
         Damaged: the new copy is damaged.
         sqlite3.Error, OSError: the new copy cannot be written.
     """
-    temporary = folder / f"{COPY}.new"
-    try:
-        remove_database(temporary)
-        with closing(connect(temporary)) as target:
-            target.execute("PRAGMA synchronous = OFF")
-            connection.backup(target)
-            # The header was copied from a WAL database. Without WAL, readers of the copy write no files beside it.
-            target.execute("PRAGMA journal_mode = DELETE")
-            verdict = verify(target, temporary, _known_rows(target, folder / COPY))
+    with _new_copy(connection, folder / COPY) as copy:
+        verdict = verify(copy, folder / COPY, _known_rows(copy, folder / COPY))
         if verdict.problems:
             raise Damaged(verdict.damage)
+
+
+@contextmanager
+def _new_copy(connection: sqlite3.Connection, file: Path) -> Iterator[sqlite3.Connection]:
+    """A connection to a new copy of the database of `connection`, with what is in its log.
+
+    The copy becomes `file`, a single file, when the block ends. If anything raises, the former `file` remains.
+    """
+    temporary = file.with_name(f"{file.name}.new")
+    try:
+        remove_database(temporary)
+        with closing(connect(temporary)) as copy:
+            copy.execute("PRAGMA synchronous = OFF")
+            connection.backup(copy)
+            # The header was copied from a WAL database. Without WAL, readers of the copy write no files beside it.
+            copy.execute("PRAGMA journal_mode = DELETE")
+            yield copy
         sync_file(temporary)
-        os.replace(temporary, folder / COPY)
-        sync_folder(folder)
+        os.replace(temporary, file)
+        sync_folder(file.parent)
     except BaseException:
         remove_database(temporary)
         raise

@@ -26,14 +26,14 @@ def begin(folder, change, generations=4):
     return api.run(api.load_config(CONFIG, settings), folder).run
 
 
-def telling(config, change):
-    """ES that changes the map's first entry in generation 2, and nothing else of the map from then on."""
+def telling(config, change, at=2):
+    """ES that changes the map in one generation, and nothing of it from then on."""
     ours = ALGORITHMS["es"](config)
 
     def tell(state, evaluations):
-        if (generation := evaluations[0].generation) < 2:
-            return ours.tell(state, evaluations)
-        return replace(state, map=change(state.map)) if generation == 2 else state
+        generation = evaluations[0].generation
+        told = ours.tell(state, evaluations) if generation < 2 else state
+        return replace(told, map=change(told.map)) if generation == at else told
 
     return replace(ours, tell=tell)
 
@@ -115,3 +115,14 @@ def test_arrays_of_other_shapes_and_types_end_the_run(tmp_path, change, what):
     with pytest.raises(StoreError, match=f"generation 2 cannot be stored: the map's {what}.*it must be float64"):
         begin(tmp_path / "run", change)
     assert api.open_run(tmp_path / "run").generation == 1
+
+
+def single_at_first(config):
+    return telling(config, lambda map_: replace(map_, fitness_N=map_.fitness_N.astype(np.float32)), at=0)
+
+
+def test_the_map_of_the_first_generation_is_checked_too(tmp_path):
+    """The store would convert it, so that a resumed run would differ from this one."""
+    message = "generation 0 cannot be stored: the map's fitness_N is float32 .*it must be float64"
+    with pytest.raises(StoreError, match=message):
+        begin(tmp_path / "run", "single_at_first")

@@ -15,10 +15,11 @@ from pathlib import Path
 
 import pytest
 
+from es_service.dispatch import cluster_facts as module
 from es_service.dispatch import node_probe
 from es_service.dispatch.cluster_facts import ClusterFacts, NodeFacts, cluster_facts, public_sockets
 from es_service.dispatch.cluster_findings import findings
-from es_service.errors import ConfigError
+from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.machine import VERSION
 
 VERSIONS = {"ray": "2.60.0", "python": "3.11.2", "es-service": "0.8.0", "jax": "0.10.2", "cpu": "A 1/1 avx2"}
@@ -217,6 +218,16 @@ def test_this_host_knows_its_own_software():
     assert software["versions"]["es-service"] == VERSION
     assert "workers/worker.py" in software["sources"]
     assert pickle.loads(pickle.dumps(software)) == software
+
+
+def test_without_the_extra_it_is_named_before_anything_is_joined(monkeypatch):
+    monkeypatch.setitem(sys.modules, "grpc", None)
+    monkeypatch.setattr(module, "connect", lambda *_, **__: pytest.fail("it was joined"))
+    monkeypatch.setattr(module, "require_node", lambda address: None)
+    with pytest.raises(EvaluationError, match="checks of a cluster need the extra `cluster`") as error:
+        cluster_facts("127.0.0.1:1")
+    assert error.value.way_out is not None
+    assert (error.value.way_out.action, error.value.way_out.extra) == ("install", "cluster")
 
 
 @pytest.mark.parametrize("folder", ["missing", "file"])

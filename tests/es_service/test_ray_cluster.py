@@ -36,7 +36,7 @@ def test_variables_that_nobody_changed_are_never_touched(monkeypatch):
 @pytest.fixture
 def found(monkeypatch):
     """A cluster on this machine, whose head accepts this process."""
-    monkeypatch.setattr(ray_cluster, "address_here", lambda address: "127.0.0.1:6379")
+    monkeypatch.setattr(ray_cluster, "address_here", lambda: "127.0.0.1:6379")
     monkeypatch.setattr(ray_cluster, "require_head", lambda address, *, is_auto: None)
 
 

@@ -93,8 +93,8 @@ def test_a_server_that_is_no_head_is_named(head, monkeypatch):
     ("address", "reason"),
     [
         ("127.0.0.1", "an address is HOST:PORT, or auto"),
-        ("127.0.0.1:1", r"nobody answers there \(Connection refused\)"),
-        ("127.0.0.1:99999", "nobody answers there "),
+        ("127.0.0.1:1", r"nothing listens at that address \(Connection refused\)"),
+        ("127.0.0.1:99999", "nothing listens at that address "),
     ],
 )
 def test_an_address_where_nothing_answers_is_named(address, reason):

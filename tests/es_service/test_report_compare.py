@@ -161,7 +161,7 @@ def test_runs_with_the_same_seed_are_not_taken_for_several_seeds(runs, tmp_path)
     wide = read_run(write_run(tmp_path / "wide", {"search.algorithm": "me_es", "search.sigma": 0.5, "seed": 0}))
     said = words(comparison_page([*runs[:3], wide], ["search.algorithm"]))
     assert "3 in 4 runs" in said
-    assert "Nor has a group in which several runs have the same seed: me_es." in said
+    assert "A group in which several runs have the same seed has no interval: me_es." in said
     assert not re.search(r"interval -?\d", said)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import sqlite3
 from pathlib import Path
 
@@ -13,8 +14,10 @@ from typer.testing import CliRunner
 from es_service import open_run
 from es_service.cli.main import app
 from es_service.cli.tables.evaluations import csv_file
-from es_service.errors import ConfigError, NotInRunError, StoreError
-from es_service.runs.folders import runs_of
+from es_service.errors import ConfigError, Interrupted, NotInRunError, StoreError
+from es_service.runs import evaluation
+from es_service.runs.folders import holds_runs, runs_of
+from es_service.runs.standing import newest_runs
 from es_service.runs.sweep import INSIDE
 from es_service.store.lock import acquire_lock
 from tests.run_examples import write_run
@@ -54,6 +57,18 @@ def test_a_folder_stands_for_its_runs_in_the_order_of_their_numbers(tmp_path):
     (tmp_path / "notes").mkdir()
     assert runs_of(tmp_path) == [tmp_path / name for name in names], "without the folder .sweep, too"
     assert runs_of(tmp_path / names[0]) == [tmp_path / names[0]]
+
+
+def test_what_an_interrupted_creation_left_is_no_run(tmp_path):
+    """`run` creates a run beside its place, under a hidden name, and then renames it."""
+    run = write_run(tmp_path / "seed=0")
+    shutil.copytree(run, tmp_path / ".seed=1.creating")
+    assert runs_of(tmp_path) == newest_runs(tmp_path) == [run]
+    shutil.rmtree(run)
+    assert not holds_runs(tmp_path)
+    assert newest_runs(tmp_path) == []
+    with pytest.raises(StoreError, match="and no run folders, as a sweep does"):
+        es("status", tmp_path)
 
 
 def test_status_of_a_sweep_is_a_line_for_each_run(sweep):
@@ -149,6 +164,35 @@ def test_evaluate_prints_one_table_of_all_runs(sweep, tmp_path):
     head, line = printed.splitlines()
     assert (code, head.split()[:2], line.split()[:2]) == (1, ["run", "policy"], [runs[0], "best"])
     assert head.index(" policy ") == line.index(" best "), "the columns are aligned"
+
+
+def test_each_row_of_several_runs_is_written_as_soon_as_it_is_printed(sweep, tmp_path, monkeypatch):
+    """A run may have thousands of elites, and an evaluation may be interrupted."""
+    evaluated = evaluation.evaluate
+
+    def interrupted(run, chosen, *others, **named):
+        """Stop after two policies of the second run."""
+        for number, fresh in enumerate(evaluated(run, chosen, *others, **named)):
+            if run.folder.name == "seed=2" and number == 2:
+                raise Interrupted(2)
+            yield fresh
+
+    monkeypatch.setattr(evaluation, "evaluate", interrupted)
+    command = ("evaluate", sweep, "--all", "--episodes", "1", "--workers", "1", "--out", str(tmp_path / "rows.csv"))
+    stopped = CliRunner().invoke(app, [*map(str, command)], env={"COLUMNS": "300"})
+    assert isinstance(stopped.exception, Interrupted)
+    written = list(csv.DictReader((tmp_path / "rows.csv.new").read_text().splitlines()))
+    printed = [line.split()[:2] for line in stopped.stdout.splitlines() if line.startswith(str(sweep))]
+    assert [[row["run"], row["policy"]] for row in written] == printed
+    assert [row["run"] for row in written].count(f"{sweep}/seed=2") == 2
+
+
+def test_too_many_workers_end_an_evaluation_before_its_first_run(sweep, tmp_path):
+    """It is the option that is wrong, so the exit code is 2; it is not a problem of each run."""
+    damage(sweep / "seed=0")
+    with pytest.raises(ConfigError, match=r"compute\.workers: 100000 workers are too many") as refused:
+        es("evaluate", sweep, "--workers", 100_000)
+    assert refused.value.field == "compute.workers"
 
 
 def test_rows_of_other_descriptors_are_not_put_into_one_file(tmp_path):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import re
 import shutil
 import socket
+import sqlite3
 from types import SimpleNamespace
 
 import pytest
@@ -19,7 +22,7 @@ from es_service.cli.tables import status
 from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.status import follow_status, print_status, print_summary
 from es_service.errors import ConfigError
-from es_service.runs import objectives
+from es_service.runs import recent
 from es_service.runs.standing import Standing, look, more, state
 from es_service.store import reader
 from es_service.store.lock import acquire_lock
@@ -45,8 +48,8 @@ def test_of_a_long_history_only_the_newest_row_is_read(run, console, monkeypatch
 
     sound_rows = reader._sound_rows
     monkeypatch.setattr(reader, "_sound_rows", no_more_than_one)
-    monkeypatch.setattr(status, "FAULTS_OF", 1)
-    monkeypatch.setattr(objectives, "RECENT", 1)
+    monkeypatch.setattr(recent, "FAULTS_OF", 1)
+    monkeypatch.setattr(recent, "CENTRES", 1)
     print_status(console, run)
     follow_status(console, run)
     print_summary(console, run, "")
@@ -57,7 +60,8 @@ def test_the_faults_of_the_newest_generations_are_counted(console, tmp_path, mon
     run = api.open_run(write_run(tmp_path / "run", generations=20))  # its only faults are those of generation 5
     counted = "\nfaults handled     1 workers replaced, 2 chunks sent again"
     for most, expected in ((1000, [f"{counted}\n"]), (16, [f"{counted} in the last 16 generations\n"]), (15, [])):
-        monkeypatch.setattr(status, "FAULTS_OF", most)
+        for module in (recent, status):
+            monkeypatch.setattr(module, "FAULTS_OF", most)
         print_status(console, run)
         assert re.findall("\nfaults .*\n", capsys.readouterr().out) == expected
 
@@ -86,10 +90,31 @@ def test_what_the_centres_climb_is_told_of_all_and_not_of_the_fittest(search, ex
 def test_with_one_centre_a_generation_the_share_is_that_of_recent_generations(console, tmp_path, monkeypatch, capsys):
     """It exploited in generations 10 to 19, and explored before and after."""
     run = api.open_run(write_run(tmp_path / "run", generations=20))
-    for recent, expected in ((1000, "of the last 20, 50.0 % explored"), (3, "of the last 3, 33.3 % explored")):
-        monkeypatch.setattr(objectives, "RECENT", recent)
+    for centres, expected in ((1000, "of the last 20, 50.0 % explored"), (3, "of the last 3, 33.3 % explored")):
+        monkeypatch.setattr(recent, "CENTRES", centres)
         print_status(console, run)
         assert f"\ncentres            1 exploring, 0 exploiting; {expected}\n" in capsys.readouterr().out
+
+
+def test_a_damaged_row_hides_only_what_is_read_from_it(console, tmp_path, capsys):
+    """The newest row, of which the rest is read, is intact."""
+    run = api.open_run(write_run(tmp_path / "run", generations=10))
+    print_status(console, run)
+    whole = capsys.readouterr().out.splitlines()
+    with contextlib.closing(sqlite3.connect(run.folder / "run.db")) as connection, connection:
+        connection.execute("UPDATE history SET sha256 = x'00' WHERE generation = 4")
+    problem = f"{run.folder} cannot be read: the history row of generation 4 is damaged or missing"
+    gone = f"not known          objectives and faults of the recent generations: {problem}"
+    print_status(console, run)
+    left = [line for line in whole if not line.startswith(("centres ", "faults handled"))]
+    assert len(left) == len(whole) - 2
+    assert capsys.readouterr().out.splitlines() == [*left, gone]
+    print_summary(console, run, "")
+    assert f"\n{gone}\n" in capsys.readouterr().out
+    shown = CliRunner().invoke(app, ["status", str(run.folder), "--json"])
+    [data] = json.loads(shown.stdout)
+    assert (shown.exit_code, data["newest"]["generation"]) == (0, 10)
+    assert data["objectives"] == {"newest": None, "recent": None, "problem": problem}
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Damaged files: the run continues with the same bits, or says that it cannot."""
 
 import contextlib
+import errno
 import os
 import random
 import shutil
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
+from es_service.store import repair
 from es_service.store import writer as store
 from es_service.store.codec import encode_part
 from es_service.store.connection import connected_to
@@ -208,6 +210,52 @@ def test_a_damaged_history_row_falls_back_to_the_newest_kept_state_before_it(tmp
         run.keep_every = 4
         advance(run, 11)
     assert digest(folder) == uninterrupted
+
+
+def test_a_database_of_which_more_than_a_generation_would_be_deleted_is_kept(tmp_path):
+    """One bad row can cost most of a run, the intact newest state included; also what is only in the log is kept."""
+    folder = tmp_path / "killed"
+    with create(tmp_path / "run") as run:
+        run.keep_every = 10
+        advance(run, 59)
+        behind_the_stores_back(tmp_path / "run", "UPDATE history SET sha256 = x'00' WHERE generation = 12")
+        shutil.copytree(tmp_path / "run", folder)
+    dump = _content(folder / "run.db")
+    for _ in ("first", "again, when an earlier one is in its place"):
+        with RunStore.open(folder) as run:
+            assert run.generation == 10
+            assert "the damaged database, with all generations, is kept as run.db.damaged" in run.notices[0]
+        assert _content(folder / "run.db.damaged") == dump
+        assert {path.name for path in folder.iterdir()} == {"config.yaml", "run.db", "run.db.damaged", "run.lock"}
+        shutil.copy(folder / "run.db.damaged", folder / "run.db")
+
+    folder = kept_run(tmp_path / "by one", 11)
+    damage_states(folder, (11,))
+    with RunStore.open(folder) as run:
+        assert (run.generation, "run.db.damaged" in run.notices[0]) == (10, False)
+    assert not (folder / "run.db.damaged").exists()
+
+
+def test_a_database_that_cannot_be_kept_loses_no_generation(tmp_path, monkeypatch):
+    folder = kept_run(tmp_path / "run", 11)
+    behind_the_stores_back(folder, "UPDATE history SET env_steps = 1 WHERE generation = 6")
+    before = _content(folder / "run.db")
+
+    def is_full(path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(repair, "sync_file", is_full)
+        with pytest.raises(StoreError, match="full"):
+            RunStore.open(folder)
+    assert _content(folder / "run.db") == before
+    assert not list(folder.glob("run.db.damaged*"))
+
+
+def _content(file):
+    """All rows of a database, as statements."""
+    with contextlib.closing(sqlite3.connect(file)) as connection:
+        return list(connection.iterdump())
 
 
 def test_what_loses_fewer_generations_is_taken_a_kept_state_or_the_copy(tmp_path, monkeypatch):

@@ -311,4 +311,4 @@ def test_a_strategy_of_evosax_reaches_the_deceptive_optimum():
 
 def test_without_a_with_block_it_says_how_it_is_meant():
     with pytest.raises(TypeError, match=r"with evaluator\(\.\.\.\) as evaluate"):
-        evaluator("point_maze_es")(np.zeros((1, 4482), np.float32))
+        es_service.evaluator("point_maze_es")(np.zeros((1, 4482), np.float32))

@@ -59,7 +59,7 @@ def test_what_is_wrong_is_said_soon_in_one_sentence_and_no_folder_is_left(tmp_pa
             ),
             (tokens, {"RAY_AUTH_TOKEN": "0" * 64}, "the token in RAY_AUTH_TOKEN is not the cluster's"),
             (none, {}, "the cluster uses no token, but RAY_AUTH_MODE=token is set here"),
-            ("127.0.0.1:1", {}, "nobody answers there (Connection refused)"),
+            ("127.0.0.1:1", {}, "nothing listens at that address (Connection refused)"),
         ):
             begun = time.monotonic()
             code, printed = es(*run, "--address", address, **right | settings)

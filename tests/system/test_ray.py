@@ -214,7 +214,7 @@ def test_a_run_that_cannot_begin_leaves_no_folder_behind(tmp_path):
     new, mine, old = tmp_path / "new", tmp_path / "mine", tmp_path / "old"
     mine.mkdir()
     for folder in (new, mine):
-        with pytest.raises(StartError, match="nobody answers there") as error:
+        with pytest.raises(StartError, match="nothing listens at that address") as error:
             run(folder, **nobody)
         inline = f"run CONFIG --out {folder} --engine inline --set compute.workers=auto"
         assert error_message(error.value).endswith(f"to work on this machine without Ray: es-service {inline}")

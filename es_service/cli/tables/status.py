@@ -9,13 +9,11 @@ from rich.console import Console
 from es_service.cli.commands import command, settings, way_command
 from es_service.cli.console import print_line
 from es_service.report.progress import plain_line
-from es_service.runs.objectives import recent_objectives
+from es_service.runs.recent import FAULTS_OF, Recent, read_recent
 from es_service.runs.standing import Standing, doing, is_waiting, look, more, population_size, state, way_on
 from es_service.runs.view import Run
 
 FOLLOW_INTERVAL_S = 1.0
-FAULTS_OF = 1000
-"""Newest generations whose faults are counted; a report shows those of all."""
 
 
 def print_status(console: Console, run: Run) -> None:
@@ -84,13 +82,7 @@ def _progress(standing: Standing) -> dict[str, str]:
     if "map_cells" in last:
         filled["map"] = f"{last['map_cells']:,} cells, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
-    rows = standing.run.history_rows(last["generation"] - FAULTS_OF + 1)
-    # A fork may have no numbers (NaN) for the generations of its parent.
-    lost, retries = (sum(row[name] for row in rows if row[name] > 0) for name in ("lost_workers", "retries"))
-    faults = {}
-    if lost or retries:
-        where = f" in the last {FAULTS_OF:,} generations" if last["generation"] >= FAULTS_OF else ""
-        faults["faults handled"] = f"{lost} workers replaced, {retries} chunks sent again{where}"
+    recent = read_recent(standing.run, last["generation"])
     of = {key: f" of {limit:,}" for key, limit in limits.items()}
     target = f" (target: {limits['target_fitness']:g})" if "target_fitness" in limits else ""
     return {
@@ -100,24 +92,36 @@ def _progress(standing: Standing) -> dict[str, str]:
         **goal,
         **filled,
         "novelty archive": f"{last['archive_size']:,} centres",
-        **_objectives(standing.run, last["generation"]),
+        **_objectives(recent),
         "environment steps": f"{last['env_steps']:,}{of.get('env_steps', '')} in {last['episodes']:,} episodes",
         "time": f"{last['wall_clock_s']:.1f}{of.get('wall_clock_s', '')} s, {rate:,.0f} steps/s overall",
-        **faults,
+        **_faults(recent, last["generation"]),
     }
 
 
-def _objectives(run: Run, generation: int) -> dict[str, str]:
-    """What the centres of the newest generation climb; nothing if it moved none."""
-    newest, recent = recent_objectives(run, generation)
-    if recent.are_separate:
-        share = 100 * recent.exploring / recent.centres
+def _objectives(recent: Recent) -> dict[str, str]:
+    """What the centres of the newest generation climb; nothing if it moved none, or if that is not known."""
+    newest, all_ = recent.newest, recent.objectives
+    if newest is None or all_ is None:
+        return {}
+    if all_.are_separate:
+        share = 100 * all_.exploring / all_.centres
         text = f"{newest.exploring:,} exploring, {newest.exploiting:,} exploiting"
-        return {"centres": f"{text}; of the last {recent.centres:,}, {share:.1f} % explored"}
+        return {"centres": f"{text}; of the last {all_.centres:,}, {share:.1f} % explored"}
     if not newest.centres:
         return {}
     weight = newest.fitness_weight
     return {"weight of fitness": f"{weight:g} (novelty: {1.0 - weight:g})"}
+
+
+def _faults(recent: Recent, generation: int) -> dict[str, str]:
+    """The faults of recent generations, if there are any; or why they and the objectives are not known."""
+    if recent.problem:
+        return {"not known": f"objectives and faults of the recent generations: {recent.problem}"}
+    if not recent.lost_workers and not recent.retries:
+        return {}
+    where = f" in the last {FAULTS_OF:,} generations" if generation >= FAULTS_OF else ""
+    return {"faults handled": f"{recent.lost_workers} workers replaced, {recent.retries} chunks sent again{where}"}
 
 
 def _print_fields(console: Console, fields: dict[str, str]) -> None:
