@@ -51,7 +51,7 @@ def test_refused_changes_shows_all_and_the_ways_to_make_them():
     fork, afresh = error.ways_out
     assert (error.way_out, fork.action, fork.run) == (fork, "fork", "runs/a")
     assert fork.settings == {"search.sigma": 0.05, "task.options.start": "c d", "budget.generations": 9}
-    assert (afresh.action, afresh.settings) == ("run", {"search.init_from": "runs/a"})
+    assert (afresh.action, afresh.settings) == ("run", {"search.init_from": "runs/a:best"})
     *_, kept, in_python, _ = lines = str(error).splitlines()
     assert {"  search.sigma: 0.02 -> 0.05", "  policy.hidden: [64, 64] -> [8, 8]"} < set(lines)
     assert kept == "a fork cannot change policy.hidden either"

@@ -140,7 +140,7 @@ def test_weights_that_make_no_gradient_are_an_error_with_a_sentence(weights, sen
 @pytest.mark.parametrize("function", ["step", "tell"])
 @pytest.mark.parametrize("returned", [None, "state"])
 def test_what_is_no_state_is_an_error_with_a_sentence(function, returned):
-    config = config_of(generations=1, algorithm="nsr_es", centres=2, pairs=16)
+    config = config_of(generations=1, algorithm="nsr_es", centres=2)
     algorithm = replace(ALGORITHMS["nsr_es"](config), **{function: lambda *given: returned})
     generation, kind = {"step": 1, "tell": 0}[function], type(returned).__name__
     with pytest.raises(EvaluationError, match=f"generation {generation}: `{function}` returned {kind}; it must return"):
