@@ -98,7 +98,7 @@ def test_a_state_that_does_not_fit_is_refused(parent, override, change):
         lineage.fork_config(parent.folder, [override, "budget.generations=9"])
     assert f"  {change}" in str(caught.value).splitlines()
     assert caught.value.way_out == start_afresh(parent.folder)
-    assert error_message(caught.value).endswith(f": es-service run CONFIG --set search.init_from={parent.folder}")
+    assert error_message(caught.value).endswith(f": es-service run CONFIG --set search.init_from={parent.folder}:best")
 
 
 def test_another_descriptor_is_refused(tmp_path, monkeypatch):
@@ -278,7 +278,7 @@ def test_fork_without_changes_goes_on_as_its_parent_would(config, finished, tmp_
     for generation in ([], ["--generation", 9]):
         code, printed = es("fork", parent, *generation, "--out", child, "--set", "budget.generations=30")
         assert code == 0
-        assert "note:" not in printed  # the same machine: no other platform to tell of
+        assert "is computed" not in printed  # the same machine: no other platform to tell of
         assert digest(child) == digest(finished[0])
         origin = open_run(child).meta.parent
         assert origin is not None
