@@ -15,6 +15,7 @@ from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError
 from es_service.protocol.messages import TrainingChunk, around
 from es_service.protocol.noise import uniforms
+from es_service.protocol.options import Option
 from es_service.search.algorithms import ALGORITHMS
 from tests.helpers import SPEC, centre, random_parameters
 from workers.environments import TaskError, describe_environment, make_environment
@@ -66,6 +67,21 @@ class FailsAnyway(Still):
 
     def reset(self, key):
         return uniforms(key, jnp.arange(2, dtype=jnp.uint32)) + jnp.zeros(3)
+
+
+class Longer(Still):
+    """an option changes what a run takes from the class"""
+
+    options = {"steps": Option(5, low=1)}  # noqa: RUF012
+
+    def __init__(self, steps=5):
+        self.episode_steps = steps
+
+
+def test_an_attribute_that_the_constructor_changes_is_refused_and_not_ignored():
+    assert make_environment(f"{HERE}:Longer", {"steps": 5}) is not None
+    with pytest.raises(TaskError, match=r"its constructor changes episode_steps \(5 -> 20\)"):
+        make_environment(f"{HERE}:Longer", {"steps": 20})
 
 
 def test_a_current_folder_with_modules_of_our_names_is_nobody_s_business(tmp_path, monkeypatch):

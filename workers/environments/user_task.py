@@ -206,7 +206,15 @@ def _check_shapes(path: str, options: Mapping[str, OptionValue]) -> None:
 
 def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
     """Functions of a user's class, constructed with the task's options."""
-    task = _import(path)(**options)
+    kind = _import(path)
+    task = kind(**options)
+    for name in (*ATTRIBUTES, "walls", "wall_clearance", "goal", "least_reward", "final_fitness"):
+        of_class, of_instance = getattr(kind, name, None), getattr(task, name, None)
+        if repr(of_class) != repr(of_instance):
+            raise TaskError(
+                f"its constructor changes {name} ({of_class!r} -> {of_instance!r}), but a run uses the value of the "
+                "class; options may change only what the methods compute"
+            )
     goal_distance = getattr(task, "goal_distance", lambda state: jnp.float32(jnp.nan))
 
     def step(state: Any, action: Any) -> tuple[Any, Any, Any]:
