@@ -129,7 +129,13 @@ def test_the_table_has_its_columns_and_a_row_for_each_centre(undisturbed):
         "novelty",
         "update_norm",
         "env_steps",
+        "fitness_first",
+        "reset_seed",
+        "reset_episode",
+        "reset_ask",
+        "reset_policy",
     ]
+    assert table["reset_policy"].isna().all()  # none of these searches asks for policies
     assert table["generation"].tolist() == np.repeat(np.arange(GENERATIONS + 1), centres).tolist()
     assert table["centre"].tolist() == list(range(centres)) * (GENERATIONS + 1)
     first = table["generation"] == 0
