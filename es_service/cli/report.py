@@ -82,6 +82,7 @@ def _compare(
     folders: Sequence[Path], out: Path, group_by: Sequence[str], threshold: float | None, figures: Path | None
 ) -> None:
     """Write the comparison of all runs with a finished generation; exit with code 1 if a run cannot be read."""
+    from es_service.report.compare import swept_keys
     from es_service.report.write import read_compared, write_compared
 
     problems: list[dict[str, str]] = []
@@ -93,7 +94,10 @@ def _compare(
             else:
                 print_note(f"note: {folder} is left out, since it has no finished generation yet")
 
-    for file in write_compared(comparable(), out, group_by, threshold, figures):
+    found = list(comparable())
+    if len(folders) == 1 and not group_by:
+        group_by = swept_keys(found)
+    for file in write_compared(found, out, group_by, threshold, figures):
         print(file)
     if problems:
         raise typer.Exit(1)

@@ -113,6 +113,13 @@ def grouped(runs: Sequence[RunData], keys: Sequence[str] = ()) -> list[Group]:
     return [Group(name, tuple(members)) for name, members in found.items()]
 
 
+def swept_keys(runs: Sequence[RunData]) -> list[str]:
+    """Settings in which the runs of one sweep differ, also options of their task: whoever swept them compares them."""
+    constants = [run.constants for run in runs]
+    known = dict.fromkeys(key for one in constants for key in one)
+    return _explaining(constants, [key for key in known if len({in_line(one.get(key)) for one in constants}) > 1])
+
+
 def _refuse_other_tasks(runs: Sequence[RunData], differing: Sequence[str]) -> None:
     for key in differing:
         if key.startswith("task."):

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from es_service import open_run
+from es_service import api, open_run
 from es_service.cli.main import app
 from es_service.cli.tables.evaluations import csv_file
 from es_service.errors import ConfigError, Interrupted, NotInRunError, StoreError
@@ -217,3 +217,22 @@ def test_a_folder_that_is_neither_is_said_to_be_neither(tmp_path):
     write_run(tmp_path / "sweep" / "seed=0")
     with pytest.raises(StoreError, match=r"sweep is not a run folder, but contains the run folder .*seed=0"):
         es("verify", tmp_path / "sweep")
+
+
+def test_the_report_of_a_sweep_over_an_option_of_the_task_groups_by_it(tmp_path):
+    """Runs of other tasks are not compared otherwise."""
+    given = {
+        "task": {"environment": "point_maze", "episode_steps": 10},
+        "policy": {"hidden": [4]},
+        "search": {"algorithm": "es", "pairs": 16, "evaluation_episodes": 1},
+        "map": {"enabled": False},
+        "budget": {"generations": 1},
+        "compute": {"engine": "inline", "workers": 1, "inline_workers": "threads"},
+    }
+    for start in ("default", "corner"):
+        api.run(api.load_config(given, {"task.options.start": start}), tmp_path / "sweep" / f"start={start}")
+    code, printed, _ = es("report", tmp_path / "sweep")
+    assert code == 0, printed
+    page = (tmp_path / "sweep" / "report.html").read_text()
+    assert "task.options.start default" in page
+    assert "task.options.start corner" in page
