@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import random
 import shutil
 import time
 import traceback
+from ast import literal_eval
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -40,7 +42,9 @@ NEWEST, COPIED = 6, 3
 """Generations of the run and of its copy."""
 LONGEST_S = 10.0
 """Seconds of the processor, since others may be busy on it; a read that waits ends at the time limit of tests."""
-RIGHT, OTHER = "right", "another answer"
+RIGHT, PARTLY, OTHER = "right", "partly right", "another answer"
+RECENT = ("weight of fitness", "not known")
+"""Lines of `status` about the recent generations, whose damage hides nothing else of a run."""
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 10},
     "policy": {"hidden": [4]},
@@ -171,7 +175,7 @@ def examined(example: Example, number: int) -> Iterator[str]:
     edited = what.startswith("config")
     name = rng.choice(tuple(COMMANDS))
     checks: dict[str, Callable[[], str]] = {
-        name: lambda name=name, read=read: RIGHT if canonical(read(folder)) == example.answers[name] else OTHER
+        name: lambda name=name, read=read: judged(name, canonical(read(folder)), example.answers[name])
         for name, read in {**READS, name: COMMANDS[name]}.items()
     }
     digest = rng.choice((True, False))
@@ -193,13 +197,34 @@ def examined(example: Example, number: int) -> Iterator[str]:
         yield f"{answer} ({name} after mutation {number}, {what})" if answer.startswith("WRONG") else answer
 
 
+def judged(name: str, answer: Any, right: Any) -> str:
+    """Whether a reader's answer is that of the undamaged run; `status` may say that recent generations are unknown."""
+    if answer == right:
+        return RIGHT
+    known = {"status": status_without_recent, "status --json": json_without_recent}.get(name)
+    return PARTLY if known and known(answer) == (known(right)[0], True) else OTHER
+
+
+def status_without_recent(answer: str) -> tuple[object, bool]:
+    """What `status` says of all but the recent generations, and whether it says that these are not known."""
+    lines = literal_eval(answer).splitlines()
+    return [line for line in lines if not line.startswith(RECENT)], any(line.startswith("not known") for line in lines)
+
+
+def json_without_recent(answer: str) -> tuple[object, bool]:
+    """The same of `status --json`."""
+    [data] = json.loads(literal_eval(answer))
+    objectives = data.pop("objectives")
+    return data, objectives["problem"] is not None and objectives["newest"] is objectives["recent"] is None
+
+
 def compared(example: Example, folder: Path, digest: bool) -> str:
     """Whether a report shows what it should; of a damaged run, whether all that it shows was so at some generation."""
     found = read_run(folder, digest=digest)
     if digest and (found.problems or found.standing.problem):
         run_page(found, lambda name: name)
     if found.problems:
-        return "partly right" if shown(found) <= example.shown else OTHER
+        return PARTLY if shown(found) <= example.shown else OTHER
     same = repr(found.standing.row) == repr(example.report.standing.row) and shown(found) == shown(example.report)
     return RIGHT if same and found.digest in ("", example.report.digest) else OTHER
 
