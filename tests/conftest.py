@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,27 @@ settings.load_profile("repeatable")
 os.environ["PJRT_NPROC"] = "1"
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # as in an activated environment
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compiled code is shared by all processes of a test run, and kept for the next one: `--cache-clear` removes it.
+
+    XLA's code depends on the number of threads, which its key does not contain: a process with another PJRT_NPROC must
+    not have this JAX_COMPILATION_CACHE_DIR.
+    """
+    kept = getattr(config, "cache", None)  # there is none with `-p no:cacheprovider`
+    folder = Path(kept.mkdir("compiled")) if kept else Path(tempfile.gettempdir(), f"es-service-tests-{os.geteuid()}")
+    folder.mkdir(exist_ok=True)
+    folder.chmod(0o700)  # or it would not be used
+    os.environ["XDG_CACHE_HOME"] = str(folder)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder / "tests-xla")
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+
+
+@pytest.fixture(scope="session")
+def compiled() -> Path:
+    """Folder of what all processes of the tests have compiled."""
+    return Path(os.environ["XDG_CACHE_HOME"])
 
 
 @pytest.fixture

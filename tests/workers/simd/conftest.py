@@ -1,21 +1,28 @@
-"""Kernels of these tests are compiled afresh for each test; where the processor has no vectors none can be."""
+"""Where the processor has no vectors no kernel can be compiled; and no test finds kernels of a changed compiler."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from workers.simd.backend import cache
 from workers.simd.backend.target import NoVectorsError, host_target
 
 
 @pytest.fixture(autouse=True)
-def kernel_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache, set as the user's."""
+def kernels_of_this_compiler(
+    request: pytest.FixtureRequest, compiled: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[None]:
+    """A test that changes the compiler in memory has an empty cache of its own; the others share one, which keeps all
+    kernels of these tests."""
     try:
         host_target()
     except NoVectorsError as error:
         pytest.skip(str(error))
-    folder = tmp_path_factory.mktemp("cache")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
-    return folder / "es-service" / "kernels"
+    changes = "monkeypatch" in request.fixturenames
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache") if changes else compiled / "simd"))
+        patch.setattr(cache, "MOST_ENTRIES", 10_000)
+        yield
