@@ -62,7 +62,7 @@ def primitives_of(jaxpr: Any) -> set[str]:
 def test_every_primitive_has_a_case() -> None:
     tested: set[str] = set()
 
-    @settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=15, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(data=st.data())
     def collect(data: st.DataObject) -> None:
         for case in CASES.values():
