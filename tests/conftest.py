@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ def pytest_configure(config: pytest.Config) -> None:
     XLA's code depends on the number of threads, which its key does not contain: a process with another PJRT_NPROC must
     not have this JAX_COMPILATION_CACHE_DIR.
     """
+    assert "jax" not in sys.modules, "a conftest.py of a folder imports JAX before it has these settings"
     kept = getattr(config, "cache", None)  # there is none with `-p no:cacheprovider`
     folder = Path(kept.mkdir("compiled")) if kept else Path(tempfile.gettempdir(), f"es-service-tests-{os.geteuid()}")
     folder.mkdir(exist_ok=True)
@@ -29,12 +31,30 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ["XDG_CACHE_HOME"] = str(folder)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder / "tests-xla")
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+    if hasattr(config.option, "loadscopereorder"):  # pytest-xdist keeps the order of files, see below
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Files with slow tests come first, so that no process of pytest-xdist begins one when the others have ended."""
+    if hasattr(config, "workerinput"):
+        slow = {item.path for item in items if item.get_closest_marker("slow")}
+        items.sort(key=lambda item: item.path not in slow)
 
 
 @pytest.fixture(scope="session")
 def compiled() -> Path:
     """Folder of what all processes of the tests have compiled."""
     return Path(os.environ["XDG_CACHE_HOME"])
+
+
+@pytest.fixture(scope="module")
+def workers_here() -> Iterator[None]:
+    """Runs, evaluations, verifications and replays start no process; for tests of what is done with a run."""
+    from tests.helpers import workers_in_this_process  # imports JAX
+
+    with workers_in_this_process():
+        yield
 
 
 @pytest.fixture

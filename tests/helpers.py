@@ -5,14 +5,19 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from es_service.dispatch.events import Limits
+from es_service.errors import Interrupted
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import Centre, Chunk, ChunkResult, PolicyShape, Work, WorkerSpec
+from workers.recording import record
 from workers.worker import make_worker
 
 SPEC = WorkerSpec(
@@ -64,6 +69,48 @@ class DirectEvaluator:
         results = self.run(work)
         self.recorded += [(centre, chunk, result) for (centre, chunk), result in zip(work, results, strict=True)]
         return results
+
+
+class WorkerHere:
+    """An engine whose one worker is the caller."""
+
+    platforms: frozenset[str] = frozenset()
+
+    def __init__(self, run: Callable[[Sequence[Work]], list[ChunkResult]], should_stop: Callable[[], int | None]):
+        self.run, self.should_stop, self.counts = run, should_stop, DispatchCounts(workers=1)
+
+    def wait_for_place(self) -> None:
+        """Return at once, since the caller is there."""
+
+    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
+        if (number := self.should_stop()) is not None:
+            raise Interrupted(number)
+        return self.run(work)
+
+
+_WORKERS: dict[str, Callable[[Sequence[Work]], list[ChunkResult]]] = {}
+"""Workers by what they know, so that runs alike compile nothing twice."""
+
+
+@contextmanager
+def inline_here(
+    worker_spec: WorkerSpec, limits: Limits, should_stop: Callable[[], int | None] = lambda: None, **_: object
+) -> Iterator[WorkerHere]:
+    """In the place of `inline_engine`, for tests of what is done with a run and not of its processes."""
+    key = repr(worker_spec)
+    if key not in _WORKERS:
+        _WORKERS[key] = make_worker(worker_spec)
+    yield WorkerHere(_WORKERS[key], should_stop)
+
+
+@contextmanager
+def workers_in_this_process() -> Iterator[None]:
+    """Inside the block neither the engine inline nor a recording of episodes starts a process."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("session", "evaluation", "verification"):
+            patch.setattr(f"es_service.runs.{module}.inline_engine", inline_here)
+        patch.setattr("es_service.runs.replay._answer", lambda question: record(*question))
+        yield
 
 
 class MemoryStore:

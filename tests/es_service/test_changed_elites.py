@@ -11,6 +11,7 @@ from es_service import api
 from es_service.errors import StoreError
 from es_service.search.algorithms import ALGORITHMS
 
+pytestmark = pytest.mark.usefixtures("workers_here")
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 20},
     "policy": {"hidden": [8]},

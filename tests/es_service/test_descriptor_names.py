@@ -30,6 +30,7 @@ def columns_of(run):
     }
 
 
+@pytest.mark.usefixtures("workers_here")
 def test_the_columns_that_names_are_held_against_are_those_of_a_run(tmp_path):
     grid, cvt = (
         columns_of(api.run(api.load_config(CONFIG, overrides), tmp_path / name).run)

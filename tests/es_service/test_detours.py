@@ -17,6 +17,8 @@ from es_service.runs.moment import make_policy
 from tests.twins import point_maze
 from workers.environments import SHIPPED
 
+pytestmark = pytest.mark.usefixtures("workers_here")
+
 POINT, TRAP = SHIPPED["point_maze"], SHIPPED["ant_trap"]
 BOUNDS = ((-2.0, 2.0), (-2.0, 2.0))
 UPRIGHT = ((0.0, -1.0), (0.0, 1.0))

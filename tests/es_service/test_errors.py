@@ -11,6 +11,8 @@ from es_service.config.keys import parse_overrides
 from es_service.errors import ConfigError, EvaluationError, StoreError, WayOut
 from tests.system.session import SMALL
 
+pytestmark = pytest.mark.usefixtures("workers_here")
+
 WAYS = (
     (WayOut("resume", "x", "a b"), "resume('a b')", "resume 'a b'"),
     (

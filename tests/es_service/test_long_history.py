@@ -51,10 +51,19 @@ def long_run(folder: Path, generations: int) -> Path:
     return folder / "long"
 
 
+FEW, SMALL, LARGE = 10, 500, 2500
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Number of generations -> a run."""
+    return {count: long_run(tmp_path_factory.mktemp("runs"), count) for count in (FEW, SMALL, LARGE)}
+
+
 @pytest.mark.parametrize("read", ["history", "evaluations", "export", "report"])
-def test_a_generation_takes_about_eight_bytes_a_value(tmp_path, read):
+def test_a_generation_takes_about_eight_bytes_a_value(runs, read):
     def peak(generations: int) -> int:
-        folder = long_run(tmp_path / str(generations), generations)
+        folder = runs[generations]
         tracemalloc.start()
         match read:
             case "report":
@@ -68,11 +77,10 @@ def test_a_generation_takes_about_eight_bytes_a_value(tmp_path, read):
         tracemalloc.stop()
         return found
 
-    peak(10)  # imports
-    small, large = 1000, 5000
-    meta = reader.read_meta(long_run(tmp_path / "run", 10))
+    peak(FEW)  # imports
+    meta = reader.read_meta(runs[FEW])
     values = len(meta.columns) * (read != "evaluations") + len(meta.evaluation_columns) * (read != "history")
-    assert peak(large) - peak(small) < 2 * 8 * values * (large - small)
+    assert peak(LARGE) - peak(SMALL) < 2 * 8 * values * (LARGE - SMALL)
 
 
 @pytest.fixture(scope="module")

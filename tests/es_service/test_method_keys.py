@@ -26,6 +26,8 @@ from tests.es_service.config_examples import MINIMAL, load
 from tests.es_service.test_shipped_configs import ALL
 from workers.environments import SHIPPED
 
+pytestmark = pytest.mark.usefixtures("workers_here")
+
 OWN = "tests.examples.minimal_criterion:minimal_criterion"
 MAP_ELITES = {
     "task": {"environment": "point_maze", "episode_steps": 20},

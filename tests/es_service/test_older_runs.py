@@ -12,6 +12,8 @@ from es_service.loop.history import evaluated_columns
 from es_service.report.write import write_report
 from tests.system.command_line import command
 
+pytestmark = pytest.mark.usefixtures("workers_here")
+
 FOLDER = Path(__file__).parent / "golden" / "run_0_5"
 """Five generations of ME-ES on PointMaze, made by version 0.5.0."""
 

@@ -20,6 +20,8 @@ from es_service.runs.checked_config import changes_from
 from es_service.runs.sweep_plan import plan
 from tests.es_service.config_examples import MINIMAL, POINT_MAZE
 
+pytestmark = pytest.mark.usefixtures("workers_here")
+
 OPTIONS = {
     "start": choice("default", "corner"),
     "legs": choice(4, 6),

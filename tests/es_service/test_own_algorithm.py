@@ -17,6 +17,8 @@ from es_service.search.maps.behaviour_map import insert
 from es_service.search.novelty import NoveltyArchive
 from es_service.search.observation_statistics import no_observations
 
+pytestmark = pytest.mark.usefixtures("workers_here")
+
 EXAMPLE = "tests.examples.minimal_criterion:minimal_criterion"
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 20},

@@ -13,6 +13,8 @@ from es_service.errors import StoreError
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store.digest import digest_parts
 
+pytestmark = pytest.mark.usefixtures("workers_here")
+
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 20},
     "policy": {"hidden": [8]},

@@ -22,6 +22,8 @@ from es_service.runs.sweep import INSIDE
 from es_service.store.lock import acquire_lock
 from tests.run_examples import write_run
 
+pytestmark = pytest.mark.usefixtures("workers_here")
+
 SEEDS = (0, 2, 10)
 
 

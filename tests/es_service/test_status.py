@@ -29,6 +29,8 @@ from es_service.store.lock import acquire_lock
 from tests.run_examples import write_run
 from tests.system.session import SMALL
 
+pytestmark = pytest.mark.usefixtures("workers_here")
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):

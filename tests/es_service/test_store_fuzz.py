@@ -12,7 +12,6 @@ import traceback
 from ast import literal_eval
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -23,19 +22,15 @@ from typer.testing import CliRunner
 
 from es_service import api
 from es_service.cli.main import app
-from es_service.config.model import worker_spec
-from es_service.config.tasks import task_of
 from es_service.errors import ServiceError, StoreError
 from es_service.report.data import RunData, read_run
 from es_service.report.page import run_page
-from es_service.runs import session
 from es_service.runs.evaluation import candidates
 from es_service.runs.export import SUMS, arrays, export, tables
 from es_service.store import upkeep
 from es_service.store.digest import checked_parts
 from es_service.store.folder import COPY
 from es_service.store.reader import read_platforms
-from tests.benchmarks.science import InThisProcess
 from tests.es_service.mutations import damage_bytes, damage_rows, edit_text
 
 NEWEST, COPIED = 6, 3
@@ -117,19 +112,8 @@ class Example:
 
 
 @pytest.fixture(scope="module")
-def example(tmp_path_factory):
-    workers: dict[str, InThisProcess] = {}
-
-    @contextmanager
-    def engine(config: Any, *_: object) -> Iterator[InThisProcess]:
-        spec = repr(worker_spec(config, task_of(config)))
-        if spec not in workers:
-            workers[spec] = InThisProcess(config, lambda: None)
-        yield workers[spec]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(session, "make_engine", engine)
-        yield Example(tmp_path_factory.mktemp("fuzz"))
+def example(tmp_path_factory, workers_here):
+    return Example(tmp_path_factory.mktemp("fuzz"))
 
 
 def canonical(value: Any) -> Any:
@@ -281,13 +265,13 @@ def wrong(example: Example, numbers: range) -> tuple[list[str], Counter[str]]:
 
 @pytest.mark.slow
 def test_damage_of_any_kind_gives_right_answers_or_errors(example):
-    found, counts = wrong(example, range(300))
+    found, counts = wrong(example, range(100))
     assert not found, "\n".join(found)
     assert counts.keys() >= {"right", "partly right", "continued", "continued with a notice", "refused: StoreError"}
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("first", range(300, 10_300, 500))
+@pytest.mark.parametrize("first", range(100, 10_100, 500))
 def test_more_damage_gives_right_answers_or_errors(example, first):
     found, _ = wrong(example, range(first, first + 500))
     assert not found, "\n".join(found)

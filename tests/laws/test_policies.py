@@ -16,6 +16,7 @@ from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Ask, PolicyAsk
 from es_service.search.algorithms.steps import archived, mapped
 from es_service.search.maps.behaviour_map import insert
+from tests.helpers import workers_in_this_process
 from tests.laws.me_es_runs import SHAPE, Sharing, config_of, run_in_memory
 
 POLICIES, OTHERS = (
@@ -225,19 +226,25 @@ def test_asks_of_both_kinds_are_checked():
         run_in_memory(few, algorithm=algorithm)
 
 
-@pytest.mark.parametrize(
-    "compute", [{"workers": 2}, {"workers": 3}, {"workers": 2, "inline_workers": "threads"}], ids=str
-)
-def test_runs_with_policies_have_the_same_bits_on_any_workers_and_when_resumed(tmp_path, compute):
-    given = {
-        "task": {"environment": "point_maze", "episode_steps": 40},
-        "policy": {"hidden": [8, 8]},
-        "search": {"algorithm": f"{__name__}:mixed", "centres": 2, "pairs": 32, "evaluation_episodes": 5},
-        "budget": {"generations": 4},
-        "compute": {"engine": "inline", "workers": 1, "chunk_pairs": 8},
-    }
-    whole = api.run(given, tmp_path / "whole").run
-    other = api.load_config(given | {"compute": given["compute"] | compute, "budget": {"generations": 2}})
+GIVEN = {
+    "task": {"environment": "point_maze", "episode_steps": 40},
+    "policy": {"hidden": [8, 8]},
+    "search": {"algorithm": f"{__name__}:mixed", "centres": 2, "pairs": 32, "evaluation_episodes": 5},
+    "budget": {"generations": 4},
+    "compute": {"engine": "inline", "workers": 1, "chunk_pairs": 8},
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run without a stop, whose one worker is this process."""
+    with workers_in_this_process():
+        return api.run(GIVEN, tmp_path_factory.mktemp("whole") / "run").run
+
+
+@pytest.mark.parametrize("compute", [{"workers": 3}, {"workers": 2, "inline_workers": "threads"}], ids=str)
+def test_runs_with_policies_have_the_same_bits_on_any_workers_and_when_resumed(whole, tmp_path, compute):
+    other = api.load_config(GIVEN | {"compute": GIVEN["compute"] | compute, "budget": {"generations": 2}})
     api.run(other, tmp_path / "parts")
     assert api.resume(tmp_path / "parts", ["budget.generations=4"]).run.digest() == whole.digest()
     assert (whole.evaluations["centre"] > 1).sum() == 4 * 21

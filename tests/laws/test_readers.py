@@ -17,6 +17,7 @@ from es_service.runs.lineage import started
 from es_service.runs.replay import record
 from es_service.search.algorithms import ALGORITHMS
 
+pytestmark = pytest.mark.usefixtures("workers_here")
 GENERATIONS, EPISODES = 3, 3
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 40},
@@ -44,7 +45,7 @@ def config_of(method, **more):
 
 
 @pytest.fixture(scope="module", params=METHODS)
-def run(request, tmp_path_factory):
+def run(request, tmp_path_factory, workers_here):
     """A finished run of a method; nobody changes it."""
     return api.run(config_of(request.param), tmp_path_factory.mktemp("run") / "first").run
 

@@ -9,51 +9,52 @@ import pytest
 
 from es_service.protocol.noise import Domain, stream_keys
 from tests.wall_watch import WALLS, Walls, colliders, crosses, depth, inside_the_maze, places_beside_walls
+from tests.workers.steps import carried, of_many, pushed, resets_of, steps_of, system_of
 from workers.environments import ant_maze
-from workers.environments.ant import STEP_S, make_ant
+from workers.environments.ant import STEP_S
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.filterwarnings("ignore:Accessing .* directly from .Data. is deprecated"),  # Brax, on its own
 ]
-ANTS_PUSHED = 300
+ANTS_PUSHED, STEPS = 300, 100
+TURN = 10
+"""Steps after which a motor may turn round."""
 
 
 @pytest.fixture(scope="module", params=list(WALLS))
-def pushed(request):
-    """(task, its walls, a compiled watch over ants that are pushed while every motor is turned fully to and fro).
+def watched(request):
+    """(task, its walls, a watch over ants that are pushed while every motor is turned fully to and fro).
 
-    The watch is f(states, push [N, 3] as an acceleration of every link, m/s2, keys) -> depth in a wall, whether a way
-    crossed one, torso position, whether all is finite; [N, steps].
+    The watch is f(places [N, 2], push [N, 3] as an acceleration of every link, m/s2) -> depth in a wall, whether a way
+    crossed one, torso position, whether all is finite; [N, STEPS].
     """
-    walls = WALLS[request.param]
-    ant = make_ant(walls)
+    name, walls, system = request.param, WALLS[request.param], system_of(request.param)
+    step, begin = steps_of(name), resets_of(name)
+    look = of_many(
+        lambda before_2, state: (depth(colliders(system, state), walls), crosses(before_2, state.q[:2], walls))
+    )
 
-    def watch(state, push_3, key):
-        def body(state, step):
-            action = jnp.sign(jax.random.uniform(jax.random.fold_in(key, step // 10), (8,)) - 0.5)
-            vel = state.motion.vel + push_3 * STEP_S
-            moved = ant.step(state._replace(motion=state.motion.replace(vel=vel)), action)
-            deep = depth(colliders(ant.system, moved), walls)
-            return moved, (deep, crosses(state.q[:2], moved.q[:2], walls), moved.q[:3], jnp.isfinite(moved.q).all())
+    def watch(places, pushes):
+        count, found = len(places), []
+        state = begin(stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(count)))
+        state = carried(state, places - state.q[:, :2])
+        for at in range(STEPS):
+            if at % TURN == 0:
+                action = motors(at // TURN)[:count]
+            before = state.q[:, :2]
+            state, *_ = step(pushed(state, pushes * STEP_S), action)
+            found.append((*look(before, state), state.q[:, :3], np.isfinite(state.q).all(1)))
+        return tuple(np.stack(one, axis=1) for one in zip(*found, strict=True))
 
-        return jax.lax.scan(body, state, jnp.arange(100))[1]
+    return name, walls, watch
 
-    watches = jax.jit(jax.vmap(watch))
 
-    def run(places, pushes):
-        count = len(places)
-        rows = np.arange(ANTS_PUSHED) % count  # of one number, for one compilation
-        return tuple(x[:count] for x in run_padded(places[rows], pushes[rows]))
-
-    def run_padded(places, pushes):
-        count = len(places)
-        keys = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(count))
-        state = jax.vmap(lambda key, xy: ant.reset(key, (xy[0], xy[1])))(keys, jnp.asarray(places, jnp.float32))
-        split = jax.random.split(jax.random.PRNGKey(1), count)
-        return tuple(np.asarray(x) for x in watches(state, jnp.asarray(pushes, jnp.float32), split))
-
-    return request.param, walls, run
+def motors(turn: int) -> np.ndarray:
+    """Motors [ANTS_PUSHED, 8], each turned fully to one side."""
+    keys = jax.random.split(jax.random.PRNGKey(1), ANTS_PUSHED)
+    drawn = jax.vmap(lambda key: jax.random.uniform(jax.random.fold_in(key, turn), (8,)))(keys)
+    return np.sign(np.asarray(drawn) - 0.5)
 
 
 def ways_into_walls(name: str, walls: Walls) -> tuple[np.ndarray, np.ndarray]:
@@ -79,9 +80,9 @@ def ways_into_walls(name: str, walls: Walls) -> tuple[np.ndarray, np.ndarray]:
     return places[free], ways[free]
 
 
-def test_walls_hold_from_every_side(pushed):
+def test_walls_hold_from_every_side(watched):
     """With its own weight behind it an ant gives way by less than a tenth of a metre."""
-    name, walls, run = pushed
+    name, walls, run = watched
     places, ways = ways_into_walls(name, walls)
     assert len(places) > 130
     deepest, crossed, _, finite = run(places, np.pad(10.0 * ways, ((0, 0), (0, 1))))
@@ -91,9 +92,9 @@ def test_walls_hold_from_every_side(pushed):
     assert (deepest.max(1) > -0.01).mean() > 0.7, "most of them must have come to a wall"
 
 
-def test_nothing_climbs_a_wall(pushed):
+def test_nothing_climbs_a_wall(watched):
     """Pushed with twice their weight and nearly lifted off: they fly, higher than a wall is drawn, but not across."""
-    name, walls, run = pushed
+    name, walls, run = watched
     places, ways = ways_into_walls(name, walls)
     _, crossed, position, finite = run(places, np.pad(20.0 * ways, ((0, 0), (0, 1)), constant_values=6.0))
     assert finite.all()
@@ -103,9 +104,9 @@ def test_nothing_climbs_a_wall(pushed):
         assert np.abs(position[..., :2] - ant_maze.MIDDLE).max() < ant_maze.HALF
 
 
-def test_walls_hold_wherever_an_ant_is_pushed(pushed):
+def test_walls_hold_wherever_an_ant_is_pushed(watched):
     """In any direction, from anywhere beside a wall. Whole episodes, without a push: `tests.benchmarks.walls_hold`."""
-    name, _, run = pushed
+    name, _, run = watched
     places = places_beside_walls(name, ANTS_PUSHED, seed=1)
     angles = np.random.default_rng(2).uniform(0, 2 * np.pi, ANTS_PUSHED)
     deepest, crossed, position, finite = run(places, np.stack([8 * np.cos(angles), 8 * np.sin(angles), 0 * angles], 1))

@@ -12,9 +12,10 @@ from es_service.errors import ConfigError
 from es_service.protocol.messages import PolicyShape, with_options
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.options import Option
-from tests.examples.ant_slalom import AntSlalom
 from tests.helpers import centre, chunk_runner, random_parameters, spec
+from tests.workers.steps import of_many, resets_of, steps_of
 from workers.environments import TaskError, brax_parts, brax_task, describe_environment, make_environment, user_task
+from workers.simd.episodes.kernel import compile_kernel
 
 pytestmark = [
     pytest.mark.slow,
@@ -24,37 +25,70 @@ EXAMPLE = "tests.examples.ant_slalom:AntSlalom"
 KEYS = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(3))
 
 
+class Slalom:
+    """a point runs far along +x, around walls"""
+
+    observation_size, action_size, episode_steps = 2, 2, 10
+    descriptor_names, descriptor_bounds = ("x", "y"), ((-5.0, 25.0), (-12.0, 12.0))
+    options = {"walls": ("both", "first")}  # noqa: RUF012
+
+    def __init__(self, walls="both"):
+        self.walls_used = walls
+
+    def reset(self, key):
+        return jnp.zeros(2)
+
+    def observe(self, state):
+        return state
+
+    def step(self, state, action):
+        return state + action, action[0], state[0] > 20.0
+
+    def descriptor(self, state):
+        return state
+
+
+POINT = f"{__name__}:Slalom"
+
+
 def test_rewards_and_observations_are_brax_s():
-    name = "hopper"
+    name = "inverted_double_pendulum"
     task, environment = brax_task.describe(name), brax_task.make(name)
     theirs = brax_task._make_brax(name, "spring")
-    state = jax.jit(jax.vmap(environment.reset))(KEYS)
-    raw = jax.jit(jax.vmap(lambda key: theirs.reset(jax.random.wrap_key_data(key[:2], impl="threefry2x32"))))(KEYS)
-    step, raw_step = jax.jit(jax.vmap(environment.step)), jax.jit(jax.vmap(theirs.step))
+    raw = of_many(lambda key: theirs.reset(jax.random.wrap_key_data(key[:2], impl="threefry2x32")))(KEYS)
+    raw_step = of_many(theirs.step)
+    state, rewards = resets_of(f"brax:{name}")(KEYS), []
     rng = np.random.default_rng(0)
-    assert environment.observe(jax.tree.map(lambda x: x[0], state)).shape == (task.observation_size,)
+    assert environment.observe(state).shape == (3, task.observation_size)
     for _ in range(10):
-        action = jnp.asarray(rng.uniform(-1.5, 1.5, (3, task.action_size)), jnp.float32)
-        state, reward, done = step(state, action)
-        raw = raw_step(raw, jnp.clip(action, -1, 1))
+        action = rng.uniform(-1.5, 1.5, (3, task.action_size)).astype(np.float32)
+        state, reward, done, observation, descriptor, _ = steps_of(f"brax:{name}")(state, action)
+        raw = raw_step(raw, np.clip(action, -1, 1))
         np.testing.assert_allclose(reward, raw.reward, rtol=1e-4, atol=1e-4)
         np.testing.assert_array_equal(done, raw.done > 0.5)
-        np.testing.assert_allclose(jax.vmap(environment.observe)(state), raw.obs, rtol=1e-3, atol=1e-4)
-    assert jax.vmap(environment.descriptor)(state).shape == (3, len(task.descriptor_names))
+        np.testing.assert_allclose(observation, raw.obs, rtol=1e-3, atol=1e-4)
+        rewards += reward.tolist()
+    assert len(set(rewards)) > 10
+    assert descriptor.shape == (3, len(task.descriptor_names))
 
 
 def test_feet_that_touch_the_floor():
     """Four feet of an ant that stands, none of one in the air."""
-    environment = brax_task.make("ant", descriptor="feet_contact")
-    state = jax.jit(jax.vmap(environment.reset))(KEYS)
-    step = jax.jit(jax.vmap(environment.step))
-    physics = state.brax.pipeline_state
-    above = physics.replace(x_i=physics.x_i.replace(pos=physics.x_i.pos + jnp.array([0.0, 0.0, 1.0])))
-    in_the_air, _, _ = step(state._replace(brax=state.brax.replace(pipeline_state=above)), jnp.zeros((3, 8)))
+    environment, theirs = brax_task.make("ant", descriptor="feet_contact"), brax_task._make_brax("ant", "spring")
+    step = compile_kernel(
+        environment.step, *jax.eval_shape(lambda key: (environment.reset(key), jnp.zeros(8)), KEYS[0])
+    )
+    state = jax.tree.map(lambda leaf: np.zeros((3, *leaf.shape), leaf.dtype), step.in_tree.unflatten(step.in_avals)[0])
+    q, qd = theirs.sys.init_q, np.zeros(14, np.float32)
+    stand = compile_kernel(lambda up: theirs.pipeline_init(q.at[2].add(up), qd), jax.ShapeDtypeStruct((), np.float32))
+    standing, above = (
+        state._replace(brax=state.brax.replace(pipeline_state=stand(np.full(3, up, np.float32)))) for up in (0.0, 1.0)
+    )
+    in_the_air, _, _ = step(above, np.zeros((3, 8), np.float32))
     assert not np.asarray(jax.vmap(environment.descriptor)(in_the_air)).any()
     for _ in range(80):
-        state, _, _ = step(state, jnp.zeros((3, 8)))
-    share = np.asarray(jax.vmap(environment.descriptor)(state))
+        standing, _, _ = step(standing, np.zeros((3, 8), np.float32))
+    share = np.asarray(jax.vmap(environment.descriptor)(standing))
     assert share.shape == (3, 4)
     assert (share > 0.5).all()
 
@@ -105,21 +139,21 @@ def test_what_cannot_be_had_is_named(name, message):
 
 
 def test_a_class_with_contradictions_is_refused(monkeypatch):
-    monkeypatch.setattr(AntSlalom, "descriptor_bounds", ((0.0, 1.0),))
-    monkeypatch.setattr(AntSlalom, "episode_steps", 0)
+    monkeypatch.setattr(Slalom, "descriptor_bounds", ((0.0, 1.0),))
+    monkeypatch.setattr(Slalom, "episode_steps", 0)
     with pytest.raises(
         TaskError, match=r"2 descriptor_names but 1 descriptor_bounds; episode_steps = 0 is not positive"
     ):
-        user_task.describe(EXAMPLE)
-    monkeypatch.setattr(AntSlalom, "descriptor_bounds", 3)
+        user_task.describe(POINT)
+    monkeypatch.setattr(Slalom, "descriptor_bounds", 3)
     with pytest.raises(TaskError, match=r"descriptor_bounds = 3 is not of type tuple"):
-        user_task.describe(EXAMPLE)
+        user_task.describe(POINT)
 
 
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("observation_size", 30, r"observe has the shape \(29,\), not \(30,\)"),
+        ("observation_size", 30, r"observe has the shape \(2,\), not \(30,\)"),
         ("descriptor_names", ("x", "y", "z"), r"descriptor has the shape \(2,\), not \(3,\)"),
         ("action_size", 7, r"cannot be traced by JAX: "),
         ("descriptor_bounds", ((1.0, 0.0), (0.0, 1.0)), r"\(1.0, 0.0\) is not a pair \(low, high\)"),
@@ -146,10 +180,10 @@ def test_a_class_with_contradictions_is_refused(monkeypatch):
 )
 def test_methods_that_do_not_fit_what_is_declared_are_named(monkeypatch, name, value, message):
     if name == "descriptor_names":
-        monkeypatch.setattr(AntSlalom, "descriptor_bounds", ((0.0, 1.0),) * 3, raising=False)
-    monkeypatch.setattr(AntSlalom, name, value, raising=False)
+        monkeypatch.setattr(Slalom, "descriptor_bounds", ((0.0, 1.0),) * 3, raising=False)
+    monkeypatch.setattr(Slalom, name, value, raising=False)
     with pytest.raises(TaskError, match=message):
-        user_task.describe(EXAMPLE)
+        user_task.describe(POINT)
 
 
 def test_the_driver_asks_a_process_and_gets_the_same_answer():

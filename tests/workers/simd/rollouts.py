@@ -59,7 +59,18 @@ def arguments(worker_spec: WorkerSpec, scale: float = 1.0, generation: int = 1, 
 
 def both(worker_spec: WorkerSpec, *given: Any) -> tuple[Episodes, Episodes]:
     """(episodes of simd, episodes of xla) for the same arguments."""
-    environment = make_environment(worker_spec.environment, {})
-    ours = rollout.make_training_rollout(environment, worker_spec)(*given)
-    theirs = workers.rollout.make_training_rollout(environment, worker_spec)(*given)
-    return ours, Episodes(*map(np.asarray, theirs))
+    ours = rollout.make_training_rollout(make_environment(worker_spec.environment, {}), worker_spec)(*given)
+    return ours, by_xla(worker_spec, *given)
+
+
+_XLA: dict[str, Any] = {}
+"""Rollouts by xla, each traced and compiled once; that of an ant takes ten seconds."""
+
+
+def by_xla(worker_spec: WorkerSpec, *given: Any) -> Episodes:
+    """Episodes of xla."""
+    key = repr(worker_spec)
+    if key not in _XLA:
+        environment = make_environment(worker_spec.environment, {})
+        _XLA[key] = workers.rollout.make_training_rollout(environment, worker_spec)
+    return Episodes(*map(np.asarray, _XLA[key](*given)))

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 import workers.rollout
-from es_service.protocol.messages import PolicyShape
+from es_service.protocol.messages import PolicyShape, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, TEST_VECTORS, Domain, normal_integers, stream_keys
 from tests.helpers import random_parameters, spec
-from tests.workers.simd.rollouts import arguments, both, targets, task_spec
+from tests.workers.simd.rollouts import arguments, both, by_xla, targets, task_spec
 from workers.environments import make_environment
 from workers.episode import Episodes
 from workers.simd.backend.function_builder import FunctionBuilder, module
@@ -32,7 +32,6 @@ def test_episodes_of_point_maze_are_xlas():
     """10,000 of them. The few that end elsewhere are at a wall's end or the goal's edge between two last bits: as many
     of xla's own do when its weights change by their last bit."""
     worker_spec = task_spec("point_maze", chunk_pairs=1000, rollout_block_pairs=8, common_random_numbers=False)
-    rollout_again = workers.rollout.make_training_rollout(make_environment("point_maze", {}), worker_spec)
     far = nudged = 0
     for generation, (scale, sigma) in enumerate([(1.0, 0.02), (1.0, 0.05), (1.0, 0.2), (3.0, 0.05), (5.0, 0.05)]):
         given = arguments(worker_spec, scale, generation, sigma)
@@ -41,7 +40,7 @@ def test_episodes_of_point_maze_are_xlas():
         for place in zip(*np.nonzero(apart > 1e-5), strict=True):
             print(f"{generation} {place}: {ours.returns[place]} {theirs.returns[place]} {ours.descriptor[place]}")
         far += int(np.count_nonzero(apart > 1e-5))
-        other = Episodes(*map(np.asarray, rollout_again(np.nextafter(given[0], np.float32(np.inf)), *given[1:])))
+        other = by_xla(worker_spec, np.nextafter(given[0], np.float32(np.inf)), *given[1:])
         nudged += int(np.count_nonzero(distance(other, theirs) > 1e-5))
     print(f"of 10,000 episodes {far} differ by more than 1e-5; of xla's own, nudged by a last bit, {nudged}")
     assert far <= 100
@@ -55,11 +54,16 @@ def distance(ours: Episodes, theirs: Episodes) -> np.ndarray:
     return np.maximum(apart, ours.steps != theirs.steps)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("task", ["ant_maze", "ant_trap"])
+def few_steps(task: str) -> WorkerSpec:
+    return dataclasses.replace(task_spec(task, chunk_pairs=16, rollout_block_pairs=8), episode_steps=5)
+
+
+@pytest.mark.parametrize(
+    "task", [pytest.param("ant_trap", marks=pytest.mark.slow), pytest.param("ant_maze", marks=pytest.mark.long)]
+)
 def test_a_few_steps_of_the_ants_are_xlas(task: str):
     """Later they part, as xla's own do when a last bit changes; whole episodes: tests/benchmarks/episode_parity.py."""
-    worker_spec = dataclasses.replace(task_spec(task, chunk_pairs=16, rollout_block_pairs=8), episode_steps=5)
+    worker_spec = few_steps(task)
     ours, theirs = both(worker_spec, *arguments(worker_spec))
     np.testing.assert_array_equal(ours.steps, theirs.steps)
     np.testing.assert_allclose(ours.descriptor, theirs.descriptor, atol=1e-4)
@@ -109,10 +113,7 @@ def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int,
 
 @pytest.mark.slow
 def test_inputs_that_are_always_zero_are_left_out_and_missed_by_nobody():
-    environment, worker_spec = (
-        make_environment("ant_trap", {}),
-        dataclasses.replace(task_spec("ant_trap"), episode_steps=10),
-    )
+    environment, worker_spec = make_environment("ant_trap", {}), few_steps("ant_trap")
     zero_O = rollout.always_zero(environment)
     assert zero_O.sum() == 54
     centre_D, unit, mean_O, std_O, keys, resets, actions = arguments(worker_spec)
@@ -128,7 +129,7 @@ def test_inputs_that_are_always_zero_are_left_out_and_missed_by_nobody():
     mean_O[zero_O] = 1.0
     ours, theirs = both(worker_spec, centre_D, unit, mean_O, std_O, keys, resets, actions)
     np.testing.assert_allclose(ours.descriptor, theirs.descriptor, atol=2e-3)
-    np.testing.assert_allclose(ours.shifted_sum_O[..., zero_O], -10.0)
+    np.testing.assert_allclose(ours.shifted_sum_O[..., zero_O], -worker_spec.episode_steps)
 
 
 @pytest.mark.parametrize("isa", WIDTHS)

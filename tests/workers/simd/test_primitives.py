@@ -32,12 +32,22 @@ def check(function: Callable, arguments: list[np.ndarray]) -> None:
             np.testing.assert_array_equal(one, other)
 
 
+SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture]
+
+
 @pytest.mark.slow  # all of them together
 @pytest.mark.parametrize("name", CASES)
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large,
-          HealthCheck.function_scoped_fixture])  # fmt: skip
+@settings(max_examples=5, deadline=None, suppress_health_check=SLOW)
 @given(data=st.data())
 def test_a_primitive_is_jaxs(name: str, data: st.DataObject) -> None:
+    check(*CASES[name](data.draw))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", CASES)
+@settings(max_examples=50, deadline=None, suppress_health_check=SLOW)
+@given(data=st.data())
+def test_so_it_is_for_more_shapes_and_values(name: str, data: st.DataObject) -> None:
     check(*CASES[name](data.draw))
 
 
@@ -52,7 +62,7 @@ def primitives_of(jaxpr: Any) -> set[str]:
 def test_every_primitive_has_a_case() -> None:
     tested: set[str] = set()
 
-    @settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=15, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(data=st.data())
     def collect(data: st.DataObject) -> None:
         for case in CASES.values():

@@ -15,6 +15,7 @@ from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingC
 from es_service.protocol.noise import Domain, normal_integers, stream_keys
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import SHIPPED, describe_environment, make_environment
+from workers.simd.backend import emit
 from workers.simd.episodes import check, noise, rollout
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.frontend.primitives.registry import PRIMITIVES
@@ -52,9 +53,10 @@ class Heat:
 
     observation_size, action_size, episode_steps = 1, 1, 5
     descriptor_names, descriptor_bounds = ("corner",), ((0.0, 1.0),)
+    size = 96
 
     def reset(self, key: Any) -> Any:
-        return jnp.zeros((96, 96))
+        return jnp.zeros((self.size, self.size))
 
     def observe(self, state: Any) -> Any:
         return state[0, :1]
@@ -67,10 +69,19 @@ class Heat:
         return state[0, :1]
 
 
-def test_what_the_compiler_refuses_after_tracing_is_refused_beforehand():
+@pytest.mark.parametrize(
+    ("size", "limit", "found"), [(12, 100, "144"), pytest.param(96, 8192, "9,216", marks=pytest.mark.long)]
+)
+def test_what_the_compiler_refuses_after_tracing_is_refused_beforehand(
+    size: int, limit: int, found: str, monkeypatch: pytest.MonkeyPatch
+):
+    """With a limit that a small plate exceeds, and with that of the compiler."""
+    monkeypatch.setattr(Heat, "size", size)
+    if size < 96:
+        monkeypatch.setattr(emit, "MOST_SLOTS", limit)
     task = describe_environment(f"{__name__}:Heat")
     why = rollout.why_not(task)
-    assert why == "loops carry and read 9,216 values; simd supports at most 8,192"
+    assert why == f"loops carry and read {found} values; simd supports at most {limit:,}"
     worker = chunk_runner(spec(environment=task.name, policy=PolicyShape((1, 8, 1)), episode_steps=5, rollout="simd"))
     point = centre(random_parameters(size=25), observation_size=1)
     for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
@@ -83,9 +94,6 @@ class Plate(Heat):
 
     size = 130
 
-    def reset(self, key: Any) -> Any:
-        return jnp.zeros((self.size, self.size))
-
     def step(self, state: Any, action: Any) -> tuple[Any, Any, Any]:
         state = 0.9 * state + 0.1 * jnp.roll(state, 1, 0) + action[0]
         return state, state[0, 0], False
@@ -94,12 +102,20 @@ class Plate(Heat):
 class SmallPlate(Plate):
     """a plate that fits"""
 
-    size = 30
+    size = 10
 
 
-def test_a_function_that_needs_more_values_at_a_time_than_the_stack_holds_is_refused():
+@pytest.mark.parametrize(
+    ("size", "limit", "found"), [(20, 256, "425"), pytest.param(130, 16384, "17,035", marks=pytest.mark.long)]
+)
+def test_a_function_that_needs_more_values_at_a_time_than_the_stack_holds_is_refused(
+    size: int, limit: int, found: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(Plate, "size", size)
+    if size < 130:
+        monkeypatch.setattr(emit, "MOST_LIVE", limit)
     why = rollout.why_not(describe_environment(f"{__name__}:Plate"))
-    assert why == "17,035 values are needed at the same time; simd supports at most 16,384"
+    assert why == f"{found} values are needed at the same time; simd supports at most {limit:,}"
     assert rollout.why_not(describe_environment(f"{__name__}:SmallPlate")) == ""
 
 

@@ -83,9 +83,9 @@ class Products:
         (f"{__name__}:Products", "final"),
         ("point_maze", "sum"),
         ("point_maze", "final"),
-        pytest.param("ant_maze", "final", marks=pytest.mark.slow),
         pytest.param("ant_trap", "sum", marks=pytest.mark.slow),
-        pytest.param("brax:hopper", "sum", marks=pytest.mark.slow),
+        pytest.param("ant_maze", "final", marks=pytest.mark.long),
+        pytest.param("brax:hopper", "sum", marks=pytest.mark.long),
     ],
 )
 def test_training_evaluation_and_omitted_zero_inputs_agree_on_every_bit(task: str, fitness: str) -> None:
@@ -134,7 +134,8 @@ def inputs_and_product() -> tuple[FoldingGraph, list[int], int]:
 def computed(graph: FoldingGraph, outputs: list[int]) -> list[np.ndarray]:
     """Outputs by machine code, which are the twin's."""
     target = host_target()
-    native = load_compiled("here", lambda: emit(graph, outputs, len(X), target.width), target)
+    text = emit(graph, outputs, len(X), target.width)
+    native = load_compiled(text, lambda: text, target)
     words = pack(list(X.T[:, :, None].transpose(1, 0, 2)), target.width)
     out = aligned((len(words), len(outputs), target.width))
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(native.address)
@@ -284,11 +285,8 @@ def run(program: list, values: list[Any]) -> list[Any]:
     return values
 
 
-@pytest.mark.slow
-@settings(max_examples=150, deadline=None)
-@given(programs(2), programs(1), programs(1))
-def test_bits_do_not_depend_on_what_else_a_kernel_computes(program: list, before: list, after: list) -> None:
-    """Neither on what was built before, nor on what else uses the same values, nor on where inputs lie."""
+def same_bits(program: list, before: list, after: list) -> None:
+    """Hold a program alone against the same program among others."""
 
     def bits(function: Any, *words: np.ndarray) -> list[np.ndarray]:
         graph, _, outputs = trace_jaxpr(jax.make_jaxpr(function)(*(jnp.zeros(len(rows)) for rows in words)))
@@ -307,6 +305,21 @@ def test_bits_do_not_depend_on_what_else_a_kernel_computes(program: list, before
     for one, other in zip(wanted, found, strict=False):
         is_number = ~np.isnan(one)
         np.testing.assert_array_equal(one.view(np.uint32)[is_number], other.view(np.uint32)[is_number])
+
+
+@pytest.mark.slow
+@settings(max_examples=40, deadline=None)
+@given(programs(2), programs(1), programs(1))
+def test_bits_do_not_depend_on_what_else_a_kernel_computes(program: list, before: list, after: list) -> None:
+    """Neither on what was built before, nor on what else uses the same values, nor on where inputs lie."""
+    same_bits(program, before, after)
+
+
+@pytest.mark.long
+@settings(max_examples=500, deadline=None)
+@given(programs(2), programs(1), programs(1))
+def test_nor_do_those_of_many_programs(program: list, before: list, after: list) -> None:
+    same_bits(program, before, after)
 
 
 def test_sums_are_added_one_by_one():
