@@ -72,7 +72,9 @@ def test_blocks_of_two_populations_or_generations_are_never_added(other):
 
 
 @pytest.mark.parametrize(
-    "blocks", [[1, 1, 0], [2, 1, 1], [1, 2, 0], [0, 1, 1], [3, 0, 0], [4, 0, 0]], ids=lambda blocks: str(blocks)
+    "blocks",
+    [[1, 1, 0], [2, 1, 1], [2, 1, 1, 0], [1, 2, 0], [0, 1, 1], [3, 0, 0], [4, 0, 0]],
+    ids=lambda blocks: str(blocks),
 )
 def test_sums_that_overlap_are_no_node_or_leave_a_block_out_are_refused(blocks):
     nodes = [GradientResult(np.ones(1, np.float32) if count else None, count) for count in blocks]
