@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-settings.register_profile("repeatable", derandomize=True)  # --hypothesis-profile=default looks at new examples
+settings.register_profile(
+    "repeatable", derandomize=True, deadline=None
+)  # --hypothesis-profile=default looks at new examples
 settings.load_profile("repeatable")
 os.environ["PJRT_NPROC"] = "1"
 os.environ["JAX_PLATFORMS"] = "cpu"

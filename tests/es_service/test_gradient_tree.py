@@ -62,8 +62,19 @@ def test_a_whole_population_is_one_sum_and_others_are_left_alone():
     assert with_neighbours_added(other, results) == results
 
 
+@pytest.mark.parametrize("other", [(1, 1), (2, 0)])
+def test_blocks_of_two_populations_or_generations_are_never_added(other):
+    """Also if their numbers follow each other."""
+    generation, ask = other
+    work = [(POINT, GradientChunk(1, 0, WEIGHTS)), (POINT, GradientChunk(generation, 1, WEIGHTS, ask))]
+    results = [GradientResult(block) for block in blocks_of(2)]
+    assert with_neighbours_added(work, results) == results
+
+
 @pytest.mark.parametrize(
-    "blocks", [[1, 1, 0], [2, 1, 1], [1, 2, 0], [0, 1, 1], [3, 0, 0], [4, 0, 0]], ids=lambda blocks: str(blocks)
+    "blocks",
+    [[1, 1, 0], [2, 1, 1], [2, 1, 1, 0], [1, 2, 0], [0, 1, 1], [3, 0, 0], [4, 0, 0]],
+    ids=lambda blocks: str(blocks),
 )
 def test_sums_that_overlap_are_no_node_or_leave_a_block_out_are_refused(blocks):
     nodes = [GradientResult(np.ones(1, np.float32) if count else None, count) for count in blocks]

@@ -271,6 +271,7 @@ def test_damage_of_any_kind_gives_right_answers_or_errors(example):
 
 
 @pytest.mark.long
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize("first", range(100, 10_100, 500))
 def test_more_damage_gives_right_answers_or_errors(example, first):
     found, _ = wrong(example, range(first, first + 500))

@@ -3,7 +3,6 @@
 import io
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -237,16 +236,15 @@ def test_a_comparison_is_shown_and_different_tasks_are_refused(page, tmp_path):
 
 @pytest.mark.long
 def test_a_long_run_with_a_large_map_is_reported_in_seconds(page, tmp_path):
-    """8,000 generations and 2,500 elites: ten seconds and a gigabyte; the test allows six times the seconds."""
+    """8,000 generations and 2,500 elites: ten seconds of a core and a gigabyte; six times the seconds are allowed."""
     folder = write_run(tmp_path / "run", {"map.cells": [50, 50]}, generations=8000, filled=1.0)
     code = (
-        "import resource, sys; from es_service.cli.main import main; sys.argv[1:] = ['report', sys.argv[1]]\n"
+        "import resource, sys, time; from es_service.cli.main import main; sys.argv[1:] = ['report', sys.argv[1]]\n"
         "try:\n    main()\nexcept SystemExit:\n    pass\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)"
+        "print(time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)"
     )
-    begin = time.monotonic()
     done = subprocess.run([sys.executable, "-c", code, folder], capture_output=True, text=True, check=True)
-    seconds, memory = time.monotonic() - begin, int(done.stdout.split()[-1])
+    seconds, memory = map(float, done.stdout.split()[-2:])
     report = folder / "report.html"
     print(f"{seconds:.1f} s, {memory / 1e6:.0f} MB of memory, a page of {report.stat().st_size / 1e6:.1f} MB")
     assert seconds < 60

@@ -1,0 +1,503 @@
+"""Rules of the project, each broken by hand: a test of `make test` must notice.
+
+    python -m tests.broken_rules                            # all of them: half an hour on one core
+    python -m tests.broken_rules "the sign of a pair"       # some of them, by the name of a rule or of a case
+
+A case replaces one piece of the code by a plausible mistake, in a copy of the tracked files as they are in the working
+tree, and runs there the tests that should notice it. Before, all of these tests must pass. The table has the first test
+that failed, and the number of those that did. The exit code is 1 if nobody noticed a case.
+
+No change is hidden by code that was compiled before, and none leaves compiled code behind: Python writes no bytecode
+here, the key of a kernel has a hash of the compiler's files and of what the kernel computes, that of XLA's code has the
+program, and the copy has its own cache of both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+IMPORTED = "import es_service, workers; print(es_service.__file__, workers.__file__)"
+IMPORTED_BY_A_WORKER = f"""
+import subprocess, sys
+from es_service.protocol.process_environment import child_environment
+subprocess.run([sys.executable, "-c", {IMPORTED!r}], env=child_environment(), cwd="/", check=True)
+"""
+
+
+class Case(NamedTuple):
+    """One way of breaking a rule."""
+
+    rule: str
+    how: str
+    file: str
+    old: str
+    """Text that occurs exactly once in the file."""
+    new: str
+    tests: str
+    """Files and node ids, separated by spaces."""
+
+    @property
+    def name(self) -> str:
+        """The rule and how it is broken."""
+        return f"{self.rule}: {self.how}"
+
+
+class CopyError(Exception):
+    """The cases cannot be tried."""
+
+
+def cases(rule: str, tests: str, *ways: tuple[str, str, str, str]) -> list[Case]:
+    """Cases of one rule with the same tests, from (how, file, old, new)."""
+    return [Case(rule, *way, tests) for way in ways]
+
+
+def broken(case: Case, root: Path = ROOT) -> str:
+    """The text of the case's file with the mistake in it."""
+    text = (root / case.file).read_text()
+    if (count := text.count(case.old)) != 1:
+        raise CopyError(
+            f"{case.name}: the text to replace occurs {count} times in {case.file}, not once; "
+            f"the code has moved on, so correct the case in tests/broken_rules.py: {case.old!r}"
+        )
+    return text.replace(case.old, case.new)
+
+
+def chosen(names: Sequence[str]) -> list[Case]:
+    """The cases with these names, or of the rules with these names; all if there are none."""
+    known = {name for case in CASES for name in (case.rule, case.name)}
+    if unknown := [name for name in names if name not in known]:
+        raise CopyError(f"no rule or case has the name {unknown[0]!r}; there are:\n" + "\n".join(sorted(known)))
+    return [case for case in CASES if not names or case.rule in names or case.name in names]
+
+
+def copy_of_repository(folder: Path) -> Path:
+    """A copy of the tracked files as they are in the working tree."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in listed.split("\0"):
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+    return folder
+
+
+def python(copy: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run this Python in the copy, so that it and all processes that it starts import the packages of the copy."""
+    environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=False)
+
+
+def require_copy(copy: Path) -> None:
+    """Raise CopyError if a process in the copy, or a worker that it starts, imports packages from elsewhere."""
+    for program in (IMPORTED, IMPORTED_BY_A_WORKER):
+        done = python(copy, "-c", program)
+        if done.stdout.split() != [str(copy / name / "__init__.py") for name in ("es_service", "workers")]:
+            raise CopyError(f"a process in {copy} imports other packages: {done.stdout}{done.stderr}")
+
+
+def failed_tests(copy: Path, tests: Sequence[str]) -> list[str]:
+    """The tests that fail in the copy, in their order."""
+    done = python(copy, "-m", "pytest", *tests)
+    if done.returncode not in (0, 1):  # such as an error in the import of a test file
+        raise CopyError(f"{' '.join(tests)} could not be run:\n{done.stdout[-4000:]}{done.stderr[-4000:]}")
+    return re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
+
+
+def try_cases(cases: Sequence[Case], copy: Path) -> list[str]:
+    """Print the table of these cases as it grows; returns the names of those that nobody noticed."""
+    for case in cases:
+        broken(case)
+    require_copy(copy)
+    every, started = sorted({test for case in cases for test in case.tests.split()}), time.monotonic()
+    if failed := failed_tests(copy, every):
+        raise CopyError("these tests fail although no rule is broken:\n" + "\n".join(failed))
+    print(
+        f"{len(cases)} cases; unbroken, their {len(every)} files of tests pass in {time.monotonic() - started:.0f} s\n"
+    )
+    print("| rule | noticed by | s |\n| --- | --- | --- |", flush=True)
+    unnoticed = []
+    for case in cases:
+        started, file = time.monotonic(), copy / case.file
+        sound = file.read_text()
+        file.write_text(broken(case, copy))
+        failed = failed_tests(copy, case.tests.split())
+        file.write_text(sound)
+        said = f"{failed[0]} and {len(failed) - 1} more" if len(failed) > 1 else "".join(failed) or "NOBODY"
+        print(f"| {case.name} | {said} | {time.monotonic() - started:.0f} |", flush=True)
+        unnoticed += [] if failed else [case.name]
+    return unnoticed
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Try cases and say which nobody noticed; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m tests.broken_rules", description="Break rules, one at a time.")
+    parser.add_argument("names", nargs="*", help="names of rules or of cases (default: all)")
+    try:
+        cases = chosen(parser.parse_args(arguments).names)
+        with tempfile.TemporaryDirectory(prefix="broken-rules-") as folder:
+            unnoticed = try_cases(cases, copy_of_repository(Path(folder).resolve()))
+    except CopyError as error:
+        print(error, file=sys.stderr)
+        return 2
+    for name in unnoticed:
+        print(f"no test noticed: {name}", file=sys.stderr)
+    return 1 if unnoticed else 0
+
+
+NOVELTY, STEPS = "es_service/search/novelty.py", "es_service/search/algorithms/steps.py"
+ME_ES, NSRA = "es_service/search/algorithms/me_es.py", "es_service/search/algorithms/nsra_es.py"
+MAP_ELITES, BASE = "es_service/search/algorithms/map_elites.py", "es_service/search/algorithms/base.py"
+OPTIMIZER, SHAPING = "es_service/search/optimizer.py", "es_service/search/shaping.py"
+BEHAVIOUR_MAP, PARTS = "es_service/search/maps/behaviour_map.py", "es_service/loop/parts.py"
+GENERATION, TREE = "es_service/loop/generation.py", "es_service/protocol/gradient_tree.py"
+SCHEDULER, CHANGES = "es_service/dispatch/scheduler.py", "es_service/dispatch/scheduler_changes.py"
+ENGINE = "es_service/dispatch/engine.py"
+EPISODE, WORKER, RESULTS, POLICY = "workers/episode.py", "workers/worker.py", "workers/results.py", "workers/policy.py"
+XLA, SIMD = "workers/rollout.py", "workers/simd/episodes/rollout.py"
+COMPILED, HIDDEN = "workers/simd/episodes/compiled.py", "workers/simd/episodes/hidden.py"
+NETWORK = "workers/simd/episodes/network.py"
+
+OF_NOVELTY, OF_NOVELTY_SEARCH = "tests/es_service/test_novelty.py", "tests/laws/test_novelty_search.py"
+OF_ME_ES, OF_RULES = "tests/laws/test_me_es.py", "tests/laws/test_update_rules.py"
+OF_MAP_ELITES = "tests/laws/test_map_elites.py"
+OF_MAPS = "tests/es_service/test_maps.py tests/es_service/test_changed_elites.py"
+OF_ROLLOUT = "tests/workers/test_rollout.py"
+OF_SCHEDULER = "tests/es_service/test_scheduler.py tests/es_service/test_scheduler_workers.py"
+
+CASES = [
+    *cases(
+        "novelty counts the own entry",
+        OF_NOVELTY_SEARCH,
+        ("of a centre to choose", STEPS, "exclude_Q=entry_M[known_M]", "exclude_Q=None"),
+    ),
+    *cases(
+        "novelty counts the own entry",
+        f"{OF_ME_ES} tests/laws/test_me_es_blocks.py",
+        ("of an elite to draw", ME_ES, "exclude_Q=_own_entries(map_, archive)", "exclude_Q=None"),
+        (
+            "of another centre of the same generation",
+            ME_ES,
+            "one.generation_N * centres + one.centre_N",
+            "one.generation_N * centres",
+        ),
+    ),
+    *cases(
+        "novelty counts the own entry",
+        OF_NOVELTY,
+        (
+            "a tree's candidate",
+            NOVELTY,
+            "near_Q_K[candidate_Q_K == excluded_Q[:, None]]",
+            "near_Q_K[candidate_Q_K < 0]",
+        ),
+        ("within a tree's radius", NOVELTY, "near_1_K[:, within == excluded_Q[index]]", "near_1_K[:, within < 0]"),
+        ("in no tree", NOVELTY, "squared_Q_N[rows, excluded_Q[rows] - first]", "squared_Q_N[rows, :0]"),
+        ("one of the newest", NOVELTY, "excluded_Q - (archive.size - newest), -1)", "0 * excluded_Q - 1, -1)"),
+    ),
+    *cases(
+        "phantom entries in the novelty archive",
+        OF_NOVELTY,
+        (
+            "one in an empty archive",
+            NOVELTY,
+            "np.zeros((0, dimensions)), np.zeros(0, np.int64), np.zeros(0, np.int64)",
+            "np.zeros((1, dimensions)), np.zeros(1, np.int64), np.zeros(1, np.int64)",
+        ),
+        (
+            "zeros as spare capacity",
+            NOVELTY,
+            "return NoveltyArchive(descriptor_N_B, room.generation[: room.used], room.centre[: room.used], tree, room)",
+            "return NoveltyArchive(room.descriptor_B * 1.0, room.generation, room.centre, tree, room)",
+        ),
+    ),
+    *cases(
+        "an Adam moment",
+        f"{OF_RULES} tests/laws/test_es.py::test_twenty_generations_equal_the_twin",
+        (
+            "the first decays at the rate of the second",
+            OPTIMIZER,
+            "m_D * np.float32(BETA_1)",
+            "m_D * np.float32(BETA_2)",
+        ),
+        ("the second is not of squares", OPTIMIZER, "np.square(descent_D)", "np.abs(descent_D)"),
+        ("the second is not kept", OPTIMIZER, "_float32(v_D), step)", "adam.v_D, step)"),
+        ("both are corrected as in the first step", OPTIMIZER, "step = adam.step + 1", "step = 1"),
+    ),
+    *cases(
+        "an Adam moment",
+        OF_ME_ES,
+        ("a block goes on with another's", BASE, "fresh_adam(elite.centre_D.size),", "state.centres[index].adam,"),
+    ),
+    *cases(
+        "Adam moments after resume",
+        f"{OF_NOVELTY_SEARCH}::test_a_state_put_together_again_is_the_same_and_only_the_moved_centre_is_written"
+        f" {OF_ME_ES}::test_a_search_put_together_again_inside_a_block_equals_an_uninterrupted_one",
+        ("the first is lost", PARTS, 'Adam(arrays["adam_m_D"],', 'Adam(np.zeros_like(arrays["adam_m_D"]),'),
+        ("the second is stored as the first", PARTS, '"adam_v_D": adam.v_D', '"adam_v_D": adam.m_D'),
+        ("the steps are lost", PARTS, 'int(arrays["adam_step"])', "0"),
+    ),
+    *cases(
+        "action noise",
+        OF_ROLLOUT,
+        ("in evaluations", EPISODE, "noisy = training and spec.action_noise > 0.0", "noisy = spec.action_noise > 0.0"),
+        (
+            "the same in every step",
+            EPISODE,
+            "action_noise(action_key, before.steps)",
+            "action_noise(action_key, jnp.int32(0))",
+        ),
+        ("of another scale", EPISODE, "np.float32(spec.action_noise / NORMAL_STD)", "np.float32(spec.action_noise)"),
+        (
+            "from the stream of the resets",
+            WORKER,
+            "Domain.TRAINING_RESET, Domain.ACTION_NOISE",
+            "Domain.TRAINING_RESET, Domain.TRAINING_RESET",
+        ),
+        (
+            "from the stream of the resets, xla",
+            XLA,
+            "reset_keys_L if action_keys_L is None else action_keys_L",
+            "reset_keys_L",
+        ),
+        (
+            "from the stream of the resets, simd",
+            COMPILED,
+            "pack([action_keys_L], width)",
+            "pack([reset_keys_L], width)",
+        ),
+    ),
+    *cases(
+        "common random numbers",
+        OF_ROLLOUT,
+        (
+            "never",
+            WORKER,
+            "sign_S = np.zeros(2, int) if spec.common_random_numbers else np.arange(2)",
+            "sign_S = np.arange(2)",
+        ),
+        ("always", WORKER, "np.zeros(2, int) if spec.common_random_numbers else np.arange(2)", "np.zeros(2, int)"),
+        (
+            "of the wrong pair, xla",
+            XLA,
+            "*(keys.reshape(2 * block_pairs, ",
+            "*(keys.swapaxes(0, 1).reshape(2 * block_pairs, ",
+        ),
+        (
+            "of the wrong pair, simd",
+            SIMD,
+            "keys_P_S.reshape(-1, KEY_WORDS)",
+            "keys_P_S.swapaxes(0, 1).reshape(-1, KEY_WORDS)",
+        ),
+    ),
+    *cases(
+        "steps after done",
+        f"{OF_ROLLOUT} tests/workers/test_episode_ends.py",
+        ("count", EPISODE, "jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)", "after"),
+        ("revive an episode", EPISODE, "Carry(state, alive & ~done, masked)", "Carry(state, ~done, masked)"),
+        ("one too many, xla", XLA, "(step < spec.episode_steps)", "(step <= spec.episode_steps)"),
+        ("one too many, simd", COMPILED, "go(self.spec.episode_steps)", "go(self.spec.episode_steps + 1)"),
+    ),
+    *cases(
+        "a duplicate answer",
+        f"{OF_SCHEDULER} tests/es_service/test_engine.py",
+        (
+            "is delivered",
+            SCHEDULER,
+            "if delivered := drop_item(s, item_id):",
+            "drop_item(s, item_id)\n    if delivered := True:",
+        ),
+        (
+            "of an earlier call is taken for one of this",
+            ENGINE,
+            "WorkItemId(self._phase, first,",
+            "WorkItemId(0, first,",
+        ),
+    ),
+    *cases(
+        "the order of requeued items",
+        OF_SCHEDULER,
+        ("is reversed", SCHEDULER, "for slot in reversed(slots):", "for slot in slots:"),
+        (
+            "puts them last",
+            CHANGES,
+            "first = s.places.first()\n        place = 0 if first is None else first[0] - 1",
+            "first = s.places.last()\n        place = 0 if first is None else first[0] + 1",
+        ),
+    ),
+    *cases(
+        "the order of arrival",
+        "tests/es_service/test_engine.py",
+        (
+            "is that of the results",
+            ENGINE,
+            "[result for item_id, _ in parts for result in self._results.pop(item_id)]",
+            "[result for results in self._results.values() for result in results]",
+        ),
+    ),
+    *cases(
+        "the sign of a pair",
+        OF_RULES,
+        ("in its weight", SHAPING, "utility_P_S[:, 0] - utility_P_S[:, 1]", "utility_P_S[:, 1] - utility_P_S[:, 0]"),
+        (
+            "in the shaping by signs",
+            SHAPING,
+            "np.stack([half_P, -half_P], axis=1)",
+            "np.stack([-half_P, half_P], axis=1)",
+        ),
+        ("of the step", OPTIMIZER, "- gradient_D\n        m_D", "+ gradient_D\n        m_D"),
+    ),
+    *cases(
+        "the sign of a pair",
+        OF_ROLLOUT,
+        ("in a member's noise, xla", XLA, "signs_S[None, :, None]", "signs_S[None, ::-1, None]"),
+        (
+            "in a member's hidden layers, simd",
+            HIDDEN,
+            """(plus, builder.value(f"fsub {floats} {doubled}, {plus}")) for""",
+            """(builder.value(f"fsub {floats} {doubled}, {plus}"), plus) for""",
+        ),
+        ("in a member's last layer, simd", NETWORK, "-1.0 if lane % 2 else 1.0", "1.0 if lane % 2 else -1.0"),
+    ),
+    *cases(
+        "the tree of sums",
+        f"tests/es_service/test_gradient_tree.py {OF_RULES}",
+        (
+            "adds one block after the other",
+            TREE,
+            "total = _node(known, 0, size, covered)",
+            "total = sum(known.values())",
+        ),
+        ("adds neighbours that are no node", TREE, " or work[left][1].chunk_id % (2 * sums.blocks):", ":"),
+        (
+            "adds populations",
+            TREE,
+            "(chunk.generation, chunk.ask) == (later.generation, later.ask)",
+            "chunk.generation == later.generation",
+        ),
+        ("accepts overlapping sums", TREE, "if first != covered or first % blocks", "if first % blocks"),
+    ),
+    *cases(
+        "NSRA's weight",
+        OF_NOVELTY_SEARCH,
+        (
+            "rises at the record",
+            NSRA,
+            "evaluation.fitness > weight.record + gain",
+            "evaluation.fitness >= weight.record + gain",
+        ),
+        ("forgets the record", NSRA, "evaluation.fitness, 0)", "weight.record, 0)"),
+        ("waits a generation too long", NSRA, "weight.stagnant + 1 < search", "weight.stagnant + 1 <= search"),
+        (
+            "goes on counting after a fall",
+            NSRA,
+            "search.fitness_weight_step), stagnant=0)",
+            "search.fitness_weight_step))",
+        ),
+        (
+            "rises above 1",
+            NSRA,
+            "min(1.0, weight.value + search.fitness_weight_step)",
+            "weight.value + search.fitness_weight_step",
+        ),
+        ("is that of novelty", STEPS, "+= w * shaped(population.fitness)", "+= (1.0 - w) * shaped(population.fitness)"),
+    ),
+    *cases(
+        "a mutant's noise address",
+        OF_MAP_ELITES,
+        (
+            "is that of the whole batch",
+            MAP_ELITES,
+            "Domain.VARIATION, generation, number)",
+            "Domain.VARIATION, generation)",
+        ),
+        (
+            "is that of every generation",
+            MAP_ELITES,
+            "Domain.VARIATION, generation, number)",
+            "Domain.VARIATION, 0, number)",
+        ),
+        (
+            "is that of a pair",
+            MAP_ELITES,
+            "Domain.VARIATION, generation, number)",
+            "Domain.PARAMETER_NOISE, generation, number)",
+        ),
+        ("has a line for each parameter", MAP_ELITES, "noise[-1] * (y_D - x_D)", "noise[1:] * (y_D - x_D)"),
+    ),
+    *cases(
+        "an elite's fitness",
+        f"{OF_MAPS} {OF_MAP_ELITES} {OF_ME_ES}::test_thirty_generations_equal_the_twin",
+        (
+            "is replaced by an equal one",
+            BEHAVIOUR_MAP,
+            "if not fitness > map_.fitness_N[row]:",
+            "if fitness < map_.fitness_N[row]:",
+        ),
+        ("is replaced by any", BEHAVIOUR_MAP, "if not fitness > map_.fitness_N[row]:", "if fitness != fitness:"),
+        ("remains that of the one before", BEHAVIOUR_MAP, '"fitness_N": fitness,', '"fitness_N": map_.fitness_N[row],'),
+        ("is not stored when it changes", BEHAVIOUR_MAP, 'COLUMNS = {"fitness_N": "f8", ', "COLUMNS = {"),
+        ("is stored as its score", PARTS, '"fitness": map_.fitness_N[row]', '"fitness": map_.score_N[row]'),
+        ("is read from its score", PARTS, '[found[cell]["fitness"] for', '[found[cell]["score"] for'),
+        (
+            "is that of its best episode",
+            GENERATION,
+            "np.mean(evaluation.fitness, dtype=np.float64)",
+            "np.max(evaluation.fitness)",
+        ),
+        (
+            "is its score",
+            STEPS,
+            "with_score(map_, centre.cell, evaluation.population_max)",
+            "with_score(map_, centre.cell, evaluation.fitness)",
+        ),
+    ),
+    *cases(
+        "one key for all",
+        "tests/workers/test_policy.py",
+        (
+            "layers",
+            POLICY,
+            "        norm = output_norm if",
+            "        weights[:] = normals(key, weights.size).reshape(weights.shape)\n        norm = output_norm if",
+        ),
+        ("initial centres", POLICY, "Domain.INITIALISATION, 0, centre)", "Domain.INITIALISATION, 0, 0)"),
+    ),
+    *cases(
+        "one seed for all",
+        f"{OF_ROLLOUT} tests/laws/test_asks.py",
+        ("workers", WORKER, "chunk.chunk_id * size + np.arange(size)", "np.arange(size)"),
+        ("populations", WORKER, "return (chunk.ask,) if chunk.ask else ()", "return ()"),
+        (
+            "runs",
+            WORKER,
+            "stream_keys(spec.seed, domains, generation, *ids)",
+            "stream_keys(0, domains, generation, *ids)",
+        ),
+    ),
+    *cases(
+        "arrays that alias the simulator's memory",
+        OF_ROLLOUT,
+        ("descriptors of members", RESULTS, "x_P_S_E[:, :, 0].copy()", "x_P_S_E[:, :, 0]"),
+        (
+            "descriptors of episodes",
+            RESULTS,
+            "host = Episodes(*map(np.array, episodes))",
+            "host = Episodes(*map(np.asarray, episodes))",
+        ),
+        ("traces", RESULTS, "np.asarray(episodes.trace_T_B)[0].copy()", "np.asarray(episodes.trace_T_B)[0]"),
+    ),
+]
+
+if __name__ == "__main__":
+    sys.exit(main())
