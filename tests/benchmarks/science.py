@@ -32,10 +32,7 @@ import pandas as pd
 from es_service import api
 from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
-from es_service.errors import Interrupted
-from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.machine import cpu_kind
-from es_service.protocol.messages import ChunkResult, Work
 from es_service.protocol.process_environment import worker_environment
 from es_service.runs import session
 from es_service.runs.view import Policy, Run
@@ -98,31 +95,13 @@ def chamber_shares(y: np.ndarray) -> list[float]:
     return [round(100 * float(share.mean()), 2) for share in (first, second, ~(first | second))]
 
 
-class InThisProcess:
-    """An Evaluator whose one worker is the caller. A fault of it would be the end of the run."""
-
-    counts = DispatchCounts(workers=1)
-    platforms: frozenset[str] = frozenset()
-
-    def __init__(self, config: RunConfig, should_stop: Callable[[], int | None]) -> None:
-        from workers.worker import make_worker
-
-        self._run = make_worker(worker_spec(config, task_of(config)))
-        self._should_stop = should_stop
-
-    def wait_for_place(self) -> None:
-        """Return at once, since the caller is there."""
-
-    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
-        if (number := self._should_stop()) is not None:
-            raise Interrupted(number)
-        return self._run(work)
-
-
 @contextmanager
-def in_this_process(config: RunConfig, should_stop: Callable[[], int | None], *_: object) -> Iterator[InThisProcess]:
-    """In the place of `session.make_engine`."""
-    yield InThisProcess(config, should_stop)
+def in_this_process(config: RunConfig, should_stop: Callable[[], int | None], *_: object) -> Iterator[object]:
+    """In the place of `session.make_engine`: the one worker is the caller, whose fault would be the end of the run."""
+    from tests.helpers import WorkerHere  # imports JAX
+    from workers.worker import make_worker
+
+    yield WorkerHere(make_worker(worker_spec(config, task_of(config))), should_stop)
 
 
 def folder_of(method: str, seed: int, env_steps: int, settings: tuple[str, ...]) -> Path:

@@ -12,11 +12,14 @@ from pathlib import Path
 import pytest
 
 from es_service import api
+from es_service.config.model import worker_spec
+from es_service.config.tasks import task_of
 from es_service.protocol.machine import VERSION, computed_on, is_mixed, platform_info, platform_text
 from es_service.runs import session
 from es_service.store.digest import checked_parts
 from es_service.store.reader import read_platforms
-from tests.benchmarks.science import InThisProcess
+from tests.helpers import WorkerHere
+from workers.worker import make_worker
 
 DRIVER = {"cpu": "a", "jax": "1"}
 LIKE_THE_DRIVER, OTHER, NEWER = platform_text(DRIVER), platform_text({"cpu": "b"}), platform_text({"cpu": "a"})
@@ -59,7 +62,7 @@ def test_workers_are_recorded_where_they_are_not_like_the_driver(workers, record
 def test_workers_of_several_kinds_make_a_run_mixed_from_the_generation_they_join(
     tmp_path, monkeypatch, joins, mixed, recorded
 ):
-    class Cluster(InThisProcess):
+    class Cluster(WorkerHere):
         """Whose workers come up in the generations of `joins`."""
 
         def evaluate(self, work):
@@ -69,7 +72,7 @@ def test_workers_of_several_kinds_make_a_run_mixed_from_the_generation_they_join
 
     @contextmanager
     def engine(config, should_stop, *_):
-        yield Cluster(config, should_stop)
+        yield Cluster(make_worker(worker_spec(config, task_of(config))), should_stop)
 
     monkeypatch.setattr(session, "make_engine", engine)
     told: list[str] = []
