@@ -148,7 +148,8 @@ assert (jax.numpy.ones(5) @ jax.numpy.ones(5)) == 5
 from es_service import load_config, run
 run(load_config({config!r}), {str(tmp_path / "run")!r})
 """
-    environment = {k: v for k, v in os.environ.items() if k not in ("PJRT_NPROC", "JAX_PLATFORMS")}
+    ours = ("PJRT_NPROC", "JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR")
+    environment = {k: v for k, v in os.environ.items() if k not in ours}
     subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path, env=environment, timeout=120)
     assert digest_parts(tmp_path / "run") == expected
 
