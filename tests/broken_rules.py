@@ -1,6 +1,6 @@
 """Rules of the project, each broken by hand: a test of `make test` must notice.
 
-    python -m tests.broken_rules                            # all of them: half an hour on one core
+    python -m tests.broken_rules                            # all of them
     python -m tests.broken_rules "the sign of a pair"       # some of them, by the name of a rule or of a case
 
 A case replaces one piece of the code by a plausible mistake, in a copy of the tracked files as they are in the working

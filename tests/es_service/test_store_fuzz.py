@@ -38,6 +38,7 @@ NEWEST, COPIED = 6, 3
 LONGEST_S = 10.0
 """Seconds of the processor, since others may be busy on it; a read that waits ends at the time limit of tests."""
 RIGHT, PARTLY, OTHER = "right", "partly right", "another answer"
+OLDER = "right but for the recent generations"
 RECENT = ("weight of fitness", "not known")
 """Lines of `status` about the recent generations, whose damage hides nothing else of a run."""
 CONFIG = {
@@ -186,7 +187,7 @@ def judged(name: str, answer: Any, right: Any) -> str:
     if answer == right:
         return RIGHT
     known = {"status": status_without_recent, "status --json": json_without_recent}.get(name)
-    return PARTLY if known and known(answer) == (known(right)[0], True) else OTHER
+    return OLDER if known and known(answer) == (known(right)[0], True) else OTHER
 
 
 def status_without_recent(answer: str) -> tuple[object, bool]:
