@@ -92,15 +92,20 @@ _WORKERS: dict[str, Callable[[Sequence[Work]], list[ChunkResult]]] = {}
 """Workers by what they know, so that runs alike compile nothing twice."""
 
 
+def worker_here(worker_spec: WorkerSpec) -> Callable[[Sequence[Work]], list[ChunkResult]]:
+    """The worker of a spec; those of equal specs are one."""
+    key = repr(worker_spec)
+    if key not in _WORKERS:
+        _WORKERS[key] = make_worker(worker_spec)
+    return _WORKERS[key]
+
+
 @contextmanager
 def inline_here(
     worker_spec: WorkerSpec, limits: Limits, should_stop: Callable[[], int | None] = lambda: None, **_: object
 ) -> Iterator[WorkerHere]:
     """In the place of `inline_engine`, for tests of what is done with a run and not of its processes."""
-    key = repr(worker_spec)
-    if key not in _WORKERS:
-        _WORKERS[key] = make_worker(worker_spec)
-    yield WorkerHere(_WORKERS[key], should_stop)
+    yield WorkerHere(worker_here(worker_spec), should_stop)
 
 
 @contextmanager
