@@ -20,14 +20,16 @@ test: .venv/installed-dev
 	  $(MAKE) --no-print-directory tests && ended=$$(date +%s) && \
 	  echo "make test: lint $$((linted - began)) s, tests $$((ended - linted)) s, all $$((ended - $(START))) s"
 
-# Those of the system start processes of their own and look at clocks, so they run one after another.
+# Those of the system start processes of their own, so two at a time; those that look at clocks, one after another.
 tests: .venv/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile tests/es_service tests/laws tests/workers
-	$(BIN)/python -m pytest tests/system
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not alone and not long and not image' tests/system
+	$(BIN)/python -m pytest -m 'alone and not long and not image' tests/system
 
-# Before an issue is closed: fifty kills in one run, a cluster whose hosts come, go, hang and die.
+# Before an issue is closed: fifty kills in one run, a cluster whose hosts come, go, hang and die, browsers.
 long: .venv/installed-dev
-	$(BIN)/python -m pytest -m long tests
+	$(BIN)/python -m pytest -n auto --dist loadfile -m long tests/es_service tests/laws tests/workers
+	$(BIN)/python -m pytest -m long tests/system
 
 # While writing code: no lint, no tests of more than five seconds, none of the whole system.
 quick: .venv/installed-dev

@@ -32,7 +32,7 @@ def running(*command: object, **options: Any) -> Iterator[subprocess.Popen[str]]
             process.kill()
 
 
-def wait_until(process: subprocess.Popen[str], what: Callable[[], Any], timeout_s: float = 60.0) -> None:
+def wait_until(process: subprocess.Popen[str], what: Callable[[], Any], timeout_s: float = 180.0) -> None:
     """Until something is true; a process that ends before, or takes too long, fails with what it printed."""
     until = time.monotonic() + timeout_s
     while not what():
@@ -43,7 +43,7 @@ def wait_until(process: subprocess.Popen[str], what: Callable[[], Any], timeout_
         time.sleep(0.002)
 
 
-def wait_for(what: Callable[[], Any], timeout_s: float = 60.0) -> Any:
+def wait_for(what: Callable[[], Any], timeout_s: float = 180.0) -> Any:
     """The first true answer."""
     until = time.monotonic() + timeout_s
     while not (answer := what()):

@@ -52,6 +52,7 @@ class Point:
     def descriptor(self, state):
         return state
 '''
+pytestmark = pytest.mark.alone
 ENGINES = ["inline", pytest.param("ray", marks=pytest.mark.slow)]
 
 

@@ -91,6 +91,7 @@ def test_evaluate_replaces_a_file_when_it_has_all_rows(tmp_path, mapped):
         pass
 
 
+@pytest.mark.alone
 def test_an_evaluation_that_would_take_days_begins_at_once_and_ends_promptly(mapped):
     """tests/es_service/test_evaluation.py counts what is in memory."""
     endless = ("evaluate", mapped.folder, "--episodes", 10**9, "--workers", 1)
