@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import pytest
@@ -87,6 +88,15 @@ class WorkerHere:
             raise Interrupted(number)
         return self.run(work)
 
+    def close(self) -> None:
+        """Leave the caller as it is."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
 
 _WORKERS: dict[str, Callable[[Sequence[Work]], list[ChunkResult]]] = {}
 """Workers by what they know, so that runs alike compile nothing twice."""
@@ -100,12 +110,11 @@ def worker_here(worker_spec: WorkerSpec) -> Callable[[Sequence[Work]], list[Chun
     return _WORKERS[key]
 
 
-@contextmanager
 def inline_here(
     worker_spec: WorkerSpec, limits: Limits, should_stop: Callable[[], int | None] = lambda: None, **_: object
-) -> Iterator[WorkerHere]:
+) -> WorkerHere:
     """In the place of `inline_engine`, for tests of what is done with a run and not of its processes."""
-    yield WorkerHere(worker_here(worker_spec), should_stop)
+    return WorkerHere(worker_here(worker_spec), should_stop)
 
 
 @contextmanager
