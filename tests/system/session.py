@@ -17,6 +17,7 @@ import time
 from contextlib import AbstractContextManager
 from pathlib import Path
 
+from tests.system import warm
 from tests.system.processes import ROOT, running
 
 Started = AbstractContextManager[subprocess.Popen[str]]
@@ -38,9 +39,8 @@ def start(folder: Path, *, config: dict | None = None, kill: dict | None = None)
 
 def finish(folder: Path, *, config: dict | None = None, kill: dict | None = None) -> int:
     """Run a session to its end; the exit code. A session that fails by itself shows its error."""
-    with start(folder, config=config, kill=kill) as process:
-        _, errors = process.communicate(timeout=300)
-    assert process.returncode in (0, -signal.SIGKILL), errors
+    process = warm.call(_main, str(folder), config, kill)
+    assert process.returncode in (0, -signal.SIGKILL), process.stderr
     return process.returncode
 
 
