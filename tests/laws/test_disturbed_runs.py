@@ -31,22 +31,26 @@ from tests.laws.test_readers import config_of as config_of_method
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 GENERATIONS, KEPT = 6, 2
-EVERY_CENTRE = "nsra_es, every centre in each generation"
-CHANGES = {EVERY_CENTRE: {"algorithm": "nsra_es", "update": "all", "fitness_weight_patience": 1}}
-"""Name -> settings of a search that is no method of its own."""
+CHANGES = {
+    "nsra_es, every centre in each generation": {
+        "search": {"algorithm": "nsra_es", "update": "all", "fitness_weight_patience": 1}
+    },
+    "ars, a linear policy": {"search": {"algorithm": "ars", "top_pairs": 5}, "policy": {"hidden": []}},
+}
+"""Name -> settings of a run that are none of a method's own."""
 KILLS = ("before_begin", "mid_transaction", "before_commit", "after_commit")
 FAULTS = ("answers", "answers twice", "fails", "is lost")
 
 
 def config_of(name: str, **compute: object) -> dict:
     """Config of a method, or of what is in CHANGES, whose generations have several chunks and blocks."""
-    changed = CHANGES.get(name, {"algorithm": name})
-    config = config_of_method(changed["algorithm"])
+    changes = CHANGES.get(name, {"search": {"algorithm": name}})
+    method = changes["search"]["algorithm"]
+    config, idle = config_of_method(method), keys_without_effect(method)
     small = {"chunk_pairs": 4, "gradient_block_pairs": 4}
-    idle = keys_without_effect(changed["algorithm"])
     used = {key: value for key, value in small.items() if f"compute.{key}" not in idle}
     return config | {
-        "search": config["search"] | changed,
+        **{section: config[section] | settings for section, settings in changes.items()},
         "budget": {"generations": GENERATIONS},
         "store": {"keep_every": KEPT},
         "compute": config["compute"] | used | compute,
@@ -130,7 +134,7 @@ def whole(request, tmp_path_factory, workers_here):
         nonlocal committed
         generation = committed + 1
         committed += at == "after_commit"
-        if at == KILLS[generation % len(KILLS)]:
+        if (at in KILLS and generation == 0) or at == KILLS[generation % len(KILLS)]:
             kills.append((committed, folder / f"killed {at} of {generation}"))
             shutil.copytree(folder / "run", kills[-1][1])
 
@@ -163,9 +167,9 @@ def test_any_number_order_loss_and_retry_of_workers_gives_the_same_bits(whole, t
 
 
 def test_killed_at_any_commit_and_resumed_it_ends_with_the_same_bits(whole):
-    """Before a transaction, in its middle, before and after its commit: each in its turn."""
+    """Before a transaction, in its middle, before and after its commit: all at the first one, then each in its turn."""
     _, run, kills = whole
-    assert [generation for generation, _ in kills] == [-1, 0, 1, 3, 3, 4, 5]
+    assert [generation for generation, _ in kills] == [-1, -1, -1, 0, 0, 1, 3, 3, 4, 5]
     for generation, folder in kills:
         assert read_generation(folder) == (None if generation < 0 else generation)
         assert api.resume(folder).run.generation == GENERATIONS

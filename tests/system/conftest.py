@@ -34,4 +34,7 @@ def finished(tmp_path_factory):
 @pytest.fixture(scope="session")
 def mapped(tmp_path_factory):
     """A finished run of ME-ES, for reading only."""
-    return run(tmp_path_factory.mktemp("me_es") / "run")
+    from tests.helpers import workers_in_this_process  # imports JAX
+
+    with workers_in_this_process():
+        return run(tmp_path_factory.mktemp("me_es") / "run")

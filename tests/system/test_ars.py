@@ -1,9 +1,8 @@
-"""ARS from the outside, with a linear policy: placement, kills, fork, and everything that reads its policies."""
+"""ARS from the outside, with a linear policy: the other rollout, and everything that reads its policies."""
 
 from __future__ import annotations
 
 import csv
-import signal
 
 import numpy as np
 import pytest
@@ -11,14 +10,10 @@ import pytest
 import es_service
 from es_service import api
 from es_service.store.digest import digest_parts
+from tests.helpers import workers_in_this_process
 from tests.system.command_line import command
-from tests.system.processes import committed
-from tests.system.session import SMALL, finish
+from tests.system.session import SMALL
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::ResourceWarning"),  # Ray leaves files and processes to the garbage collector
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
 CONFIG = SMALL | {
     "policy": {"hidden": []},
     "search": {
@@ -40,22 +35,8 @@ def config_of(**compute):
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     """A finished run on one worker, for reading only."""
-    return api.run(config_of(), tmp_path_factory.mktemp("ars") / "run").run
-
-
-@pytest.mark.parametrize(
-    "compute",
-    [
-        {"workers": 2},
-        {"workers": 2, "inline_workers": "threads"},
-        pytest.param({"workers": 2, "engine": "ray"}, marks=pytest.mark.slow),
-    ],
-    ids=str,
-)
-def test_number_and_kind_of_workers(tmp_path, undisturbed, compute):
-    other = api.run(config_of(**compute), tmp_path / "run", on_notice=pytest.fail).run
-    assert digest_parts(other.folder) == digest_parts(undisturbed.folder)
-    assert set(other.history["workers"]) == {compute["workers"]}
+    with workers_in_this_process():
+        return api.run(config_of(), tmp_path_factory.mktemp("ars") / "run").run
 
 
 def test_xla_computes_a_linear_policy_too(tmp_path, undisturbed):
@@ -64,28 +45,6 @@ def test_xla_computes_a_linear_policy_too(tmp_path, undisturbed):
     theirs, ours = (run.history["centre_fitness_mean"] for run in (one, undisturbed))
     np.testing.assert_allclose(theirs[:3], ours[:3], rtol=1e-4)
     assert ours.max() > ours[0] + 1.0, "it has learned something"
-
-
-def test_killed_at_three_points_in_three_generations(tmp_path, undisturbed):
-    folder = tmp_path / "run"
-    for at, nth, newest in (("mid_transaction", 3, 1), ("before_commit", 4, 4), ("after_commit", 4, 8)):
-        kill, config = {"at": at, "nth": nth}, None if folder.exists() else CONFIG
-        assert finish(folder, config=config, kill=kill) == -signal.SIGKILL
-        assert committed(folder) == newest
-    assert finish(folder) == 0
-    assert digest_parts(folder) == digest_parts(undisturbed.folder)
-
-
-def test_resumed_and_forked_in_the_middle(tmp_path, undisturbed):
-    part, whole = (
-        api.run(api.load_config(CONFIG, ["budget.generations=6"]), tmp_path / "part").run,
-        "budget.generations=14",
-    )
-    fork = api.fork(part.folder, [whole], out=tmp_path / "fork", generation=5).run
-    other = api.fork(part.folder, [whole, "search.top_pairs=null"], out=tmp_path / "other").run
-    api.resume(part.folder, [whole])
-    assert digest_parts(part.folder) == digest_parts(fork.folder) == digest_parts(undisturbed.folder)
-    assert digest_parts(other.folder) != digest_parts(undisturbed.folder)
 
 
 def test_a_linear_policy_is_read_evaluated_exported_and_started_from(tmp_path, undisturbed):

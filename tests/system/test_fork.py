@@ -31,6 +31,8 @@ from tests.system.command_line import digest, es
 from tests.system.session import ROOT, SMALL, finish
 from workers.environments import SHIPPED
 
+pytestmark = pytest.mark.usefixtures("workers_here")
+
 
 def run(folder: Path, *overrides: str, config=SMALL):
     return api.run(api.load_config(config, overrides), folder).run
@@ -41,7 +43,7 @@ def fork(parent, folder: Path, *overrides: str):
 
 
 @pytest.fixture(scope="module")
-def parent(tmp_path_factory):
+def parent(tmp_path_factory, workers_here):
     """Six generations of nsra_es."""
     return run(tmp_path_factory.mktemp("parent") / "run", "budget.generations=6")
 

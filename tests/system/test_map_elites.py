@@ -1,4 +1,4 @@
-"""MAP-Elites from the outside: placement, kills, resume, fork, and what the command line says of it."""
+"""MAP-Elites from the outside: placement, kills, a fork of another task, and what the command line says of it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,6 @@ from tests.system.command_line import command
 from tests.system.processes import committed
 from tests.system.session import SMALL, finish
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::ResourceWarning"),  # Ray leaves files and processes to the garbage collector
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
 SEARCH = {"algorithm": "map_elites", "batch": 40, "centres": 4, "iso_sigma": 0.2, "evaluation_episodes": 2}
 GENERATIONS = 14
 
@@ -32,7 +28,7 @@ def undisturbed(tmp_path_factory):
     return api.run(api.load_config(config_of()), folder).run
 
 
-@pytest.mark.parametrize("compute", [{"workers": 2}, {"workers": 3}, {"workers": 2, "engine": "ray"}], ids=str)
+@pytest.mark.parametrize("compute", [{"workers": 2}, {"workers": 3}], ids=str)
 def test_number_and_kind_of_workers(tmp_path, undisturbed, compute):
     other = api.run(api.load_config(config_of(**compute)), tmp_path / "run", on_notice=pytest.fail).run
     assert digest_parts(other.folder) == digest_parts(undisturbed.folder)
@@ -47,14 +43,6 @@ def test_killed_at_three_points_in_three_generations(tmp_path, undisturbed):
         assert committed(folder) == newest
     assert finish(folder) == 0
     assert digest_parts(folder) == digest_parts(undisturbed.folder)
-
-
-def test_resumed_and_forked_in_the_middle(tmp_path, undisturbed):
-    part = api.run(api.load_config(config_of(), ["budget.generations=6"]), tmp_path / "part").run
-    fork = api.fork(part.folder, [f"budget.generations={GENERATIONS}"], out=tmp_path / "fork", generation=5).run
-    api.resume(part.folder, [f"budget.generations={GENERATIONS}"])
-    for run in (part, fork):
-        assert digest_parts(run.folder) == digest_parts(undisturbed.folder)
 
 
 def test_a_fork_whose_map_is_empty_begins_with_children_of_the_centres(tmp_path, undisturbed):

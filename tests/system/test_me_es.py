@@ -1,11 +1,8 @@
-"""ME-ES from the outside: placement, resume, fork, what can be asked of a finished map, and what cannot."""
+"""ME-ES from the outside: fork with another task, what can be asked of a finished map, and what cannot."""
 
 from __future__ import annotations
 
-import os
 import re
-import signal
-import threading
 
 import numpy as np
 import pandas as pd
@@ -18,7 +15,8 @@ from es_service.search.maps.geometry import Grid
 from es_service.store.digest import digest_parts
 from tests.system.command_line import command
 from tests.system.me_es_runs import CONFIG, run
-from tests.system.processes import children
+
+pytestmark = pytest.mark.usefixtures("workers_here")
 
 
 def test_a_map_has_filled_and_blocks_began_in_several_cells(mapped):
@@ -34,29 +32,6 @@ def test_a_map_has_filled_and_blocks_began_in_several_cells(mapped):
     assert set(history["fitness_weight"].iloc[1:]) == {0.0, 1.0}
     assert history["coverage"].iloc[-1] == history["coverage_reachable"].iloc[-1] == len(mapped.map) / 256
     assert (history["qd_score"].diff().iloc[1:] >= 0).all()
-
-
-@pytest.mark.slow
-def test_two_workers_of_which_one_is_killed(tmp_path, mapped):
-    notices = []
-
-    def strike(row):
-        if row["generation"] == 6:
-            threading.Timer(0.002, os.kill, (children()[-1], signal.SIGKILL)).start()
-
-    other = run(tmp_path / "two", "compute.workers=2", on_generation=strike, on_notice=notices.append)
-    assert other.history["lost_workers"].sum() == 1
-    assert digest_parts(tmp_path / "two") == digest_parts(mapped.folder)
-
-
-def test_resumed_inside_a_block_and_forked(tmp_path, mapped):
-    folder = tmp_path / "stopped"
-    run(folder, "budget.generations=13")
-    api.resume(folder, ["budget.generations=18"])
-    api.fork(folder, ["budget.generations=40"], out=tmp_path / "fork")
-    assert digest_parts(tmp_path / "fork") == digest_parts(mapped.folder)
-    api.resume(folder, ["budget.generations=40"])
-    assert digest_parts(folder) == digest_parts(mapped.folder)
 
 
 def test_a_fork_with_another_task_begins_with_an_empty_map(tmp_path, mapped):

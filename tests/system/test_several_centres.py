@@ -1,10 +1,9 @@
-"""Generations of several populations from the outside: placement, kills, the table of evaluated centres, evaluate."""
+"""Generations of several populations from the outside: kills, the table of evaluated centres, evaluate."""
 
 from __future__ import annotations
 
 import csv
 import random
-import signal
 import time
 
 import numpy as np
@@ -17,10 +16,7 @@ from tests.system.command_line import command
 from tests.system.processes import committed, wait_until
 from tests.system.session import SMALL, finish, start
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::ResourceWarning"),  # Ray leaves files and processes to the garbage collector
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = pytest.mark.usefixtures("workers_here")
 SEARCHES = {
     "me_es": {"algorithm": "me_es", "emitters": 3, "pairs": 16, "evaluation_episodes": 4, "block_generations": 4},
     "memes": {"algorithm": "memes", "emitters": 3, "pairs": 16, "evaluation_episodes": 4, "stagnation_generations": 1},
@@ -35,7 +31,7 @@ def config_of(name, **compute):
 
 
 @pytest.fixture(scope="module", params=SEARCHES)
-def undisturbed(request, tmp_path_factory):
+def undisturbed(request, tmp_path_factory, workers_here):
     """A search's name, and its finished run on one worker, for reading only."""
     folder = tmp_path_factory.mktemp(request.param) / "run"
     api.run(api.load_config(config_of(request.param)), folder)
@@ -43,30 +39,11 @@ def undisturbed(request, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def emitters(tmp_path_factory):
+def emitters(tmp_path_factory, workers_here):
     """A finished run of ME-ES, for reading only; many elites, and resets that differ."""
     folder = tmp_path_factory.mktemp("emitters") / "run"
     search = {**SEARCHES["me_es"], "sigma": 0.2, "learning_rate": 0.3}
     return api.run(api.load_config(config_of("me_es") | {"search": search}), folder).run
-
-
-@pytest.mark.parametrize("compute", [{"workers": 2}, {"workers": 3}, {"workers": 2, "engine": "ray"}], ids=str)
-def test_number_and_kind_of_workers(tmp_path, undisturbed, compute):
-    name, folder = undisturbed
-    other = api.run(api.load_config(config_of(name, **compute)), tmp_path / "run", on_notice=pytest.fail).run
-    assert digest_parts(other.folder) == digest_parts(folder)
-    assert set(other.history["workers"]) == {compute["workers"]}
-
-
-def test_killed_at_three_points_in_three_generations(tmp_path, undisturbed):
-    name, reference = undisturbed
-    folder = tmp_path / "run"
-    for at, nth, newest in (("mid_transaction", 3, 1), ("before_commit", 4, 4), ("after_commit", 4, 8)):
-        kill, config = {"at": at, "nth": nth}, None if folder.exists() else config_of(name)
-        assert finish(folder, config=config, kill=kill) == -signal.SIGKILL
-        assert committed(folder) == newest
-    assert finish(folder) == 0
-    assert digest_parts(folder) == digest_parts(reference)
 
 
 @pytest.mark.long
@@ -91,18 +68,6 @@ def test_killed_twenty_times_at_random(tmp_path, name):
     print(f"{name}: killed at generations {reached} of 600")
     assert finish(folder) == 0
     assert digest_parts(folder) == digest_parts(undisturbed)
-
-
-def test_resumed_and_forked_in_the_middle(tmp_path, undisturbed):
-    name, reference = undisturbed
-    part = api.run(api.load_config(config_of(name), ["budget.generations=6"]), tmp_path / "part").run
-    assert len(part.evaluations) == 7 * part.constants["search.centres"]
-    fork = api.fork(part.folder, [f"budget.generations={GENERATIONS}"], out=tmp_path / "fork", generation=5).run
-    api.resume(part.folder, [f"budget.generations={GENERATIONS}"])
-    whole = api.open_run(reference)
-    for run in (part, fork):
-        assert digest_parts(run.folder) == digest_parts(reference)
-        pd.testing.assert_frame_equal(run.evaluations, whole.evaluations)
 
 
 # The table of evaluated centres

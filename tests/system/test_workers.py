@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -58,6 +57,7 @@ def test_bits_of_xla_are_others_and_as_independent_of_workers(tmp_path, referenc
     assert digest_parts(tmp_path / "1") == digest_parts(tmp_path / "2") != reference
 
 
+@pytest.mark.alone
 def test_a_child_that_is_killed_takes_its_threads_with_it_and_changes_nothing(tmp_path, reference):
     notices = []
 
@@ -72,21 +72,7 @@ def test_a_child_that_is_killed_takes_its_threads_with_it_and_changes_nothing(tm
     assert children() == []
 
 
-def test_order_of_chunks(tmp_path, reference, monkeypatch):
-    """Chunks go out in random order, so answers come back in random order too."""
-    rng = random.Random(0)
-    evaluate = Engine.evaluate
-
-    def shuffled(self, work):
-        order = rng.sample(range(len(work)), len(work))
-        results = evaluate(self, [work[i] for i in order])
-        return [result for _, result in sorted(zip(order, results, strict=True), key=lambda item: item[0])]
-
-    monkeypatch.setattr(Engine, "evaluate", shuffled)
-    run(tmp_path / "run")
-    assert digest_parts(tmp_path / "run") == reference
-
-
+@pytest.mark.alone
 @pytest.mark.parametrize(
     ("number", "after", "chunk_timeout_s"), [(signal.SIGKILL, (4, 8), 30.0), (signal.SIGSTOP, (4,), 1.0)]
 )
@@ -181,6 +167,7 @@ def test_workers_that_cannot_start_end_the_run_with_their_last_words(tmp_path, m
     assert children() == []
 
 
+@pytest.mark.alone
 def test_a_killed_driver_leaves_no_workers(tmp_path):
     script = f"""
 from es_service import load_config, run
