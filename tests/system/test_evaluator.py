@@ -8,6 +8,7 @@ import pickle
 import signal
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from es_service.dispatch.inline_engine import ChildProcesses
 from es_service.dispatch.ray_engine import Actors
 from es_service.errors import ConfigError, EvaluationError, ServiceError
 from es_service.loop.policies import no_statistics
-from tests.helpers import stop
+from tests.helpers import stop, workers_in_this_process
 from tests.system import cluster
 from tests.system.cluster import Cluster
 from tests.system.processes import children, wait_for, without_copies
@@ -46,6 +47,13 @@ def bits(result) -> list[bytes]:
     return [getattr(result, name).tobytes() for name in FIELDS]
 
 
+@pytest.fixture
+def here():
+    """Evaluators and runs start no process."""
+    with workers_in_this_process():
+        yield
+
+
 @pytest.fixture(scope="module")
 def reference():
     """Bits of two generations of the policies, three episodes each, on one worker."""
@@ -63,7 +71,6 @@ def twice(evaluate) -> list[list[bytes]]:
         {"workers": 2},
         {"workers": 3},
         {"engine": "inline", "workers": "auto"},
-        pytest.param({"engine": "ray", "workers": 2}, marks=pytest.mark.slow),
     ],
     ids=str,
 )
@@ -90,6 +97,7 @@ def test_bits_are_the_same_with_threads_and_from_a_run_config(reference):
     ],
     ids=["inline", "ray"],
 )
+@pytest.mark.alone
 @pytest.mark.slow
 def test_workers_that_are_killed_and_stopped_in_mid_evaluation_change_no_bit(
     reference, monkeypatch, engine, transport, pid_of
@@ -115,6 +123,7 @@ def test_workers_that_are_killed_and_stopped_in_mid_evaluation_change_no_bit(
     assert children() == before
 
 
+@pytest.mark.alone
 @pytest.mark.slow
 @pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))
 def test_a_cluster_gives_the_same_bits_also_when_a_node_dies(tmp_path, reference):
@@ -146,6 +155,7 @@ with es_service.evaluator(CONFIG, workers="auto", address=sys.argv[1]) as evalua
     assert lost
 
 
+@pytest.mark.usefixtures("here")
 def test_results_have_the_shapes_and_meaning_that_are_documented():
     with es_service.evaluator(CONFIG) as evaluate:
         assert evaluate.parameters == D
@@ -172,6 +182,7 @@ def test_results_have_the_shapes_and_meaning_that_are_documented():
         )
 
 
+@pytest.mark.usefixtures("here")
 def test_initial_policies_are_those_of_a_run(tmp_path):
     """Generation 1 updates centre 0 alone."""
     choice = {"search.algorithm": "nsr_es", "search.centres": 2, "search.centre_choice": "round_robin"}
@@ -220,10 +231,13 @@ def test_a_wrong_argument_is_an_error_that_names_it_and_the_next_call_works(one_
 
 @pytest.fixture(scope="module")
 def one_evaluator():
-    with es_service.evaluator(CONFIG) as evaluate:
+    with ExitStack() as stack:
+        with workers_in_this_process():
+            evaluate = stack.enter_context(es_service.evaluator(CONFIG))
         yield evaluate
 
 
+@pytest.mark.usefixtures("here")
 def test_a_config_needs_no_search_and_no_budget_and_is_checked_nevertheless(reference):
     bare = {name: section for name, section in CONFIG.items() if name not in ("search", "budget")}
     for config in (bare, bare | {"search": {"pairs": 32}, "budget": {"env_steps": 9}, "map": {"enabled": False}}):

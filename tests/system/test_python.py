@@ -13,6 +13,8 @@ from es_service.errors import StartError
 from tests.examples import optuna_pruning
 from tests.system.session import SMALL
 
+pytestmark = pytest.mark.usefixtures("workers_here")
+
 
 def row_of(generation: int, answer: object):
     """A function that answers at one generation, and the list of the generations with which it was called."""
@@ -26,7 +28,7 @@ def row_of(generation: int, answer: object):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def whole(tmp_path_factory, workers_here):
     """Digest of an uninterrupted run of six generations."""
     return es_service.run(of(6), tmp_path_factory.mktemp("whole") / "run").run.digest()
 
@@ -35,15 +37,12 @@ def of(generations: int, **compute) -> dict:
     return SMALL | {"budget": {"generations": generations}, "compute": SMALL["compute"] | compute}
 
 
-@pytest.mark.parametrize("engine", ["inline", pytest.param("ray", marks=pytest.mark.slow)])
-@pytest.mark.filterwarnings("ignore::ResourceWarning")  # Ray leaves files and processes to the garbage collector
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_stop_ends_a_run_after_its_commit_and_the_run_can_go_on(tmp_path, whole, engine):
+def test_stop_ends_a_run_after_its_commit_and_the_run_can_go_on(tmp_path, whole):
     on_generation, seen = row_of(2, Stop("pruned"))
-    outcome = es_service.run(of(6, engine=engine), tmp_path / "run", on_generation=on_generation)
+    outcome = es_service.run(of(6), tmp_path / "run", on_generation=on_generation)
     assert (outcome.reason, outcome.run.generation, seen) == ("pruned", 2, [0, 1, 2])
     on_generation, seen = row_of(4, Stop("again"))
-    outcome = es_service.resume(tmp_path / "run", {"compute.engine": "inline"}, on_generation=on_generation)
+    outcome = es_service.resume(tmp_path / "run", on_generation=on_generation)
     assert (outcome.reason, outcome.run.generation, seen) == ("again", 4, [3, 4])
     outcome = es_service.run_or_resume(of(6), tmp_path / "run")
     assert "6 generations" in outcome.reason

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import sys
 import threading
@@ -18,12 +17,10 @@ from es_service.dispatch import ray_engine as module
 from es_service.dispatch.events import Limits
 from es_service.dispatch.ray_engine import Actors, ray_engine
 from es_service.errors import EvaluationError, StartError
-from es_service.protocol.messages import TrainingChunk, WorkerPlace, around
-from es_service.protocol.process_environment import worker_environment
 from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation
 from tests.dispatch_checker import check_dispatch
-from tests.helpers import centre, random_parameters, spec
+from tests.helpers import spec, workers_in_this_process
 from tests.system.processes import ROOT, running, wait_until, without_copies
 from tests.system.session import SMALL
 from workers.actor import WorkerActor
@@ -55,10 +52,12 @@ def run(folder: Path, on_notice=pytest.fail, **compute):
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reference") / "run"
-    run(folder, engine="inline", workers=1)
+    with workers_in_this_process():
+        run(folder, engine="inline", workers=1)
     return digest_parts(folder)
 
 
+@pytest.mark.alone
 def test_the_same_bits_as_inline_and_nothing_of_the_caller_s_changed(tmp_path, reference, monkeypatch):
     """A leftover RAY_ADDRESS captures nothing, settings of JAX reach no worker, handlers and environment stay; nothing
     of Ray's is left in /tmp, nor a link to it, which would keep Ray from making another."""
@@ -76,6 +75,7 @@ def test_the_same_bits_as_inline_and_nothing_of_the_caller_s_changed(tmp_path, r
     assert dict(os.environ) == environment
 
 
+@pytest.mark.alone
 def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatch):
     """One of two workers is killed in mid-generation, then one is stopped, which only our own deadline notices if the
     other worker gets no copies. Their last words stay in Ray's logs."""
@@ -105,6 +105,7 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
     assert counts["repeated"] == outcome.run.history["retries"].sum() >= 2
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("cores", [1, 2])
 def test_a_run_goes_on_without_an_actor_that_hangs(tmp_path, reference, monkeypatch, cores):
     """The other one computes what it has, long before the deadline; a copy is no retry."""
@@ -127,31 +128,6 @@ def test_a_run_goes_on_without_an_actor_that_hangs(tmp_path, reference, monkeypa
     assert counts["copied"] > 0
 
 
-@pytest.mark.parametrize("rollout", ["simd", "xla"])
-def test_an_actor_with_two_cores_gives_the_same_bits_and_is_replaced_as_a_whole(tmp_path, monkeypatch, rollout):
-    """It is killed in mid-generation. With simd its cores are threads, with xla child processes, which end with it."""
-    straight = tmp_path / "straight"
-    run(straight, engine="inline", workers=1, rollout=rollout)
-    strikes, send, children = [5], Actors.send, []
-
-    def send_and_strike(self, worker, key, attempt, work):
-        send(self, worker, key, attempt, work)
-        if strikes and key.kind == "TrainingChunk" and key.generation == strikes[0]:
-            strikes.pop()
-            pid = self.places()[worker].pid
-            children.extend(Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
-            os.kill(pid, signal.SIGKILL)
-
-    monkeypatch.setattr(Actors, "send", send_and_strike)
-    cores = {"worker_resources": {"cpu": 2}, "workers": 2}
-    outcome = run(tmp_path / "run", on_notice=lambda notice: None, rollout=rollout, **cores)
-    assert digest_parts(tmp_path / "run") == digest_parts(straight)
-    assert outcome.run.history["lost_workers"].sum() == 1
-    assert set(outcome.run.history["workers"]) == {2}, "cores, not actors"
-    assert len(children) >= (2 if rollout == "xla" else 0)
-    assert not any(Path(f"/proc/{pid}").exists() for pid in children)
-
-
 def test_a_run_that_began_inline_goes_on_with_ray_where_home_cannot_be_written(tmp_path, reference):
     """As a user would, from the shell; SIGTERM stops it with its own exit code, although Ray has a handler too."""
     program = [sys.executable, "-m", "es_service"]
@@ -170,27 +146,12 @@ def test_a_run_that_began_inline_goes_on_with_ray_where_home_cannot_be_written(t
     inline = api.load_config(
         CONFIG | {"budget": {"generations": reached}, "compute": CONFIG["compute"] | {"engine": "inline"}}
     )
-    api.run(inline, tmp_path / "straight")
+    with workers_in_this_process():
+        api.run(inline, tmp_path / "straight")
     assert digest_parts(tmp_path / "run") == digest_parts(tmp_path / "straight")
 
 
-def test_workers_that_raise_while_starting_stop_the_run_with_their_error():
-    with (
-        pytest.raises(EvaluationError, match=r"no_such_task(.|\n)*no worker started in 3 consecutive attempts"),
-        ray_engine(spec(environment="no_such_task"), Limits(1, restart_backoff_s=0.0), actor=WorkerActor) as engine,
-    ):
-        engine.evaluate(around(centre(random_parameters()), [TrainingChunk(1, 0)]))
-
-
-def test_a_chunk_that_raises_everywhere_stops_the_run_with_its_error():
-    wrong = random_parameters(size=3)  # parameters of another network
-    with (
-        pytest.raises(EvaluationError, match=r"TypeError(.|\n)*TrainingChunk 0 of generation 1 failed in 2 attempts"),
-        ray_engine(spec(), Limits(1, max_attempts=2), actor=WorkerActor) as engine,
-    ):
-        engine.evaluate(around(centre(wrong), [TrainingChunk(1, 0)]))
-
-
+@pytest.mark.alone
 def test_a_cluster_without_room_is_named_with_what_it_has(monkeypatch):
     connect = module.connect
     monkeypatch.setattr(module, "connect", lambda address, *, gpus, cpus: connect(address, gpus=gpus, cpus=0))
@@ -247,60 +208,6 @@ def test_it_works_in_a_thread_where_signals_cannot_be_set(tmp_path, reference):
     thread.start()
     thread.join()
     assert digest_parts(tmp_path / "run") == reference
-
-
-class Mirror:
-    """An actor that answers each chunk with the environment its worker would have, and Ray's name for its GPU."""
-
-    def __init__(self, spec: bytes, index: int, gpus: float, cores: int) -> None:
-        self.gpus = gpus
-
-    def place(self) -> WorkerPlace:
-        return WorkerPlace("host", os.getpid(), "node")
-
-    def build(self) -> str:
-        return "a mirror's"
-
-    def compile(self, chunks: bytes, *centres: bytes) -> float:
-        return 0.0
-
-    def run(self, chunks: bytes, *centres: bytes) -> bytes:
-        import ray
-
-        ids = ray.get_runtime_context().get_accelerator_ids()["GPU"]
-        answer = os.getpid(), ids, worker_environment(os.environ, self.gpus)
-        return pickle.dumps([answer for _ in pickle.loads(chunks)])
-
-
-def with_two_pretended_gpus(monkeypatch):
-    """Ray only counts GPUs: it takes our word for how many there are."""
-    import ray
-
-    start = ray.init
-    monkeypatch.setattr(ray, "init", lambda **options: start(**options | {"num_gpus": 2}))
-
-
-def mirrored(workers: int, gpus: float = 0.0) -> list[tuple[int, list[str], dict[str, str]]]:
-    with ray_engine(spec(), Limits(workers), actor=Mirror, gpus=gpus) as engine:
-        answers = engine.evaluate(around(centre(random_parameters()), [TrainingChunk(1, chunk) for chunk in range(16)]))
-    return list({answer[0]: answer for answer in answers}.values())
-
-
-def test_workers_without_a_gpu_see_none_and_use_the_cpu(monkeypatch):
-    with_two_pretended_gpus(monkeypatch)
-    for _, ids, environment in mirrored(2):
-        assert ids == []
-        assert (environment["CUDA_VISIBLE_DEVICES"], environment["JAX_PLATFORMS"]) == ("", "cpu")
-
-
-def test_two_workers_share_one_gpu_and_its_memory(monkeypatch):
-    with_two_pretended_gpus(monkeypatch)
-    found = mirrored(4, gpus=0.5)
-    assert found
-    for _, ids, environment in found:
-        assert ids == [environment["CUDA_VISIBLE_DEVICES"]]
-        assert environment["JAX_PLATFORMS"] == "cuda"
-        assert environment["XLA_CLIENT_MEM_FRACTION"] == "0.45"
 
 
 def test_a_gpu_that_is_not_there_is_named():
