@@ -12,6 +12,7 @@ import pytest
 from es_service import api
 from es_service.store.digest import digest_parts
 from tests.benchmarks import ants
+from tests.helpers import workers_in_this_process
 from tests.system.processes import children
 
 pytestmark = pytest.mark.slow
@@ -28,15 +29,16 @@ def run(folder: Path, environment: str, workers: int, on_generation=lambda row: 
             "workers": workers,
             "chunk_pairs": 2,
             "gradient_block_pairs": 4,
-            "chunk_timeout_s": 10,
+            "chunk_timeout_s": 60,
         },
     }
     return api.run(api.load_config(config), folder, on_generation=on_generation, on_notice=on_notice)
 
 
-@pytest.mark.parametrize("environment", ["ant_maze", "ant_trap"])
+@pytest.mark.parametrize("environment", [pytest.param("ant_maze", marks=pytest.mark.long), "ant_trap"])
 def test_one_worker_and_two_of_which_one_is_killed(tmp_path, environment):
-    run(tmp_path / "one", environment, 1)
+    with workers_in_this_process():
+        run(tmp_path / "one", environment, 1)
     notices = []
 
     def strike(row):

@@ -22,7 +22,7 @@ from tests.system.processes import ROOT
 from tests.system.session import SMALL
 from tests.system.test_cluster import inline_digest
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
+pytestmark = [pytest.mark.long, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
 SEED = int(os.environ.get("ES_CHAOS_SEED", "11"))
 CONFIG = SMALL | {
     "search": {"algorithm": "me_es", "pairs": 64, "evaluation_episodes": 16, "block_generations": 5},
@@ -97,7 +97,7 @@ def test_a_link_is_slow_as_long_as_it_is_limited(tmp_path):
     ("seconds", "kinds"),
     [
         pytest.param(60.0, 6, marks=pytest.mark.timeout(1200)),
-        pytest.param(600.0, len(chaos.FAULTS), marks=[pytest.mark.long, pytest.mark.timeout(3600)]),
+        pytest.param(600.0, len(chaos.FAULTS), marks=pytest.mark.timeout(3600)),
     ],
     ids=["one minute", "ten minutes"],
 )

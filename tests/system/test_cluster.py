@@ -32,7 +32,7 @@ from tests.system.processes import committed, wait_for
 from tests.system.session import SMALL
 from tests.system.test_code_identity import REWARD, SEARCH, TASK
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
+pytestmark = [pytest.mark.long, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
 
 CONFIG = SMALL | {
     "search": SMALL["search"] | {"pairs": 64},
@@ -96,7 +96,6 @@ def stop_a_little_later(hosts, driver, run):
     return printed
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("cores", [1, 2])
 def test_hosts_come_go_hang_and_die_and_the_digest_is_that_of_one_process(tmp_path, cores):
     """Each host has one actor, which owns all of its cores."""

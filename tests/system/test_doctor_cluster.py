@@ -23,7 +23,7 @@ from tests.system.cluster import TOKEN, Cluster
 from tests.system.processes import ROOT, wait_for
 from tests.system.test_cluster import CONFIG, inline_digest
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
+pytestmark = [pytest.mark.long, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
 PUBLIC = "11.0.0.77"
 """An address that is public, but for the namespace that has it here."""
 SERVERS = "1 head, 2 raylets, 2 agents, 2 runtime env agents, 1 dashboard"
@@ -143,7 +143,6 @@ def test_a_cluster_without_a_token_is_found(tmp_path):
         ), where
 
 
-@pytest.mark.long
 def test_what_does_not_answer_is_found_within_its_time(tmp_path):
     """A node that is stopped, a host with another Ray, a host that is no node, a head that is stopped."""
     with Cluster(tmp_path) as hosts:
@@ -195,7 +194,6 @@ def certificates(folder, addresses):
     return dict(entry.split("=", 1) for entry in made.stdout.split("\0") if entry.startswith(("RAY_USE_", "RAY_TLS_")))
 
 
-@pytest.mark.long
 def test_a_run_in_a_cluster_with_tls_has_the_digest_that_it_has_alone(tmp_path):
     """Nobody can read the token in the traffic, nobody joins without a certificate, and nothing at all is found."""
     config, run = tmp_path / "config.yaml", tmp_path / "run"

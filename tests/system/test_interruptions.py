@@ -18,6 +18,7 @@ from tests.system.processes import ROOT, committed, running, wait_until
 ENDLESS = ["--set", "budget.generations=100000"]  # a fast machine finishes the 30 of the config before the signal
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_signals_stop_promptly_and_resume_equals_uninterrupted(config, tmp_path, number, code):
     folder = tmp_path / "run"
@@ -26,7 +27,7 @@ def test_signals_stop_promptly_and_resume_equals_uninterrupted(config, tmp_path,
         wait_until(process, lambda: (committed(folder) or 0) >= 5)
         sent = time.monotonic()
         process.send_signal(number)
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=60)
     assert time.monotonic() - sent < 2.0
     assert process.returncode == code
     assert 5 <= (read_generation(folder) or 0) < 400
@@ -53,15 +54,15 @@ def test_a_signal_during_start_up_ends_quietly(config, tmp_path):
             wait_until(process, lambda pid=process.pid: listens(pid))
             time.sleep(delay_s)
             process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=20)
+            _, errors = process.communicate(timeout=60)
         assert (process.returncode, "Traceback" in errors) == (130, False), (delay_s, errors)
         reached.append(committed(folder))
-        delay_s = 1.6 * delay_s or 0.1
+        delay_s = 2 * delay_s or 0.1
     assert reached[0] is None
     assert reached.count(None) >= 3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_sigterm_while_ray_starts_ends_as_at_any_other_time(config, tmp_path):
     """Ray has a handler of its own meanwhile. From when the run folder is there, before Ray starts; later and later."""
     reached, delay_s = [], 0.0
@@ -95,8 +96,8 @@ def test_a_second_driver_is_refused_and_told_who_holds_the_run(config, tmp_path)
         ):
             wait_until(follower, lambda: follow.read_text().count("\ngeneration ") >= 2)
             process.terminate()
-            process.communicate(timeout=20)
-            follower.communicate(timeout=20)
+            process.communicate(timeout=60)
+            follower.communicate(timeout=60)
     followed = follow.read_text()
     seen = [int(number) for number in re.findall(r"^generation (\d+)", followed, re.MULTILINE)]
     assert seen == sorted(set(seen))
@@ -113,6 +114,6 @@ def test_a_signal_ends_doctor_without_a_finding(tmp_path, number, code):
         assert any("noise equals" in line for line in process.stdout)
         time.sleep(0.2)
         process.send_signal(number)
-        printed, _ = process.communicate(timeout=20)
+        printed, _ = process.communicate(timeout=60)
     assert process.returncode == code
     assert "FAIL" not in printed

@@ -8,7 +8,7 @@ from tests.system import cluster
 from tests.system.chaos_world import HEAD, World
 from tests.system.test_chaos import CONFIG
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
+pytestmark = [pytest.mark.long, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
 
 
 def test_a_driver_whose_head_is_replaced_says_so_and_ray_does_not_end_it(tmp_path):

@@ -1,4 +1,7 @@
-"""Reports in a headless browser: what a pointer does, no complaint of the page, and no request to any network."""
+"""Reports in a headless browser: what a pointer does, no complaint of the page, and no request to any network.
+
+`make test` opens one page; `make long` does the rest.
+"""
 
 import io
 import subprocess
@@ -58,6 +61,7 @@ def test_a_cell_is_shown_and_chosen_by_a_pointer(page, point_maze):
     assert (x, y) == pytest.approx((0.5, 0.5), abs=0.1)
 
 
+@pytest.mark.long
 def test_no_path_that_is_drawn_crosses_a_wall(page, tmp_path, monkeypatch):
     """The paths of this run go to and fro round the end of the lower wall, in long steps, and once through a wall."""
     monkeypatch.setattr(
@@ -96,11 +100,13 @@ def slowest_hover(page) -> float:
     )
 
 
+@pytest.mark.long
 def test_a_hover_is_answered_within_100_ms(page, point_maze):
     page.open(point_maze)
     assert slowest_hover(page) < 100
 
 
+@pytest.mark.long
 def test_curves_show_their_values_and_other_axes(page, point_maze):
     page.open(point_maze)
     assert page.value("getComputedStyle(document.querySelector('.x-env_steps')).display") == "none"
@@ -112,6 +118,7 @@ def test_curves_show_their_values_and_other_axes(page, point_maze):
     assert page.text(".chart .at").startswith("generation 1: ")
 
 
+@pytest.mark.long
 def test_the_slider_shows_the_centres_up_to_a_generation(page, point_maze):
     page.open(point_maze)
     drawn = "document.getElementById('cloud').toDataURL()"
@@ -122,6 +129,7 @@ def test_the_slider_shows_the_centres_up_to_a_generation(page, point_maze):
     assert page.value(drawn) != whole
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dark", [False, True])
 @pytest.mark.parametrize("width", [1280, 400])
 def test_a_page_fits_its_window_in_light_and_dark(page, point_maze, width, dark):
@@ -141,6 +149,7 @@ def replayed(folder, settings, task, *options, **environment):
     return folder / "report.html"
 
 
+@pytest.mark.long
 def test_a_point_is_replayed_in_the_plane(page, tmp_path):
     page.open(replayed(tmp_path / "run", {"map.enabled": False, "search.algorithm": "es"}, SHIPPED["point_maze"]))
     assert page.text("#step").startswith("step 0 of 40; return so far 0")
@@ -159,7 +168,7 @@ def test_a_point_is_replayed_in_the_plane(page, tmp_path):
 SLALOM = "tests.examples.ant_slalom:AntSlalom"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["ant_maze", "ant_trap", "brax:hopper", SLALOM])
 def test_bodies_are_replayed_in_three_dimensions(page, tmp_path, name):
     environment = {"PYTHONPATH": str(ROOT)}
@@ -177,7 +186,7 @@ def test_bodies_are_replayed_in_three_dimensions(page, tmp_path, name):
     assert (seen[0] != seen[1]).mean() > 1e-4, "the body does not move"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_webgl_the_path_is_shown_from_above(tmp_path):
     report = replayed(tmp_path / "run", {"map.enabled": False, "search.algorithm": "es"}, SHIPPED["ant_trap"])
     with browser() as page:
@@ -191,6 +200,7 @@ def test_without_webgl_the_path_is_shown_from_above(tmp_path):
         assert page.complaints == []
 
 
+@pytest.mark.long
 def test_a_task_that_is_gone_is_reported_without_a_replay(page, tmp_path):
     gone = replace(SHIPPED["point_maze"], name="no_such_package:Task")
     page.open(replayed(tmp_path / "run", {}, gone))
@@ -216,6 +226,7 @@ def test_wrong_replays_are_refused(tmp_path):
         assert message in printed
 
 
+@pytest.mark.long
 def test_a_comparison_is_shown_and_different_tasks_are_refused(page, tmp_path):
     runs = [write_run(tmp_path / f"run{seed}", {"seed": seed}) for seed in range(3)]
     code, printed = es("report", *runs, "--out", tmp_path / "all.html", "--group-by", "seed", "--threshold", "-70")

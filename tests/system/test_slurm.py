@@ -29,7 +29,7 @@ def test_it_asks_slurm_for_what_it_relies_on():
     assert options["open-mode"] == "append"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))
 def test_a_job_that_is_preempted_is_requeued_and_ends_with_the_same_digest(tmp_path):
     config, run = tmp_path / "config.yaml", tmp_path / "run"

@@ -22,7 +22,7 @@ from tests.system.command_line import es
 from tests.system.processes import committed, wait_for
 from tests.system.test_cluster import CONFIG, entries, inline_digest
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
+pytestmark = [pytest.mark.long, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
 GENERATIONS = 20
 
 
@@ -93,7 +93,6 @@ def test_a_run_that_finds_the_cluster_full_waits_and_then_ends_with_the_digest_t
     assert digest_parts(run) == inline_digest(tmp_path / "inline", CONFIG, GENERATIONS)
 
 
-@pytest.mark.long
 def test_an_autoscaler_gives_a_run_its_nodes_takes_some_and_all_of_them_and_the_digest_is_the_same(tmp_path):
     """A run that begins without nodes gets all that it may have. One is preempted and replaced. When the run is
     stopped, all are idle and end; it goes on without nodes again, and gets as many as it asks for."""
