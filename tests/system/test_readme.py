@@ -48,12 +48,19 @@ def steps(guide: str) -> list[tuple[str, str]]:
 
 
 STEPS = [(guide, text) for guide in BUDGET_S for _, text in steps(guide)]
-ALL_OF_THEM = pytest.mark.timeout(3600)  # the first test that needs a guide's reader waits for all its commands
+
+
+def of_a_reader(test):
+    """Mark a test whose guide's commands it may be the first to need: it waits for all of them."""
+    return pytest.mark.slow(pytest.mark.timeout(3600)(test))
 
 
 @pytest.fixture(scope="module")
 def read(tmp_path_factory):
-    """Guide -> the folder in which everything in it was run in order, and what each step that failed has printed."""
+    """Guide -> the folder in which everything in it was run in order, and what each step that failed has printed.
+
+    The reader has one core: most of a short run is the start of its workers, of which `auto` is one for each core.
+    """
 
     @cache
     def read(guide: str) -> tuple[Path, dict[str, str]]:
@@ -62,11 +69,20 @@ def read(tmp_path_factory):
         path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
         environment = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT)}
         programs = {"bash": ["sh", "-c"], "python": [sys.executable, "-c"]}
+        core = max(os.sched_getaffinity(0))
         end = time.monotonic() + BUDGET_S[guide]
         for language, text in steps(guide):
             left = f"{max(1.0, end - time.monotonic()):.0f}"
             limited = ["timeout", "--kill-after=10", left, *programs[language], text]  # ends what a step started, too
-            result = subprocess.run(limited, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+            result = subprocess.run(
+                limited,
+                cwd=folder,
+                env=environment,
+                capture_output=True,
+                text=True,
+                check=False,
+                preexec_fn=lambda: os.sched_setaffinity(0, {core}),
+            )
             if result.returncode:
                 late = f"; {guide} has {BUDGET_S[guide]} s for all its steps" if result.returncode == 124 else ""
                 failed[text] = f"exit code {result.returncode}{late}:\n{result.stdout}{result.stderr}"
@@ -75,14 +91,14 @@ def read(tmp_path_factory):
     return read
 
 
-@ALL_OF_THEM
+@of_a_reader
 @pytest.mark.parametrize(("guide", "text"), STEPS, ids=[f"{guide}: {text.splitlines()[0]}" for guide, text in STEPS])
 def test_every_command_and_every_script_works(read, guide, text):
     _, failed = read(guide)
     assert text not in failed, failed[text]
 
 
-@ALL_OF_THEM
+@of_a_reader
 def test_exported_policies_replayed_by_a_guide_s_lines_return_what_the_run_says(read, monkeypatch):
     """From the corner, so that there is no luck in an episode: but for last bits, which 200 steps add up, and which a
     few episodes, at the end of a wall or the edge of the goal, add up to more."""
