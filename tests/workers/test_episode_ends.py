@@ -13,8 +13,11 @@ from workers.environments import Environment
 from workers.worker import episode_keys
 
 
-def counting_environment(lifetimes, poison_after_done: bool) -> Environment:
-    """State = (own lifetime, steps so far): reward is the step's number, done at the lifetime, NaN afterwards."""
+def counting_environment(lifetimes, poison_after_done: bool, gets_up: bool = False) -> Environment:
+    """State = (own lifetime, steps so far): reward is the step's number, done at the lifetime, NaN afterwards.
+
+    With `gets_up` it is done in that step only, as a body that falls and stands up again.
+    """
 
     def reset(key):
         return jnp.stack([jnp.asarray(lifetimes, jnp.float32)[key[0] % len(lifetimes)], jnp.float32(0)])
@@ -22,7 +25,7 @@ def counting_environment(lifetimes, poison_after_done: bool) -> Environment:
     def step(state, action):
         lifetime, t = state[0], state[1] + 1
         value = jnp.where((t > lifetime) & poison_after_done, jnp.nan, t)
-        return jnp.stack([lifetime, t]), value, t >= lifetime
+        return jnp.stack([lifetime, t]), value, t == lifetime if gets_up else t >= lifetime
 
     return Environment(
         reset=reset,
@@ -35,8 +38,8 @@ def counting_environment(lifetimes, poison_after_done: bool) -> Environment:
 
 @pytest.mark.parametrize("fitness", ["sum", "final"])
 def test_steps_after_done_never_count(spec, monkeypatch, fitness):
-    """Nothing after `done` reaches return, descriptor, distances or statistics, even if it is NaN."""
-    environment = counting_environment([1, 5, 17, 1000], poison_after_done=True)
+    """Nothing after `done` reaches return, descriptor, distances or statistics, even if it is NaN, or not done."""
+    environment = counting_environment([1, 5, 17, 1000], poison_after_done=True, gets_up=True)
     monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: environment)
     result = chunk_runner(spec(episode_steps=30, fitness=fitness))(centre(random_parameters()), TrainingChunk(1, 0))
     assert isinstance(result, EpisodesResult)
