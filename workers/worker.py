@@ -10,6 +10,7 @@ from functools import partial
 from itertools import accumulate
 from typing import Any, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 
 from es_service.protocol.gradient_tree import with_neighbours_added
@@ -177,7 +178,8 @@ def _policy_results(work: Sequence[tuple[Policies, PolicyChunk]], episodes: Epis
     results, start = [], 0
     for one, chunk in work:
         _, episode_L = slots(one, chunk)
-        part = Episodes(*(leaf[start : start + len(episode_L)] for leaf in episodes))
+        of_chunk = slice(start, start + len(episode_L))
+        part = jax.tree.map(lambda leaf, of=of_chunk: leaf[of], episodes)
         results.append(policies_result(part, episode_L == 0 if one.traces else None))
         start += len(episode_L)
     return results
@@ -218,7 +220,7 @@ def _split(episodes: Episodes, size: int) -> list[Episodes]:
     count = len(episodes.fitness) // size
     if count == 1:
         return [episodes]
-    return [Episodes(*(leaf[i * size : (i + 1) * size] for leaf in episodes)) for i in range(count)]
+    return [jax.tree.map(lambda leaf, of=slice(i * size, (i + 1) * size): leaf[of], episodes) for i in range(count)]
 
 
 def population_id(chunk: Chunk) -> tuple[int, ...]:

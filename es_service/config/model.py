@@ -189,8 +189,12 @@ def policy_shape(config: RunConfig, task: TaskSpec) -> PolicyShape:
     return PolicyShape((task.observation_size, *config.policy.hidden, task.action_size))
 
 
-def worker_spec(config: RunConfig, task: TaskSpec) -> WorkerSpec:
-    """The message that every worker of the run receives once, when it starts."""
+def worker_spec(config: RunConfig, task: TaskSpec, outputs: tuple[str, ...] = ()) -> WorkerSpec:
+    """The message that every worker of the run receives once, when it starts.
+
+    Args:
+        outputs: see `WorkerSpec.outputs`.
+    """
     settings, policy, compute = config.task, config.policy, config.compute
     return WorkerSpec(
         seed=config.seed,
@@ -207,5 +211,6 @@ def worker_spec(config: RunConfig, task: TaskSpec) -> WorkerSpec:
         rollout_block_pairs=compute.rollout_block_pairs,
         gradient_block_pairs=compute.gradient_block_pairs,
         rollout=compute.rollout,
+        outputs=outputs,
         sources=worker_sources(settings.environment),
     )

@@ -7,7 +7,7 @@ fixed binary tree. Axes: P antithetic pairs, S signs [+, -], E evaluation episod
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
 from typing import Literal, TypeVar
 
@@ -220,15 +220,16 @@ def _highest(fitness: FloatArray) -> float:
 def _concatenate(results: Sequence[EpisodesResult], count: int) -> EpisodesResult:
     """Join results along the first axis and keep the first `count`; the result has no observation moments."""
 
-    def join(name: str) -> np.ndarray:
-        return np.concatenate([getattr(result, name) for result in results])[:count]
+    def join(of: Callable[[EpisodesResult], np.ndarray]) -> np.ndarray:
+        return np.concatenate([of(result) for result in results])[:count]
 
     return EpisodesResult(
-        fitness=join("fitness"),
-        returns=join("returns"),
-        descriptor=join("descriptor"),
-        steps=join("steps"),
-        goal_distance=join("goal_distance"),
+        fitness=join(lambda result: result.fitness),
+        returns=join(lambda result: result.returns),
+        descriptor=join(lambda result: result.descriptor),
+        steps=join(lambda result: result.steps),
+        goal_distance=join(lambda result: result.goal_distance),
         moments=None,
         trace_T_B=results[0].trace_T_B,
+        outputs={name: join(lambda result, name=name: result.outputs[name]) for name in results[0].outputs},
     )

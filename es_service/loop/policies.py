@@ -5,7 +5,7 @@ Axes: N policies, E episodes, D policy parameters, O observation, T points of a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,8 +64,8 @@ def policy_episodes(asked: PolicyWork, results: Sequence[EpisodesResult]) -> Epi
     policies, episodes = len(asked.parameters_N_D), asked.episodes
     whole = policies // POLICY_SLOTS * POLICY_SLOTS
 
-    def by_policy(name: str) -> np.ndarray:
-        flat = np.concatenate([getattr(result, name) for result in results])
+    def by_policy(of: Callable[[EpisodesResult], np.ndarray]) -> np.ndarray:
+        flat = np.concatenate([of(result) for result in results])
         full, last = flat[: whole * episodes], flat[whole * episodes :]
         full = full.reshape(-1, episodes, POLICY_SLOTS, *flat.shape[1:]).swapaxes(1, 2)
         last = last.reshape(episodes, policies - whole, *flat.shape[1:]).swapaxes(0, 1)
@@ -73,13 +73,14 @@ def policy_episodes(asked: PolicyWork, results: Sequence[EpisodesResult]) -> Epi
 
     traces = [result.trace_T_B for result in results if result.trace_T_B is not None]
     return EpisodesResult(
-        fitness=by_policy("fitness"),
-        returns=by_policy("returns"),
-        descriptor=by_policy("descriptor"),
-        steps=by_policy("steps"),
-        goal_distance=by_policy("goal_distance"),
+        fitness=by_policy(lambda result: result.fitness),
+        returns=by_policy(lambda result: result.returns),
+        descriptor=by_policy(lambda result: result.descriptor),
+        steps=by_policy(lambda result: result.steps),
+        goal_distance=by_policy(lambda result: result.goal_distance),
         moments=None,
         trace_T_B=np.concatenate(traces) if traces else None,
+        outputs={name: by_policy(lambda result, name=name: result.outputs[name]) for name in results[0].outputs},
     )
 
 
@@ -95,6 +96,7 @@ def each_policy(result: EpisodesResult) -> list[EpisodesResult]:
             goal_distance=result.goal_distance[policy],
             moments=None,
             trace_T_B=result.trace_T_B[policy],
+            outputs={name: array[policy] for name, array in result.outputs.items()},
         )
         for policy in range(len(result.fitness))
     ]

@@ -36,6 +36,8 @@ CHUNKS_PER_WORKER = 16
 EPISODES_AT_ONCE = 2**16
 """Most episodes of a policy whose results are in memory at a time; a constant, since it affects the last bits of the
 statistics of more episodes."""
+_Totals = tuple[Moments, Moments, int]
+"""Moments of the fitness, moments of the descriptors, and number of successes, of the episodes of a policy."""
 FRESH_GENERATION = 2**40
 """Generation number in the random streams of fresh episodes with seed 0; no run reaches it."""
 
@@ -64,6 +66,8 @@ class Fresh:
     """Count, mean and squared deviations of the fitness, without axes."""
     descriptors: Moments
     """The same of the descriptors, [B]."""
+    successes: int | None
+    """Number of fresh episodes that succeeded; None if the task does not declare success."""
     cell: int | None
     """Cell of its mean fresh descriptor; None without a map, or if the descriptor is not finite."""
 
@@ -162,7 +166,9 @@ def evaluate(
     config = evaluation_config(run, workers)
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
-    limits, spec = dispatch_limits(config, chunks * len(chosen)), worker_spec(config, task_of(config))
+    task = task_of(config)
+    limits = dispatch_limits(config, chunks * len(chosen))
+    spec = worker_spec(config, task, ("success",) if task.success else ())
 
     def tell_compiling(kind: str) -> None:
         if kind:
@@ -176,27 +182,33 @@ def evaluate(
         for first in range(0, len(chosen), together):
             group = chosen[first : first + together]
             centres = [_centre(candidate.policy, config.search.sigma, seed) for candidate in group]
-            for candidate, (fitness, descriptors) in zip(group, _moments(engine, centres, episodes), strict=True):
+            for candidate, (fitness, descriptors, successes) in zip(
+                group, _totals(engine, centres, episodes), strict=True
+            ):
                 cell = None
                 if geometry is not None and np.isfinite(descriptors.mean_O).all():
                     cell = int(geometry.cells_of(descriptors.mean_O[None])[0])
-                yield Fresh(candidate, fitness, descriptors, cell)
+                yield Fresh(candidate, fitness, descriptors, successes if task.success else None, cell)
 
 
 @np.errstate(invalid="ignore", over="ignore")  # a policy may have an infinite fitness
-def _moments(engine: Evaluator, centres: Sequence[Centre], episodes: int) -> list[tuple[Moments, ...]]:
-    """Moments of the fitness and of the descriptors of each centre, a limited number of episodes at a time."""
-    found: list[tuple[Moments, ...]] = []
+def _totals(engine: Evaluator, centres: Sequence[Centre], episodes: int) -> list[_Totals]:
+    """Moments of the fitness and of the descriptors of each centre, and its number of successes, a limited number of
+    episodes at a time."""
+    found: list[_Totals] = []
     for start in range(0, episodes, EPISODES_AT_ONCE):
         count, first = min(EPISODES_AT_ONCE, episodes - start), start // EVALUATION_EPISODES_PER_CHUNK
         results = evaluate_centres(engine, centres, count, resets="same", first=first)
-        parts = [(moments_of(result.fitness), moments_of(result.descriptor)) for result in results]
-        found = [tuple(map(_merged, *both)) for both in zip(found, parts, strict=True)] if found else parts
+        parts = [
+            (moments_of(result.fitness), moments_of(result.descriptor), int(np.sum(result.outputs.get("success", 0))))
+            for result in results
+        ]
+        found = list(map(_added, found, parts)) if found else parts
     return found
 
 
-def _merged(total: Moments, part: Moments) -> Moments:
-    return merge_moments(total, [part])
+def _added(total: _Totals, part: _Totals) -> _Totals:
+    return merge_moments(total[0], [part[0]]), merge_moments(total[1], [part[1]]), total[2] + part[2]
 
 
 def _centre(policy: Policy, sigma: float, seed: int) -> Centre:

@@ -48,6 +48,8 @@ class PolicyEvaluations:
     """[N, E]: number of environment steps, up to and including `done`."""
     valid: NDArray[np.bool_]
     """[N, E]: whether fitness and descriptor are finite."""
+    success: NDArray[np.bool_] | None
+    """[N, E]: whether an episode succeeded, as the task declares it; None if the task declares nothing."""
 
 
 class PolicyEvaluator:
@@ -111,8 +113,8 @@ class PolicyEvaluator:
             self.close(f"this evaluator was closed by an error during a call ({type(error).__name__}: {error})")
             raise
         result = policy_episodes(asked, [answer for answer in answers if isinstance(answer, EpisodesResult)])
-        valid = valid_members(result)
-        return PolicyEvaluations(result.fitness, result.returns, result.descriptor, result.steps, valid)
+        valid, success = valid_members(result), result.outputs.get("success")
+        return PolicyEvaluations(result.fitness, result.returns, result.descriptor, result.steps, valid, success)
 
     def close(self, why: str = "this evaluator is closed") -> None:
         """End the workers. Later calls raise an EvaluationError that begins with `why`."""
@@ -215,7 +217,8 @@ def _started(
         task_of(config)  # refuses a task that has changed, which `changed_config` would take as it is now
         config = changed_config(config.model_dump(mode="json"), overrides)
     task = task_of(config)  # before the workers start, since it may raise
-    started = make_engine(config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER)
+    outputs = ("success",) if task.success else ()
+    started = make_engine(config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER, outputs=outputs)
     made = PolicyEvaluator(config, task, started)
     try:
         yield made

@@ -38,7 +38,7 @@ CONFIG = {
 }
 D = 2 * 8 + 8 + 8 * 8 + 8 + 8 * 2 + 2
 POLICIES = np.random.default_rng(0).normal(size=(100, D))
-FIELDS = ("fitness", "returns", "descriptor", "steps", "valid")
+FIELDS = ("fitness", "returns", "descriptor", "steps", "valid", "success")
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 

@@ -59,6 +59,7 @@ def _about(task: TaskSpec) -> str:
         task.summary,
         f"observation {task.observation_size}, action {task.action_size}, steps {task.episode_steps}",
         "descriptor: " + ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in bounds),
+        *([f"success: {task.success}"] if task.success else []),
         *(f"option {name}: {_option(option)}" for name, option in task.options.items()),
     ]
     return "\n".join(lines)
