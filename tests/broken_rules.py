@@ -492,8 +492,8 @@ CASES = [
         (
             "descriptors of episodes",
             RESULTS,
-            "host = Episodes(*map(np.array, episodes))",
-            "host = Episodes(*map(np.asarray, episodes))",
+            "host = jax.tree.map(np.array, episodes)",
+            "host = jax.tree.map(np.asarray, episodes)",
         ),
         ("traces", RESULTS, "np.asarray(episodes.trace_T_B)[0].copy()", "np.asarray(episodes.trace_T_B)[0]"),
     ),
