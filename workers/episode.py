@@ -131,7 +131,7 @@ def episode_steps(
             shifted_sum_O=before.shifted_sum_O + shifted_O,
             shifted_square_sum_O=before.shifted_square_sum_O + shifted_O * shifted_O,
             trace_T_B=before.trace_T_B if training else traced(before.trace_T_B, before.steps, descriptor_B),
-            outputs={name: one.after(environment, state, before.outputs[name]) for name, one in named.items()},
+            outputs={name: one.after(environment, state, reward, before.outputs[name]) for name, one in named.items()},
         )
         masked = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)
         return Carry(state, alive & ~done, masked)

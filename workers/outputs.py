@@ -15,8 +15,9 @@ class Output(NamedTuple):
 
     begin: Callable[[Environment, Any], Any]
     """Function (environment, state of the reset) -> value before the first step."""
-    after: Callable[[Environment, Any, Any], Any]
-    """Function (environment, state after a step, value before it) -> value after it. Steps after `done` never count."""
+    after: Callable[[Environment, Any, Any, Any], Any]
+    """Function (environment, state after a step, its reward, value before it) -> value after it. Steps after `done`
+    never count."""
 
 
 def _success(environment: Environment, state: Any, before: Any) -> Any:
@@ -24,6 +25,13 @@ def _success(environment: Environment, state: Any, before: Any) -> Any:
 
 
 OUTPUTS: Mapping[str, Output] = {
-    "success": Output(lambda environment, state: _success(environment, state, jnp.array(False)), _success)
+    "success": Output(
+        lambda environment, state: _success(environment, state, jnp.array(False)),
+        lambda environment, state, reward, before: _success(environment, state, before),
+    ),
+    "last_reward": Output(
+        lambda environment, state: jnp.float32(0.0),
+        lambda environment, state, reward, before: jnp.asarray(reward, jnp.float32),
+    ),
 }
 """All outputs by name."""

@@ -170,7 +170,7 @@ def _policy_arguments(work: Sequence[tuple[Policies, PolicyChunk]]) -> tuple[Any
         np.concatenate([one.observation_mean_N_O for one in together])[row_L],
         np.concatenate([one.observation_std_N_O for one in together])[row_L],
         row_L,
-        evaluation_reset_keys(policies.seed, chunk.generation, episode_L, chunk.ask, number_L),
+        evaluation_reset_keys(policies.seed, chunk.generation, episode_L, chunk.ask, number_L, policies.domain),
     )
 
 
@@ -200,9 +200,11 @@ def _groups(work: Sequence[Work], *, together: bool) -> list[list[Work]]:
     return groups
 
 
-def _shared_by(subject: Subject) -> tuple[str, int]:
-    """What chunks that run together share: the centre, or the seed of the policies' resets."""
-    return ("seed", subject.seed) if isinstance(subject, Policies) else ("centre", id(subject))
+def _shared_by(subject: Subject) -> tuple[str, int, int]:
+    """What chunks that run together share: the centre, or the seed and the domain of the policies' resets."""
+    if isinstance(subject, Policies):
+        return "policies", subject.seed, subject.domain
+    return "centre", id(subject), 0
 
 
 def _around_one(work: Sequence[tuple[Centre, AnyChunk]]) -> tuple[Centre, list[AnyChunk]]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from es_service.protocol.messages import EpisodesResult, FloatArray, Policies, PolicyChunk, Work, around
+from es_service.protocol.noise import Domain
 from es_service.protocol.policies import POLICY_SLOTS, chunks_of
 
 
@@ -35,10 +36,12 @@ def policy_work(
     generation: int,
     ask: int = 0,
     traces: bool = False,
+    domain: Domain = Domain.EVALUATION_RESET,
 ) -> PolicyWork:
     """The chunks of policies with some number of episodes each.
 
-    The reset of each episode depends on (seed, generation, ask, number of the policy, number of the episode) alone.
+    The reset of each episode depends on (seed, domain, generation, ask, number of the policy, number of the episode)
+    alone.
 
     Args:
         statistics: mean and standard deviation of observations, [N, O] each.
@@ -47,7 +50,7 @@ def policy_work(
     for first in range(0, len(parameters_N_D), POLICY_SLOTS):
         of = slice(first, first + POLICY_SLOTS)
         arrays = [np.ascontiguousarray(array[of]) for array in (parameters_N_D, *statistics)]
-        policies = Policies(first, episodes, seed, traces, *arrays)
+        policies = Policies(first, episodes, seed, traces, *arrays, domain=domain)
         parts = range(chunks_of(len(policies.parameters_N_D), episodes))
         work += around(policies, [PolicyChunk(generation, len(work) + part, ask, part) for part in parts])
     return PolicyWork(parameters_N_D, *statistics, episodes, work)

@@ -299,7 +299,7 @@ class EpisodesResult:
     possible step; None for training. For policies [..., T, B]: of each slot with a first episode, or None."""
     outputs: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Outputs that `WorkerSpec.outputs` names, by name, with the leading axes of the other arrays; none in training.
-    success: bool, whether the episode succeeded as the task declares it."""
+    success: bool, whether the episode succeeded as the task declares it; last_reward: reward of the last valid step."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from es_service.runs.compiling import compiling_sentence
 from es_service.runs.moment import Policy, make_policy
 from es_service.runs.session import dispatch_limits, require_cores
 from es_service.runs.signals import stop_on_signals
-from es_service.runs.view import Run, is_no_elite
+from es_service.runs.view import Run, is_light, is_no_elite
 from es_service.search.observation_statistics import merge_moments, moments_of
 
 CHUNKS_PER_WORKER = 16
@@ -98,31 +98,49 @@ class Fresh:
         return np.sqrt(self.descriptors.m2_O / self.episodes)
 
 
-def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[int]], every: bool) -> list[Candidate]:
+def candidates(
+    run: Run,
+    *,
+    best: bool,
+    centre: bool,
+    cells: Sequence[Sequence[int]],
+    every: bool,
+    top: int = 0,
+    generation: int | None = None,
+) -> list[Candidate]:
     """The policies to evaluate: the best centre, the newest centre, then elites.
 
-    The elites are those of `cells` in the given order or, with `every`, all of the map in the order of discovery. The
-    best centre, the newest centre and the elites are each read from one generation, also while a driver is writing.
+    The elites are those of `cells` in the given order, then the `top` ones with the highest stored fitness (the older
+    entry of equal ones first), or with `every` all of the map in the order of discovery; each elite once. The best
+    centre, the newest centre and the elites are each read from one generation, also while a driver is writing.
+
+    Args:
+        generation: one whose state the run keeps; None: the newest.
 
     Raises NotInRunError for a cell that does not exist or is empty, for `every` with an empty map, for `centre` if the
-    run has no newest centre, and for a run without a finished generation.
+    run has no newest centre, and for a run without a finished generation; StoreError if the generation is not kept.
     """
     if run.generation is None:
         way_out = WayOut("resume", "continue it", str(run.folder))
         raise NotInRunError(f"{run.folder} has no finished generation yet", run=run.folder, ways_out=[way_out])
     found = []
     if best:
-        moment = run.at(wanted=lambda part: part == BEST)
+        moment = run.at(generation, lambda part: part == BEST)
         found.append(Candidate("best", moment.policy("best"), moment.best.generation, moment.best.fitness))
     if centre:
-        moment = run.at(wanted=is_no_elite)
+        moment = run.at(generation, is_no_elite)
         _, fitness = moment.require_newest_centre()
         found.append(Candidate("centre", moment.policy("centre"), moment.generation, fitness))
-    if not cells and not every:
+    if not cells and not every and not top:
         return found
-    wanted = None if every else [run.cell(place) for place in cells]
-    map_, elites = run.elites(wanted)
-    if not elites:
+    wanted = None
+    if not every:
+        moment = run.at(generation, is_light)
+        fittest = np.argsort(-moment.behaviour_map.fitness_N, kind="stable")[:top]
+        best_cells = moment.behaviour_map.cell_N[fittest].tolist()
+        wanted = list(dict.fromkeys([*map(moment.cell, cells), *best_cells]))
+    map_, elites = run.elites(wanted, generation)
+    if not elites and (cells or every):
         raise NotInRunError(f"the map of {run.folder} is empty", run=run.folder)
     for cell in map_.cell_N.tolist() if wanted is None else wanted:
         row, elite = map_.row_of(cell), elites[cell]

@@ -57,14 +57,17 @@ def export(run: Run, to: str, folder: Path) -> list[Path]:
 
 
 def tables(run: Run) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Names and content of history, evaluated centres, novelty archive and, where there is one, the map, as of one
-    generation. They come one by one, because the first two may be large."""
+    """Names and content of history, evaluated centres, novelty archive and, where there are any, the map and the
+    certified policies; all but the last as of one generation. They come one by one, because the first two may be
+    large."""
     moment = run.at(wanted=is_no_elite)
     yield "history", run.history_until(moment.generation).reset_index()
     yield "evaluations", run.evaluations_until(moment.generation)
     yield "novelty", moment.novelty
     if run.constants["map.enabled"]:
         yield "map", moment.map
+    if not (certified := run.certified).empty:
+        yield "certified", certified
 
 
 def arrays(run: Run) -> dict[str, np.ndarray]:

@@ -6,6 +6,7 @@ import sqlite3
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from es_service.store.certifications import Key, damaged_rows
 from es_service.store.codec import column_bytes, decode_part, part_sha256, row_sha256
 from es_service.store.folder import is_disk_full
 from es_service.store.kept import KeptRows, whole_states
@@ -40,6 +41,8 @@ class Verdict:
     """Intact state rows."""
     bad_rows: tuple[tuple[str, int], ...] = ()
     """Damaged state rows as (part, generation), which must be deleted."""
+    bad_certifications: tuple[Key, ...] = ()
+    """Damaged rows of the table of certified policies, which must be deleted as well."""
     problems: tuple[str, ...] = field(default=())
     """All problems found, as messages for the user."""
 
@@ -118,7 +121,11 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
         lost = 0 if good is None else good + 1
         which = f"generation {newest} is" if lost == newest else f"generations {lost} to {newest} are"
         problems.append(f"{which} not complete and intact")
-    return Verdict(meta, newest, good, kept, tuple(bad_rows), tuple(problems))
+    bad_certifications = damaged_rows(connection)
+    problems += [
+        f"row {rank} of certification {number} does not match its SHA-256" for number, rank in bad_certifications
+    ]
+    return Verdict(meta, newest, good, kept, tuple(bad_rows), tuple(bad_certifications), tuple(problems))
 
 
 def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems: list[str]) -> tuple[int, int]:

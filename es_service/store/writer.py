@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
 from es_service.store.beginning import Beginning, load_start
+from es_service.store.certifications import encoded, next_number
 from es_service.store.codec import (
     Part,
     changed_sum,
@@ -246,6 +247,23 @@ class RunStore:
         with self._transaction("recording the platform") as execute:
             self._recorded = True
             return record(execute, generation, platform)
+
+    @property
+    def next_certification(self) -> int:
+        """Number of the next certification, from 0."""
+        with self._explaining("reading the certifications"):
+            return next_number(self._connection)
+
+    def add_certification(self, policies: Sequence[tuple[Mapping[str, Any], Part]]) -> None:
+        """Store a certification in one transaction: (facts, arrays) of each policy, in the order of rank.
+
+        Raises:
+            StoreError: the disk is full, or the database cannot be written.
+        """
+        rows = encoded(self.next_certification, policies)
+        with self._transaction("storing a certification") as execute:
+            for row in rows:
+                execute("INSERT INTO certification (number, rank, facts, payload, sha256) VALUES (?, ?, ?, ?, ?)", row)
 
     def platform_before(self, generation: int) -> dict[str, Any] | None:
         """The platform recorded for the generation before this one; None if there is none."""

@@ -8,7 +8,10 @@ from rich.console import Console
 
 from es_service.cli.commands import command, settings, way_command
 from es_service.cli.console import print_line
+from es_service.cli.tables.certified import certified_line
+from es_service.errors import StoreError
 from es_service.report.progress import plain_line
+from es_service.runs.certified import certified_policies, newest_certified
 from es_service.runs.recent import FAULTS_OF, Recent, read_recent
 from es_service.runs.standing import Standing, doing, is_waiting, look, more, population_size, state, way_on
 from es_service.runs.view import Run
@@ -30,7 +33,7 @@ def print_status(console: Console, run: Run) -> None:
     fields["state"] = (
         state(standing) if standing.driver else f"{state(standing)}; continue with: {way_command(way_on(standing))}"
     )
-    _print_fields(console, fields | _progress(standing))
+    _print_fields(console, fields | _progress(standing) | _certified(run))
 
 
 def follow_status(console: Console, run: Run) -> None:
@@ -58,12 +61,12 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
     sigma = "search.iso_sigma" if run.constants["search.algorithm"] == "map_elites" else "search.sigma"
     doubled = {sigma: float(f"{run.constants[sigma] * 2:g}")}
     print_line(console, f"\nDone: {reason}.")
-    _print_fields(console, _progress(standing))
+    _print_fields(console, _progress(standing) | _certified(run))
     print_line(console, f"\nThe run is in {folder}. Next:")
     for words in (
         ("status", folder),
         ("report", folder),
-        ("evaluate", folder),
+        ("evaluate", folder, "--certify"),
         ("digest", folder),
         ("resume", folder, *settings(more(standing))),
         ("fork", folder, *settings(doubled | more(standing))),
@@ -87,7 +90,7 @@ def _progress(standing: Standing) -> dict[str, str]:
     target = f" (target: {limits['target_fitness']:g})" if "target_fitness" in limits else ""
     return {
         "generation": f"{last['generation']:,}{of.get('generations', '')}",
-        "best fitness": f"{last['best_fitness']:.2f}{target}",
+        "best fitness": f"{last['best_fitness']:.2f}{target}; selected, not certified",
         "centre fitness": f"{last['centre_fitness_mean']:.2f} ± {last['centre_fitness_std']:.2f}",
         **goal,
         **filled,
@@ -112,6 +115,15 @@ def _objectives(recent: Recent) -> dict[str, str]:
         return {}
     weight = newest.fitness_weight
     return {"weight of fitness": f"{weight:g} (novelty: {1.0 - weight:g})"}
+
+
+def _certified(run: Run) -> dict[str, str]:
+    """The policy of the newest certification, if there is one."""
+    try:
+        found = newest_certified(certified_policies(run.folder))
+    except StoreError as error:
+        return {"certified": f"not known: {error.sentence}"}
+    return {} if found is None else {"certified": f"{found.name}: {certified_line(found.row())}"}
 
 
 def _faults(recent: Recent, generation: int) -> dict[str, str]:
