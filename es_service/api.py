@@ -35,6 +35,7 @@ from es_service.runs.lineage import fork_config, forked, started
 from es_service.runs.session import OnGeneration, OnNotice, Outcome, require_cores, work
 from es_service.runs.standing import Standing, look
 from es_service.runs.view import open_run
+from es_service.search.algorithms import ALGORITHMS
 from es_service.store.beginning import Beginning
 from es_service.store.create import remove_run_folder
 from es_service.store.folder import CONFIG, explained, holds_run, write_config
@@ -198,7 +199,7 @@ def _go_on(
         require_cores(config, WayOut("resume", "", str(folder), asked))
         if changes := changes_from(store.meta.constants, config):
             besides = _budget_of_a_fork(config, look(open_run(folder)))
-            raise refused_changes(folder, changes, besides)
+            raise refused_changes(folder, changes, ALGORITHMS, besides)
         task = task_of(config)
         if other := _other_task(store.meta.task, task):
             raise ConfigError(

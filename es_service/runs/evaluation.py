@@ -175,7 +175,7 @@ def evaluate(
         together = max(1, CHUNKS_PER_WORKER * engine.counts.workers // chunks)
         for first in range(0, len(chosen), together):
             group = chosen[first : first + together]
-            centres = [_centre(candidate.policy, config.search.sigma, seed) for candidate in group]
+            centres = [_centre(candidate.policy, seed) for candidate in group]
             for candidate, (fitness, descriptors) in zip(group, _moments(engine, centres, episodes), strict=True):
                 cell = None
                 if geometry is not None and np.isfinite(descriptors.mean_O).all():
@@ -199,6 +199,6 @@ def _merged(total: Moments, part: Moments) -> Moments:
     return merge_moments(total, [part])
 
 
-def _centre(policy: Policy, sigma: float, seed: int) -> Centre:
+def _centre(policy: Policy, seed: int) -> Centre:
     mean_O, std_O = policy.observation_mean_O, policy.observation_std_O
-    return Centre(FRESH_GENERATION + seed, policy.parameters_D, sigma, mean_O, std_O)
+    return Centre(FRESH_GENERATION + seed, policy.parameters_D, 0.0, mean_O, std_O)
