@@ -56,7 +56,7 @@ from es_service.loop.state import Best, RunState
 from es_service.protocol.evaluator import DispatchCounts, Evaluator
 from es_service.protocol.messages import TaskSpec
 from es_service.search.algorithms.base import Ask
-from es_service.search.algorithms.steps import first_state
+from es_service.search.algorithms.common import first_state
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map
 from es_service.search.maps.geometry import make_geometry, reachable_cells
 from es_service.search.novelty import novelty
@@ -129,7 +129,8 @@ def _first_generation(
     """Evaluate the initial centres, which is generation 0. Its row of the history describes the fittest of them."""
     config, algorithm = search.config, search.algorithm
     centres, observations = search.initial()
-    learned = first_state(centres, len(search.task.descriptor_names), algorithm.fitness_weight, map_, algorithm.own)
+    dimensions = len(search.task.descriptor_names)
+    learned = first_state(centres, dimensions, algorithm.fitness_weight, map_, algorithm.own, config.search)
     points = [make_centre(config, 0, centre_D, observations) for centre_D in centres]
     evaluations = evaluate_centres(evaluator, points, config.search.evaluation_episodes, resets="by_chunk")
     clock.lap("seconds_evaluation")
@@ -223,7 +224,7 @@ def _next_generation(
         replace(centre, parameters_D=moved.centres[ask.centre].centre_D)
         for ask, centre in zip(asks, centres, strict=True)
     ]
-    require_finite(new_centres, settings.learning_rate, generation)
+    require_finite(new_centres, settings, generation)
     clock.lap("seconds_driver")
     evaluations = evaluate_centres(evaluator, new_centres, settings.evaluation_episodes)
     clock.lap("seconds_evaluation")

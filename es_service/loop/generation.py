@@ -45,16 +45,16 @@ def make_centre(
     centre_D: FloatArray,
     observations: Moments,
     state: CentreState | None = None,
-    sigma: float | None = None,
+    sigma: float = 0.0,
 ) -> Centre:
     """The centre as it is sent to the workers: its parameters and the observation statistics that it runs with.
 
     Args:
         state: it may have statistics of its own; None for an initial centre.
-        sigma: of its population; None for an initial centre, which has none.
+        sigma: of its population; 0 for an initial centre, which has none.
     """
     mean_O, std_O = statistics_in_force(observations, state, config.policy.observation_normalization)
-    return Centre(generation, centre_D, config.search.sigma if sigma is None else sigma, mean_O, std_O)
+    return Centre(generation, centre_D, sigma, mean_O, std_O)
 
 
 def evaluate_populations(

@@ -17,7 +17,7 @@ from es_service.search.algorithms.base import CentreState, FitnessWeight, Search
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map, unchanged_entries
 from es_service.search.maps.geometry import Cvt, Geometry, Grid
 from es_service.search.novelty import NoveltyArchive, archive_of, empty_archive
-from es_service.search.optimizer import Adam
+from es_service.search.steps import StepState
 
 Arrays = dict[str, np.ndarray]
 Parts = Mapping[str, Mapping[str, np.ndarray]]
@@ -122,25 +122,27 @@ def moments_from_arrays(arrays: Mapping[str, np.ndarray]) -> Moments:
 
 
 def centre_to_arrays(centre: CentreState) -> Arrays:
-    """Arrays of a centre: its parameters, its optimiser, its archive entry, its cell and its own statistics."""
-    adam = centre.adam
+    """Arrays of a centre: its parameters, its archive entry, its cell, its own statistics, and those of its step."""
     own = {"own_mean_O": centre.own_mean_O, "own_std_O": centre.own_std_O}
     return {
         **{name: values for name, values in own.items() if values is not None},
         "centre_D": centre.centre_D,
-        "adam_m_D": adam.m_D,
-        "adam_v_D": adam.v_D,
-        "adam_step": np.asarray(adam.step, np.int64),
+        **centre.step,
         "entry": np.asarray(centre.entry, np.int64),
         "cell": np.asarray(centre.cell, np.int64),
     }
 
 
 def centre_from_arrays(arrays: Mapping[str, np.ndarray]) -> CentreState:
-    """Inverse of `centre_to_arrays`."""
-    adam = Adam(arrays["adam_m_D"], arrays["adam_v_D"], int(arrays["adam_step"]))
+    """Inverse of `centre_to_arrays`. What is not of the centre itself is of its step."""
     own_mean_O, own_std_O = arrays.get("own_mean_O"), arrays.get("own_std_O")
-    return CentreState(arrays["centre_D"], adam, int(arrays["entry"]), int(arrays["cell"]), own_mean_O, own_std_O)
+    step = {name: values for name, values in arrays.items() if name not in CentreState.__dataclass_fields__}
+    return CentreState(arrays["centre_D"], step, int(arrays["entry"]), int(arrays["cell"]), own_mean_O, own_std_O)
+
+
+def with_step(arrays: Mapping[str, np.ndarray], step: StepState) -> Arrays:
+    """The arrays of a centre with another state of its step."""
+    return {name: values for name, values in arrays.items() if name in CentreState.__dataclass_fields__} | dict(step)
 
 
 def weight_to_arrays(weight: FitnessWeight) -> Arrays:

@@ -18,6 +18,7 @@ from es_service.runs.checked_config import changes_from
 from es_service.runs.identity import require_unchanged
 from es_service.runs.standing import Standing, look
 from es_service.runs.view import open_run
+from es_service.search.algorithms import ALGORITHMS
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
 
@@ -37,7 +38,7 @@ def require_resumable(store: RunStore, config: RunConfig, *, strict: bool) -> No
     """
     folder = store.folder
     if changes := changes_from(store.meta.constants, config):
-        raise refused_changes(folder, changes, _budget_of_a_fork(config, look(open_run(folder))))
+        raise refused_changes(folder, changes, ALGORITHMS, _budget_of_a_fork(config, look(open_run(folder))))
     task = task_of(config)
     if other := _other_task(store.meta.task, task):
         raise ConfigError(

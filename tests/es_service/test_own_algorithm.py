@@ -12,7 +12,7 @@ from es_service.errors import ConfigError, StoreError
 from es_service.protocol.messages import EpisodesResult
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Ask, CentreEvaluation
-from es_service.search.algorithms.steps import archived, first_state
+from es_service.search.algorithms.common import archived, first_state
 from es_service.search.maps.behaviour_map import insert
 from es_service.search.novelty import NoveltyArchive
 from es_service.search.observation_statistics import no_observations
@@ -23,7 +23,7 @@ EXAMPLE = "tests.examples.minimal_criterion:minimal_criterion"
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 20},
     "policy": {"hidden": [8]},
-    "search": {"algorithm": EXAMPLE, "pairs": 16, "sigma": 0.2, "learning_rate": 0.1},
+    "search": {"algorithm": EXAMPLE, "pairs": 16, "sigma": 0.2, "step": {"learning_rate": 0.1}},
     "budget": {"generations": 6},
     "compute": {"engine": "inline", "workers": 1},
 }
@@ -162,7 +162,7 @@ def _rows(map_, rows):
     ],
 )
 def test_a_state_that_the_store_could_not_give_back_ends_the_run(tmp_path, name, reason):
-    settings = [f"search.algorithm={__name__}:{name}", "map.cells=[200, 200]", "search.learning_rate=1"]
+    settings = [f"search.algorithm={__name__}:{name}", "map.cells=[200, 200]", "search.step.learning_rate=1"]
     with pytest.raises(StoreError, match=reason):
         api.run(api.load_config(CONFIG, settings), tmp_path / "run")
 
@@ -184,7 +184,7 @@ def test_elites_are_those_that_the_map_says_entered(tmp_path):
 
 def started(folder, name, **settings):
     """A run of an example in which every episode starts in one corner."""
-    search = {"pairs": 32, "sigma": 0.1, "learning_rate": 0.05, "evaluation_episodes": 4, "algorithm": name}
+    search = {"pairs": 32, "sigma": 0.1, "step": {"learning_rate": 0.05}, "evaluation_episodes": 4, "algorithm": name}
     config = CONFIG | {
         "task": {"environment": "point_maze", "episode_steps": 60, "options": {"start": "corner"}},
         "policy": {"hidden": [8], "init": "small_columns"},
@@ -198,7 +198,7 @@ ADAPTIVE = "tests.examples.adaptive_sigma:adaptive_sigma"
 
 def test_sigma_rises_with_success_and_falls_without(tmp_path):
     """And is stored: a run that was stopped has the same one, and the same bits."""
-    settings = {"search.learning_rate": 0.4, "budget.generations": 20}
+    settings = {"search.step.learning_rate": 0.4, "budget.generations": 20}
     whole = started(tmp_path / "whole", ADAPTIVE, **settings)
     started(tmp_path / "parts", ADAPTIVE, **settings | {"budget.generations": 9})
     assert api.resume(tmp_path / "parts", ["budget.generations=20"]).run.digest() == whole.digest()
@@ -242,7 +242,7 @@ def test_repelling_centres_end_apart_where_others_meet(tmp_path):
     apart = distances("apart")
     assert apart[0] < 0.01
     assert apart[10:].min() > 0.5
-    assert distances("together", **{"search.options.reach": 0})[10:].max() < 0.1
+    assert distances("together", **{"search.reach": 0})[10:].max() < 0.1
 
 
 def test_repelling_centres_go_on_where_they_were_with_the_same_bits(tmp_path):

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("workers_here")
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 20},
     "policy": {"hidden": [8]},
-    "search": {"algorithm": f"{__name__}:counting", "pairs": 16, "sigma": 0.2, "learning_rate": 0.1},
+    "search": {"algorithm": f"{__name__}:counting", "pairs": 16, "sigma": 0.2, "step": {"learning_rate": 0.1}},
     "budget": {"generations": 6},
     "compute": {"engine": "inline", "workers": 1},
 }

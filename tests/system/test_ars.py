@@ -24,9 +24,9 @@ CONFIG = SMALL | {
     "search": {
         "algorithm": "ars",
         "pairs": 16,
-        "top_pairs": 5,
+        "shaping": {"count": 5},
         "sigma": 0.2,
-        "learning_rate": 0.1,
+        "step": {"learning_rate": 0.1},
         "evaluation_episodes": 4,
     },
     "budget": {"generations": 14},
@@ -82,7 +82,7 @@ def test_resumed_and_forked_in_the_middle(tmp_path, undisturbed):
         "budget.generations=14",
     )
     fork = api.fork(part.folder, [whole], out=tmp_path / "fork", generation=5).run
-    other = api.fork(part.folder, [whole, "search.top_pairs=null"], out=tmp_path / "other").run
+    other = api.fork(part.folder, [whole, "search.shaping.count=null"], out=tmp_path / "other").run
     api.resume(part.folder, [whole])
     assert digest_parts(part.folder) == digest_parts(fork.folder) == digest_parts(undisturbed.folder)
     assert digest_parts(other.folder) != digest_parts(undisturbed.folder)

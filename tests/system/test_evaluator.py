@@ -181,7 +181,7 @@ def test_initial_policies_are_those_of_a_run(tmp_path):
     with es_service.evaluator(config) as evaluate:
         np.testing.assert_array_equal(evaluate.initial(1), centres[1])
         moved = np.abs(evaluate.initial() - centres[0]).max()
-        assert 0.0 < moved <= 2.0 * config.search.learning_rate
+        assert 0.0 < moved <= 2.0 * config.search.step.learning_rate
 
 
 @pytest.mark.parametrize(

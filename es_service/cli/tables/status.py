@@ -23,10 +23,11 @@ def print_status(console: Console, run: Run) -> None:
     """Print the settings of a run, its state (waiting, running, stopped or finished) and its progress."""
     standing = look(run)
     constants, parent = run.constants, run.meta.parent
+    method = (constants["search.algorithm"], population_size(constants))
     fields = {
         "run": str(run.folder),
         "task": f"{constants['task.environment']}, {constants['task.episode_steps']} steps an episode",
-        "search": f"{constants['search.algorithm']}, {population_size(constants)}, seed {constants['seed']}",
+        "search": ", ".join(filter(None, [*method, f"seed {constants['seed']}"])),
     }
     if parent:
         fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
@@ -58,8 +59,8 @@ def follow_status(console: Console, run: Run) -> None:
 def print_summary(console: Console, run: Run, reason: str) -> None:
     """Print the summary of a session at its end: the result, the folder and the next commands."""
     standing, folder = look(run), run.folder
-    sigma = "search.iso_sigma" if run.constants["search.algorithm"] == "map_elites" else "search.sigma"
-    doubled = {sigma: float(f"{run.constants[sigma] * 2:g}")}
+    sigma = next((key for key in ("search.sigma", "search.iso_sigma") if key in run.constants), None)
+    doubled = {sigma: float(f"{run.constants[sigma] * 2:g}")} if sigma else {}
     print_line(console, f"\nDone: {reason}.")
     _print_fields(console, _progress(standing) | _certified(run))
     print_line(console, f"\nThe run is in {folder}. Next:")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.novelty import NoveltyArchive
-from es_service.search.optimizer import Adam, fresh_adam
+from es_service.search.steps import StepState, restarted
 
 NO_ENTRY = -1
 """Value of `CentreState.entry` for a centre without a valid evaluation so far."""
@@ -26,14 +26,15 @@ NO_CELL = -1
 
 @dataclass(frozen=True)
 class CentreState:
-    """One centre with its optimiser.
+    """One centre with the state of its step.
 
     NS-ES, NSR-ES and NSRA-ES search with several centres side by side (the meta-population of Conti et al. 2018), ME-ES
     with one centre per emitter, ES with one.
     """
 
     centre_D: FloatArray
-    adam: Adam
+    step: StepState
+    """What its step remembers, such as the moments of Adam; empty for a search without steps."""
     entry: int = NO_ENTRY
     """Index of the centre's newest entry in the novelty archive, or NO_ENTRY."""
     cell: int = NO_CELL
@@ -92,7 +93,7 @@ def read_only(own: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
 def frozen(state: SearchState) -> SearchState:
     """The same state, all of whose arrays are read-only from now on."""
     for centre in state.centres:
-        _freeze([*vars(centre).values(), *vars(centre.adam).values()])
+        _freeze([*vars(centre).values(), *centre.step.values()])
     _freeze(vars(state.archive).values())
     if state.map is not None:
         _freeze(vars(state.map).values())
@@ -106,7 +107,7 @@ def _freeze(values: Iterable[Any]) -> None:
 
 
 def from_elite(state: SearchState, index: int, cell: int, elite: Elite, *, own_statistics: bool = False) -> SearchState:
-    """The state in which an elite replaces a centre, with a fresh optimiser.
+    """The state in which an elite replaces a centre, whose step begins anew.
 
     Args:
         index: index of the centre.
@@ -114,10 +115,11 @@ def from_elite(state: SearchState, index: int, cell: int, elite: Elite, *, own_s
         own_statistics: whether the centre keeps the observation statistics with which the elite was evaluated; else it
             uses those of the whole run.
     """
+    before = state.centres[index]
     centre = CentreState(
         elite.centre_D,
-        fresh_adam(elite.centre_D.size),
-        state.centres[index].entry,
+        restarted(before.step),
+        before.entry,
         cell,
         elite.observation_mean_O if own_statistics else None,
         elite.observation_std_O if own_statistics else None,
@@ -179,21 +181,25 @@ class CentreEvaluation:
     """Highest fitness of a valid member of the population that led to it; NaN for an initial centre."""
 
 
+def _without_populations(*arguments: object) -> Any:
+    raise NotImplementedError("a search that asks for populations needs the functions `weights` and `step`")
+
+
 @dataclass(frozen=True)
 class Algorithm:
     """The functions of one method. All are pure."""
 
     ask: Callable[[SearchState, int], tuple[Ask | PolicyAsk, ...]]
     """(state, generation) -> populations and policies to evaluate in that generation, side by side."""
-    weights: Callable[[SearchState, Ask, EpisodesResult], NDArray[np.float32]]
-    """(state, asked, the whole population's results with axes P, S) -> weight of each pair's noise [P]."""
-    step: Callable[[SearchState, Ask, FloatArray], SearchState]
-    """(state, asked, gradient estimate [D]) -> state with the asked centre moved up the gradient. Called for each
-    population asked for, in order."""
     tell: Callable[[SearchState, tuple[CentreEvaluation, ...]], SearchState]
     """(state, evaluations of a generation's centres and policies in the order of the asks) -> state updated with them.
     The first call has all initial centres."""
-    fitness_weight: float
+    weights: Callable[[SearchState, Ask, EpisodesResult], NDArray[np.float32]] = _without_populations
+    """(state, asked, the whole population's results with axes P, S) -> weight of each pair's noise [P]."""
+    step: Callable[[SearchState, Ask, FloatArray], SearchState] = _without_populations
+    """(state, asked, gradient estimate [D]) -> state with the asked centre moved up the gradient. Called for each
+    population asked for, in order."""
+    fitness_weight: float = 1.0
     """Initial value of the state's `weight`."""
     start_cells: Callable[[SearchState, int], Mapping[int, int]] = lambda state, generation: {}
     """(state, generation) -> index of a centre -> cell whose elite takes its place at the start of the generation; the
