@@ -22,6 +22,8 @@ from es_service.search.optimizer import Adam
 Arrays = dict[str, np.ndarray]
 Parts = Mapping[str, Mapping[str, np.ndarray]]
 """Name of a part -> name of an array -> array."""
+Changes = Mapping[str, Arrays | None]
+"""Parts that a generation has changed, by name; None for a part that it has removed."""
 
 OBSERVATIONS, COUNTERS, WEIGHT, BEST, GEOMETRY_PART = "observations", "counters", "weight", "best", "map"
 OWN = "own"

@@ -13,8 +13,8 @@ from es_service.errors import StoreError
 from es_service.loop.history import Column
 from es_service.store.codec import text_sha256
 
-SCHEMA_VERSION = 5
-READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0", 4: "0.6.0"}
+SCHEMA_VERSION = 6
+READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0", 4: "0.6.0", 5: "0.12.0"}
 """Older schema version -> newest version of es-service that reads it."""
 APPLICATION_ID = 0x45535256
 """Number in the header of the file, by which tools recognise the kind of a database."""
