@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from es_service.config.model import BudgetConfig
 from es_service.loop import budget as budgets
+from es_service.loop.changes import changed_parts
 from es_service.loop.checks import (
     invalidate,
     require_asks,
@@ -50,7 +51,7 @@ from es_service.loop.history import (
     step_columns,
 )
 from es_service.loop.interfaces import Search, Stop, Store, Stored
-from es_service.loop.parts import ELITE_PREFIX, elite_from_arrays, elite_part, state_from_parts, state_parts
+from es_service.loop.parts import ELITE_PREFIX, elite_from_arrays, elite_part, state_from_parts
 from es_service.loop.policies import as_population
 from es_service.loop.state import Best, RunState
 from es_service.protocol.evaluator import DispatchCounts, Evaluator
@@ -90,7 +91,9 @@ def run(
     budget = search.config.budget
     clock, answer = Clock(0.0), None
     if state is None:
-        map_ = empty_map(make_geometry(search.config.map)) if search.config.map.enabled else None
+        map_ = None
+        if search.config.map.enabled:
+            map_ = empty_map(make_geometry(search.config.map), counts_samples=search.algorithm.counts_samples)
         reachable = _reachable(search, map_)
         first = _first_generation(search, evaluator, clock, map_, reachable)
         state, answer = _keep(store, report, clock, None, *first)
@@ -140,7 +143,7 @@ def _first_generation(
     first = Best(0, -math.inf, centres[0], points[0].observation_mean_O, points[0].observation_std_O)
     state = RunState(
         generation=0,
-        search=learned,
+        search=replace(learned, elites={}),
         observations=observations,
         best=better(first, points, told),
         env_steps=sum(map(steps_of, evaluations)),
@@ -264,7 +267,7 @@ def _next_generation(
     points, evaluations = [one.point for one in evaluated], [one.evaluation for one in evaluated]
     state = RunState(
         generation=generation,
-        search=learned,
+        search=replace(learned, elites={}),
         observations=merge_moments(state.observations, observed),
         best=better(state.best, points, told),
         env_steps=state.env_steps + sum(one.env_steps for one in evaluated),
@@ -300,7 +303,7 @@ def _keep(
         "steps_per_second": steps / seconds,
         **laps,
     }
-    store.commit(state.generation, state_parts(state, before), row, evaluations)
+    store.commit(state.generation, changed_parts(state, before, store.part), row, evaluations)
     clock.lap("seconds_store")
     return state, report(row)
 

@@ -163,6 +163,7 @@ def centre_evaluation(
         float(np.mean(evaluation.fitness, dtype=np.float64)),
         evaluation.descriptor.astype(np.float64).mean(axis=0),
         _highest(population.fitness) if population is not None else math.nan,
+        len(evaluation.fitness),
     )
 
 
@@ -185,11 +186,13 @@ def entered(
     centres: Sequence[Centre],
     evaluations: Sequence[EpisodesResult],
 ) -> dict[int, Elite]:
-    """The centres just evaluated that are elites now, by their cells.
+    """The policies of elites that the store does not have, by their cells: those of the centres just evaluated that are
+    elites now, and those that the search has given.
 
     The map decides this and not `CentreState.cell`, which a search of the user need not set.
     """
-    found: dict[int, Elite] = {}
+    filled = set() if state.map is None or not state.elites else set(state.map.cell_N.tolist())
+    found = {cell: elite for cell, elite in state.elites.items() if cell in filled}
     for one, centre, evaluation in zip(told, centres, evaluations, strict=True):
         if state.map is not None and (cell := state.map.cell_of(one.generation, one.centre)) is not None:
             assert evaluation.trace_T_B is not None, "an evaluation has a trace"

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from es_service.loop.changes import map_changes
 from es_service.loop.parts import (
     GEOMETRY_PART,
     cell_part,
@@ -15,7 +16,6 @@ from es_service.loop.parts import (
     elite_part,
     elite_to_arrays,
     map_from_parts,
-    map_to_parts,
 )
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map, insert, map_statistics, with_score
 from tests.es_service.map_examples import PLANE
@@ -33,11 +33,13 @@ def filled(*offers, geometry=PLANE):
 
 
 def columns_of(map_):
-    return {field.name: getattr(map_, field.name) for field in dataclasses.fields(map_) if field.name != "geometry"}
+    found = {field.name: getattr(map_, field.name) for field in dataclasses.fields(map_) if field.name != "geometry"}
+    return {name: values for name, values in found.items() if values is not None}
 
 
 def assert_same_map(map_, other):
     assert map_.geometry == other.geometry
+    assert columns_of(map_).keys() == columns_of(other).keys()
     for name, values in columns_of(map_).items():
         np.testing.assert_array_equal(values, getattr(other, name))
         assert values.dtype == getattr(other, name).dtype
@@ -146,7 +148,7 @@ def test_the_qd_score_does_not_depend_on_the_order_of_its_terms():
 def test_a_map_comes_back_from_its_parts():
     map_ = filled(((5.0, 1.9), 1.0), ((0.0, 0.0), -2.5), ((3.0, 1.0), 1e-300), ((5.5, 1.8), 2.0))
     map_ = with_score(map_, 0, math.nan)
-    parts = map_to_parts(map_, None)
+    parts = map_changes(map_, None)
     assert set(parts) == {GEOMETRY_PART, cell_part(11), cell_part(0), cell_part(6)}
     others = {"centre_0": {"cell": np.asarray(3)}, elite_part(4): {"centre_D": np.zeros(1)}}
     again = map_from_parts(dict(reversed((parts | others).items())))
@@ -155,7 +157,7 @@ def test_a_map_comes_back_from_its_parts():
 
 
 def test_an_empty_map_comes_back_and_no_map_stays_none():
-    again = map_from_parts(map_to_parts(empty_map(PLANE), None))
+    again = map_from_parts(map_changes(empty_map(PLANE), None))
     assert isinstance(again, BehaviourMap)
     assert_same_map(again, empty_map(PLANE))
     assert map_from_parts({"centre_0": {}}) is None
@@ -164,27 +166,27 @@ def test_an_empty_map_comes_back_and_no_map_stays_none():
 def test_only_rows_that_changed_are_written():
     map_ = filled(((5.0, 1.9), 1.0), ((0.0, 0.0), -2.5), ((3.0, 1.0), 3.0))
     map_ = with_score(map_, 0, math.nan)
-    assert map_to_parts(map_, map_) == {}
-    assert map_to_parts(with_score(map_, 0, math.nan), map_) == {}
-    assert set(map_to_parts(with_score(map_, 0, 4.0), map_)) == {cell_part(0)}
-    assert set(map_to_parts(with_score(map_, 11, math.nan), map_)) == {cell_part(11)}
+    assert map_changes(map_, map_) == {}
+    assert map_changes(with_score(map_, 0, math.nan), map_) == {}
+    assert set(map_changes(with_score(map_, 0, 4.0), map_)) == {cell_part(0)}
+    assert set(map_changes(with_score(map_, 11, math.nan), map_)) == {cell_part(11)}
     new, _, _ = insert(map_, np.array([0.0, 1.9]), 0.0, 3, 0, math.nan)
-    assert set(map_to_parts(new, map_)) == {cell_part(3)}
+    assert set(map_changes(new, map_)) == {cell_part(3)}
     replaced, _, _ = insert(with_score(map_, 11, 7.0), np.array([3.0, 1.0]), 4.0, 3, 0, 102.0)
-    assert set(map_to_parts(replaced, map_)) == {cell_part(11), cell_part(6)}
-    assert set(map_to_parts(map_, empty_map(PLANE))) == {cell_part(cell) for cell in (11, 0, 6)}
+    assert set(map_changes(replaced, map_)) == {cell_part(11), cell_part(6)}
+    assert set(map_changes(map_, empty_map(PLANE))) == {cell_part(cell) for cell in (11, 0, 6)}
 
 
 def test_parts_written_one_change_at_a_time_give_the_last_map():
     rng = np.random.default_rng(0)
     map_ = empty_map(PLANE)
-    stored = map_to_parts(map_, None)
+    stored = map_changes(map_, None)
     for generation in range(60):
         before = map_
         if map_.size and rng.random() < 0.5:
             map_ = with_score(map_, int(rng.choice(map_.cell_N)), rng.normal())
         map_, _, _ = insert(map_, rng.uniform([0, 0], [6, 2]), rng.normal(), generation, 0, rng.normal())
-        stored |= map_to_parts(map_, before)
+        stored |= map_changes(map_, before)
     again = map_from_parts(stored)
     assert isinstance(again, BehaviourMap)
     assert_same_map(again, map_)

@@ -66,7 +66,8 @@ def map_elites(config: RunConfig) -> Algorithm:
         map_ = state.map
         for one in evaluations:
             if map_ is not None and one.valid:
-                map_, _, _ = insert(map_, one.descriptor_B, one.fitness, one.generation, one.centre, one.population_max)
+                origin = one.generation, one.centre
+                map_, _, _ = insert(map_, one.descriptor_B, one.fitness, *origin, one.population_max, one.episodes)
         return replace(state, map=map_)
 
     return replace(shared, parents=parents, ask=ask, tell=tell)

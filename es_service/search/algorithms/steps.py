@@ -83,7 +83,7 @@ def first_state(
     dimensions: int,
     fitness_weight: float,
     map_: BehaviourMap | None = None,
-    own: Mapping[str, NDArray[Any]] | None = None,
+    own: Mapping[str, Any] | None = None,
 ) -> SearchState:
     """The state before any evaluation: initial centres, fresh optimisers and an empty novelty archive.
 
@@ -92,7 +92,7 @@ def first_state(
         dimensions: number of descriptor dimensions.
         fitness_weight: initial weight of fitness.
         map_: the empty behaviour map; None for a run without one.
-        own: initial arrays of the search's own, by name.
+        own: `Algorithm.own`.
     """
     states = tuple(CentreState(centre_D, fresh_adam(centre_D.size)) for centre_D in centres)
     return SearchState(states, empty_archive(dimensions), FitnessWeight(fitness_weight), map_, read_only(own or {}))
@@ -206,6 +206,7 @@ def mapped(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
             evaluation.generation,
             evaluation.centre,
             evaluation.population_max,
+            evaluation.episodes,
         )
         cell = offered if entered else NO_CELL
     centres = [replace(one, cell=NO_CELL) if cell != NO_CELL and one.cell == cell else one for one in state.centres]
