@@ -170,6 +170,32 @@ def moved(map_: BehaviourMap, cell: int, descriptor_B: NDArray[np.float64]) -> t
     return _offered(removed(map_, cell), to, entry | {"descriptor_N_B": descriptor_B})
 
 
+def resampled(
+    map_: BehaviourMap, cell: int, descriptor_B: NDArray[np.float64], fitness: float, samples: int
+) -> tuple[BehaviourMap, int, bool]:
+    """Add samples to a cell's elite, whose fitness and descriptor become the means of all; returns as `moved`.
+
+    Args:
+        descriptor_B: mean over the new samples, finite.
+        fitness: likewise.
+        samples: number of the new samples.
+
+    Raises:
+        KeyError: the cell is empty.
+        ValueError: the map does not count samples.
+    """
+    row = map_.row_of(cell)
+    if map_.samples_N is None:
+        raise ValueError("this map does not count samples; set Algorithm.counts_samples")
+    if row is None:
+        raise KeyError(cell)
+    total = int(map_.samples_N[row]) + samples
+    share = samples / total
+    fitness = float((1.0 - share) * map_.fitness_N[row] + share * fitness)
+    descriptor_B = (1.0 - share) * map_.descriptor_N_B[row] + share * descriptor_B
+    return moved(changed(map_, cell, fitness=fitness, samples=total), cell, descriptor_B)
+
+
 def orders(map_: BehaviourMap) -> NDArray[np.int64]:
     """Number of each entry in the order in which the cells were filled, [N], increasing.
 
