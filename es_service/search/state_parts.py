@@ -131,7 +131,8 @@ def problem(own: Mapping[str, Any]) -> str:
         wrong = [one for arrays in every for one in arrays.values() if not _is_array(one)]
         if wrong:
             return f"{what} has {_kind(wrong[0])} where a NumPy array of bools or numbers must be"
-        if isinstance(value, Appended) and len({one.shape[:1] for one in value.arrays.values()} - {()}) != 1:
+        counts = {one.shape[:1] for one in value.arrays.values()} if isinstance(value, Appended) else {(0,)}
+        if len(counts) != 1 or () in counts:
             return f"{what} must have one or more arrays, all with the same number of rows"
     return ""
 
