@@ -15,8 +15,9 @@ import numpy as np
 
 from es_service.config.model import RunConfig
 from es_service.loop.checks import require_state, valid_members
+from es_service.loop.interfaces import Search
 from es_service.loop.policies import PolicyWork, policy_episodes
-from es_service.loop.state import Best, statistics_in_force
+from es_service.loop.state import Best, RunState, statistics_in_force
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.gradient_tree import tree_sum
 from es_service.protocol.messages import (
@@ -34,9 +35,23 @@ from es_service.protocol.messages import (
     evaluation_chunks,
 )
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, CentreState, SearchState, frozen
-from es_service.search.maps.behaviour_map import Elite, make_elite
+from es_service.search.algorithms.steps import first_state
+from es_service.search.maps.behaviour_map import Elite, empty_map, make_elite
+from es_service.search.maps.geometry import make_geometry
 
 Result = TypeVar("Result", EpisodesResult, GradientResult)
+
+
+def initial_state(search: Search) -> RunState:
+    """The state before generation 0: nothing has been evaluated."""
+    algorithm, (centres, observations) = search.algorithm, search.initial()
+    map_ = None
+    if search.config.map.enabled:
+        map_ = empty_map(make_geometry(search.config.map), counts_samples=algorithm.counts_samples)
+    learned = first_state(centres, len(search.task.descriptor_names), algorithm.fitness_weight, map_, algorithm.own)
+    first = make_centre(search.config, 0, centres[0], observations)
+    best = Best(0, -math.inf, centres[0], first.observation_mean_O, first.observation_std_O)
+    return RunState(-1, learned, observations, best, env_steps=0, episodes=0, wall_clock_s=0.0)
 
 
 def make_centre(
