@@ -154,11 +154,12 @@ def _malformed(search: SearchState, earlier: SearchState | None) -> str:
         return "the behaviour map was added or removed, which only `map.enabled` decides"
     if (earlier is None or search.own is not earlier.own) and (wrong := state_parts.problem(search.own)):
         return wrong
-    return _malformed_map(search.map) if search.map is not None else ""
+    map_before = earlier.map if earlier is not None else None
+    return _malformed_map(search.map, map_before) if search.map is not None and search.map is not map_before else ""
 
 
-def _malformed_map(map_: BehaviourMap) -> str:
-    """Which array of a map has another type or shape than its cells need; empty if none has."""
+def _malformed_map(map_: BehaviourMap, before: BehaviourMap | None) -> str:
+    """Which array of a map has another type, shape or content than its cells need; empty if none has."""
     needed = {"cell_N": "i8", **COLUMNS, **({} if map_.samples_N is None else {"samples_N": "i8"})}
     for name, type_ in needed.items():
         array = getattr(map_, name)
@@ -166,7 +167,8 @@ def _malformed_map(map_: BehaviourMap) -> str:
         if not isinstance(array, np.ndarray) or array.dtype != type_ or array.shape != shape:
             now = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
             return f"the map's {name} is {now}; it must be {np.dtype(type_)} {shape}"
-    if len(np.unique(map_.cell_N)) < map_.size or not ((map_.cell_N >= 0) & (map_.cell_N < map_.geometry.size)).all():
+    cells = map_.cell_N if before is None or map_.cell_N is not before.cell_N else map_.cell_N[:0]
+    if len(np.unique(cells)) < len(cells) or not ((cells >= 0) & (cells < map_.geometry.size)).all():
         return f"the map's cells must be different ones from 0 to {map_.geometry.size - 1}"
     return ""
 

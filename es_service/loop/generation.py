@@ -14,6 +14,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from es_service.config.model import RunConfig
+from es_service.errors import EvaluationError
 from es_service.loop.checks import require_state, valid_members
 from es_service.loop.interfaces import Search
 from es_service.loop.policies import PolicyWork, policy_episodes
@@ -186,7 +187,11 @@ def tell(algorithm: Algorithm, state: SearchState, told: tuple[CentreEvaluation,
     """The state after the search is told a generation's evaluations; its arrays are read-only from now on."""
     after = algorithm.tell(state, told)
     require_state(after, "tell", told[0].generation)
-    return frozen(after)
+    try:
+        return frozen(after)
+    except ValueError as error:
+        text = f"generation {told[0].generation}: `tell` returned a state that is none: {error}"
+        raise EvaluationError(text, field="search.algorithm") from error
 
 
 def fittest(told: Sequence[CentreEvaluation]) -> int:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.loop.parts import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.protocol.machine import is_mixed
+from es_service.search.state_parts import PIECE
 from es_service.store.codec import NO_PAYLOAD, column_bytes, decode_part, leading_values, row_bytes
 from es_service.store.connection import reading
 from es_service.store.folder import DATABASE
@@ -30,8 +31,6 @@ from es_service.store.verify import verify
 
 Connection = sqlite3.Connection
 
-PIECE = "/"
-"""Separates the name of a part and the number of its piece in the name of a part that consists of pieces."""
 NEWEST = 2**62
 """Number that stands for the newest generation."""
 

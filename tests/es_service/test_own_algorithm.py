@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from es_service import api
-from es_service.errors import ConfigError, StoreError
+from es_service.errors import ConfigError, EvaluationError, StoreError
 from es_service.protocol.messages import EpisodesResult
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Ask, CentreEvaluation
@@ -134,6 +134,14 @@ def centreless(config):
     return _telling(config, lambda state: replace(state, centres=()))
 
 
+def ragged(config):
+    """An archive with fewer generations than descriptors."""
+    return _telling(
+        config,
+        lambda state: replace(state, archive=replace(state.archive, generation_N=np.zeros(0, np.int64), room=None)),
+    )
+
+
 def without_map(config):
     return _telling(config, lambda state: replace(state, map=state.map if state.archive.size < 3 else None))
 
@@ -210,6 +218,13 @@ def test_what_is_no_state_ends_the_run(tmp_path, name, reason):
     settings = [f"search.algorithm={__name__}:{name}", *FAR]
     with pytest.raises(StoreError, match=reason):
         api.run(api.load_config(CONFIG, settings), tmp_path / "run")
+
+
+def test_an_archive_whose_arrays_do_not_fit_ends_the_run(tmp_path):
+    with pytest.raises(
+        EvaluationError, match="generation 0: `tell` returned a state that is none: the arrays"
+    ):
+        api.run(api.load_config(CONFIG, [f"search.algorithm={__name__}:ragged"]), tmp_path / "run")
 
 
 def test_elites_are_those_that_the_map_says_entered(tmp_path):

@@ -87,7 +87,7 @@ def frozen(state: SearchState) -> SearchState:
     for values in (archive.descriptor_N_B, archive.generation_N, archive.centre_N):
         values.flags.writeable = False  # but not the arrays of which they are the first part
     if state.map is not None:
-        freeze(vars(state.map).values())
+        freeze([*vars(state.map).values(), *vars(state.map.geometry).values()])
     return replace(state, archive=archive, own=read_only(state.own))
 
 

@@ -222,9 +222,9 @@ def unchanged_entries(map_: BehaviourMap, before: BehaviourMap) -> NDArray[np.bo
 
 def rows_in(map_: BehaviourMap, other: BehaviourMap) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Whether each cell is filled in another map, [N], and the index of its entry there, [N] (0 if it is not)."""
-    if np.array_equal(map_.cell_N[: other.size], other.cell_N):  # no entry has left, as in shipped searches
-        row_N = np.arange(map_.size)
-        return row_N < other.size, np.where(row_N < other.size, row_N, 0)
+    first, row_N = min(map_.size, other.size), np.arange(map_.size)
+    if np.array_equal(map_.cell_N[:first], other.cell_N[:first]):  # no entry has left, as in shipped searches
+        return row_N < first, np.where(row_N < first, row_N, 0)
     sorted_rows = np.argsort(other.cell_N)
     found_N = np.searchsorted(other.cell_N, map_.cell_N, sorter=sorted_rows)
     row_N = np.append(sorted_rows, 0)[found_N]
