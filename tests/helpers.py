@@ -132,7 +132,7 @@ class MemoryStore:
 
     def commit(self, generation, parts, history, evaluations=()) -> None:
         self.generation = generation
-        self.parts |= parts
+        self.parts = {name: part for name, part in (self.parts | parts).items() if part is not None}
         self.rows.append(dict(history))
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from es_service.config.loading import load_config
 from es_service.config.model import policy_shape
+from es_service.loop.changes import changed_parts
 from es_service.loop.history import evaluated_columns, history_columns
-from es_service.loop.parts import state_parts
 from es_service.loop.state import Best, RunState
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import Moments, TaskSpec
@@ -88,7 +88,7 @@ def write_run(
     )
     beginning = Beginning(
         history=[{name: value for name, value in row.items() if name != "evaluated"} for row in rows],
-        parts=state_parts(state, None),
+        parts={name: part for name, part in changed_parts(state, None).items() if part is not None},
         platforms=[(0, dict(platform_info()))],
         newest=generations,
         evaluations=[row["evaluated"] for row in rows],

@@ -128,7 +128,8 @@ class Run:
     @property
     def map(self) -> pd.DataFrame:
         """The behaviour map, one row per filled cell in the order of discovery: the cell's number (as in the history)
-        and its index along each dimension (not for a cvt map); the elite's fitness, descriptor, generation and centre.
+        and its index along each dimension (not for a cvt map); the elite's fitness, descriptor, generation and centre,
+        and the number of its samples where the search counts them.
         """
         return self.at(wanted=is_light).map
 

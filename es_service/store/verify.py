@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from es_service.store.certifications import Key, damaged_rows
-from es_service.store.codec import column_bytes, decode_part, part_sha256, row_sha256
+from es_service.store.codec import NO_PAYLOAD, column_bytes, decode_part, listed, part_sha256, row_sha256
 from es_service.store.folder import is_disk_full
 from es_service.store.kept import KeptRows, whole_states
 from es_service.store.platforms import sound_platforms
@@ -163,12 +163,12 @@ def _state(connection: sqlite3.Connection, problems: list[str]) -> tuple[KeptRow
     for part, generation, sha256, payload in connection.execute("SELECT part, generation, sha256, payload FROM state"):
         try:
             sound = part_sha256(part, generation, payload) == sha256
-            if sound:
+            if sound and payload != NO_PAYLOAD:
                 decode_part(payload)
         except (ValueError, TypeError):
             sound = False
         if sound:
-            kept.setdefault(part, {})[generation] = sha256
+            kept.setdefault(part, {})[generation] = listed(sha256, payload)
         else:
             problems.append(f"state of {part!r} at generation {generation} does not match its SHA-256")
             bad_rows.append((part, generation))

@@ -9,7 +9,7 @@ from es_service.api import load_config
 from es_service.config.parallel import parallel_sentence
 from es_service.errors import ConfigError
 from es_service.loop.history import history_columns
-from es_service.loop.parts import OWN, elite_part
+from es_service.loop.parts import elite_part
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
@@ -18,6 +18,7 @@ from es_service.search.algorithms.common import first_state
 from es_service.search.algorithms.memes import RESET_CHOICE, STAGNANT
 from es_service.search.maps.behaviour_map import Elite, empty_map
 from es_service.search.maps.geometry import Grid
+from es_service.search.state_parts import OWN
 from es_service.store.codec import decode_part, encode_part
 from tests.laws import me_es_runs
 from tests.laws.me_es_runs import (

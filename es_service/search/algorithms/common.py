@@ -84,7 +84,7 @@ def first_state(
     dimensions: int,
     fitness_weight: float,
     map_: BehaviourMap | None = None,
-    own: Mapping[str, NDArray[Any]] | None = None,
+    own: Mapping[str, Any] | None = None,
     search: SearchConfig | None = None,
 ) -> SearchState:
     """The state before any evaluation: initial centres, none of which has made a step, and an empty novelty archive.
@@ -94,7 +94,7 @@ def first_state(
         dimensions: number of descriptor dimensions.
         fitness_weight: initial weight of fitness.
         map_: the empty behaviour map; None for a run without one.
-        own: initial arrays of the search's own, by name.
+        own: `Algorithm.own`.
         search: settings with the kind of the steps; None for a search without steps.
     """
     states = tuple(CentreState(centre_D, fresh_state(search, centre_D.size)) for centre_D in centres)
@@ -214,6 +214,7 @@ def mapped(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
             evaluation.generation,
             evaluation.centre,
             evaluation.population_max,
+            evaluation.episodes,
         )
         cell = offered if entered else NO_CELL
     centres = [replace(one, cell=NO_CELL) if cell != NO_CELL and one.cell == cell else one for one in state.centres]

@@ -103,7 +103,8 @@ def map_elites(config: RunConfig) -> Algorithm:
         map_ = state.map
         for one in evaluations:
             if map_ is not None and one.valid:
-                map_, _, _ = insert(map_, one.descriptor_B, one.fitness, one.generation, one.centre, one.population_max)
+                origin = one.generation, one.centre
+                map_, _, _ = insert(map_, one.descriptor_B, one.fitness, *origin, one.population_max, one.episodes)
         return replace(state, map=map_)
 
     return Algorithm(ask, tell, parents=parents)
