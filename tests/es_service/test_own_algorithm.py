@@ -185,7 +185,7 @@ def _rows(map_, rows):
     return replace(map_, **{name: getattr(map_, name)[rows] for name in names})
 
 
-FAR = ["map.cells=[200, 200]", "search.learning_rate=1"]
+FAR = ["map.cells=[200, 200]", "search.step.learning_rate=1"]
 
 
 @pytest.mark.parametrize("name", ["forgetful", "growing", "shrinking", "emptying"])
