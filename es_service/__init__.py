@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from es_service.api import Stop, evaluator, fork, load_config, open_run, resume, run, run_or_resume
     from es_service.report import plots
     from es_service.report.write import write_comparison, write_report
+    from es_service.runs.certification import certify, certify_run
     from es_service.runs.sweep import sweep
 
     __version__: str
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 __all__ = [
     "Stop",
     "__version__",
+    "certify",
+    "certify_run",
     "evaluator",
     "fork",
     "load_config",
@@ -32,6 +35,8 @@ __all__ = [
     "write_report",
 ]
 _MODULES = {
+    "certify": "es_service.runs.certification",
+    "certify_run": "es_service.runs.certification",
     "sweep": "es_service.runs.sweep",
     "write_comparison": "es_service.report.write",
     "write_report": "es_service.report.write",

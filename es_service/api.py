@@ -14,26 +14,21 @@ from types import MappingProxyType
 from typing import Any
 from uuid import uuid4
 
-from es_service.config.changes import again_with, refused_changes
+from es_service.config.changes import again_with
 from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
 from es_service.config.tasks import task_of
-from es_service.config.yaml_text import show
 from es_service.dispatch import dispatch_log
-from es_service.errors import ConfigError, StartError, StoreError, WayOut
+from es_service.errors import StartError, WayOut
 from es_service.logs import in_run
-from es_service.loop.budget import REACHED, limits_of, raised
-from es_service.loop.history import Column, evaluated_columns, history_columns
 from es_service.loop.interfaces import Stop as Stop
-from es_service.protocol.messages import TaskSpec
 from es_service.report.progress import in_notebook, show_in_notebook
-from es_service.runs.checked_config import accepted, changed_config, changes_from, load_config
+from es_service.runs.checked_config import accepted, changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
-from es_service.runs.identity import require_unchanged
 from es_service.runs.lineage import fork_config, forked, started
+from es_service.runs.resume_checks import columns, require_resumable
 from es_service.runs.session import OnGeneration, OnNotice, Outcome, require_cores, work
-from es_service.runs.standing import Standing, look
 from es_service.runs.view import open_run
 from es_service.store.beginning import Beginning
 from es_service.store.create import remove_run_folder
@@ -43,10 +38,6 @@ from es_service.store.writer import RunStore, no_hook
 
 RUNS_FOLDER = Path("runs")
 """Default parent folder of runs, relative to the current folder."""
-
-
-_KEPT_OF_A_TASK = ("observation_size", "action_size", "descriptor_names", "has_goal")
-"""Fields of a task that the policies and the history of a run depend on."""
 
 
 def _warn(notice: str) -> None:
@@ -196,49 +187,13 @@ def _go_on(
         store.notices.clear()
         config = make_config(store)
         require_cores(config, WayOut("resume", "", str(folder), asked))
-        if changes := changes_from(store.meta.constants, config):
-            besides = _budget_of_a_fork(config, look(open_run(folder)))
-            raise refused_changes(folder, changes, besides)
-        task = task_of(config)
-        if other := _other_task(store.meta.task, task):
-            raise ConfigError(
-                f"{folder}: the task {config.task.environment} has changed since the run was created ({other}), so the "
-                "run's data do not fit it; undo the change, or start a new run",
-                field="task.environment",
-                value=config.task.environment,
-                run=folder,
-            )
-        if not _fits(store.meta, *_columns(config, task)):
-            raise StoreError(
-                f"{folder} was written by a version of es-service with other history columns; continue it with that "
-                "version",
-                run=folder,
-                ways_out=[WayOut("fork", "continue from its state in a new run", str(folder))],
-            )
-        if strict:
-            require_unchanged(store, config)
+        require_resumable(store, config, strict=strict)
         try:
             write_config(folder, config.resolved_yaml())
         except OSError as error:
             raise explained(error, folder, f"writing {CONFIG}") from error
         with listener.shown(folder) as on_generation:
             return work(config, store, on_generation, listener.on_notice, listener.on_compile, strict=strict)
-
-
-def _budget_of_a_fork(config: RunConfig, standing: Standing) -> dict[str, Any]:
-    """Budget settings that a fork needs besides the changed keys: the limits in `config` that differ from those of the
-    run, and larger limits where they are already spent."""
-    limits = limits_of(config.budget)
-    wanted = {key: limits.get(key) for key in REACHED if limits.get(key) != standing.limits.get(key)}
-    wanted |= raised(limits, standing.row) if standing.row else {}
-    return {f"budget.{key}": value for key, value in wanted.items()}
-
-
-def _other_task(recorded: Mapping[str, Any], task: TaskSpec) -> str:
-    """Differences between the recorded task and the present one that the run's data depend on; empty if none."""
-    present = asdict(task) | {"descriptor_names": list(task.descriptor_names)}
-    values = [(name, recorded[name], present[name]) for name in _KEPT_OF_A_TASK]
-    return ", ".join(f"{name}: {show(old)} -> {show(new)}" for name, old, new in values if old != new)
 
 
 def fork(
@@ -304,19 +259,6 @@ def default_folder(config: RunConfig, which: str = "") -> Path:
     return next(RUNS_FOLDER / name for name in names if not (RUNS_FOLDER / name).exists())
 
 
-def _columns(config: RunConfig, task: TaskSpec) -> tuple[tuple[Column, ...], tuple[Column, ...]]:
-    """The columns of a run's history, and those of its evaluated centres."""
-    return history_columns(task, config.map.enabled), evaluated_columns(task, config.map.enabled)
-
-
-def _fits(meta: RunMeta, columns: tuple[Column, ...], evaluation_columns: tuple[Column, ...]) -> bool:
-    """Whether this version can continue the tables of a run, which may lack columns that are not in the digest."""
-    lacking = [column for column in evaluation_columns if column not in meta.evaluation_columns]
-    kept = tuple(column for column in evaluation_columns if column not in lacking)
-    has_all = not any(column.deterministic for column in lacking)
-    return meta.columns == columns and meta.evaluation_columns == kept and has_all
-
-
 def _create_and_work(
     config: RunConfig,
     out: str | os.PathLike[str] | None,
@@ -333,15 +275,15 @@ def _create_and_work(
     require_cores(config, again)
     folder = Path(out) if out is not None else default_folder(config)
     is_new, task = not folder.exists(), task_of(accepted(config))
-    columns, evaluation_columns = _columns(config, task)
+    history, evaluations = columns(config, task)
     meta = RunMeta(
         run_id=uuid4().hex,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         config=config.model_dump(mode="json"),
         constants=config.constants(),
         task=asdict(task),
-        columns=columns,
-        evaluation_columns=evaluation_columns,
+        columns=history,
+        evaluation_columns=evaluations,
         parent=parent,
     )
     with (

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from textwrap import indent
 from typing import Any, Literal
 
-Action = Literal["run", "resume", "fork", "watch", "report", "install"]
+Action = Literal["run", "resume", "fork", "watch", "report", "certify", "install"]
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class WayOut:
     """A remedy for an error: a function of this package and its arguments."""
 
     action: Action
-    """run, resume and fork are functions; watch stands for `open_run`, report for `write_report`, and install for an
-    installation of an extra."""
+    """run, resume and fork are functions; watch stands for `open_run`, report for `write_report`, certify for
+    `certify_run`, and install for an installation of an extra."""
     purpose: str
     """What it achieves, as words that follow "to", such as "continue it"."""
     run: str | None = None
@@ -57,6 +57,8 @@ class WayOut:
                 return f"open_run({self.run!r})"
             case "report":
                 return f"write_report({self.run!r}, {self.out!r})"
+            case "certify":
+                return f"certify_run({self.run!r})"
         options = {"generation": self.generation, "out": self.out}
         named = [f"{name}={value!r}" for name, value in options.items() if value is not None]
         words = [repr(self.run) if self.run else "folder", *([settings] if settings else []), *named]

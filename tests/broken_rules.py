@@ -155,10 +155,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if unnoticed else 0
 
 
-NOVELTY, STEPS = "es_service/search/novelty.py", "es_service/search/algorithms/steps.py"
+NOVELTY, COMMON = "es_service/search/novelty.py", "es_service/search/algorithms/common.py"
 ME_ES, NSRA = "es_service/search/algorithms/me_es.py", "es_service/search/algorithms/nsra_es.py"
 MAP_ELITES, BASE = "es_service/search/algorithms/map_elites.py", "es_service/search/algorithms/base.py"
-OPTIMIZER, SHAPING = "es_service/search/optimizer.py", "es_service/search/shaping.py"
+ADAM, SHAPING = "es_service/search/steps/adam.py", "es_service/search/shaping.py"
 BEHAVIOUR_MAP, PARTS = "es_service/search/maps/behaviour_map.py", "es_service/loop/parts.py"
 GENERATION, TREE = "es_service/loop/generation.py", "es_service/protocol/gradient_tree.py"
 SCHEDULER, CHANGES = "es_service/dispatch/scheduler.py", "es_service/dispatch/scheduler_changes.py"
@@ -179,7 +179,7 @@ CASES = [
     *cases(
         "novelty counts the own entry",
         OF_NOVELTY_SEARCH,
-        ("of a centre to choose", STEPS, "exclude_Q=entry_M[known_M]", "exclude_Q=None"),
+        ("of a centre to choose", COMMON, "exclude_Q=entry_M[known_M]", "exclude_Q=None"),
     ),
     *cases(
         "novelty counts the own entry",
@@ -226,26 +226,31 @@ CASES = [
         f"{OF_RULES} tests/laws/test_es.py::test_twenty_generations_equal_the_twin",
         (
             "the first decays at the rate of the second",
-            OPTIMIZER,
-            "m_D * np.float32(BETA_1)",
-            "m_D * np.float32(BETA_2)",
+            ADAM,
+            '"adam_m_D"] * np.float32(BETA_1)',
+            '"adam_m_D"] * np.float32(BETA_2)',
         ),
-        ("the second is not of squares", OPTIMIZER, "np.square(descent_D)", "np.abs(descent_D)"),
-        ("the second is not kept", OPTIMIZER, "_float32(v_D), step)", "adam.v_D, step)"),
-        ("both are corrected as in the first step", OPTIMIZER, "step = adam.step + 1", "step = 1"),
+        ("the second is not of squares", ADAM, "np.square(descent_D)", "np.abs(descent_D)"),
+        ("the second is not kept", ADAM, '"adam_v_D": v_D,', '"adam_v_D": state["adam_v_D"],'),
+        ("both are corrected as in the first step", ADAM, 'step = int(state["adam_step"]) + 1', "step = 1"),
     ),
     *cases(
         "an Adam moment",
         OF_ME_ES,
-        ("a block goes on with another's", BASE, "fresh_adam(elite.centre_D.size),", "state.centres[index].adam,"),
+        ("a block goes on with another's", BASE, "restarted(before.step),", "before.step,"),
     ),
     *cases(
         "Adam moments after resume",
         f"{OF_NOVELTY_SEARCH}::test_a_state_put_together_again_is_the_same_and_only_the_moved_centre_is_written"
         f" {OF_ME_ES}::test_a_search_put_together_again_inside_a_block_equals_an_uninterrupted_one",
-        ("the first is lost", PARTS, 'Adam(arrays["adam_m_D"],', 'Adam(np.zeros_like(arrays["adam_m_D"]),'),
-        ("the second is stored as the first", PARTS, '"adam_v_D": adam.v_D', '"adam_v_D": adam.m_D'),
-        ("the steps are lost", PARTS, 'int(arrays["adam_step"])', "0"),
+        ("the first is lost", PARTS, "step = {name: values for", 'step = {name: values * (name != "adam_m_D") for'),
+        (
+            "the second is stored as the first",
+            PARTS,
+            "**centre.step,",
+            '**{**centre.step, "adam_v_D": centre.step["adam_m_D"]},',
+        ),
+        ("the steps are lost", PARTS, "step = {name: values for", 'step = {name: values * (name != "adam_step") for'),
     ),
     *cases(
         "action noise",
@@ -352,10 +357,10 @@ CASES = [
         (
             "in the shaping by signs",
             SHAPING,
-            "np.stack([half_P, -half_P], axis=1)",
-            "np.stack([-half_P, half_P], axis=1)",
+            "np.stack([half_P, -half_P], axis=1)\n\n\ndef standardised",
+            "np.stack([-half_P, half_P], axis=1)\n\n\ndef standardised",
         ),
-        ("of the step", OPTIMIZER, "- gradient_D\n        m_D", "+ gradient_D\n        m_D"),
+        ("of the step", ADAM, "- gradient_D\n        m_D", "+ gradient_D\n        m_D"),
     ),
     *cases(
         "the sign of a pair",
@@ -410,7 +415,12 @@ CASES = [
             "min(1.0, weight.value + search.fitness_weight_step)",
             "weight.value + search.fitness_weight_step",
         ),
-        ("is that of novelty", STEPS, "+= w * shaped(population.fitness)", "+= (1.0 - w) * shaped(population.fitness)"),
+        (
+            "is that of novelty",
+            COMMON,
+            "+= w * shaped(shaping, population.fitness)",
+            "+= (1.0 - w) * shaped(shaping, population.fitness)",
+        ),
     ),
     *cases(
         "a mutant's noise address",
@@ -441,14 +451,19 @@ CASES = [
         (
             "is replaced by an equal one",
             BEHAVIOUR_MAP,
-            "if not fitness > map_.fitness_N[row]:",
-            "if fitness < map_.fitness_N[row]:",
+            'enters = entry["fitness_N"] > map_.fitness_N[row]',
+            'enters = entry["fitness_N"] >= map_.fitness_N[row]',
         ),
-        ("is replaced by any", BEHAVIOUR_MAP, "if not fitness > map_.fitness_N[row]:", "if fitness != fitness:"),
-        ("remains that of the one before", BEHAVIOUR_MAP, '"fitness_N": fitness,', '"fitness_N": map_.fitness_N[row],'),
-        ("is not stored when it changes", BEHAVIOUR_MAP, 'COLUMNS = {"fitness_N": "f8", ', "COLUMNS = {"),
+        ("is replaced by any", BEHAVIOUR_MAP, 'enters = entry["fitness_N"] > map_.fitness_N[row]', "enters = True"),
+        (
+            "remains that of the one before",
+            BEHAVIOUR_MAP,
+            "(_with(map_, row, entry) if enters",
+            '(_with(map_, row, {**entry, "fitness_N": map_.fitness_N[row]}) if enters',
+        ),
+        ("is not stored when it changes", BEHAVIOUR_MAP, "for name in now:", 'for name in now.keys() - {"fitness_N"}:'),
         ("is stored as its score", PARTS, '"fitness": map_.fitness_N[row]', '"fitness": map_.score_N[row]'),
-        ("is read from its score", PARTS, '[found[cell]["fitness"] for', '[found[cell]["score"] for'),
+        ("is read from its score", PARTS, 'column("fitness", np.float64)', 'column("score", np.float64)'),
         (
             "is that of its best episode",
             GENERATION,
@@ -457,7 +472,7 @@ CASES = [
         ),
         (
             "is its score",
-            STEPS,
+            COMMON,
             "with_score(map_, centre.cell, evaluation.population_max)",
             "with_score(map_, centre.cell, evaluation.fitness)",
         ),
@@ -492,8 +507,8 @@ CASES = [
         (
             "descriptors of episodes",
             RESULTS,
-            "host = Episodes(*map(np.array, episodes))",
-            "host = Episodes(*map(np.asarray, episodes))",
+            "host = jax.tree.map(np.array, episodes)",
+            "host = jax.tree.map(np.asarray, episodes)",
         ),
         ("traces", RESULTS, "np.asarray(episodes.trace_T_B)[0].copy()", "np.asarray(episodes.trace_T_B)[0]"),
     ),

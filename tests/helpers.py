@@ -121,7 +121,7 @@ def inline_here(
 def workers_in_this_process() -> Iterator[None]:
     """Inside the block neither the engine inline nor a recording of episodes starts a process."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("session", "evaluation", "verification"):
+        for module in ("session", "evaluation", "verification", "certification"):
             patch.setattr(f"es_service.runs.{module}.inline_engine", inline_here)
         patch.setattr("es_service.runs.replay._answer", lambda question: record(*question))
         yield
@@ -146,7 +146,7 @@ class MemoryStore:
 
     def commit(self, generation, parts, history, evaluations=()) -> None:
         self.generation = generation
-        self.parts |= parts
+        self.parts = {name: part for name, part in (self.parts | parts).items() if part is not None}
         self.rows.append(dict(history))
 
 

@@ -10,16 +10,17 @@ import numpy as np
 
 from es_service.config.loading import load_config
 from es_service.config.model import policy_shape
+from es_service.loop.changes import changed_parts
 from es_service.loop.history import evaluated_columns, history_columns
-from es_service.loop.parts import state_parts
 from es_service.loop.state import Best, RunState
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import Moments, TaskSpec
+from es_service.search.algorithms import OURS
 from es_service.search.algorithms.base import CentreState, FitnessWeight, SearchState
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.maps.geometry import Geometry, Grid, make_geometry
 from es_service.search.novelty import archive_of
-from es_service.search.optimizer import Adam
+from es_service.search.steps import fresh_state
 from es_service.store.beginning import Beginning
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
@@ -43,7 +44,7 @@ def write_run(
         parent: `RunMeta.parent`.
     """
     source = {"task.environment": task.name, "search.algorithm": "me_es", "budget.generations": generations or 1}
-    config = load_config({}, source | (settings or {}), tasks={task.name: task}, algorithms={"me_es": 0, "es": 0})
+    config = load_config({}, source | (settings or {}), tasks={task.name: task}, algorithms=OURS)
     enabled, shape = config.map.enabled, policy_shape(config, task)
     meta = RunMeta(
         run_id=f"run-{config.seed}",
@@ -68,7 +69,7 @@ def write_run(
     state = RunState(
         generation=generations,
         search=SearchState(
-            (CentreState(centre_D, Adam(0 * centre_D, 0 * centre_D, generations)),),
+            (CentreState(centre_D, fresh_state(config.search, centre_D.size)),),
             archive_of(descriptor_G_B, np.arange(generations + 1), np.zeros(generations + 1, np.int64)),
             FitnessWeight(1.0),
             map_,
@@ -87,7 +88,7 @@ def write_run(
     )
     beginning = Beginning(
         history=[{name: value for name, value in row.items() if name != "evaluated"} for row in rows],
-        parts=state_parts(state, None),
+        parts={name: part for name, part in changed_parts(state, None).items() if part is not None},
         platforms=[(0, dict(platform_info()))],
         newest=generations,
         evaluations=[row["evaluated"] for row in rows],

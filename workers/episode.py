@@ -16,6 +16,7 @@ import numpy as np
 from es_service.protocol.messages import TRACE_POINTS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
 from workers.environments import Environment
+from workers.outputs import OUTPUTS
 from workers.policy import normalise
 
 
@@ -40,6 +41,8 @@ class Episodes(NamedTuple):
     trace_T_B: Any
     """Descriptor along an evaluation episode; empty in training. Point k is the descriptor after k / (points - 1) of
     the episode's maximal number of steps, or at its end if it ended before."""
+    outputs: dict[str, Any]
+    """Outputs of an evaluation episode that the run names, by name; empty in training."""
 
 
 class Carry(NamedTuple):
@@ -72,6 +75,7 @@ def episode_steps(
     action_unit = np.float32(spec.action_noise / NORMAL_STD)
     action_size = spec.policy.widths[-1]
     noisy = training and spec.action_noise > 0.0
+    named = {} if training else {name: OUTPUTS[name] for name in spec.outputs}
     points = min(TRACE_POINTS, spec.episode_steps + 1)
     last_steps_T = (np.arange(points) * spec.episode_steps // (points - 1)).astype(np.int32)
 
@@ -93,6 +97,7 @@ def episode_steps(
             shifted_sum_O=sums_O,
             shifted_square_sum_O=sums_O,
             trace_T_B=trace_T_B,
+            outputs={name: output.begin(environment, state) for name, output in named.items()},
         )
         return Carry(state, jnp.array(True), nothing)
 
@@ -126,6 +131,7 @@ def episode_steps(
             shifted_sum_O=before.shifted_sum_O + shifted_O,
             shifted_square_sum_O=before.shifted_square_sum_O + shifted_O * shifted_O,
             trace_T_B=before.trace_T_B if training else traced(before.trace_T_B, before.steps, descriptor_B),
+            outputs={name: one.after(environment, state, reward, before.outputs[name]) for name, one in named.items()},
         )
         masked = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)
         return Carry(state, alive & ~done, masked)

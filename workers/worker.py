@@ -10,6 +10,7 @@ from functools import partial
 from itertools import accumulate
 from typing import Any, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 
 from es_service.protocol.gradient_tree import with_neighbours_added
@@ -169,7 +170,7 @@ def _policy_arguments(work: Sequence[tuple[Policies, PolicyChunk]]) -> tuple[Any
         np.concatenate([one.observation_mean_N_O for one in together])[row_L],
         np.concatenate([one.observation_std_N_O for one in together])[row_L],
         row_L,
-        evaluation_reset_keys(policies.seed, chunk.generation, episode_L, chunk.ask, number_L),
+        evaluation_reset_keys(policies.seed, chunk.generation, episode_L, chunk.ask, number_L, policies.domain),
     )
 
 
@@ -177,7 +178,8 @@ def _policy_results(work: Sequence[tuple[Policies, PolicyChunk]], episodes: Epis
     results, start = [], 0
     for one, chunk in work:
         _, episode_L = slots(one, chunk)
-        part = Episodes(*(leaf[start : start + len(episode_L)] for leaf in episodes))
+        of_chunk = slice(start, start + len(episode_L))
+        part = jax.tree.map(lambda leaf, of=of_chunk: leaf[of], episodes)
         results.append(policies_result(part, episode_L == 0 if one.traces else None))
         start += len(episode_L)
     return results
@@ -198,9 +200,11 @@ def _groups(work: Sequence[Work], *, together: bool) -> list[list[Work]]:
     return groups
 
 
-def _shared_by(subject: Subject) -> tuple[str, int]:
-    """What chunks that run together share: the centre, or the seed of the policies' resets."""
-    return ("seed", subject.seed) if isinstance(subject, Policies) else ("centre", id(subject))
+def _shared_by(subject: Subject) -> tuple[str, int, int]:
+    """What chunks that run together share: the centre, or the seed and the domain of the policies' resets."""
+    if isinstance(subject, Policies):
+        return "policies", subject.seed, subject.domain
+    return "centre", id(subject), 0
 
 
 def _around_one(work: Sequence[tuple[Centre, AnyChunk]]) -> tuple[Centre, list[AnyChunk]]:
@@ -218,7 +222,7 @@ def _split(episodes: Episodes, size: int) -> list[Episodes]:
     count = len(episodes.fitness) // size
     if count == 1:
         return [episodes]
-    return [Episodes(*(leaf[i * size : (i + 1) * size] for leaf in episodes)) for i in range(count)]
+    return [jax.tree.map(lambda leaf, of=slice(i * size, (i + 1) * size): leaf[of], episodes) for i in range(count)]
 
 
 def population_id(chunk: Chunk) -> tuple[int, ...]:

@@ -49,6 +49,8 @@ def way_command(way: WayOut) -> str:
             return command("status", folder, "--follow")
         case "report":
             return command("report", folder, "--out", way.out)
+        case "certify":
+            return command("evaluate", folder, "--certify")
         case "run":
             return command("run", way.config or "CONFIG", *out, *settings(way.settings))
     generation = [] if way.generation is None else ["--generation", way.generation]

@@ -55,7 +55,7 @@ def catalogue_data(tasks: Mapping[str, TaskSpec]) -> dict[str, Any]:
     return {
         "tasks": [asdict(task) for task in tasks.values()],
         "algorithms": list(ALGORITHMS),
-        "presets": [asdict(row) for row in preset_table()],
+        "presets": [asdict(row) for row in preset_table(ALGORITHMS)],
         "configs": list(shipped_configs()),
     }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,8 +26,36 @@ def evaluate(
         list[str] | None, typer.Option("--cell", metavar="I,J", help="Evaluate a cell's elite; can be repeated.")
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="Evaluate every elite of the map.")] = False,
-    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes per policy.")] = 100,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the episodes.")] = 0,
+    top: Annotated[
+        int | None, typer.Option("--top", min=0, help="Evaluate the fittest elites; with --certify: 10 if left out.")
+    ] = None,
+    generation: Annotated[
+        int | None, typer.Option("--generation", min=0, help="Generation whose state is kept; default: the newest.")
+    ] = None,
+    episodes: Annotated[
+        int | None, typer.Option("--episodes", min=1, help="Episodes per policy; default: 100, with --certify 256.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the episodes; default: 0.")
+    ] = None,
+    certify: Annotated[
+        bool,
+        typer.Option(
+            "--certify",
+            help="Select the best of the policies (default: the best centre and the fittest elites) with episodes of "
+            "their own, certify it in new episodes, and store the result in the run.",
+        ),
+    ] = False,
+    keep: Annotated[
+        int | None, typer.Option("--keep", min=1, help="With --certify: policies that are certified; default: 1.")
+    ] = None,
+    by: Annotated[
+        str | None,
+        typer.Option(
+            "--by",
+            help="With --certify: select by return, last_reward, success or goal_distance; default: by task.fitness.",
+        ),
+    ] = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one per core.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Also write the rows to this CSV file.")] = None,
     as_json: JsonOption = False,
@@ -44,18 +72,29 @@ def evaluate(
         for _, found in of_each(folders, lambda folder: evaluation.evaluation_config(api.open_run(folder), workers)):
             if isinstance(found, ConfigError) and found.field == "compute.workers":
                 raise found
+    if certify:
+        for option, value in (("--all", every or None), ("--seed", seed)):
+            if value is not None:
+                raise ConfigError(f"{option} and --certify cannot be combined; leave one of them out")
+        _certify(folders, out, as_json, best, centre, cells, top, generation, episodes, keep, by, workers)
+        return
+    for option, value in (("--keep", keep), ("--by", by)):
+        if value is not None:
+            raise ConfigError(f"{option} {value} needs --certify; add it, or leave {option} out")
     single = is_single(folders)
     width = None if single else max(map(len, map(str, started_runs(folders))), default=0)
 
     def rows_of(folder: Path) -> Iterator[dict[str, Any]]:
         run = api.open_run(folder)
-        best_too = best or not (centre or cell or every)
-        chosen = evaluation.candidates(run, best=best_too, centre=centre, cells=cells, every=every)
+        best_too = best or not (centre or cell or every or top)
+        chosen = evaluation.candidates(
+            run, best=best_too, centre=centre, cells=cells, every=every, top=top or 0, generation=generation
+        )
         if single and not as_json:
             print_header(console)
         results = []
         tell = partial(print_notice, errors)
-        for fresh in evaluation.evaluate(run, chosen, episodes, workers, seed, on_compile=tell):
+        for fresh in evaluation.evaluate(run, chosen, episodes or 100, workers, seed or 0, on_compile=tell):
             results.append(fresh)
             row = row_of(fresh, run.descriptor_names, None if single else folder)
             if not as_json:
@@ -75,6 +114,50 @@ def evaluate(
             found = (row for _, row in readable(items_of_each(folders, rows_of), problems))
         for row in found:
             rows.append(row)
+            write(row)
+    if as_json:
+        print_json([*rows, *problems])
+    if problems:
+        raise typer.Exit(1)
+
+
+def _certify(
+    folders: list[Path],
+    out: Path | None,
+    as_json: bool,
+    best: bool,
+    centre: bool,
+    cells: Sequence[Sequence[int]],
+    top: int | None,
+    generation: int | None,
+    episodes: int | None,
+    keep: int | None,
+    by: str | None,
+    workers: int | None,
+) -> None:
+    """Certify policies, with the options of the command."""
+    from es_service.cli.certify import certified_rows
+    from es_service.cli.tables.evaluations import csv_file
+    from es_service.runs.certification import EPISODES, TOP
+
+    anything = best or centre or cells or top is not None
+    problems: list[dict[str, str]] = []
+    with csv_file(out, print_note) as write:
+        rows = certified_rows(
+            folders,
+            problems,
+            as_json=as_json,
+            best=best or not anything,
+            centre=centre,
+            cells=cells,
+            top=(top or 0) if anything else TOP,
+            generation=generation,
+            episodes=episodes or EPISODES,
+            keep=keep or 1,
+            by=by,
+            workers=workers,
+        )
+        for row in rows:
             write(row)
     if as_json:
         print_json([*rows, *problems])

@@ -13,7 +13,6 @@ import typer
 from es_service.cli.commands import assignments, error_message
 from es_service.cli.console import console, errors, print_line
 from es_service.config.compute import implied_by
-from es_service.config.fields import TASK_OPTIONS
 from es_service.config.keys import Overrides
 from es_service.config.loading import left_out
 from es_service.config.model import RunConfig
@@ -21,6 +20,7 @@ from es_service.config.resolution import config_warnings
 from es_service.config.tasks import no_vectors, task_of
 from es_service.errors import ConfigError, ServiceError
 from es_service.logs import FORMAT
+from es_service.search.algorithms import ALGORITHMS
 
 ConfigArgument = Annotated[Path, typer.Argument(help="YAML file, or the name of a shipped config.", show_default=False)]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a run.", show_default=False)]
@@ -125,13 +125,10 @@ def print_config_notes(source: Path, configs: Sequence[tuple[Overrides, RunConfi
     ignored keys, and settings that are probably not intended. What several configs have in common is printed once."""
     notes: dict[str, None] = {}
     for wanted, config in configs:
-        foreign = left_out(source, wanted)
-        for kind, chosen, keys in (
-            ("task", config.task.environment, [key for key in foreign if key.startswith(TASK_OPTIONS)]),
-            ("algorithm", config.search.algorithm, [key for key in foreign if not key.startswith(TASK_OPTIONS)]),
-        ):
-            if keys:
-                notes[f"ignored {', '.join(keys)} of {source}, since {chosen} replaces its {kind}"] = None
+        foreign = left_out(source, wanted, ALGORITHMS)
+        for why in dict.fromkeys(foreign.values()):
+            keys = [key for key in foreign if foreign[key] == why]
+            notes[f"ignored {', '.join(keys)} of {source}, since {why}"] = None
         notes |= dict.fromkeys(config_warnings(config, task_of(config), no_vectors()))
     for note in notes:
         print_note(f"note: {note}")

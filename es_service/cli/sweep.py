@@ -180,9 +180,7 @@ def grid_of(words: Sequence[str]) -> dict[str, list[Any]]:
             for one in texts:
                 values, wrong = parse_overrides([f"{key}={one}"])
                 problems += wrong
-                if wrong:
-                    break  # an unknown key is unknown with every value
-                grid[key].append(values[key])
+                grid[key] += values.values()
     if problems:
         raise ConfigError.listing("--grid: " + ("1 problem" if len(problems) == 1 else "several problems"), problems)
     return grid

@@ -12,6 +12,7 @@ from es_service.cli.console import console, print_line
 from es_service.cli.data import print_json
 from es_service.cli.options import JsonOption, LogLevelOption, RunArgument, print_error, print_note
 from es_service.errors import RunLockedError
+from es_service.runs.certification import recomputed as recomputed_certifications
 from es_service.runs.verification import Recomputed
 from es_service.runs.verification import verify as recompute
 
@@ -39,9 +40,24 @@ def verify(
         found.append(one)
         if not as_json:
             print_line(console, _line(one))
-    equal = not any(one.differences for one in found)
+    certified = [(one, differences) for one, differences in recomputed_certifications(run, workers)]
+    if not as_json:
+        for one, differences in certified:
+            what = f"differs: {', '.join(differences)}" if differences else "equal"
+            print_line(console, f"certification {one.number}, {one.name}: {what}")
+    equal = not any(one.differences for one in found) and not any(differences for _, differences in certified)
     if as_json:
-        print_json({"digest": digest, "equal": equal, "recomputed": [asdict(one) for one in found]})
+        print_json(
+            {
+                "digest": digest,
+                "equal": equal,
+                "recomputed": [asdict(one) for one in found],
+                "certified": [
+                    {"certification": one.number, "policy": one.name, "differences": differences}
+                    for one, differences in certified
+                ],
+            }
+        )
     else:
         again = sum(one.last - one.first + 1 for one in found)
         print(f"{digest}  {'equal' if equal else 'different'}")

@@ -8,9 +8,19 @@ from types import MappingProxyType
 from typing import Any
 
 from es_service.config.compute import implied_by
-from es_service.config.fields import SEARCH_OPTIONS, TASK_OPTIONS
+from es_service.config.fields import TASK_OPTIONS
 from es_service.config.keys import FIELDS
-from es_service.config.method_keys import keys_without_effect
+from es_service.config.methods import (
+    KIND,
+    Methods,
+    all_search_fields,
+    are_alike,
+    filled_in,
+    has_effect,
+    kinds_without,
+    parts_of,
+)
+from es_service.config.search import SearchConfig
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, Problem, WayOut
 
@@ -26,9 +36,6 @@ STATE_KEYS = (
     "map.cells",
 )
 """Keys that determine the form and the meaning of a run's state; if one of them changes, the state cannot be used."""
-ALIKE = ("ns_es", "nsr_es", "nsra_es")
-"""Algorithms whose states have the same form, so that a fork may change from one to another. They differ only in the
-weight of fitness, which the fork starts anew."""
 START_KEYS = ("search.preset", "search.init_from", "policy.init", "search.fitness_weight_start")
 """Keys that are used only when a run starts."""
 _SHAPES = ("compute.chunk_pairs", "compute.rollout_block_pairs", "compute.gradient_block_pairs")
@@ -50,48 +57,61 @@ ABSENT = "(absent)"
 """Stands for the value of a constant that only the other run has."""
 
 
-def without_followers(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
+def without_followers(values: Mapping[str, Any], wanted: Mapping[str, Any], algorithms: Methods) -> dict[str, Any]:
     """Resolved values without those that are derived from a key which is about to change.
 
     Args:
         values: resolved values of the config.
         wanted: the values that are about to replace some of them.
+        algorithms: the methods by name.
     """
     changed = [
         key
         for key in _FOLLOWERS
-        if key in wanted and wanted[key] != values.get(key) and not are_alike(key, values.get(key), wanted[key])
+        if key in wanted
+        and wanted[key] != values.get(key)
+        and not (key == "search.algorithm" and are_alike(values.get(key), wanted[key], algorithms))
     ]
     followers = tuple(name for key in changed for name in _FOLLOWERS[key])
     return {key: value for key, value in values.items() if not key.startswith(followers)}
 
 
-def are_alike(name: str, old: Any, new: Any) -> bool:
-    """Whether this change keeps the state usable although its key is in STATE_KEYS: both algorithms are in ALIKE."""
-    return name == "search.algorithm" and old in ALIKE and new in ALIKE
-
-
-def does_not_fit(name: str, old: Any, new: Any) -> bool:
+def does_not_fit(name: str, old: Any, new: Any, algorithms: Methods) -> bool:
     """Whether a state made with the old value of a key cannot be used with the new value."""
-    return name in STATE_KEYS and not are_alike(name, old, new)
+    return name in STATE_KEYS and not (name == "search.algorithm" and are_alike(old, new, algorithms))
 
 
-def foreign_keys(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
-    """Keys that go with the task or the algorithm of a config, if `wanted` chooses another one that does not use them.
+def foreign_keys(
+    values: Mapping[str, Any], wanted: Mapping[str, Any], settings: type[SearchConfig] | None, algorithms: Methods
+) -> dict[str, str]:
+    """Keys that go with the task, the algorithm or a part of a config, if `wanted` replaces that and what replaces it
+    does not use them; each with a clause that says what is replaced.
 
-    These are the options of the config's own task and search, and keys without effect with the other algorithm.
+    Args:
+        settings: those of the method with `wanted`; None if it is not known.
     """
 
     def is_replaced(key: str) -> bool:
         return key in wanted and wanted[key] != values.get(key)
 
-    found: list[str] = []
+    found: dict[str, str] = {}
     if is_replaced("task.environment"):
-        found += [key for key in values if key.startswith(TASK_OPTIONS)]
-    if is_replaced("search.algorithm"):
-        idle = keys_without_effect(wanted["search.algorithm"])
-        found += [key for key in values if key.startswith(SEARCH_OPTIONS) or key in idle]
-    return [key for key in found if key not in wanted]
+        why = f"{wanted['task.environment']} replaces its task"
+        found |= {key: why for key in values if key.startswith(TASK_OPTIONS)}
+    if settings is None:
+        return found
+    chosen = filled_in({**values, **wanted}, settings) | dict(values) | dict(wanted)
+    if other := is_replaced("search.algorithm"):
+        known = values if ":" in str(values.get("search.algorithm")) else all_search_fields(algorithms)
+        known = {*known, *settings.unused}
+        why = f"{wanted['search.algorithm']} replaces its algorithm"
+        found |= {key: why for key in values if key in known and not has_effect(key, settings)}
+    for kind in (f"{part}.{KIND}" for part in parts_of(settings)):
+        if other or is_replaced(kind):
+            why = f"{chosen[kind]} replaces its {kind}"
+            own = [key for key in values if key.startswith(kind.removesuffix(KIND))]
+            found |= {key: why for key in own if kinds_without(key, chosen[kind], settings)}
+    return {key: why for key, why in found.items() if key not in wanted}
 
 
 def changed_constants(
@@ -99,18 +119,23 @@ def changed_constants(
 ) -> list[tuple[str, Any, Any]]:
     """Differences between two results of `constants()`: (dotted key, old value, new value), ABSENT if missing.
 
-    A key that only `new` has may be younger than the run. It counts as its default, which is what the run has done. A
-    key without effect with both algorithms makes no difference.
+    A key that only `new` has may be younger than the run. It counts as its default, which is what the run has done.
+    Keys that only one of two methods has, or of two kinds of a part, go with these and are not listed.
 
     Args:
-        defaults: those of the options that the task and the search of `new` declare, by key.
+        defaults: those of the keys that the task and the search of `new` declare, by key.
     """
-    idle = keys_without_effect(old.get("search.algorithm")) & keys_without_effect(new.get("search.algorithm"))
+
+    def goes_with_another(name: str) -> bool:
+        chosen = ("search.algorithm", f"{name.rpartition('.')[0]}.{KIND}")
+        is_shared = name in old and name in new
+        return name.startswith("search.") and not is_shared and any(old.get(key) != new.get(key) for key in chosen)
+
     before = {name: _default(name) for name in new} | dict(defaults) | dict(old)
     return [
-        (name, before[name], new.get(name, ABSENT))
+        (name, before.get(name, ABSENT), new.get(name, ABSENT))
         for name in {**old, **new}
-        if before[name] != new.get(name, ABSENT) and name not in idle
+        if before.get(name, ABSENT) != new.get(name, ABSENT) and not goes_with_another(name)
     ]
 
 
@@ -120,16 +145,20 @@ def _default(name: str) -> Any:
 
 
 def refused_changes(
-    run: object, changes: Sequence[tuple[str, Any, Any]], besides: Mapping[str, Any] = MappingProxyType({})
+    run: object,
+    changes: Sequence[tuple[str, Any, Any]],
+    algorithms: Methods,
+    besides: Mapping[str, Any] = MappingProxyType({}),
 ) -> ConfigError:
     """The error for a resume that would change constants of the run; it lists all of them and the ways out.
 
     Args:
         run: folder of the run.
         changes: (dotted key, old value, new value) of each constant, as `changed_constants` returns them.
+        algorithms: the methods by name.
         besides: further keys that a fork must set, and their values.
     """
-    fixed = [name for name, old, new in changes if does_not_fit(name, old, new) or name in START_KEYS]
+    fixed = [name for name, old, new in changes if does_not_fit(name, old, new, algorithms) or name in START_KEYS]
     forkable = {name: new for name, _, new in changes if name not in fixed and new != ABSENT}
     problems = [Problem(f"{name}: {show(old)} -> {show(new)}", name, new, show(old), old) for name, old, new in changes]
     heading = (

@@ -9,11 +9,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from es_service.protocol.messages import Bounds
 
 TASK_OPTIONS = "task.options."
-SEARCH_OPTIONS = "search.options."
 RESOURCES = "compute.worker_resources."
-"""Prefixes of the keys in the three groups that are inside a section."""
-OPTION_GROUPS = (TASK_OPTIONS, SEARCH_OPTIONS)
-"""The groups whose keys the task and the search declare."""
+"""Prefixes of the keys in two groups inside sections; a task declares those of the first."""
 
 
 def _tuple(value: Any) -> Any:

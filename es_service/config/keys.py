@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from typing import Any
 
 from pydantic import BaseModel
 
 from es_service.config.compute import WorkerResources
-from es_service.config.fields import OPTION_GROUPS, RESOURCES
+from es_service.config.fields import RESOURCES, TASK_OPTIONS
+from es_service.config.methods import (
+    KIND,
+    Methods,
+    all_search_fields,
+    kinds_without,
+    methods_with,
+    no_effect,
+    parts_of,
+    search_fields,
+)
 from es_service.config.model import RunConfig
-from es_service.config.problems import nearest, unfit
+from es_service.config.problems import nearest, one_of, unfit
+from es_service.config.search import SearchConfig
 from es_service.config.yaml_text import in_line, parse_value, show
 from es_service.errors import Problem
 
@@ -25,20 +35,29 @@ FIELDS = {name: field for name, field in RunConfig.model_fields.items() if name 
     f"{section}.{name}": field
     for section, model in {**SECTIONS, RESOURCES.removesuffix("."): WorkerResources}.items()
     for name, field in model.model_fields.items()
-    if f"{section}.{name}." not in (*OPTION_GROUPS, RESOURCES)
+    if f"{section}.{name}." not in (TASK_OPTIONS, RESOURCES)
 }
-"""Dotted key -> its field in the model. Options are not included, since tasks and searches declare them."""
-GROUPS = (*SECTIONS, *(group.removesuffix(".") for group in (*OPTION_GROUPS, RESOURCES)))
-"""Names of sections and of groups inside sections, which hold keys and have no value."""
+"""Dotted key -> its field in the model. Keys of single methods are not included, nor options, which tasks declare."""
+GROUPS = (*SECTIONS, TASK_OPTIONS.removesuffix("."), RESOURCES.removesuffix("."))
+"""Names of sections and of groups inside sections, which hold keys and have no value. Those in `search` are not
+included: they belong to methods."""
 ALIASES = {
     "population": "search.pairs",
     "popsize": "search.pairs",
-    "lr": "search.learning_rate",
+    "lr": "search.step.learning_rate",
     "std": "search.sigma",
 }
 """Name that other libraries use -> our key."""
-RENAMED = {"search.members": "search.centres", "search.member_choice": "search.centre_choice"}
-"""Name of a key before version 0.6 -> its present name."""
+SEARCH_OPTIONS = "search.options."
+RENAMED = {
+    "search.members": "search.centres",
+    "search.member_choice": "search.centre_choice",
+    "search.learning_rate": "search.step.learning_rate",
+    "search.l2": "search.step.l2",
+    "search.shaping": "search.shaping.kind",
+    "search.top_pairs": "search.shaping.count",
+}
+"""Name of a key before version 0.13 -> its present name. What was an option of a search is a key of `search`."""
 BUDGET = [name for name in FIELDS if name.startswith("budget.")]
 """Keys of which at least one must be set."""
 
@@ -46,7 +65,7 @@ BUDGET = [name for name in FIELDS if name.startswith("budget.")]
 def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, Any], set[str], list[Problem]]:
     """Sort the keys of a nested mapping: (values by dotted key, names of groups that are not mappings, problems).
 
-    There is a problem for each unknown key, each key with a dot, and each group that is not a mapping.
+    There is a problem for each key with a dot, and each group that is not a mapping. `key_problems` finds unknown keys.
     """
     values: dict[str, Any] = {}
     unusable: set[str] = set()
@@ -56,20 +75,62 @@ def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, An
         if "." in str(key):
             section, leaf = name.rsplit(".", 1)
             problems.append(unfit(name, value, f"a key in a file has no dots; write {leaf} inside {section}:"))
-        elif name in GROUPS and isinstance(value, Mapping):
+        elif isinstance(value, Mapping) and (name in GROUPS or group == "search."):
             below = sort_keys(value, f"{name}.")
             values |= below[0]
             unusable |= below[1]
             problems += below[2]
         elif name in GROUPS:
             unusable.add(name)
-            hint = f"indent its keys below `{_leaf(name)}:`, or delete the line to use the defaults"
-            problems.append(unfit(name, value, f"{show(value)} is not a mapping of keys; {hint}"))
-        elif name in FIELDS or group in OPTION_GROUPS:
-            values[name] = value
+            problems.append(unfit(name, value, _not_a_mapping(name, value)))
         else:
-            problems.append(_unknown_key(name, (*GROUPS, *FIELDS) if isinstance(value, Mapping) else FIELDS, value))
+            values[name] = value
     return values, unusable, problems
+
+
+def _not_a_mapping(group: str, value: object) -> str:
+    hint = f"indent its keys below `{_leaf(group)}:`, or delete the line to use the defaults"
+    return f"{show(value)} is not a mapping of keys; {hint}"
+
+
+def key_problems(
+    values: Mapping[str, Any], wanted: Mapping[str, Any], settings: type[SearchConfig] | None, algorithms: Methods
+) -> dict[str, Problem]:
+    """Key -> problem of each key that a config with this method cannot have.
+
+    Args:
+        values: all values of the config by dotted key, with the kind of each part.
+        wanted: those of them that overrides have set.
+        settings: those of the method; None if it is not known, which allows the keys of every method.
+    """
+    known = FIELDS | (search_fields(settings) if settings else all_search_fields(algorithms))
+    parts = {part: kinds for one in algorithms.values() for part, kinds in parts_of(one.settings).items()}
+    found: dict[str, Problem] = {}
+    for key, value in values.items():
+        if key in known:
+            part = key.rpartition(".")[0]
+            if settings and (kinds := kinds_without(key, kind := values.get(f"{part}.{KIND}"), settings)):
+                what = f"{show(value)} has no effect with {part}.{KIND} = {kind}; leave it out"
+                found[key] = unfit(key, value, f"{what} (a key of kind {one_of(kinds)})")
+        elif not (key.startswith(TASK_OPTIONS) and _leaf(key) and key.count(".") == 2):
+            group = key in (*GROUPS, *parts)
+            if key in RENAMED or key.startswith(SEARCH_OPTIONS):
+                now = RENAMED.get(key, key.replace(SEARCH_OPTIONS, "search."))
+                found[key] = unfit(key, value, f"this key is now {now}", suggestion=now)
+            elif group and key in wanted:
+                first = next((one for one in known if one.startswith(f"{key}.")), f"{key}.NAME")
+                what = f"this is a section; set its keys one by one, such as {first}=..."
+                found[key] = unfit(key, value, what, suggestion=first)
+            elif group:
+                found[key] = unfit(key, value, _not_a_mapping(key, value))
+            elif methods_with(key, algorithms) and key.startswith("search."):
+                found[key] = no_effect(key, value, values["search.algorithm"], algorithms)
+            else:
+                groups = GROUPS if isinstance(value, Mapping) else ()
+                found[key] = _unknown_key(key, (*groups, *known), value)
+                if found[key].suggestion is None:
+                    found[key] = _unknown_key(key, (*groups, *known, *all_search_fields(algorithms)), value)
+    return found
 
 
 MOST_NAMED = 16
@@ -81,7 +142,7 @@ mapping from key to value."""
 
 
 def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]]:
-    """Values by dotted key, and a problem for each override that cannot be used."""
+    """Values by dotted key, and a problem for each override that cannot be read. Its key need not exist."""
     values: dict[str, Any] = {}
     problems: list[Problem] = []
     if isinstance(overrides, Mapping):
@@ -93,25 +154,12 @@ def parse_overrides(overrides: Overrides) -> tuple[dict[str, Any], list[Problem]
             example = "write KEY=VALUE, such as search.sigma=0.05"
             hint = "the value is missing; write null for no value" if name and equals else example
             problems.append(Problem(f"{where}: {hint}"))
-        elif name in GROUPS:
-            keys = [key for key in FIELDS if key.startswith(f"{name}.")] or [f"{name}.NAME"]
-            what = f"{where}: {name} is a section; set its keys one by one, such as {keys[0]}=..."
-            problems.append(Problem(what, name, text, suggestion=keys[0]))
-        elif name in FIELDS or _is_option(name):
-            try:
-                values[name] = parse_value(text)
-            except ValueError as error:
-                problems.append(Problem(f"{where}: {error}", name, text))
-        else:
-            problem = _unknown_key(name, FIELDS, text)
-            problems.append(replace(problem, sentence=f"{where}: {problem.sentence}"))
+            continue
+        try:
+            values[name] = parse_value(text)
+        except ValueError as error:
+            problems.append(Problem(f"{where}: {error}", name, text))
     return values, problems
-
-
-def _is_option(name: str) -> bool:
-    """Whether a key has the form of an option, of any task or search."""
-    group, dot, option = name.rpartition(".")
-    return option != "" and f"{group}{dot}" in OPTION_GROUPS
 
 
 def _unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:
@@ -121,8 +169,7 @@ def _unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:
     Args:
         candidates: keys that may have been meant.
     """
-    if name in RENAMED:
-        return unfit(name, value, f"this key is now {RENAMED[name]}", suggestion=RENAMED[name])
+    candidates = dict.fromkeys(candidates)
     section, _, leaf = name.rpartition(".")
     everywhere = {_leaf(key): key for key in candidates}
     near_by = {leaf: key for leaf, key in everywhere.items() if key.rpartition(".")[0] == section}
@@ -130,7 +177,7 @@ def _unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:
     for keys in ({leaf: exactly[leaf]} if leaf in exactly else {}, near_by, everywhere):
         if near := nearest(leaf, keys):
             return unfit(name, value, f"unknown key; did you mean {keys[near]}?", suggestion=keys[near])
-    if siblings := [_leaf(key) for key in (*GROUPS, *FIELDS) if key.rpartition(".")[0] == section]:
+    if siblings := [_leaf(key) for key in (*GROUPS, *candidates) if key.rpartition(".")[0] == section]:
         named, others = siblings[:MOST_NAMED], len(siblings) - MOST_NAMED
         more = f" and {others} others" if others > 0 else ""
         return unfit(name, value, f"unknown key; {section or 'the top level'} has {', '.join(named)}{more}")

@@ -13,16 +13,23 @@ from types import FunctionType, NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import ValidationError
+from pydantic.fields import FieldInfo
 
 from es_service.config.changes import foreign_keys, without_followers
-from es_service.config.fields import OPTION_GROUPS, SEARCH_OPTIONS, TASK_OPTIONS
-from es_service.config.keys import BUDGET, FIELDS, SECTIONS, Overrides, parse_overrides, sort_keys
+from es_service.config.fields import TASK_OPTIONS
+from es_service.config.keys import BUDGET, FIELDS, SECTIONS, Overrides, key_problems, parse_overrides, sort_keys
 from es_service.config.map_rules import map_problems
-from es_service.config.method_keys import keys_without_effect, no_effect
-from es_service.config.method_rules import method_problems
+from es_service.config.methods import (
+    Methods,
+    all_search_fields,
+    filled_in,
+    method_problems,
+    no_effect,
+    parts_of,
+    search_fields,
+)
 from es_service.config.model import RunConfig
 from es_service.config.options import read_options
-from es_service.config.presets import PRESETS, preset_values
 from es_service.config.problems import nearest, not_allowed, one_of, unfit, wrong_value
 from es_service.config.resolution import (
     LEFT_OPEN,
@@ -33,6 +40,7 @@ from es_service.config.resolution import (
     shape_problems,
     task_problems,
 )
+from es_service.config.search import SearchConfig
 from es_service.config.shipped import read_config
 from es_service.config.start import folder_problems
 from es_service.config.yaml_text import show
@@ -42,8 +50,6 @@ from es_service.protocol.user_code import in_no_file
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
 """Where a config comes from: the path of a YAML file, the name of a shipped one, or the content of one."""
-WITHOUT_SEARCH = {"search.algorithm": "es", "budget.generations": 1}
-"""Values of a config that no search uses, where it leaves out what only a search needs."""
 
 
 def load_config(
@@ -51,7 +57,7 @@ def load_config(
     overrides: Overrides = (),
     *,
     tasks: Mapping[str, TaskSpec],
-    algorithms: Mapping[str, object],
+    algorithms: Methods,
     no_vectors: str = "",
     new: bool = True,
     searches: bool = True,
@@ -64,7 +70,7 @@ def load_config(
             mapping from key to value. If they choose another task or algorithm, keys of the source that go with its
             own one are dropped; `left_out` returns those.
         tasks: the tasks that `task.environment` may name.
-        algorithms: the algorithms that `search.algorithm` may name; one may declare `options`.
+        algorithms: the methods that `search.algorithm` may name, of which the first is the simplest.
         no_vectors: why this machine's processor cannot run the code that simd compiles; empty if it can.
         new: whether the run that `search.init_from` names, if any, must exist.
         searches: whether a search uses the config; if none does, `search.algorithm` and the budget may be left out.
@@ -72,17 +78,20 @@ def load_config(
     Raises:
         ConfigError: names the file, then lists every problem on a line of its own.
     """
-    defaults = {} if searches else WITHOUT_SEARCH
+    defaults = {} if searches else {"search.algorithm": next(iter(algorithms)), "budget.generations": 1}
     return _load(source, overrides, tasks, algorithms, no_vectors, defaults, new=new, resolved=False)
 
 
-def left_out(source: Source, overrides: Overrides) -> list[str]:
-    """Keys that `load_config` drops because the overrides choose another task or algorithm, which does not use them.
+def left_out(source: Source, overrides: Overrides, algorithms: Methods) -> dict[str, str]:
+    """Keys that `load_config` drops because the overrides choose another task, algorithm or kind of a part, which does
+    not use them; each with a clause that says so.
 
     `source` and `overrides` must be ones that `load_config` accepts.
     """
     mapping = source if isinstance(source, Mapping) else read_config(source)
-    return foreign_keys(sort_keys(mapping)[0], parse_overrides(overrides)[0])
+    values, wanted = sort_keys(mapping)[0], parse_overrides(overrides)[0]
+    method = algorithms[{**values, **wanted}["search.algorithm"]]
+    return foreign_keys(values, wanted, method.settings, algorithms)
 
 
 def changed_config(
@@ -90,15 +99,14 @@ def changed_config(
     overrides: Overrides = (),
     *,
     tasks: Mapping[str, TaskSpec],
-    algorithms: Mapping[str, object],
+    algorithms: Methods,
     no_vectors: str = "",
 ) -> RunConfig:
     """The config of an existing run with some keys changed.
 
     Values that are derived from the changed keys, by a preset or from the task, are resolved again. The caller checks
     whether the run may change in this way. Arguments are as for `load_config`; `source` is a resolved config, such as
-    the run's own `config.yaml`. The run that `search.init_from` names need not exist any more. A key without effect is
-    refused only if an override changes it, since versions up to 0.11 recorded any value.
+    the run's own `config.yaml`. The run that `search.init_from` names need not exist any more.
 
     Raises:
         ConfigError: as for `load_config`.
@@ -110,7 +118,7 @@ def _load(
     source: Source,
     overrides: Overrides,
     tasks: Mapping[str, TaskSpec],
-    algorithms: Mapping[str, object],
+    algorithms: Methods,
     no_vectors: str,
     defaults: Mapping[str, Any],
     *,
@@ -125,64 +133,63 @@ def _load(
     values, unusable, problems = sort_keys(mapping)
     wanted, more = parse_overrides(overrides)
     problems += more
-    if resolved:
-        values = without_followers(values, wanted)
-    foreign = foreign_keys(values, wanted)
-    values = {**defaults, **{key: value for key, value in values.items() if key not in foreign}}
-    recorded = values if resolved else {}
-    values = values | wanted
-    without_effect = keys_without_effect(values.get("search.algorithm"))
-    idle = {key: value for key, value in values.items() if key in without_effect}
-    values = {key: value for key, value in values.items() if key not in idle}
-    values |= {key: recorded[key] for key in idle if key in recorded}  # their values stay what they were
-
-    left_open = {key for key, ask in LEFT_OPEN.items() if _asks(values.get(key, ask), ask)}
-    values = {key: value for key, value in values.items() if key not in left_open}
-    if "search" not in unusable:
-        values = _preset_values(values) | values
-    bad = _value_problems(values)
-    problems += bad.values()
-    values = {key: value for key, value in values.items() if key not in bad}
-
+    chosen = {**defaults, **values, **wanted}
     found: dict[str, Any] = {}
+    unknown: list[Problem] = []
     for key, what, known, besides in (
         ("task.environment", "task", tasks, "brax:NAME, or module:Class"),
         ("search.algorithm", "algorithm", algorithms, "module:function"),
     ):
-        chosen = values.get(key)
+        given = chosen.get(key)
+        if key not in chosen and key.split(".")[0] not in unusable:
+            unknown.append(unfit(key, None, f"missing; must be {one_of(known)}", allowed=one_of(known)))
         try:
-            found[key] = known[chosen] if chosen is not None else None
+            found[key] = known[given] if isinstance(given, str) and given else None
         except KeyError:
-            allowed, meant = f"{one_of(known)}, or {besides}", nearest(chosen, known)
+            allowed, meant = f"{one_of(known)}, or {besides}", nearest(given, known)
             hint = f"; did you mean {meant}?" if meant else ""
-            sentence = f"{key}: {show(chosen)} is not a known {what}; must be {allowed}{hint}"
-            problems.append(Problem(sentence, key, chosen, allowed, meant))
+            sentence = f"{key}: {show(given)} is not a known {what}; must be {allowed}{hint}"
+            unknown.append(Problem(sentence, key, given, allowed, meant))
         except ConfigError as error:
-            problems.append(Problem(f"{key}: {error}", key, chosen))
-        if chosen is None and key not in bad and key.split(".")[0] not in unusable:
-            problems.append(unfit(key, None, f"missing; must be {one_of(known)}", allowed=one_of(known)))
+            unknown.append(Problem(f"{key}: {error}", key, given))
     task: TaskSpec | None = found.get("task.environment")
-    declared = {} if task is None else {TASK_OPTIONS: (task.name, task.options)}
-    if "search.algorithm" in values.keys() & found.keys():
-        declared[SEARCH_OPTIONS] = values["search.algorithm"], getattr(found["search.algorithm"], "options", {})
-    for group, (owner, options) in declared.items():
-        read, wrong = read_options(values, group, owner, options)
-        values = {key: value for key, value in values.items() if not key.startswith(group)} | read
-        problems += wrong
-    values = resolve(values, left_open, task, no_vectors)
+    method = found.get("search.algorithm")
+    settings: type[SearchConfig] | None = None if method is None else method.settings
+
+    foreign = foreign_keys(values, wanted, settings, algorithms)
+    if resolved:
+        values = without_followers(values, wanted, algorithms)
+    values = {**defaults, **{key: value for key, value in values.items() if key not in foreign}} | wanted
+    filled = {} if settings is None or "search" in unusable else filled_in(values, settings)
+    wrong = key_problems(filled | values, wanted, settings, algorithms)
+    problems += wrong.values()
+    unused = settings.unused if settings is not None else ()
+    idle = {key: value for key, value in values.items() if key in unused}
+    left_open = {key for key, ask in LEFT_OPEN.items() if key in idle or _asks(values.get(key, ask), ask)}
+    values = {key: value for key, value in values.items() if key not in {*wrong, *idle, *left_open}}
+    values = {key: value for key, value in filled.items() if key not in left_open} | values
+    bad = _value_problems(values, settings, algorithms)
+    problems += [*bad.values(), *unknown]
+    values = {key: value for key, value in values.items() if key not in bad}
+    if task is not None:
+        read, more = read_options(values, task)
+        values = {key: value for key, value in values.items() if not key.startswith(TASK_OPTIONS)} | read
+        problems += more
+    values = resolve(values, left_open, task, settings, no_vectors)
     if task is not None:
         problems += task_problems(values, task) + policy_problems(values, task)
         problems += map_problems(values, task) + rollout_problems(values, task)
-    problems += _idle_problems(idle, values)
-    problems += method_problems(values) + shape_problems(values) + engine_problems(values)
+    if settings is not None:
+        problems += _idle_problems(idle, values, algorithms) + method_problems(values, settings)
+    problems += shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):
         problems.append(unfit("budget", None, f"this run has no limit; set at least one of {one_of(BUDGET)}"))
-    if problems:
+    if problems or settings is None:
         count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
         raise ConfigError.listing(f"{name}: {count}", problems)
-    config = RunConfig.model_validate(_nested(values))
-    return config.made_for(task, declared.get(SEARCH_OPTIONS, ("", {}))[1])
+    nested = _nested(values)
+    return RunConfig.model_validate(nested | {"search": settings.model_validate(nested["search"])}).made_for(task)
 
 
 def _asks(value: object, ask: str | None) -> bool:
@@ -190,7 +197,7 @@ def _asks(value: object, ask: str | None) -> bool:
     return value is None if ask is None else isinstance(value, str) and value == ask
 
 
-def _idle_problems(idle: Mapping[str, Any], values: Mapping[str, Any]) -> list[Problem]:
+def _idle_problems(idle: Mapping[str, Any], values: Mapping[str, Any], algorithms: Methods) -> list[Problem]:
     """Problems of values of keys without effect. A value that the key has anyway is none, so that a resolved config can
     be loaded like any other.
 
@@ -200,23 +207,11 @@ def _idle_problems(idle: Mapping[str, Any], values: Mapping[str, Any]) -> list[P
     """
     known = {key: field.default for key, field in FIELDS.items() if not field.is_required()} | dict(values)
     return [
-        no_effect(key, value, values["search.algorithm"], known[key])
+        no_effect(key, value, values["search.algorithm"], algorithms, known[key])
         for key, value in idle.items()
         if key in known and not (key in LEFT_OPEN and _asks(value, LEFT_OPEN[key]))
         if not (isinstance(value, int | float | str | None) and value == known[key])
     ]
-
-
-def _preset_values(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values of the config's preset; empty if the preset is unknown, which is reported as a bad value."""
-    preset = values.get("search.preset", FIELDS["search.preset"].default)
-    if not isinstance(preset, str) or preset not in PRESETS:
-        return {}
-    filled = preset_values(preset, values.get("search.algorithm"))
-    normalised = "policy.observation_normalization"
-    if values.get(normalised, filled.get(normalised)) is False:
-        filled["policy.observation_clip"] = None  # the bound is in standard deviations, which are then unknown
-    return filled
 
 
 def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -231,23 +226,39 @@ def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
     return nested
 
 
-def _value_problems(values: Mapping[str, Any]) -> dict[str, Problem]:
-    """Key -> problem for each value that is invalid by itself. Missing keys are not reported here, nor are options."""
-    values = {key: value for key, value in values.items() if not key.startswith(OPTION_GROUPS)}
-    try:
-        RunConfig.model_validate(_nested(values))
-    except ValidationError as error:
-        found = [item["loc"] for item in error.errors(include_url=False)]
-    else:
-        return {}
-    # Where a value has parts, a location is longer than our key: ("policy", "hidden", 1).
-    names = {n for loc in found for k in range(len(loc)) if (n := ".".join(map(str, loc[: k + 1]))) in values}
-    return {name: _bad_value(name, value) for name, value in values.items() if name in names}
+def _value_problems(
+    values: Mapping[str, Any], settings: type[SearchConfig] | None, algorithms: Methods
+) -> dict[str, Problem]:
+    """Key -> problem for each value that is invalid by itself. Missing keys are not reported here, nor are options.
+
+    Args:
+        settings: those of the method; None if it is not known: then those of the method that has most of the keys.
+    """
+    if settings is None:
+        known = [method.settings for method in algorithms.values()]
+        settings = max(known, key=lambda one: len(values.keys() & search_fields(one)))
+    fields, parts = FIELDS | all_search_fields(algorithms) | search_fields(settings), parts_of(settings)
+    kinds = {key: fields[key].default for part in parts if (key := f"{part}.kind")}
+    nested = _nested({key: value for key, value in (kinds | dict(values)).items() if not key.startswith(TASK_OPTIONS)})
+    found: set[str] = set()
+    problems: dict[str, Problem] = {}
+    for model, section, mapping in ((RunConfig, (), nested), (settings, ("search",), nested.pop("search"))):
+        try:
+            model.model_validate(mapping)
+        except ValidationError as error:
+            for item in error.errors(include_url=False):
+                place = [str(one) for one in (*section, *item["loc"])]
+                if ".".join(place[:2]) in parts:  # a kind follows, or was wrong
+                    place[2:3] = [] if len(place) > 2 else ["kind"]
+                if not item["loc"]:  # a rule that the class of a user's search has
+                    problems["search"] = unfit("search", None, item["msg"])
+                # Where a value has parts, a location is longer than our key: ("policy", "hidden", 1).
+                found |= {".".join(place[: k + 1]) for k in range(len(place))}
+    return problems | {key: _bad_value(key, value, fields[key]) for key, value in values.items() if key in found}
 
 
-def _bad_value(name: str, value: object) -> Problem:
+def _bad_value(name: str, value: object, field: FieldInfo) -> Problem:
     """The problem of an invalid value: what is allowed, and how to write what was probably meant."""
-    field = FIELDS[name]
     allowed = _allowed(field.annotation, field.metadata)
     if name in LEFT_OPEN:
         allowed = f"{show(LEFT_OPEN[name])} or {allowed}"
@@ -258,11 +269,21 @@ def _bad_value(name: str, value: object) -> Problem:
     return wrong_value(name, value, allowed, choices)
 
 
+_PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+_LIMITS = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
+"""Types and limits that the settings of a user's search may have without the words of `config/fields.py`."""
+
+
 def _allowed(annotation: Any, metadata: Iterable[object] = ()) -> str:
     """What a type allows, in words: the text in its annotation if there is one, else its literal values."""
     for words in metadata:
         if isinstance(words, str):
             return words
+    if annotation in _PLAIN:
+        limits = [
+            f"{words} {getattr(one, name):g}" for one in metadata for name, words in _LIMITS if hasattr(one, name)
+        ]
+        return ", ".join([_PLAIN[annotation], *limits])
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return _allowed(parts[0], parts[1:])

@@ -6,8 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from es_service.config.fields import TASK_OPTIONS
-from es_service.config.method_rules import map_needed_by
 from es_service.config.options import options_of
 from es_service.config.problems import not_allowed, unfit
 from es_service.config.yaml_text import show
@@ -51,12 +49,9 @@ def default_qd_offset(values: Mapping[str, Any], task: TaskSpec) -> float:
 
 
 def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
-    """Problems of a map that does not fit the descriptor, is too large, or is off although the algorithm needs it."""
+    """Problems of a map that does not fit the descriptor or is too large."""
     problems = []
-    if (purpose := map_needed_by(values)) and values.get("map.enabled", True) is False:
-        why = f" for {values['search.algorithm']}, {purpose}"
-        problems.append(not_allowed("map.enabled", False, "true", why=why))
-    names = with_options(task, options_of(values, TASK_OPTIONS)).descriptor_names
+    names = with_options(task, options_of(values)).descriptor_names
     bounds, cells, kind = values.get("map.bounds"), values.get("map.cells"), values.get("map.kind")
     qd_offset = values.get("map.qd_offset", 0.0)
     for key, numbers in (("map.bounds", [x for pair in bounds or () for x in pair]), ("map.qd_offset", [qd_offset])):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field, PrivateAttr, SerializeAsAny
 
 from es_service.config.compute import COMPUTE_CONSTANTS, ComputeConfig
 from es_service.config.fields import (
@@ -26,10 +26,9 @@ from es_service.config.fields import (
     Text,
     Widths,
 )
-from es_service.config.search import SearchConfig
+from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.yaml_text import dump_yaml
 from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
-from es_service.protocol.options import Option
 from es_service.protocol.sources import worker_sources
 
 
@@ -63,8 +62,8 @@ class PolicyConfig(Section):
     )
     observation_normalization: Switch = Field(
         True,
-        description="Whether observations are shifted and scaled by the running statistics of the training. "
-        "map_elites, which has none, allows only false, its default.",
+        description="Whether observations are shifted and scaled by the running statistics of the training. A method "
+        "without training episodes allows only false, its default.",
     )
     observation_clip: Positive | None = Field(
         description="Bound on each normalised observation, in standard deviations; null for none. Set by the preset; "
@@ -95,7 +94,7 @@ class NoveltyConfig(Section):
 class MapConfig(Section):
     """The behaviour map, in which each cell keeps the fittest evaluated centre. Constants of the run."""
 
-    enabled: Switch = Field(True, description="Whether the run fills a map; me_es, memes and map_elites need one.")
+    enabled: Switch = Field(True, description="Whether the run fills a map; some methods need one.")
     kind: Literal["grid", "cvt"] = Field(
         description="grid: cells of equal size. cvt: any number of cells around centroids, for many dimensions. auto: "
         "grid for up to six dimensions, else cvt."
@@ -138,7 +137,7 @@ class RunConfig(Section):
 
     task: TaskConfig
     policy: PolicyConfig
-    search: SearchConfig
+    search: SerializeAsAny[SearchConfig]
     novelty: NoveltyConfig
     map: MapConfig
     budget: BudgetConfig
@@ -146,23 +145,17 @@ class RunConfig(Section):
     store: StoreConfig
     seed: Seed = Field(0, description="Seed of all random numbers of the run.")
     _task: TaskSpec | None = PrivateAttr(None)
-    _search_options: Mapping[str, Option] | None = PrivateAttr(None)
 
-    def made_for(self, task: TaskSpec | None, search_options: Mapping[str, Option]) -> RunConfig:
-        """The same config, which knows the task and the options of the search from which its values were resolved."""
+    def made_for(self, task: TaskSpec | None) -> RunConfig:
+        """The same config, which knows the task from which its values were resolved."""
         config = self.model_copy()
-        config._task, config._search_options = task, dict(search_options)
+        config._task = task
         return config
 
     @property
     def resolved_with(self) -> TaskSpec | None:
         """The task from which values that were left open were resolved; None if it is not known."""
         return self._task
-
-    @property
-    def resolved_search_options(self) -> Mapping[str, Option] | None:
-        """The options that the search declared when the config was loaded; None if this is not known."""
-        return self._search_options
 
     def resolved_yaml(self) -> str:
         """The text of the run folder's `config.yaml`, with every value. Loading it gives an equal config."""
@@ -189,9 +182,13 @@ def policy_shape(config: RunConfig, task: TaskSpec) -> PolicyShape:
     return PolicyShape((task.observation_size, *config.policy.hidden, task.action_size))
 
 
-def worker_spec(config: RunConfig, task: TaskSpec) -> WorkerSpec:
-    """The message that every worker of the run receives once, when it starts."""
-    settings, policy, compute = config.task, config.policy, config.compute
+def worker_spec(config: RunConfig, task: TaskSpec, outputs: tuple[str, ...] = ()) -> WorkerSpec:
+    """The message that every worker of the run receives once, when it starts.
+
+    Args:
+        outputs: see `WorkerSpec.outputs`.
+    """
+    settings, policy, compute, search = config.task, config.policy, config.compute, config.search
     return WorkerSpec(
         seed=config.seed,
         environment=settings.environment,
@@ -202,10 +199,11 @@ def worker_spec(config: RunConfig, task: TaskSpec) -> WorkerSpec:
         episodes_per_member=settings.episodes_per_member,
         observation_clip=policy.observation_clip,
         action_noise=policy.action_noise,
-        common_random_numbers=config.search.common_random_numbers,
+        common_random_numbers=not isinstance(search, PopulationConfig) or search.common_random_numbers,
         chunk_pairs=compute.chunk_pairs,
         rollout_block_pairs=compute.rollout_block_pairs,
         gradient_block_pairs=compute.gradient_block_pairs,
         rollout=compute.rollout,
+        outputs=outputs,
         sources=worker_sources(settings.environment),
     )

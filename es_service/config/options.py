@@ -1,38 +1,36 @@
-"""Options in a config: their values, below `task.options` and `search.options`, against what is declared."""
+"""Options in a config: their values, below `task.options`, against what the task declares."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+from es_service.config.fields import TASK_OPTIONS
 from es_service.config.problems import nearest, one_of, unfit, wrong_value
 from es_service.config.yaml_text import in_line, show
 from es_service.errors import Problem
+from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import Option, OptionValue, is_within
 
 
-def options_of(values: Mapping[str, Any], group: str) -> dict[str, Any]:
-    """The options in a group, such as "task.options.", among flat values: name -> value."""
-    return {key.removeprefix(group): value for key, value in values.items() if key.startswith(group)}
+def options_of(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of the task among flat values: name -> value."""
+    return {key.removeprefix(TASK_OPTIONS): value for key, value in values.items() if key.startswith(TASK_OPTIONS)}
 
 
-def read_options(
-    values: Mapping[str, Any], group: str, owner: str, declared: Mapping[str, Option]
-) -> tuple[dict[str, OptionValue], list[Problem]]:
-    """Value of every declared option by its key, and the problems of the given values.
+def read_options(values: Mapping[str, Any], task: TaskSpec) -> tuple[dict[str, OptionValue], list[Problem]]:
+    """Value of every option that a task declares by its key, and the problems of the given values.
 
     Args:
-        values: flat values of a config; those in the group are read.
-        group: "task.options." or "search.options.".
-        owner: name of the task or of the search.
-        declared: its options.
+        values: flat values of a config, of which the options are read.
     """
-    found: dict[str, OptionValue] = {f"{group}{name}": option.default for name, option in declared.items()}
+    declared = task.options
+    found: dict[str, OptionValue] = {f"{TASK_OPTIONS}{name}": option.default for name, option in declared.items()}
     problems = []
-    for name, value in options_of(values, group).items():
-        key = f"{group}{name}"
+    for name, value in options_of(values).items():
+        key = f"{TASK_OPTIONS}{name}"
         if name not in declared:
-            known = f"{owner} has {one_of(declared)}" if declared else f"{owner} has none"
+            known = f"{task.name} has {one_of(declared) if declared else 'none'}"
             meant = nearest(name, declared)
             hint = f"; did you mean {meant}?" if meant else ""
             problems.append(unfit(key, value, f"unknown option; {known}{hint}", suggestion=meant))

@@ -12,13 +12,14 @@ import os
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from es_service.config.fields import RESOURCES, TASK_OPTIONS
+from es_service.config.fields import RESOURCES
 from es_service.config.keys import FIELDS
 from es_service.config.map_rules import default_cells, default_kind, default_qd_offset
-from es_service.config.method_rules import default_centres
+from es_service.config.methods import default_centres
 from es_service.config.model import RunConfig
 from es_service.config.options import options_of
 from es_service.config.problems import not_allowed, unfit
+from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
 from es_service.protocol.messages import PolicyShape, TaskSpec, with_options
@@ -53,6 +54,8 @@ MOST_GRADIENT_BLOCKS = 32
 """A partial gradient is as large as the policy, so a generation should send only a few."""
 LEAST_GRADIENT_BLOCK_NUMBERS = 4_000_000
 """Fewest noise numbers in a block, about 2 ms of work; a smaller block would cost more to send than to sum."""
+WITHOUT_PAIRS = 512
+"""Pairs from which the shapes of a search without any are derived; they have no effect then."""
 FEW_CHUNK_PAIRS = 8
 """A chunk with fewer pairs is likely to cost more to send and start than to compute."""
 
@@ -87,7 +90,11 @@ def default_gradient_block_pairs(pairs: int, chunk_pairs: int, parameters: int) 
 
 
 def resolve(
-    values: Mapping[str, Any], left_open: Collection[str], task: TaskSpec | None, no_vectors: str
+    values: Mapping[str, Any],
+    left_open: Collection[str],
+    task: TaskSpec | None,
+    settings: type[SearchConfig] | None,
+    no_vectors: str,
 ) -> dict[str, Any]:
     """Fill in the values that were left open, if the values from which they are derived are present.
 
@@ -95,13 +102,14 @@ def resolve(
         values: valid values of the config.
         left_open: keys of LEFT_OPEN that are to be resolved.
         task: the task that `task.environment` names, or None where that is invalid.
+        settings: those of the method that `search.algorithm` names, or None where that is invalid.
         no_vectors: why this machine's processor cannot run the code that simd compiles; empty if it can.
     """
     values = dict(values)
     if task is not None:
         if "task.episode_steps" in left_open:
             values["task.episode_steps"] = task.episode_steps
-        chosen = with_options(task, options_of(values, TASK_OPTIONS))
+        chosen = with_options(task, options_of(values))
         if "map.kind" in left_open:
             values["map.kind"] = default_kind(len(chosen.descriptor_names))
         kind = values.get("map.kind")
@@ -111,15 +119,16 @@ def resolve(
             values["map.cells"] = default_cells(kind, len(chosen.descriptor_names))
         if "map.qd_offset" in left_open:
             values["map.qd_offset"] = default_qd_offset(values, task)
-    if "search.centres" in left_open and "search.algorithm" in values:
-        values["search.centres"] = default_centres(values)
+    if "search.centres" in left_open and settings is not None:
+        values["search.centres"] = default_centres(values, settings)
     if "compute.engine" in left_open:
         has_actor_cores = _value(values, f"{RESOURCES}cpu") not in ("auto", 1)
         for_ray = _value(values, "compute.address") is not None or has_actor_cores or _on_gpu(values)
         values["compute.engine"] = "ray" if for_ray else "inline"
     if "compute.rollout" in left_open and task is not None:
         values["compute.rollout"] = "xla" if _on_gpu(values) or _why_no_simd(values, task, no_vectors) else "simd"
-    pairs = values.get("search.pairs")
+    has_pairs = settings is None or issubclass(settings, PopulationConfig)
+    pairs = values.get("search.pairs") if has_pairs else WITHOUT_PAIRS
     if pairs is not None and "compute.chunk_pairs" in left_open:
         values["compute.chunk_pairs"] = default_chunk_pairs(pairs)
     chunk_pairs = values.get("compute.chunk_pairs")
@@ -174,10 +183,10 @@ def shape_problems(values: Mapping[str, Any]) -> list[Problem]:
         near = sorted(sorted(divisors, key=lambda size: abs(size - rollout))[:2])
         what = f"{rollout} does not divide compute.chunk_pairs ({chunk}); try {' or '.join(map(str, near))}, or auto"
         problems.append(unfit("compute.rollout_block_pairs", rollout, what, suggestion=near[0]))
-    top = values.get("search.top_pairs")
+    top = values.get("search.shaping.count")
     if pairs is not None and top is not None and top > pairs:
         what = f"{top} is more than search.pairs ({pairs}); try {pairs}, or null for all"
-        problems.append(unfit("search.top_pairs", top, what, suggestion=pairs))
+        problems.append(unfit("search.shaping.count", top, what, suggestion=pairs))
     if pairs is not None and gradient is not None and gradient > pairs:
         what = f"{gradient} is more than search.pairs ({pairs}); try {pairs}, or auto"
         problems.append(unfit("compute.gradient_block_pairs", gradient, what, suggestion=pairs))
@@ -252,7 +261,8 @@ def config_warnings(config: RunConfig, task: TaskSpec, no_vectors: str = "") -> 
     values = {"compute.address": config.compute.address}
     if config.compute.rollout == "xla" and (why := _why_no_simd(values, task, no_vectors)):
         warnings.append(f"compute.rollout: xla is used because simd cannot run {task.name}: {why}")
-    pairs, chunk = config.search.pairs, config.compute.chunk_pairs
+    pairs = config.search.pairs if isinstance(config.search, PopulationConfig) else WITHOUT_PAIRS
+    chunk = config.compute.chunk_pairs
     if chunk < FEW_CHUNK_PAIRS and pairs > MOST_CHUNK_PAIRS:
         near = round(pairs / MOST_CHUNK_PAIRS) * MOST_CHUNK_PAIRS
         auto = default_chunk_pairs(pairs)

@@ -1,16 +1,22 @@
-"""The config section `search`: the method and its settings."""
+"""The config section `search`: the keys of every method, and those of methods that perturb a centre.
+
+The settings of a method are a class that derives from one of these two and stands in the method's own file. Its fields
+are the method's keys; its class variables and its methods declare what the rest of the service has to know of it.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from es_service.config.fields import Count, Fraction, NotNegative, Options, Positive, Section, Switch, Text
+from es_service.config.fields import Count, Fraction, Positive, Section, Switch, Text
+from es_service.config.parts import AdamStep, Ranks, Shaping, Step
+from es_service.config.presets import PresetRow
 
 
 class SearchConfig(Section):
-    """The evolution strategy. Constants of the run."""
+    """The search. Constants of the run."""
 
     algorithm: Text = Field(
         description="Name of the search algorithm: a shipped one, or module:function for one of your own."
@@ -18,111 +24,12 @@ class SearchConfig(Section):
     preset: Literal["literature", "uber"] = Field(
         "literature", description="Which column of the preset table fills in the keys that the config leaves out."
     )
-    pairs: Count = Field(
-        description="Antithetic pairs of a population, which has twice as many members. A generation has one "
-        "population, or one for each centre with search.emitters and search.update: all. Set by the preset."
-    )
-    sigma: Positive = Field(0.02, description="Standard deviation of the parameter noise, in parameter units.")
-    learning_rate: Positive = Field(
-        0.01, description="Step size of Adam, in parameter units. ars: factor of the plain step."
-    )
-    l2: NotNegative = Field(
-        0.005, description="Weight decay, added to the gradient before Adam: lambda in -g + lambda x."
-    )
-    shaping: Literal["ranks", "signs", "returns"] = Field(
-        "ranks",
-        description="How fitness, and novelty, become utilities of members. ranks: evenly spaced by rank. signs: of "
-        "each pair, only which member is better. returns: the values, less their mean, over their standard deviation.",
-    )
     centres: Count = Field(
-        description="Number of centres searched side by side, each with its own optimiser. auto: 1 for es "
-        "and ars, search.emitters for me_es and memes (these allow no other number), 32 for map_elites, whose first "
-        "random policies they are, 1 for a search of your own; else 5."
-    )
-    update: Literal["one", "all"] = Field(
-        "one",
-        description="ns_es, nsr_es, nsra_es: how many of the centres a generation updates. one: that of "
-        "search.centre_choice. all: every centre, with search.pairs pairs each.",
-    )
-    centre_choice: Literal["novelty", "round_robin", "uniform"] = Field(
-        "novelty",
-        description="ns_es, nsr_es, nsra_es: how the centre to update is chosen. novelty: with probability "
-        "proportional to its novelty. round_robin: in turn. uniform: all with the same probability.",
-    )
-    top_pairs: Count | None = Field(
-        None,
-        description="ars: number of pairs from which a step is computed, those with the highest fitness of their "
-        "better member; null: all pairs.",
-    )
-    emitters: Count = Field(
-        1,
-        description="me_es: number of blocks that run side by side, with search.pairs pairs each in every generation. "
-        "memes: number of evolution strategies, likewise; 16 if left out.",
-    )
-    fitness_weight_start: Fraction = Field(
-        description="nsra_es: weight of fitness beside novelty at the start. Set by the preset."
-    )
-    fitness_weight_step: Fraction = Field(
-        0.05, description="nsra_es: how much the weight of fitness rises after an improvement or falls in stagnation."
-    )
-    fitness_weight_patience: Count = Field(
-        description="nsra_es: generations without improvement before the weight of fitness falls. Set by the preset."
-    )
-    fitness_weight_min_gain: NotNegative = Field(
-        description="nsra_es: a centre is an improvement if its fitness exceeds the record by more than this fraction "
-        "of the record's absolute value. Set by the preset."
-    )
-    mode: Literal["explore_exploit", "explore", "exploit"] = Field(
-        "explore_exploit",
-        description="me_es: what a block of generations maximises. explore: novelty. exploit: fitness. "
-        "explore_exploit: one of the two, as search.alternation says. memes: what an emitter maximises; "
-        "explore_exploit: novelty and fitness by turns, beginning with novelty for the first emitter.",
-    )
-    alternation: Literal["round_robin", "coin"] = Field(
-        "round_robin",
-        description="me_es: how exploring and exploiting blocks follow each other. round_robin: in turn. coin: each "
-        "block is chosen at random, with probability 1/2.",
-    )
-    first_block: Literal["explore", "exploit"] = Field(
-        description="me_es: what the first block does with alternation round_robin. Set by the preset."
-    )
-    block_generations: Count = Field(
-        10,
-        description="me_es: generations in a block; each block starts from an elite drawn from the map, with a fresh "
-        "optimiser.",
-    )
-    cell_sampling: Literal["top", "score"] = Field(
-        description="me_es: how the cell of that elite is drawn: as in QDax (top) or as in the released code (score); "
-        "es_service/search/algorithms/me_es.py describes both. Set by the preset."
-    )
-    stagnation_generations: Count = Field(
-        32,
-        description="memes: generations after which an emitter none of whose centres has entered the map since then "
-        "begins again from an elite, with a fresh optimiser.",
-    )
-    parent_statistics: Literal["global", "elite"] = Field(
-        "global",
-        description="me_es, memes: observation statistics that a block uses. global: those of the whole run. elite: "
-        "those with which the elite at its start was evaluated. With elite, all elites descend from the first centre "
-        "and keep its statistics, so observations are not normalised unless the run started from a policy of another "
-        "run.",
-    )
-    batch: Count = Field(256, description="map_elites: number of policies that a generation makes and evaluates.")
-    iso_sigma: NotNegative = Field(
-        0.005, description="map_elites: standard deviation of the noise in each parameter, in parameter units."
-    )
-    line_sigma: NotNegative = Field(
-        0.05,
-        description="map_elites: standard deviation of the step along the line through both parents, as a share of the "
-        "distance between them.",
+        description="Number of centres searched side by side, each with its own optimiser. auto: as many as the method "
+        "usually has, 1 for a search of your own."
     )
     evaluation_episodes: Count = Field(
-        30,
-        description="Noise-free episodes on which each new centre is evaluated; they count as environment steps. "
-        "memes, and map_elites for each policy: 1 if left out.",
-    )
-    common_random_numbers: Switch = Field(
-        description="Whether the two members of a pair share resets and action noise. Set by the preset."
+        30, description="Noise-free episodes on which each new centre is evaluated; they count as environment steps."
     )
     max_invalid_fraction: Fraction = Field(
         0.5, description="Share of members with a non-finite fitness or descriptor above which the run stops."
@@ -132,7 +39,82 @@ class SearchConfig(Section):
         description="Policy of another run from which this run starts: RUN (its folder) for the centre updated last, "
         "RUN:best for the best centre, or RUN:3,17 for a cell's elite; null for random weights.",
     )
-    options: Options = Field(
-        default_factory=dict,
-        description="Settings of a search of your own, which declares them; the shipped methods have none.",
+
+    presets: ClassVar[tuple[PresetRow, ...]] = (
+        # Column norms: 1.0 in hidden layers and 0.01 in the output layer, or 0.01 in every layer.
+        PresetRow("policy.init", "unit_columns", "small_columns", "literature: ES-starter and DNE. uber: ME-ES."),
+        PresetRow("policy.observation_clip", 5.0, None, "literature: ES-starter and DNE. uber: ME-ES, without a clip."),
+        PresetRow("novelty.distance", "euclidean", "squared_euclidean", "literature: DNE and QDax. uber: ME-ES."),
     )
+    """Values by preset of this class's own keys, and of keys that it has from elsewhere, which precede those of the
+    classes above it."""
+    first_centres: ClassVar[int] = 1
+    """What `centres: auto` stands for."""
+    only_centres: ClassVar[int | str | None] = None
+    """The only number of centres that is allowed, or the key that has it; None: any number."""
+    needs_map: ClassVar[str] = ""
+    """What the method needs a behaviour map for, as a clause about it: "whose ..."; empty if it needs none."""
+    gathers_statistics: ClassVar[bool] = False
+    """Whether it has training episodes, from which observation statistics are gathered."""
+    unused: ClassVar[tuple[str, ...]] = (
+        "task.episodes_per_member",
+        "policy.action_noise",
+        "compute.chunk_pairs",
+        "compute.rollout_block_pairs",
+        "compute.gradient_block_pairs",
+    )
+    """Keys of other sections that have no effect with it."""
+    family: ClassVar[str] = ""
+    """Methods of one family have states of the same form: a fork may change from one to another. They differ only in
+    the weight of fitness, which the fork starts anew. Empty: it has no such relatives."""
+
+    def populations(self) -> int:
+        """Number of populations that a generation asks for at most."""
+        return 0
+
+    def policies(self) -> int:
+        """Number of policies that a generation asks for at most, where it asks for no populations."""
+        return 1
+
+    def spread_keys(self) -> tuple[str, ...]:
+        """Keys that change the number of populations, or of policies."""
+        return ()
+
+
+class PopulationConfig(SearchConfig):
+    """A search that perturbs centres with pairs of noise and moves them along gradient estimates."""
+
+    pairs: Count = Field(
+        description="Antithetic pairs of a population, which has twice as many members. A generation has one "
+        "population, or one for each centre with search.emitters and search.update: all. Set by the preset."
+    )
+    sigma: Positive = Field(0.02, description="Standard deviation of the parameter noise, in parameter units.")
+    step: Step = Field(
+        AdamStep(learning_rate=0.01, l2=0.005),
+        discriminator="kind",
+        description="How a centre moves along the gradient estimate. adam: by Adam. plain: by the estimate times the "
+        "learning rate.",
+    )
+    shaping: Shaping = Field(
+        Ranks(),
+        discriminator="kind",
+        description="How fitness, and novelty, become utilities of members. ranks: evenly spaced by rank. signs: of "
+        "each pair, only which member is better. returns: the values, less their mean, over their standard deviation. "
+        "top_pairs: the differences within the best pairs, over the standard deviation of the values of these pairs.",
+    )
+    common_random_numbers: Switch = Field(
+        description="Whether the two members of a pair share resets and action noise. Set by the preset."
+    )
+
+    presets = (
+        # Our choice is sized for one machine. The papers used 5,000 to 10,000 episodes a generation, so compare results
+        # at equal environment steps. A pair that shares resets and action noise differs by less noise.
+        PresetRow("search.pairs", 512, 5000, "literature: our choice. uber: ME-ES, 10,000 episodes in + and - pairs."),
+        PresetRow("search.common_random_numbers", True, False, "literature: our choice. uber: ME-ES."),
+    )
+    gathers_statistics = True
+    unused = ()
+
+    def populations(self) -> int:
+        """One population, unless a method has several."""
+        return 1

@@ -9,9 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.errors import EvaluationError, WayOut
 from es_service.protocol.messages import Centre, EpisodesResult
 from es_service.search.algorithms.base import Ask, PolicyAsk, SearchState
+
+LEARNING_RATE = "search.step.learning_rate"
 
 
 def require_asks(asks: object, state: SearchState, chunk_pairs: int, observation_size: int, generation: int) -> None:
@@ -111,7 +114,7 @@ def invalidate(
         raise EvaluationError(
             f"generation {generation}: {invalid} of {members} members returned a fitness or descriptor that is "
             f"not finite, more than search.max_invalid_fraction ({max_invalid_fraction}) allows. Everything up to "
-            f"generation {generation - 1} is saved; a smaller search.sigma or search.learning_rate may help.",
+            f"generation {generation - 1} is saved; a smaller search.sigma or learning rate may help.",
             field="search.max_invalid_fraction",
             value=max_invalid_fraction,
         )
@@ -141,19 +144,21 @@ def require_some_finite(evaluations: Sequence[EpisodesResult], environment: str)
     )
 
 
-def require_finite(centres: Sequence[Centre], learning_rate: float, generation: int) -> None:
+def require_finite(centres: Sequence[Centre], search: SearchConfig, generation: int) -> None:
     """Raise an EvaluationError if a centre is not finite after its update."""
-    if not all(np.isfinite(centre.parameters_D).all() for centre in centres):
-        raise EvaluationError(
-            f"generation {generation}: a centre is not finite after its update with search.learning_rate = "
-            f"{learning_rate:g}, so it is not kept. Everything up to generation {generation - 1} is saved.",
-            field="search.learning_rate",
-            value=learning_rate,
-            ways_out=[
-                WayOut(
-                    "fork",
-                    "continue from there with a smaller learning rate",
-                    settings={"search.learning_rate": learning_rate / 10},
-                )
-            ],
-        )
+    if all(np.isfinite(centre.parameters_D).all() for centre in centres):
+        return
+    learning_rate = search.step.learning_rate if isinstance(search, PopulationConfig) else 0.0
+    raise EvaluationError(
+        f"generation {generation}: a centre is not finite after its update with {LEARNING_RATE} = {learning_rate:g}, "
+        f"so it is not kept. Everything up to generation {generation - 1} is saved.",
+        field=LEARNING_RATE,
+        value=learning_rate,
+        ways_out=[
+            WayOut(
+                "fork",
+                "continue from there with a smaller learning rate",
+                settings={LEARNING_RATE: learning_rate / 10},
+            )
+        ],
+    )

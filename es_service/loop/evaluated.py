@@ -1,4 +1,4 @@
-"""What a generation has evaluated, in the order of its asks: new centres with their populations, and policies."""
+"""What a generation proposes and what comes of it, in the order of its asks: centres, populations and policies."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from es_service.config.model import RunConfig
-from es_service.loop.generation import steps_of
+from es_service.loop.generation import first_episode, steps_of
 from es_service.loop.history import HistoryRow, Resets, evaluated_row, norm
 from es_service.loop.policies import PolicyWork, each_policy, no_statistics, policy_work
-from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, TaskSpec
-from es_service.search.algorithms.base import Ask, PolicyAsk
+from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, Moments, TaskSpec
+from es_service.search.algorithms.base import Ask, CentreEvaluation, PolicyAsk, SearchState
 from es_service.search.maps.behaviour_map import BehaviourMap
 
 
@@ -42,6 +42,54 @@ class Evaluated:
     def env_steps(self) -> int:
         """Environment steps of the evaluation and of the population."""
         return steps_of(self.evaluation) + (0 if self.population is None else steps_of(self.population))
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What a generation evaluates, and the state that asks for it."""
+
+    generation: int
+    search: SearchState
+    """State in which some centres may have restarted from elites."""
+    start_cells: Mapping[int, int]
+    """Index of a centre -> cell of the elite from which it has restarted."""
+    asked: Sequence[Ask | PolicyAsk]
+    """What the search asks for; nothing in generation 0."""
+    centres: Sequence[Centre]
+    """The centre of each population asked for; in generation 0 the initial centres, which have no populations."""
+    policies: Sequence[PolicyWork]
+
+    @property
+    def asks(self) -> list[Ask]:
+        """The populations asked for."""
+        return [ask for ask in self.asked if isinstance(ask, Ask)]
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """Results of what was proposed."""
+
+    populations: Sequence[EpisodesResult]
+    """Of each population [P, S]; the fitness of invalid members is NaN."""
+    policies: Sequence[EpisodesResult]
+    """Of each ask for policies [N, E]."""
+    members: Sequence[EpisodesResult]
+    """The populations, and the policies as if they were one each."""
+    observed: Sequence[Moments]
+    """Moments of the populations' observations, in the order in which they are merged."""
+
+
+@dataclass(frozen=True)
+class Update:
+    """What has become of the centres, and the state that has learned from it."""
+
+    search: SearchState
+    evaluated: Sequence[Evaluated]
+    """New centres and policies, in the order of the asks."""
+    told: tuple[CentreEvaluation, ...]
+    """What the search was told of each."""
+    novelties: Sequence[float | None]
+    """Novelty of each in the archive before the generation; None for initial centres."""
 
 
 def policies_asked(
@@ -105,13 +153,24 @@ def in_ask_order(
     return found
 
 
+def initial_centres(
+    points: Iterable[Centre], evaluations: Iterable[EpisodesResult], config: RunConfig, fitness_weight: float
+) -> list[Evaluated]:
+    """The initial centres, which have no populations; the episodes of each begin with a chunk of its own."""
+    episodes = config.search.evaluation_episodes
+    return [
+        Evaluated(index, point, evaluation, Resets(config.seed, first_episode(index, episodes)), fitness_weight)
+        for index, (point, evaluation) in enumerate(zip(points, evaluations, strict=True))
+    ]
+
+
 def evaluated_rows(
     evaluated: Sequence[Evaluated],
     task: TaskSpec,
     map_: BehaviourMap | None,
     generation: int,
     start_cells: Mapping[int, int],
-    novelties: Sequence[float],
+    novelties: Sequence[float | None],
 ) -> list[HistoryRow]:
     """The rows of a generation in the table of evaluated centres."""
     return [

@@ -7,16 +7,18 @@ fixed binary tree. Axes: P antithetic pairs, S signs [+, -], E evaluation episod
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
 from typing import Literal, TypeVar
 
 import numpy as np
 
 from es_service.config.model import RunConfig
+from es_service.errors import EvaluationError
 from es_service.loop.checks import require_state, valid_members
+from es_service.loop.interfaces import Search
 from es_service.loop.policies import PolicyWork, policy_episodes
-from es_service.loop.state import Best, statistics_in_force
+from es_service.loop.state import Best, RunState, statistics_in_force
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.gradient_tree import tree_sum
 from es_service.protocol.messages import (
@@ -34,9 +36,24 @@ from es_service.protocol.messages import (
     evaluation_chunks,
 )
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, CentreState, SearchState, frozen
-from es_service.search.maps.behaviour_map import Elite, make_elite
+from es_service.search.algorithms.common import first_state
+from es_service.search.maps.behaviour_map import Elite, empty_map, make_elite
+from es_service.search.maps.geometry import make_geometry
 
 Result = TypeVar("Result", EpisodesResult, GradientResult)
+
+
+def initial_state(search: Search) -> RunState:
+    """The state before generation 0: nothing has been evaluated."""
+    algorithm, (centres, observations) = search.algorithm, search.initial()
+    map_ = None
+    if search.config.map.enabled:
+        map_ = empty_map(make_geometry(search.config.map), counts_samples=algorithm.counts_samples)
+    dimensions, settings = len(search.task.descriptor_names), search.config.search
+    learned = first_state(centres, dimensions, algorithm.fitness_weight, map_, algorithm.own, settings)
+    first = make_centre(search.config, 0, centres[0], observations)
+    best = Best(0, -math.inf, centres[0], first.observation_mean_O, first.observation_std_O)
+    return RunState(-1, learned, observations, best, env_steps=0, episodes=0, wall_clock_s=0.0)
 
 
 def make_centre(
@@ -45,16 +62,16 @@ def make_centre(
     centre_D: FloatArray,
     observations: Moments,
     state: CentreState | None = None,
-    sigma: float | None = None,
+    sigma: float = 0.0,
 ) -> Centre:
     """The centre as it is sent to the workers: its parameters and the observation statistics that it runs with.
 
     Args:
         state: it may have statistics of its own; None for an initial centre.
-        sigma: of its population; None for an initial centre, which has none.
+        sigma: of its population; 0 for an initial centre, which has none.
     """
     mean_O, std_O = statistics_in_force(observations, state, config.policy.observation_normalization)
-    return Centre(generation, centre_D, config.search.sigma if sigma is None else sigma, mean_O, std_O)
+    return Centre(generation, centre_D, sigma, mean_O, std_O)
 
 
 def evaluate_populations(
@@ -163,6 +180,7 @@ def centre_evaluation(
         float(np.mean(evaluation.fitness, dtype=np.float64)),
         evaluation.descriptor.astype(np.float64).mean(axis=0),
         _highest(population.fitness) if population is not None else math.nan,
+        len(evaluation.fitness),
     )
 
 
@@ -170,7 +188,11 @@ def tell(algorithm: Algorithm, state: SearchState, told: tuple[CentreEvaluation,
     """The state after the search is told a generation's evaluations; its arrays are read-only from now on."""
     after = algorithm.tell(state, told)
     require_state(after, "tell", told[0].generation)
-    return frozen(after)
+    try:
+        return frozen(after)
+    except ValueError as error:
+        text = f"generation {told[0].generation}: `tell` returned a state that is none: {error}"
+        raise EvaluationError(text, field="search.algorithm") from error
 
 
 def fittest(told: Sequence[CentreEvaluation]) -> int:
@@ -185,11 +207,13 @@ def entered(
     centres: Sequence[Centre],
     evaluations: Sequence[EpisodesResult],
 ) -> dict[int, Elite]:
-    """The centres just evaluated that are elites now, by their cells.
+    """The policies of elites that the store does not have, by their cells: those of the centres just evaluated that are
+    elites now, and those that the search has given.
 
     The map decides this and not `CentreState.cell`, which a search of the user need not set.
     """
-    found: dict[int, Elite] = {}
+    filled = set() if state.map is None or not state.elites else set(state.map.cell_N.tolist())
+    found = {cell: elite for cell, elite in state.elites.items() if cell in filled}
     for one, centre, evaluation in zip(told, centres, evaluations, strict=True):
         if state.map is not None and (cell := state.map.cell_of(one.generation, one.centre)) is not None:
             assert evaluation.trace_T_B is not None, "an evaluation has a trace"
@@ -220,15 +244,16 @@ def _highest(fitness: FloatArray) -> float:
 def _concatenate(results: Sequence[EpisodesResult], count: int) -> EpisodesResult:
     """Join results along the first axis and keep the first `count`; the result has no observation moments."""
 
-    def join(name: str) -> np.ndarray:
-        return np.concatenate([getattr(result, name) for result in results])[:count]
+    def join(of: Callable[[EpisodesResult], np.ndarray]) -> np.ndarray:
+        return np.concatenate([of(result) for result in results])[:count]
 
     return EpisodesResult(
-        fitness=join("fitness"),
-        returns=join("returns"),
-        descriptor=join("descriptor"),
-        steps=join("steps"),
-        goal_distance=join("goal_distance"),
+        fitness=join(lambda result: result.fitness),
+        returns=join(lambda result: result.returns),
+        descriptor=join(lambda result: result.descriptor),
+        steps=join(lambda result: result.steps),
+        goal_distance=join(lambda result: result.goal_distance),
         moments=None,
         trace_T_B=results[0].trace_T_B,
+        outputs={name: join(lambda result, name=name: result.outputs[name]) for name in results[0].outputs},
     )

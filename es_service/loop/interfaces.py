@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from es_service.config.model import RunConfig
 from es_service.loop.history import HistoryRow
-from es_service.loop.parts import Arrays
+from es_service.loop.parts import Arrays, Changes
 from es_service.protocol.messages import FloatArray, Moments, TaskSpec
 from es_service.search.algorithms.base import Algorithm
 
@@ -30,7 +30,7 @@ class Store(Protocol):
 
     def part(self, name: str) -> Arrays: ...
     def commit(
-        self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow, evaluations: Sequence[HistoryRow]
+        self, generation: int, parts: Changes, history: HistoryRow, evaluations: Sequence[HistoryRow]
     ) -> None: ...
 
 

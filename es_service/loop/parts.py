@@ -1,31 +1,33 @@
 """The state as the run store keeps it: parts by name, each a few arrays. Inverse functions stand side by side.
 
-`state_parts` returns the parts that a generation has changed, and `state_from_parts` makes a state from parts. The
-content of the parts is defined only here; searches and maps do not depend on it. Elites are written when they enter the
-map and read one at a time.
+`state_from_parts` makes a state from parts; `changes.py` finds those that a generation has changed. The content of the
+parts is defined only here and, for what a search of the user's adds, in `search/state_parts.py`. Elites are read one at
+a time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
-from es_service.loop.state import Best, RunState, require_successor
+from es_service.loop.state import Best, RunState
 from es_service.protocol.messages import Moments
+from es_service.search import state_parts
 from es_service.search.algorithms.base import CentreState, FitnessWeight, SearchState, frozen
-from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map, unchanged_entries
+from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map, orders
 from es_service.search.maps.geometry import Cvt, Geometry, Grid
 from es_service.search.novelty import NoveltyArchive, archive_of, empty_archive
-from es_service.search.optimizer import Adam
+from es_service.search.steps import StepState
 
 Arrays = dict[str, np.ndarray]
 Parts = Mapping[str, Mapping[str, np.ndarray]]
 """Name of a part -> name of an array -> array."""
+Changes = Mapping[str, Mapping[str, np.ndarray] | None]
+"""Parts that a generation has changed, by name; None for a part that it has removed."""
 
 OBSERVATIONS, COUNTERS, WEIGHT, BEST, GEOMETRY_PART = "observations", "counters", "weight", "best", "map"
-OWN = "own"
-"""Name of the part with the arrays of a search's own."""
 CENTRE_PREFIX, CELL_PREFIX, ELITE_PREFIX, BLOCK_PREFIX = "centre_", "cell_", "elite_", "novelty_"
 """Prefixes of the names of numbered parts."""
 BLOCK_ENTRIES = 256
@@ -52,34 +54,8 @@ def block_part(block: int) -> str:
     return f"{BLOCK_PREFIX}{block:05d}"
 
 
-def state_parts(state: RunState, before: RunState | None) -> dict[str, Arrays]:
-    """The parts of `state` that differ from `before`; all parts if `before` is None.
-
-    Raises:
-        StoreError: the search's state cannot follow `before`; see `SearchState`.
-    """
-    require_successor(before, state)
-    search, earlier = state.search, before.search if before is not None else None
-    parts = {OBSERVATIONS: moments_to_arrays(state.observations), COUNTERS: _counters_to_arrays(state)}
-    for index, centre in enumerate(search.centres):
-        if earlier is None or centre is not earlier.centres[index]:
-            parts[centre_part(index)] = centre_to_arrays(centre)
-    if earlier is None or search.weight != earlier.weight:
-        parts[WEIGHT] = weight_to_arrays(search.weight)
-    if search.own and (earlier is None or search.own is not earlier.own):
-        parts[OWN] = dict(search.own)
-    if earlier is None or search.archive is not earlier.archive:
-        parts |= archive_to_parts(search.archive, earlier.archive.size if earlier is not None else 0)
-    if search.map is not None:
-        parts |= map_to_parts(search.map, earlier.map if earlier is not None else None)
-        parts |= {elite_part(cell): elite_to_arrays(elite) for cell, elite in state.elites.items()}
-    if before is None or state.best is not before.best:
-        parts[BEST] = best_to_arrays(state.best)
-    return parts
-
-
 def state_from_parts(parts: Parts, generation: int, wall_clock_s: float, dimensions: int) -> RunState:
-    """Inverse of `state_parts(state, None)`; elites are not needed.
+    """The state that consists of parts; inverse of `changes.changed_parts(state, None)`. Elites are not needed.
 
     Args:
         dimensions: number of descriptor dimensions, needed while the novelty archive has no entry.
@@ -96,7 +72,7 @@ def state_from_parts(parts: Parts, generation: int, wall_clock_s: float, dimensi
                 archive_from_parts(parts, dimensions),
                 weight_from_arrays(parts[WEIGHT]),
                 map_from_parts(parts),
-                parts.get(OWN, {}),
+                state_parts.from_parts(parts),
             )
         ),
         observations=moments_from_arrays(parts[OBSERVATIONS]),
@@ -107,7 +83,8 @@ def state_from_parts(parts: Parts, generation: int, wall_clock_s: float, dimensi
     )
 
 
-def _counters_to_arrays(state: RunState) -> Arrays:
+def counters_to_arrays(state: RunState) -> Arrays:
+    """Arrays of what a run has counted."""
     return {"env_steps": np.asarray(state.env_steps, np.int64), "episodes": np.asarray(state.episodes, np.int64)}
 
 
@@ -122,25 +99,27 @@ def moments_from_arrays(arrays: Mapping[str, np.ndarray]) -> Moments:
 
 
 def centre_to_arrays(centre: CentreState) -> Arrays:
-    """Arrays of a centre: its parameters, its optimiser, its archive entry, its cell and its own statistics."""
-    adam = centre.adam
+    """Arrays of a centre: its parameters, its archive entry, its cell, its own statistics, and those of its step."""
     own = {"own_mean_O": centre.own_mean_O, "own_std_O": centre.own_std_O}
     return {
         **{name: values for name, values in own.items() if values is not None},
         "centre_D": centre.centre_D,
-        "adam_m_D": adam.m_D,
-        "adam_v_D": adam.v_D,
-        "adam_step": np.asarray(adam.step, np.int64),
+        **centre.step,
         "entry": np.asarray(centre.entry, np.int64),
         "cell": np.asarray(centre.cell, np.int64),
     }
 
 
 def centre_from_arrays(arrays: Mapping[str, np.ndarray]) -> CentreState:
-    """Inverse of `centre_to_arrays`."""
-    adam = Adam(arrays["adam_m_D"], arrays["adam_v_D"], int(arrays["adam_step"]))
+    """Inverse of `centre_to_arrays`. What is not of the centre itself is of its step."""
     own_mean_O, own_std_O = arrays.get("own_mean_O"), arrays.get("own_std_O")
-    return CentreState(arrays["centre_D"], adam, int(arrays["entry"]), int(arrays["cell"]), own_mean_O, own_std_O)
+    step = {name: values for name, values in arrays.items() if name not in CentreState.__dataclass_fields__}
+    return CentreState(arrays["centre_D"], step, int(arrays["entry"]), int(arrays["cell"]), own_mean_O, own_std_O)
+
+
+def with_step(arrays: Mapping[str, np.ndarray], step: StepState) -> Arrays:
+    """The arrays of a centre with another state of its step."""
+    return {name: values for name, values in arrays.items() if name in CentreState.__dataclass_fields__} | dict(step)
 
 
 def weight_to_arrays(weight: FitnessWeight) -> Arrays:
@@ -158,7 +137,7 @@ def weight_from_arrays(arrays: Mapping[str, np.ndarray]) -> FitnessWeight:
 
 
 def archive_to_parts(archive: NoveltyArchive, stored: int) -> dict[str, Arrays]:
-    """The blocks that are new or changed if the archive's first `stored` entries are stored already."""
+    """The blocks with the archive's entries from `stored` on, and the one before if it is not full."""
     parts = {}
     for block in range(stored // BLOCK_ENTRIES, -(-archive.size // BLOCK_ENTRIES)):
         entries = slice(block * BLOCK_ENTRIES, (block + 1) * BLOCK_ENTRIES)
@@ -199,41 +178,55 @@ def geometry_from_arrays(arrays: Mapping[str, np.ndarray]) -> Geometry:
     return Cvt(bounds, arrays["centroid_C_B"])
 
 
-def map_to_parts(map_: BehaviourMap, before: BehaviourMap | None) -> dict[str, Arrays]:
-    """Parts of the cells whose entries differ from an earlier map; for None, of all cells, and the geometry's part."""
-    parts = {GEOMETRY_PART: geometry_to_arrays(map_.geometry)} if before is None else {}
-    same_N = np.zeros(map_.size, bool)
-    if before is not None:
-        same_N[: before.size] = unchanged_entries(map_, before)
-    for row in np.flatnonzero(~same_N):
-        parts[cell_part(int(map_.cell_N[row]))] = {
-            "order": np.asarray(row, np.int64),
+def map_to_arrays(map_: BehaviourMap) -> Arrays:
+    """Arrays of a map without its entries."""
+    samples = {} if map_.samples_N is None else {"counts_samples": np.asarray(True)}
+    return geometry_to_arrays(map_.geometry) | samples
+
+
+def entries_to_parts(map_: BehaviourMap, rows: Iterable[int]) -> dict[str, Arrays]:
+    """Parts of the cells of some rows of a map."""
+    order_N = orders(map_)
+    return {
+        cell_part(int(map_.cell_N[row])): {
+            "order": order_N[row],
             "fitness": map_.fitness_N[row],
             "descriptor_B": map_.descriptor_N_B[row],
             "generation": map_.generation_N[row],
             "centre": map_.centre_N[row],
             "score": map_.score_N[row],
+            **({} if map_.samples_N is None else {"samples": map_.samples_N[row]}),
         }
-    return parts
+        for row in rows
+    }
 
 
 def map_from_parts(parts: Parts) -> BehaviourMap | None:
-    """Inverse of `map_to_parts(map, None)`, among any other parts; None where there is no map."""
+    """Inverse of `map_to_arrays` and `entries_to_parts` of all rows, among any other parts; None without a map."""
     if GEOMETRY_PART not in parts:
         return None
-    empty = empty_map(geometry_from_arrays(parts[GEOMETRY_PART]))
+    empty = empty_map(
+        geometry_from_arrays(parts[GEOMETRY_PART]), counts_samples="counts_samples" in parts[GEOMETRY_PART]
+    )
     found = {int(name.removeprefix(CELL_PREFIX)): part for name, part in parts.items() if name.startswith(CELL_PREFIX)}
     if not found:
         return empty
     cells = sorted(found, key=lambda cell: int(found[cell]["order"]))
+
+    def column(name: str, kind: type[Any]) -> np.ndarray:
+        return np.array([found[cell][name] for cell in cells], kind)
+
+    order_N = column("order", np.int64)
     return BehaviourMap(
         empty.geometry,
         np.array(cells, np.int64),
-        np.array([found[cell]["fitness"] for cell in cells], np.float64),
-        np.array([found[cell]["descriptor_B"] for cell in cells], np.float64),
-        np.array([found[cell]["generation"] for cell in cells], np.int64),
-        np.array([found[cell]["centre"] for cell in cells], np.int64),
-        np.array([found[cell]["score"] for cell in cells], np.float64),
+        column("fitness", np.float64),
+        column("descriptor_B", np.float64),
+        column("generation", np.int64),
+        column("centre", np.int64),
+        column("score", np.float64),
+        None if empty.samples_N is None else column("samples", np.int64),
+        None if np.array_equal(order_N, np.arange(order_N.size)) else order_N,
     )
 
 

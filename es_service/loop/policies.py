@@ -5,12 +5,13 @@ Axes: N policies, E episodes, D policy parameters, O observation, T points of a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from es_service.protocol.messages import EpisodesResult, FloatArray, Policies, PolicyChunk, Work, around
+from es_service.protocol.noise import Domain
 from es_service.protocol.policies import POLICY_SLOTS, chunks_of
 
 
@@ -35,10 +36,12 @@ def policy_work(
     generation: int,
     ask: int = 0,
     traces: bool = False,
+    domain: Domain = Domain.EVALUATION_RESET,
 ) -> PolicyWork:
     """The chunks of policies with some number of episodes each.
 
-    The reset of each episode depends on (seed, generation, ask, number of the policy, number of the episode) alone.
+    The reset of each episode depends on (seed, domain, generation, ask, number of the policy, number of the episode)
+    alone.
 
     Args:
         statistics: mean and standard deviation of observations, [N, O] each.
@@ -47,7 +50,7 @@ def policy_work(
     for first in range(0, len(parameters_N_D), POLICY_SLOTS):
         of = slice(first, first + POLICY_SLOTS)
         arrays = [np.ascontiguousarray(array[of]) for array in (parameters_N_D, *statistics)]
-        policies = Policies(first, episodes, seed, traces, *arrays)
+        policies = Policies(first, episodes, seed, traces, *arrays, domain=domain)
         parts = range(chunks_of(len(policies.parameters_N_D), episodes))
         work += around(policies, [PolicyChunk(generation, len(work) + part, ask, part) for part in parts])
     return PolicyWork(parameters_N_D, *statistics, episodes, work)
@@ -64,8 +67,8 @@ def policy_episodes(asked: PolicyWork, results: Sequence[EpisodesResult]) -> Epi
     policies, episodes = len(asked.parameters_N_D), asked.episodes
     whole = policies // POLICY_SLOTS * POLICY_SLOTS
 
-    def by_policy(name: str) -> np.ndarray:
-        flat = np.concatenate([getattr(result, name) for result in results])
+    def by_policy(of: Callable[[EpisodesResult], np.ndarray]) -> np.ndarray:
+        flat = np.concatenate([of(result) for result in results])
         full, last = flat[: whole * episodes], flat[whole * episodes :]
         full = full.reshape(-1, episodes, POLICY_SLOTS, *flat.shape[1:]).swapaxes(1, 2)
         last = last.reshape(episodes, policies - whole, *flat.shape[1:]).swapaxes(0, 1)
@@ -73,13 +76,14 @@ def policy_episodes(asked: PolicyWork, results: Sequence[EpisodesResult]) -> Epi
 
     traces = [result.trace_T_B for result in results if result.trace_T_B is not None]
     return EpisodesResult(
-        fitness=by_policy("fitness"),
-        returns=by_policy("returns"),
-        descriptor=by_policy("descriptor"),
-        steps=by_policy("steps"),
-        goal_distance=by_policy("goal_distance"),
+        fitness=by_policy(lambda result: result.fitness),
+        returns=by_policy(lambda result: result.returns),
+        descriptor=by_policy(lambda result: result.descriptor),
+        steps=by_policy(lambda result: result.steps),
+        goal_distance=by_policy(lambda result: result.goal_distance),
         moments=None,
         trace_T_B=np.concatenate(traces) if traces else None,
+        outputs={name: by_policy(lambda result, name=name: result.outputs[name]) for name in results[0].outputs},
     )
 
 
@@ -95,6 +99,7 @@ def each_policy(result: EpisodesResult) -> list[EpisodesResult]:
             goal_distance=result.goal_distance[policy],
             moments=None,
             trace_T_B=result.trace_T_B[policy],
+            outputs={name: array[policy] for name, array in result.outputs.items()},
         )
         for policy in range(len(result.fitness))
     ]

@@ -61,6 +61,8 @@ class TaskSpec:
     least_reward: float | None = None
     """Reward per step from which a QD-score counts: about the least mean reward of an episode. It is not always a
     lower bound: short episodes of AntTrap can be below it. None if it is not specified."""
+    success: str = ""
+    """Which episodes succeed, in words; empty if the task does not say."""
     no_simd: str = ""
     """Reason why simd cannot compile episodes of this task; empty if it can."""
 
@@ -115,6 +117,8 @@ class WorkerSpec:
     """Pairs whose weighted noise is summed into one partial gradient."""
     rollout: Literal["xla", "simd"] = "xla"
     """Implementation that computes episodes and gradients."""
+    outputs: tuple[str, ...] = ()
+    """Outputs of evaluation and policy episodes besides those of every result; names of `workers.outputs.OUTPUTS`."""
     sources: dict[str, str] = field(default_factory=dict)
     """`sources.worker_sources` of the driver, which a worker must have as well; empty if this is not checked."""
 
@@ -293,6 +297,9 @@ class EpisodesResult:
     trace_T_B: FloatArray | None = None
     """Descriptor along the first episode of an evaluation chunk, at equal time intervals from the reset to the last
     possible step; None for training. For policies [..., T, B]: of each slot with a first episode, or None."""
+    outputs: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Outputs that `WorkerSpec.outputs` names, by name, with the leading axes of the other arrays; none in training.
+    success: bool, whether the episode succeeded as the task declares it; last_reward: reward of the last valid step."""
 
 
 @dataclass(frozen=True)

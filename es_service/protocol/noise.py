@@ -44,6 +44,10 @@ class Domain(IntEnum):
     ACTION_NOISE = 4
     SELECTION = 5
     VARIATION = 6
+    CANDIDATE_RESET = 7
+    """Resets of episodes that choose among the candidates of a certification."""
+    CERTIFICATION_RESET = 8
+    """Resets of episodes that only report the value of what was chosen."""
 
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -95,7 +99,14 @@ def stream_keys(seed: int, domain: Domain | tuple[Domain, ...], generation: int,
     return words if isinstance(domain, tuple) else words[0]
 
 
-def evaluation_reset_keys(seed: int, generation: int, episode: Any, ask: int = 0, policy: Any = None) -> Keys:
+def evaluation_reset_keys(
+    seed: int,
+    generation: int,
+    episode: Any,
+    ask: int = 0,
+    policy: Any = None,
+    domain: Domain = Domain.EVALUATION_RESET,
+) -> Keys:
     """Keys of the streams of the resets of evaluation episodes.
 
     Args:
@@ -103,9 +114,10 @@ def evaluation_reset_keys(seed: int, generation: int, episode: Any, ask: int = 0
             on.
         ask: number of the ask in its generation, where populations and policies are counted separately.
         policy: number of the policy in its ask; None for a centre.
+        domain: purpose of the episodes.
     """
     ids = (episode, *((ask,) if ask else ())) if policy is None else (episode, policy, ask)
-    return stream_keys(seed, Domain.EVALUATION_RESET, generation, *ids)
+    return stream_keys(seed, domain, generation, *ids)
 
 
 def _prefix(seed: int, domain: Domain, generation: int) -> int:

@@ -1,23 +1,21 @@
-"""Options: settings that a task or a search declares, with a default and what is allowed.
+"""Options: settings that a task declares, with a default and what is allowed.
 
     options = {
         "start": ("default", "corner"),    # one of these values, the first of which is the default
         "reach": Option(0.5, low=0.0),     # a number of the type of the default, here within a bound
     }
 
-A task has `options` as an attribute of its class. A search, which is a function, gets the same attribute from the
-decorator `has_options`. A config sets them below `task.options` and `search.options`.
+They are the attribute `options` of the task's class. A config sets them below `task.options`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 OptionValue = bool | int | float | str
-Owner = TypeVar("Owner", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
@@ -37,18 +35,8 @@ def choice(*values: OptionValue) -> Option:
     return Option(values[0], choices=values)
 
 
-def has_options(**options: Option | tuple[OptionValue, ...]) -> Callable[[Owner], Owner]:
-    """Decorator that declares the options of a function that makes a search."""
-
-    def declare(owner: Owner) -> Owner:
-        owner.options = options  # pyright: ignore[reportFunctionMemberAccess]
-        return owner
-
-    return declare
-
-
 def declared_options(owner: object) -> tuple[dict[str, Option], list[str]]:
-    """The options that a class or a function declares in its attribute `options`, and what is wrong with them."""
+    """The options that a class declares in its attribute `options`, and what is wrong with them."""
     given: Any = getattr(owner, "options", {})
     if not isinstance(given, Mapping):
         return {}, [f"options = {given!r} is not a mapping from names to options"]

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.protocol.noise import Domain
+
 POLICY_SLOTS = 16
 """Slots of a policy chunk, each of which is one episode of one policy. This is a constant so that the shape that is
 compiled never changes."""
@@ -32,6 +34,8 @@ class Policies:
     observation_mean_N_O: NDArray[np.float32]
     observation_std_N_O: NDArray[np.float32]
     """Observation statistics of each policy; 0 and 1 if there are none."""
+    domain: Domain = Domain.EVALUATION_RESET
+    """Purpose of the episodes, which is part of the addresses of their resets."""
 
     @property
     def nbytes(self) -> int:

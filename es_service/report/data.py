@@ -24,6 +24,7 @@ from es_service.loop.parts import (
 )
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
+from es_service.runs.certified import Certified, certified_policies, newest_certified
 from es_service.runs.standing import Standing, standing_at
 from es_service.runs.view import Run
 from es_service.search.maps.behaviour_map import BehaviourMap
@@ -55,6 +56,8 @@ class RunData:
     """Number of a cell -> descriptor along the first evaluation episode of its elite, [T, B]."""
     best: tuple[int, float] | None
     """Generation and fitness of the best centre; None before the first generation."""
+    certified: Certified | None
+    """The policy that the newest certification has put first; None if there is none, or if it cannot be read."""
     standing: Standing
     platforms: list[tuple[int, dict[str, Any]]]
     """(first generation, platform); each applies until the next one."""
@@ -133,6 +136,7 @@ def read_run(folder: Path, *, paths: bool = True, digest: bool = True) -> RunDat
         map=_map(found, problems),
         paths=_paths(found),
         best=None if best is None else (int(best["generation"]), float(best["fitness"])),
+        certified=_certified(folder, problems),
         standing=standing_at(run, driver, row),
         platforms=found.platforms,
         digest=_digest(folder, problems) if digest and driver is None and row is not None else "",
@@ -158,6 +162,15 @@ def _paths(found: SoundRun) -> dict[int, NDArray[np.float32]]:
         for part, arrays in found.parts.items()
         if part.startswith(ELITE_PREFIX)
     }
+
+
+def _certified(folder: Path, problems: list[str]) -> Certified | None:
+    try:
+        return newest_certified(certified_policies(folder))
+    except StoreError as error:
+        if not problems:
+            problems.append(error.sentence)
+        return None
 
 
 def _digest(folder: Path, problems: list[str]) -> str:

@@ -34,7 +34,7 @@ def verdict(data: RunData) -> str:
     alone = "" if data.last("generation") else "Only the initial centres were evaluated so far. "
     episodes = data.constants["search.evaluation_episodes"]
     found = f"The best centre, found {where}, has a mean fitness of {number(fitness)}"
-    sentence = f"{alone}{found} over {count(episodes, 'evaluation episode')}"
+    sentence = f"{alone}{found} over {count(episodes, 'evaluation episode')} (selected, not certified)"
     target = data.standing.limits.get("target_fitness")
     if target is not None:
         reached = "reaches" if fitness >= target else "does not reach"
@@ -45,7 +45,20 @@ def verdict(data: RunData) -> str:
     if data.map is not None:
         cells, size = data.map.size, data.map.geometry.size
         sentence += f"; {cells:,} of {size:,} cells of the behaviour map are filled ({100 * cells / size:.1f} %)"
-    return f"{sentence}."
+    return f"{_certified(data)}{sentence}."
+
+
+def _certified(data: RunData) -> str:
+    """The value of the certified policy, as a sentence that others follow; empty if there is none."""
+    if data.certified is None:
+        return ""
+    row = data.certified.row()
+    value = f"{number(row['return_mean'])} ({number(row['return_low'])} to {number(row['return_high'])})"
+    success = "" if row["successes"] is None else f" and succeeds in {row['successes']:,} of them"
+    return (
+        f"The certified policy, {row['policy']}, has the return {value} in {row['episodes']:,} episodes that no "
+        f"choice has seen{success}. "
+    )
 
 
 def what_was_run(data: RunData) -> list[tuple[str, str]]:

@@ -5,19 +5,28 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from es_service.config.fields import SEARCH_OPTIONS, TASK_OPTIONS
+from es_service.config.fields import TASK_OPTIONS
 from es_service.config.loading import load_config
-from es_service.config.method_keys import keys_without_effect
+from es_service.config.methods import search_fields
 from es_service.config.model import flat
 from es_service.config.options import options_of
 from es_service.config.resolution import LEFT_OPEN
+from es_service.config.search import SearchConfig
 from es_service.config.yaml_text import in_line
 from es_service.errors import ConfigError
 from es_service.protocol.messages import TaskSpec
+from es_service.search.algorithms import OURS
+from es_service.search.algorithms.settings import UndeclaredSettings
 
 SHOWN_ELSEWHERE = ("task.environment", "search.algorithm", "seed", "budget.", "compute.workers", "compute.engine")
 """Keys, or beginnings of keys, that a report shows in any case."""
 PRESET = "search.preset"
+
+
+class _Keys(NamedTuple):
+    """A method of which only the keys are known."""
+
+    settings: type[SearchConfig]
 
 
 class Setting(NamedTuple):
@@ -51,15 +60,17 @@ def changed_settings(config: Mapping[str, Any], task: TaskSpec) -> list[Setting]
 def _defaults(config: Mapping[str, Any], values: Mapping[str, Any], task: TaskSpec) -> dict[str, Any]:
     environment, algorithm = values["task.environment"], values["search.algorithm"]
     least = {
-        "task": {"environment": environment, "options": options_of(values, TASK_OPTIONS)},
+        "task": {"environment": environment, "options": options_of(values)},
         "search": {"algorithm": algorithm, "preset": values.get(PRESET, "literature")},
         "budget": config["budget"],
     }
-    # A run of version 0.11 may have any value of a key without effect; options of its search are declared in its code.
-    others = {*LEFT_OPEN, *keys_without_effect(algorithm)}
-    following = {key: values[key] for key in values if key not in others and not key.startswith(SEARCH_OPTIONS)}
+    method = OURS.get(algorithm, _Keys(UndeclaredSettings))  # a search of the user is not imported
+    unknown = {key for key in values if key.startswith("search.") and ":" in algorithm} - search_fields(
+        method.settings
+    ).keys()
+    following = {key: values[key] for key in values if key not in LEFT_OPEN and key not in unknown}
     try:
-        known: dict[str, Any] = {"tasks": {environment: task}, "algorithms": {algorithm: None}, "new": False}
+        known: dict[str, Any] = {"tasks": {environment: task}, "algorithms": {algorithm: method}, "new": False}
         plain, followed = (
             flat(load_config(source, overrides, **known).model_dump(mode="json"))
             for source, overrides in ((least, {}), (least, following))

@@ -10,9 +10,10 @@ from typing import Any
 
 from es_service.config import loading
 from es_service.config.changes import changed_constants
-from es_service.config.fields import SEARCH_OPTIONS, TASK_OPTIONS
+from es_service.config.fields import TASK_OPTIONS
 from es_service.config.keys import Overrides
 from es_service.config.loading import Source
+from es_service.config.methods import search_fields
 from es_service.config.model import RunConfig
 from es_service.config.tasks import TASKS, no_vectors
 from es_service.search.algorithms import ALGORITHMS
@@ -54,10 +55,10 @@ def changed_config(source: Source, overrides: Overrides = ()) -> RunConfig:
 
 def changes_from(constants: Mapping[str, Any], config: RunConfig) -> list[tuple[str, Any, Any]]:
     """What a config would change of the constants of a run, as `changed_constants` returns it."""
-    task, search = TASKS[config.task.environment], ALGORITHMS[config.search.algorithm]
-    declared = {TASK_OPTIONS: task.options, SEARCH_OPTIONS: getattr(search, "options", {})}
-    defaults = {f"{group}{name}": one.default for group, options in declared.items() for name, one in options.items()}
-    return changed_constants(constants, config.constants(), defaults)
+    fields = search_fields(type(config.search))
+    defaults = {key: field.default for key, field in fields.items() if not field.is_required()}
+    options = {TASK_OPTIONS + name: one.default for name, one in TASKS[config.task.environment].options.items()}
+    return changed_constants(constants, config.constants(), defaults | options)
 
 
 def accepted(config: RunConfig) -> RunConfig:

@@ -28,7 +28,7 @@ from es_service.runs.compiling import compiling_sentence
 from es_service.runs.moment import Policy, make_policy
 from es_service.runs.session import dispatch_limits, require_cores
 from es_service.runs.signals import stop_on_signals
-from es_service.runs.view import Run, is_no_elite
+from es_service.runs.view import Run, is_light, is_no_elite
 from es_service.search.observation_statistics import merge_moments, moments_of
 
 CHUNKS_PER_WORKER = 16
@@ -36,6 +36,8 @@ CHUNKS_PER_WORKER = 16
 EPISODES_AT_ONCE = 2**16
 """Most episodes of a policy whose results are in memory at a time; a constant, since it affects the last bits of the
 statistics of more episodes."""
+_Totals = tuple[Moments, Moments, int]
+"""Moments of the fitness, moments of the descriptors, and number of successes, of the episodes of a policy."""
 FRESH_GENERATION = 2**40
 """Generation number in the random streams of fresh episodes with seed 0; no run reaches it."""
 
@@ -64,6 +66,8 @@ class Fresh:
     """Count, mean and squared deviations of the fitness, without axes."""
     descriptors: Moments
     """The same of the descriptors, [B]."""
+    successes: int | None
+    """Number of fresh episodes that succeeded; None if the task does not declare success."""
     cell: int | None
     """Cell of its mean fresh descriptor; None without a map, or if the descriptor is not finite."""
 
@@ -94,31 +98,49 @@ class Fresh:
         return np.sqrt(self.descriptors.m2_O / self.episodes)
 
 
-def candidates(run: Run, *, best: bool, centre: bool, cells: Sequence[Sequence[int]], every: bool) -> list[Candidate]:
+def candidates(
+    run: Run,
+    *,
+    best: bool,
+    centre: bool,
+    cells: Sequence[Sequence[int]],
+    every: bool,
+    top: int = 0,
+    generation: int | None = None,
+) -> list[Candidate]:
     """The policies to evaluate: the best centre, the newest centre, then elites.
 
-    The elites are those of `cells` in the given order or, with `every`, all of the map in the order of discovery. The
-    best centre, the newest centre and the elites are each read from one generation, also while a driver is writing.
+    The elites are those of `cells` in the given order, then the `top` ones with the highest stored fitness (the older
+    entry of equal ones first), or with `every` all of the map in the order of discovery; each elite once. The best
+    centre, the newest centre and the elites are each read from one generation, also while a driver is writing.
+
+    Args:
+        generation: one whose state the run keeps; None: the newest.
 
     Raises NotInRunError for a cell that does not exist or is empty, for `every` with an empty map, for `centre` if the
-    run has no newest centre, and for a run without a finished generation.
+    run has no newest centre, and for a run without a finished generation; StoreError if the generation is not kept.
     """
     if run.generation is None:
         way_out = WayOut("resume", "continue it", str(run.folder))
         raise NotInRunError(f"{run.folder} has no finished generation yet", run=run.folder, ways_out=[way_out])
     found = []
     if best:
-        moment = run.at(wanted=lambda part: part == BEST)
+        moment = run.at(generation, lambda part: part == BEST)
         found.append(Candidate("best", moment.policy("best"), moment.best.generation, moment.best.fitness))
     if centre:
-        moment = run.at(wanted=is_no_elite)
+        moment = run.at(generation, is_no_elite)
         _, fitness = moment.require_newest_centre()
         found.append(Candidate("centre", moment.policy("centre"), moment.generation, fitness))
-    if not cells and not every:
+    if not cells and not every and not top:
         return found
-    wanted = None if every else [run.cell(place) for place in cells]
-    map_, elites = run.elites(wanted)
-    if not elites:
+    wanted = None
+    if not every:
+        moment = run.at(generation, is_light)
+        fittest = np.argsort(-moment.behaviour_map.fitness_N, kind="stable")[:top]
+        best_cells = moment.behaviour_map.cell_N[fittest].tolist()
+        wanted = list(dict.fromkeys([*map(moment.cell, cells), *best_cells]))
+    map_, elites = run.elites(wanted, generation)
+    if not elites and (cells or every):
         raise NotInRunError(f"the map of {run.folder} is empty", run=run.folder)
     for cell in map_.cell_N.tolist() if wanted is None else wanted:
         row, elite = map_.row_of(cell), elites[cell]
@@ -162,7 +184,9 @@ def evaluate(
     config = evaluation_config(run, workers)
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
-    limits, spec = dispatch_limits(config, chunks * len(chosen)), worker_spec(config, task_of(config))
+    task = task_of(config)
+    limits = dispatch_limits(config, chunks * len(chosen))
+    spec = worker_spec(config, task, ("success",) if task.success else ())
 
     def tell_compiling(kind: str) -> None:
         if kind:
@@ -175,30 +199,36 @@ def evaluate(
         together = max(1, CHUNKS_PER_WORKER * engine.counts.workers // chunks)
         for first in range(0, len(chosen), together):
             group = chosen[first : first + together]
-            centres = [_centre(candidate.policy, config.search.sigma, seed) for candidate in group]
-            for candidate, (fitness, descriptors) in zip(group, _moments(engine, centres, episodes), strict=True):
+            centres = [_centre(candidate.policy, seed) for candidate in group]
+            for candidate, (fitness, descriptors, successes) in zip(
+                group, _totals(engine, centres, episodes), strict=True
+            ):
                 cell = None
                 if geometry is not None and np.isfinite(descriptors.mean_O).all():
                     cell = int(geometry.cells_of(descriptors.mean_O[None])[0])
-                yield Fresh(candidate, fitness, descriptors, cell)
+                yield Fresh(candidate, fitness, descriptors, successes if task.success else None, cell)
 
 
 @np.errstate(invalid="ignore", over="ignore")  # a policy may have an infinite fitness
-def _moments(engine: Evaluator, centres: Sequence[Centre], episodes: int) -> list[tuple[Moments, ...]]:
-    """Moments of the fitness and of the descriptors of each centre, a limited number of episodes at a time."""
-    found: list[tuple[Moments, ...]] = []
+def _totals(engine: Evaluator, centres: Sequence[Centre], episodes: int) -> list[_Totals]:
+    """Moments of the fitness and of the descriptors of each centre, and its number of successes, a limited number of
+    episodes at a time."""
+    found: list[_Totals] = []
     for start in range(0, episodes, EPISODES_AT_ONCE):
         count, first = min(EPISODES_AT_ONCE, episodes - start), start // EVALUATION_EPISODES_PER_CHUNK
         results = evaluate_centres(engine, centres, count, resets="same", first=first)
-        parts = [(moments_of(result.fitness), moments_of(result.descriptor)) for result in results]
-        found = [tuple(map(_merged, *both)) for both in zip(found, parts, strict=True)] if found else parts
+        parts = [
+            (moments_of(result.fitness), moments_of(result.descriptor), int(np.sum(result.outputs.get("success", 0))))
+            for result in results
+        ]
+        found = list(map(_added, found, parts)) if found else parts
     return found
 
 
-def _merged(total: Moments, part: Moments) -> Moments:
-    return merge_moments(total, [part])
+def _added(total: _Totals, part: _Totals) -> _Totals:
+    return merge_moments(total[0], [part[0]]), merge_moments(total[1], [part[1]]), total[2] + part[2]
 
 
-def _centre(policy: Policy, sigma: float, seed: int) -> Centre:
+def _centre(policy: Policy, seed: int) -> Centre:
     mean_O, std_O = policy.observation_mean_O, policy.observation_std_O
-    return Centre(FRESH_GENERATION + seed, policy.parameters_D, sigma, mean_O, std_O)
+    return Centre(FRESH_GENERATION + seed, policy.parameters_D, 0.0, mean_O, std_O)

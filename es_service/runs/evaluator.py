@@ -48,6 +48,8 @@ class PolicyEvaluations:
     """[N, E]: number of environment steps, up to and including `done`."""
     valid: NDArray[np.bool_]
     """[N, E]: whether fitness and descriptor are finite."""
+    success: NDArray[np.bool_] | None
+    """[N, E]: whether an episode succeeded, as the task declares it; None if the task declares nothing."""
 
 
 class PolicyEvaluator:
@@ -96,8 +98,8 @@ class PolicyEvaluator:
         """
         if self._closed:
             raise EvaluationError(f"{self._closed}; make another one with es_service.evaluator")
-        policies_N_D = self._policies(parameters)
-        statistics = self._statistics(len(policies_N_D), observation_mean, observation_std)
+        policies_N_D = policies_of(self.config, self.task, parameters)
+        statistics = statistics_of(self.task, len(policies_N_D), observation_mean, observation_std)
         asked = policy_work(
             policies_N_D,
             statistics,
@@ -111,48 +113,14 @@ class PolicyEvaluator:
             self.close(f"this evaluator was closed by an error during a call ({type(error).__name__}: {error})")
             raise
         result = policy_episodes(asked, [answer for answer in answers if isinstance(answer, EpisodesResult)])
-        valid = valid_members(result)
-        return PolicyEvaluations(result.fitness, result.returns, result.descriptor, result.steps, valid)
+        valid, success = valid_members(result), result.outputs.get("success")
+        return PolicyEvaluations(result.fitness, result.returns, result.descriptor, result.steps, valid, success)
 
     def close(self, why: str = "this evaluator is closed") -> None:
         """End the workers. Later calls raise an EvaluationError that begins with `why`."""
         if not self._closed:
             self._closed = why
             self._engine.close()
-
-    def _policies(self, parameters: ArrayLike) -> FloatArray:
-        """The policies as float32 [N, D]."""
-        allowed = f"an array of numbers of shape (policies, {self.parameters}), with at least one policy"
-        policies_N_D = _floats("parameters", parameters, allowed)
-        if policies_N_D.ndim != 2 or not len(policies_N_D) or policies_N_D.shape[1] != self.parameters:
-            raise _wrong("parameters", f"has the shape {policies_N_D.shape}", policies_N_D.shape, allowed)
-        wrong = np.flatnonzero(~np.isfinite(policies_N_D).all(axis=1))
-        if wrong.size:
-            which = f"{wrong.size} of {len(policies_N_D)} policies, the first of which is policy {wrong[0]}"
-            raise _wrong("parameters", f"has NaN or infinite float32 numbers in {which}", None, "finite numbers")
-        return policies_N_D
-
-    def _statistics(
-        self, policies: int, mean: ArrayLike | None, std: ArrayLike | None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Mean and standard deviation of each policy, [N, O]."""
-        size = self.task.observation_size
-        if mean is None and std is None:
-            return no_statistics(policies, size)
-        found = []
-        for name, given in (("observation_mean", mean), ("observation_std", std)):
-            allowed = f"an array of shape ({size},) or ({policies}, {size}), or None for both statistics"
-            if given is None:
-                raise _wrong(name, "is None, but the other statistic is given", None, allowed)
-            array = _floats(name, given, allowed)
-            if array.shape not in ((size,), (policies, size)):
-                raise _wrong(name, f"has the shape {array.shape}", array.shape, allowed)
-            if not np.isfinite(array).all():
-                raise _wrong(name, "has NaN or infinite float32 numbers", None, "finite numbers")
-            found.append(np.ascontiguousarray(np.broadcast_to(array, (policies, size))))
-        if not (found[1] > 0.0).all():
-            raise _wrong("observation_std", "has numbers that are not positive", None, "positive numbers")
-        return found[0], found[1]
 
 
 class Evaluating(AbstractContextManager[PolicyEvaluator]):
@@ -202,11 +170,64 @@ def evaluator(
     return Evaluating(_started(config, workers, engine, address))
 
 
+def policies_of(config: RunConfig, task: TaskSpec, parameters: ArrayLike) -> FloatArray:
+    """The argument `parameters` as policies, float32 [N, D]. Raises ConfigError if it is wrong."""
+    size = policy_shape(config, task).parameters
+    allowed = f"an array of numbers of shape (policies, {size}), with at least one policy"
+    policies_N_D = _floats("parameters", parameters, allowed)
+    if policies_N_D.ndim != 2 or not len(policies_N_D) or policies_N_D.shape[1] != size:
+        raise _wrong("parameters", f"has the shape {policies_N_D.shape}", policies_N_D.shape, allowed)
+    wrong = np.flatnonzero(~np.isfinite(policies_N_D).all(axis=1))
+    if wrong.size:
+        which = f"{wrong.size} of {len(policies_N_D)} policies, the first of which is policy {wrong[0]}"
+        raise _wrong("parameters", f"has NaN or infinite float32 numbers in {which}", None, "finite numbers")
+    return policies_N_D
+
+
+def statistics_of(
+    task: TaskSpec, policies: int, mean: ArrayLike | None, std: ArrayLike | None
+) -> tuple[FloatArray, FloatArray]:
+    """The arguments `observation_mean` and `observation_std` for each policy, [N, O]; 0 and 1 for None. Raises
+    ConfigError if one is wrong."""
+    size = task.observation_size
+    if mean is None and std is None:
+        return no_statistics(policies, size)
+    found = []
+    for name, given in (("observation_mean", mean), ("observation_std", std)):
+        allowed = f"an array of shape ({size},) or ({policies}, {size}), or None for both statistics"
+        if given is None:
+            raise _wrong(name, "is None, but the other statistic is given", None, allowed)
+        array = _floats(name, given, allowed)
+        if array.shape not in ((size,), (policies, size)):
+            raise _wrong(name, f"has the shape {array.shape}", array.shape, allowed)
+        if not np.isfinite(array).all():
+            raise _wrong(name, "has NaN or infinite float32 numbers", None, "finite numbers")
+        found.append(np.ascontiguousarray(np.broadcast_to(array, (policies, size))))
+    if not (found[1] > 0.0).all():
+        raise _wrong("observation_std", "has numbers that are not positive", None, "positive numbers")
+    return found[0], found[1]
+
+
 @contextmanager
 def _started(
     config: RunConfig | Source, workers: int | str | None, engine: str | None, address: str | None
 ) -> Iterator[PolicyEvaluator]:
     """See `evaluator`."""
+    config = evaluating_config(config, workers, engine, address)
+    task = task_of(config)  # before the workers start, since it may raise
+    outputs = ("success",) if task.success else ()
+    started = make_engine(config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER, outputs=outputs)
+    made = PolicyEvaluator(config, task, started)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def evaluating_config(
+    config: RunConfig | Source, workers: int | str | None, engine: str | None, address: str | None
+) -> RunConfig:
+    """The config with which policies are evaluated; arguments and errors as `evaluator`."""
     given = {"compute.workers": workers, "compute.engine": engine, "compute.address": address}
     overrides = implied_by(engine, address) | {key: value for key, value in given.items() if value is not None}
     if not isinstance(config, RunConfig):
@@ -214,13 +235,7 @@ def _started(
     elif overrides:
         task_of(config)  # refuses a task that has changed, which `changed_config` would take as it is now
         config = changed_config(config.model_dump(mode="json"), overrides)
-    task = task_of(config)  # before the workers start, since it may raise
-    started = make_engine(config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER)
-    made = PolicyEvaluator(config, task, started)
-    try:
-        yield made
-    finally:
-        made.close()
+    return config
 
 
 def _tell_wait(shortage: str) -> None:

@@ -57,14 +57,17 @@ def export(run: Run, to: str, folder: Path) -> list[Path]:
 
 
 def tables(run: Run) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Names and content of history, evaluated centres, novelty archive and, where there is one, the map, as of one
-    generation. They come one by one, because the first two may be large."""
+    """Names and content of history, evaluated centres, novelty archive and, where there are any, the map and the
+    certified policies; all but the last as of one generation. They come one by one, because the first two may be
+    large."""
     moment = run.at(wanted=is_no_elite)
     yield "history", run.history_until(moment.generation).reset_index()
     yield "evaluations", run.evaluations_until(moment.generation)
     yield "novelty", moment.novelty
     if run.constants["map.enabled"]:
         yield "map", moment.map
+    if not (certified := run.certified).empty:
+        yield "certified", certified
 
 
 def arrays(run: Run) -> dict[str, np.ndarray]:
@@ -73,8 +76,9 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
 
     Names: `widths` of the layers, `observation_clip` (NaN: none); for the best and the newest centre `best_parameters`
     [D], `best_mean` [O], `best_std` [O], `centre_parameters`, ...; for N elites `cell` [N, dimensions of the map],
-    `fitness` [N], `descriptor` [N, B], `generation` [N], `parameters` [N, D], `mean` [N, O], `std` [N, O], `trace`
-    [N, T, B]. A layer's weights [inputs, outputs] come before its biases, layer after layer.
+    `fitness` [N], `descriptor` [N, B], `generation` [N], `samples` [N] (where they are counted), `parameters` [N, D],
+    `mean` [N, O], `std` [N, O], `trace` [N, T, B]. A layer's weights [inputs, outputs] come before its biases, layer
+    after layer.
     """
     moment = run.at()
     clip = run.constants["policy.observation_clip"]
@@ -162,6 +166,7 @@ def _map_arrays(run: Run, map_: BehaviourMap, elites: dict[int, Elite]) -> dict[
         "fitness": map_.fitness_N,
         "descriptor": map_.descriptor_N_B,
         "generation": map_.generation_N,
+        **({} if map_.samples_N is None else {"samples": map_.samples_N}),
         **{
             name: np.array([getattr(elite, field) for elite in elites.values()], np.float32)
             if elites

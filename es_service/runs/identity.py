@@ -9,7 +9,7 @@ from es_service.config.model import RunConfig
 from es_service.dispatch.engine import Engine
 from es_service.errors import ConfigError, WayOut
 from es_service.loop.history import HistoryRow
-from es_service.loop.parts import Arrays
+from es_service.loop.parts import Changes
 from es_service.protocol.machine import CODE, computed_on, is_mixed, platform_info, without_code
 from es_service.protocol.sources import Sources, driver_sources, in_words, other_files, worker_sources
 from es_service.store.writer import RunStore
@@ -122,7 +122,7 @@ class Recorder:
     def commit(
         self,
         generation: int,
-        parts: Mapping[str, Arrays],
+        parts: Changes,
         history: HistoryRow,
         evaluations: Sequence[HistoryRow],
     ) -> None:

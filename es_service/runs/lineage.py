@@ -28,6 +28,7 @@ from es_service.loop.parts import (
     moments_to_arrays,
     weight_from_arrays,
     weight_to_arrays,
+    with_step,
 )
 from es_service.protocol.messages import Moments
 from es_service.runs.checked_config import changed_config, changes_from
@@ -35,6 +36,7 @@ from es_service.runs.view import Run, is_no_elite, open_run
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import NO_CELL, FitnessWeight
 from es_service.search.observation_statistics import no_observations
+from es_service.search.steps import fresh_state
 from es_service.store import reader
 from es_service.store.beginning import Beginning
 from es_service.store.codec import Part
@@ -72,7 +74,7 @@ def fork_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> Ru
     mapping = present | {"search": present["search"] | {"init_from": None}}  # a fork has the parent's state instead
     config = changed_config(mapping, overrides)
     changes = changes_from(origin.constants, config)
-    unfit = [_unfit(name, old, new, name) for name, old, new in changes if does_not_fit(name, old, new)]
+    unfit = [_unfit(name, old, new, name) for name, old, new in changes if does_not_fit(name, old, new, ALGORITHMS)]
     names = task_of(config).descriptor_names
     if not unfit and list(names) != origin.descriptor_names:  # a task of the user that was edited
         what = f"the descriptor of {config.task.environment}"
@@ -110,7 +112,15 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
     if "search.algorithm" in changed:
         weight = FitnessWeight(ALGORITHMS[config.search.algorithm](config).fitness_weight)
         parts = {**parts, WEIGHT: weight_to_arrays(weight)}
-    if "search.parent_statistics" in changed and config.search.parent_statistics == "global":
+    constants = config.constants()
+    if "search.step.kind" in changed:
+        parts = {
+            name: with_step(part, fresh_state(config.search, part["centre_D"].size))
+            if name.startswith(CENTRE_PREFIX)
+            else part
+            for name, part in parts.items()
+        }
+    if "search.parent_statistics" in changed and constants["search.parent_statistics"] == "global":
         parts = _without_own_statistics(parts)
     platforms = [(first, platform) for first, platform in reader.read_platforms(origin.folder) if first <= at]
     return _lineage(origin, at), Beginning(

@@ -105,6 +105,7 @@ class Moment:
             | {"fitness": map_.fitness_N}
             | dict(zip(names, map_.descriptor_N_B.T, strict=True))
             | {"generation": map_.generation_N, "centre": map_.centre_N}
+            | ({} if map_.samples_N is None else {"samples": map_.samples_N})
         )
 
     def cell(self, place: int | Sequence[int]) -> int:

@@ -82,16 +82,16 @@ def record(run: Run, *, best: bool, cells: Sequence[Sequence[int]]) -> tuple[lis
     now = {**platform_info(), CODE: code_of(config)}
     stored = [_stored(run, one, now) for one in chosen]
     requests = [
-        RecordRequest(_centre(one, config.search.sigma), **vars(Resets(config.seed) if its is None else its.resets))
+        RecordRequest(_centre(one), **vars(Resets(config.seed) if its is None else its.resets))
         for one, its in zip(chosen, stored, strict=True)
     ]
     found = _answer((worker_spec(config, task_of(config)), requests))
     return [Replay(*one) for one in zip(chosen, found.recordings, stored, strict=True)], found
 
 
-def _centre(one: Candidate, sigma: float) -> Centre:
+def _centre(one: Candidate) -> Centre:
     policy = one.policy
-    return Centre(one.generation, policy.parameters_D, sigma, policy.observation_mean_O, policy.observation_std_O)
+    return Centre(one.generation, policy.parameters_D, 0.0, policy.observation_mean_O, policy.observation_std_O)
 
 
 def _stored(run: Run, one: Candidate, now: Mapping[str, Any]) -> StoredEpisode | None:

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from es_service.config.model import RunConfig, worker_spec
-from es_service.config.parallel import chunks_of_phases, populations
+from es_service.config.parallel import chunks_of_phases
+from es_service.config.search import PopulationConfig
 from es_service.config.tasks import task_of
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
@@ -74,21 +75,22 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
     messages slower. Raises EvaluationError if Ray or the task cannot be used, ConfigError if the method asks for no
     populations.
     """
-    if not populations(config):
-        name = config.search.algorithm
+    search = config.search
+    if not isinstance(search, PopulationConfig):
+        name = search.algorithm
         why = f"bench scaling cannot predict {name}, which has policies instead of populations"
         raise ConfigError(why, field="search.algorithm", value=name)
     task = task_of(config)
     spec = worker_spec(config, task)
     parameters = initial_parameters(spec.policy, config.policy.init, config.seed, 0)
     zeros_O = np.zeros(task.observation_size, np.float32)
-    centres = [Centre(1, parameters, config.search.sigma, zeros_O, zeros_O + 1.0) for _ in range(populations(config))]
+    centres = [Centre(1, parameters, search.sigma, zeros_O, zeros_O + 1.0) for _ in range(search.populations())]
     phases = _phases(config)
-    works = [_work(phase, centres, spec, config.search.evaluation_episodes) for phase in phases]
+    works = [_work(phase, centres, spec, search.evaluation_episodes) for phase in phases]
     chunk_s, answers = _chunk_costs(spec, works)
     message_s, way_s = _message_costs([work[0] for work in works], answers)
     costs = Costs(chunk_s, message_s, way_s, _driver_cost(config, answers))
-    steps = _steps(config, answers)
+    steps = _steps(search, answers)
     for count in workers:
         cores = actor_cores([cores_per_node], count, None)
         found = predict(phases, costs, count // cores, cores, partial(_longest_part, cores=cores))
@@ -122,14 +124,14 @@ def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec, evaluation_
     ]
 
 
-def _steps(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float:
+def _steps(search: PopulationConfig, answers: Mapping[str, ChunkResult]) -> float:
     """Environment steps of a generation."""
     episodes = {
-        "TrainingChunk": 2 * config.search.pairs,  # the steps of a member are those of all of its episodes
-        "EvaluationChunk": config.search.evaluation_episodes,
+        "TrainingChunk": 2 * search.pairs,  # the steps of a member are those of all of its episodes
+        "EvaluationChunk": search.evaluation_episodes,
     }
     each = [(answers[kind], count) for kind, count in episodes.items()]
-    return populations(config) * sum(
+    return search.populations() * sum(
         count * float(answer.steps.mean()) for answer, count in each if isinstance(answer, EpisodesResult)
     )
 

@@ -199,6 +199,7 @@ def make_engine(
     on_compile: Callable[[str], None] = lambda kind: None,
     *,
     at_once: int | None = None,
+    outputs: tuple[str, ...] = (),
 ) -> Engine[Any]:
     """The configured engine, whose workers are starting.
 
@@ -206,8 +207,9 @@ def make_engine(
         should_stop, log, on_wait, on_compile: as in `Engine`.
         on_refusal: as in `ray_engine`.
         at_once: number of chunks that can be computed at the same time; None: as in a generation of a run.
+        outputs: see `WorkerSpec.outputs`.
     """
-    spec, compute = worker_spec(config, task_of(config)), config.compute
+    spec, compute = worker_spec(config, task_of(config), outputs), config.compute
     most = work_at_once(config) if at_once is None else at_once
     limits = dispatch_limits(config, most)
     if compute.engine == "inline":

@@ -40,10 +40,9 @@ class Standing:
 
 
 def population_size(constants: Mapping[str, Any]) -> str:
-    """The size of a run's population, in words."""
-    if constants["search.algorithm"] == "map_elites":
-        return f"{constants['search.batch']:,} policies"
-    return f"{constants['search.pairs']:,} pairs"
+    """The size of a generation's populations, or of its batch of policies, in words; empty if it is not known."""
+    sizes = {"search.pairs": "pairs", "search.batch": "policies"}
+    return next((f"{constants[key]:,} {unit}" for key, unit in sizes.items() if key in constants), "")
 
 
 def newest_runs(folder: Path, most: int = 10) -> list[Path]:

@@ -18,7 +18,7 @@ from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop import driver
 from es_service.loop.history import HistoryRow
-from es_service.loop.parts import Arrays
+from es_service.loop.parts import Arrays, Changes
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info
 from es_service.runs.checked_config import changed_config
@@ -30,7 +30,8 @@ from es_service.search.algorithms import ALGORITHMS
 from es_service.store import reader
 from es_service.store.codec import (
     changed_sum,
-    encode_part,
+    encode_change,
+    listed,
     part_sha256,
     row_dict,
     row_values,
@@ -142,7 +143,7 @@ class _Comparison:
         self._stored, self._whole = reader.read_kept(run.folder)
         self._in_force = {} if begin is None else rows_in_force(self._stored, begin)
         self._sum = state_sum(self._in_force)
-        self._changed: dict[str, Mapping[str, Any]] = {}
+        self._changed: dict[str, Mapping[str, Any] | None] = {}
 
     def load(self, without: str | None = None) -> dict[str, Arrays]:
         """The state at the beginning, without the parts whose names begin with a prefix."""
@@ -155,14 +156,16 @@ class _Comparison:
     def part(self, name: str) -> Arrays:
         """A part of the newest state: as it was computed, or else as it was at the beginning."""
         if name in self._changed:
-            return dict(self._changed[name])
+            if (changed := self._changed[name]) is None:
+                raise KeyError(name)
+            return dict(changed)
         return self._run.parts(self.generation, lambda part: part == name)[1][name]
 
-    def commit(
-        self, generation: int, parts: Mapping[str, Arrays], history: HistoryRow, evaluations: Sequence[HistoryRow]
-    ) -> None:
+    def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Sequence[HistoryRow]) -> None:
         """Compare a generation. Raises _End after the last one, and after one that differs."""
-        new = {part: (generation, part_sha256(part, generation, encode_part(new))) for part, new in parts.items()}
+        payloads = {part: encode_change(arrays) for part, arrays in parts.items()}
+        sums = {part: part_sha256(part, generation, payload) for part, payload in payloads.items()}
+        new = {part: (generation, listed(sums[part], payload)) for part, payload in payloads.items()}
         old = {part: self._in_force[part] for part in new if part in self._in_force}
         self._sum = changed_sum(self._sum, old, new)
         self._in_force |= new

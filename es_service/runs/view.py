@@ -13,8 +13,10 @@ import numpy as np
 
 from es_service.config.compute import COMPUTE_CONSTANTS
 from es_service.config.yaml_text import read_yaml_file
+from es_service.errors import NotInRunError, WayOut
 from es_service.loop.parts import BEST, BLOCK_PREFIX, CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART, elite_part
 from es_service.protocol.messages import PolicyShape
+from es_service.runs.certified import certified_policies, newest_certified
 from es_service.runs.moment import Moment, Policy, descriptor_names, make_policy, policy_shape
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.store import reader
@@ -126,7 +128,8 @@ class Run:
     @property
     def map(self) -> pd.DataFrame:
         """The behaviour map, one row per filled cell in the order of discovery: the cell's number (as in the history)
-        and its index along each dimension (not for a cvt map); the elite's fitness, descriptor, generation and centre.
+        and its index along each dimension (not for a cvt map); the elite's fitness, descriptor, generation and centre,
+        and the number of its samples where the search counts them.
         """
         return self.at(wanted=is_light).map
 
@@ -142,18 +145,32 @@ class Run:
         cell = self.cell(place)
         return self.elites([cell])[1][cell]
 
-    def elites(self, cells: Collection[int] | None = None) -> tuple[BehaviourMap, dict[int, Elite]]:
+    def elites(
+        self, cells: Collection[int] | None = None, generation: int | None = None
+    ) -> tuple[BehaviourMap, dict[int, Elite]]:
         """The map, and its elites by the numbers of their cells, read from one generation.
 
         Args:
             cells: numbers of the elites' cells; None: all, which takes as much memory as all of their policies.
+            generation: one whose state is kept; None: the newest.
         """
         names = None if cells is None else {elite_part(cell) for cell in cells}
 
         def wanted(part: str) -> bool:
             return is_light(part) or (part.startswith(ELITE_PREFIX) if names is None else part in names)
 
-        return self.at(wanted=wanted).elites(cells)
+        return self.at(generation, wanted).elites(cells)
+
+    @property
+    def certified(self) -> pd.DataFrame:
+        """The certified policies, one row per policy in the order of certification and rank; empty if there are none.
+
+        `Certified.row` in `es_service.runs.certified` has the columns. Values are of episodes that no choice has
+        seen, with intervals of 95 %; the policy with rank 0 is the one that selection put first.
+        """
+        import pandas as pd
+
+        return pd.DataFrame([one.row() for one in certified_policies(self.folder)])
 
     @property
     def descriptor_names(self) -> list[str]:
@@ -177,7 +194,7 @@ class Run:
         """Layer widths of this run's policies."""
         return policy_shape(self.meta)
 
-    def policy(self, which: Literal["best", "centre"] | int | Sequence[int] = "best") -> Policy:
+    def policy(self, which: Literal["best", "centre", "certified"] | int | Sequence[int] = "best") -> Policy:
         """A policy of the run, with its observation statistics.
 
         Args:
@@ -185,15 +202,24 @@ class Run:
                 statistics of their evaluation; or "centre" (the centre that the newest generation updated, the fittest
                 of several), with the statistics it would use next.
 
-        Raises NotInRunError for a cell that does not exist or is empty, and for "centre" if the newest generation
-        evaluated only policies, as those of map_elites do; ValueError for another name.
+        "certified" is the policy that the newest certification of the run has put first.
+
+        Raises NotInRunError for "certified" if the run has no certification, for a cell that does not exist or is
+        empty, and for "centre" if the newest generation evaluated only policies, as those of map_elites do; ValueError
+        for another name.
         """
         if which == "best":
             return self.at(wanted=lambda part: part == BEST).policy("best")
         if which == "centre":
             return self.at(wanted=is_no_elite).policy("centre")
+        if which == "certified":
+            found = newest_certified(certified_policies(self.folder))
+            if found is None:
+                way_out = WayOut("certify", "certify one", str(self.folder))
+                raise NotInRunError(f"{self.folder} has no certified policy", run=self.folder, ways_out=[way_out])
+            return make_policy(self.meta, found.parameters_D, found.observation_mean_O, found.observation_std_O)
         if isinstance(which, str):
-            raise ValueError(f"policy({which!r}): choose 'best', 'centre', or a cell such as (3, 17)")
+            raise ValueError(f"policy({which!r}): choose 'best', 'centre', 'certified', or a cell such as (3, 17)")
         elite = self.elite(which)
         return make_policy(self.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
 

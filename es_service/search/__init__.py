@@ -1,1 +1,1 @@
-"""Search methods as pure functions of a search's state: algorithms, maps, novelty, shaping, optimiser, statistics."""
+"""Search methods as pure functions of a search's state: algorithms, steps, maps, novelty, shaping, statistics."""

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from es_service.search.novelty_tree import COPIES, Tree, make_tree
+from es_service.search.state_parts import same_rows
 
 Distance = Literal["euclidean", "squared_euclidean"]
 
@@ -47,6 +48,11 @@ class _Room:
     centre: NDArray[np.int64]
     used: int
     """Number of entries written so far."""
+
+    @property
+    def is_writeable(self) -> bool:
+        """Whether there can be more; a search may have made a view of these arrays read-only, and them with it."""
+        return all(one.flags.writeable for one in (self.descriptor_B, self.generation, self.centre))
 
 
 @dataclass(frozen=True)
@@ -97,25 +103,39 @@ def extended(archive: NoveltyArchive, descriptor_B: ArrayLike, generation: int, 
     if np.shape(descriptor_B) != archive.descriptor_N_B.shape[1:]:
         shapes = f"{np.shape(descriptor_B)}, but those of the archive have {archive.descriptor_N_B.shape[1:]}"
         raise ValueError(f"the descriptor has shape {shapes}")
-    if room is None or room.used != size or room.used == room.generation.size:
+    if room is None or room.used != size or room.used == room.generation.size or not room.is_writeable:
         room = _copied(archive)
     room.descriptor_B[size], room.generation[size], room.centre[size] = descriptor_B, generation, centre
     room.used = size + 1
     return _with_tree(room, archive.tree)
 
 
-def extends(archive: NoveltyArchive, earlier: NoveltyArchive) -> bool:
-    """Whether an archive begins with all entries of an earlier one, unchanged and in the same order."""
-    if archive.room is not None and archive.room is earlier.room and _address(archive) == _address(earlier):
-        return archive.size >= earlier.size
-    return all(
-        np.array_equal(of_archive[: earlier.size], of_earlier)
-        for of_archive, of_earlier in (
-            (archive.descriptor_N_B, earlier.descriptor_N_B),
-            (archive.generation_N, earlier.generation_N),
-            (archive.centre_N, earlier.centre_N),
-        )
-    )
+def same_entries(archive: NoveltyArchive, earlier: NoveltyArchive) -> int:
+    """Number of first entries in which two archives that `sound_archive` has returned are the same, bit for bit."""
+    count = min(archive.size, earlier.size)
+    if archive.room is earlier.room:
+        return count  # an entry of a room is written once
+    if archive.descriptor_N_B.shape[1:] != earlier.descriptor_N_B.shape[1:]:
+        return 0
+    for now, then in zip(_columns(archive), _columns(earlier), strict=True):
+        count = same_rows(now[:count], then[:count])
+    return count
+
+
+def sound_archive(archive: NoveltyArchive) -> NoveltyArchive:
+    """The archive itself if this module has made it; else one of the same entries, with a tree over these.
+
+    Raises:
+        ValueError: it has not as many descriptors, generations and centres.
+    """
+    if archive.room is not None and (archive.tree is None or archive.tree.entries <= archive.size):
+        in_room = (archive.room.descriptor_B, archive.room.generation, archive.room.centre)
+        if all(_address(ours) == _address(given) for ours, given in zip(in_room, _columns(archive), strict=True)):
+            return archive
+    columns = [np.array(given, kind, order="C") for given, kind in zip(_columns(archive), "dqq", strict=True)]
+    if columns[0].ndim != 2 or any(len(given) != len(columns[0]) for given in columns):
+        raise ValueError(f"the arrays of the novelty archive have the shapes {[given.shape for given in columns]}")
+    return archive_of(*columns)
 
 
 def novelty(
@@ -168,8 +188,12 @@ def novelty(
     return novelty_Q.reshape(shape)
 
 
-def _address(archive: NoveltyArchive) -> int:
-    return archive.descriptor_N_B.__array_interface__["data"][0]
+def _columns(archive: NoveltyArchive) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return archive.descriptor_N_B, archive.generation_N, archive.centre_N
+
+
+def _address(values: np.ndarray) -> int:
+    return np.asarray(values).__array_interface__["data"][0]
 
 
 def _copied(archive: NoveltyArchive) -> _Room:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Shaping = Literal["ranks", "signs", "returns"]
+from es_service.config.parts import Shaping, TopPairs
 
 
 def centred_ranks(fitness_PS: ArrayLike) -> NDArray[np.float64]:
@@ -90,12 +90,44 @@ def _mean(values: NDArray[np.float64]) -> float:
     return math.fsum(values.ravel().tolist()) / values.size
 
 
-SHAPINGS: dict[Shaping, Callable[[ArrayLike], NDArray[np.float64]]] = {
-    "ranks": centred_ranks,
-    "signs": pair_signs,
-    "returns": standardised,
+def top_pair_differences(settings: TopPairs, fitness_P_S: ArrayLike) -> NDArray[np.float64]:
+    """Map fitness to utilities with which a pair has the weight (f+ - f-) * P / (b * s); 0 for all but the best pairs.
+
+    These are the b = `count` pairs whose better member has the highest fitness, and s is the standard deviation of
+    their 2 b fitness values; P is the number of all pairs, by which the gradient estimate is divided. An invalid member
+    counts with the lowest fitness of the others. Of equally good pairs the first one is taken (the released code takes
+    all of them). If all these fitness values are equal, all utilities are 0 (it divides by 0).
+
+    Args:
+        fitness_P_S: fitness of every member, with axes P (pairs) and S (signs [+, -]).
+
+    Returns:
+        Utilities of the same shape, of a pair half of its weight and the negative of that.
+
+    Source: augmented random search, Mania et al. 2018 (arXiv:1803.07055).
+    """
+    known_P_S = invalid_lowest(fitness_P_S)
+    count = settings.count or len(known_P_S)
+    top = np.argsort(-known_P_S.max(axis=1), kind="stable")[:count]
+    spread = standard_deviation(known_P_S[top])
+    half_P = np.zeros(len(known_P_S))
+    if spread:
+        half_P[top] = 0.5 * ((known_P_S[top, 0] - known_P_S[top, 1]) * (len(known_P_S) / (count * spread)))
+    return np.stack([half_P, -half_P], axis=1)
+
+
+SHAPINGS: dict[str, Callable[[Any, ArrayLike], NDArray[np.float64]]] = {
+    "ranks": lambda settings, fitness_P_S: centred_ranks(fitness_P_S),
+    "signs": lambda settings, fitness_P_S: pair_signs(fitness_P_S),
+    "returns": lambda settings, fitness_P_S: standardised(fitness_P_S),
+    "top_pairs": top_pair_differences,
 }
-"""Value of `search.shaping` -> the utilities [P, S] of the fitness (or the novelty) [P, S] of a population."""
+"""Kind of `search.shaping` -> (its settings, fitness or novelty of a population [P, S]) -> utilities [P, S]."""
+
+
+def shaped(settings: Shaping, fitness_P_S: ArrayLike) -> NDArray[np.float64]:
+    """Utilities [P, S] of the fitness, or of the novelty, [P, S] of a population."""
+    return SHAPINGS[settings.kind](settings, fitness_P_S)
 
 
 def pair_weights(utility_P_S: NDArray[np.float64]) -> NDArray[np.float32]:

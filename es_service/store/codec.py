@@ -25,6 +25,10 @@ Part = Mapping[str, NDArray[Any]]
 Row = tuple[int | float | None, ...]
 """Values of one history row in the order of the run's columns; None stands for no value."""
 
+NO_PAYLOAD = b""
+"""Payload of a row that removes its part from the state, from its generation on."""
+GONE = ""
+"""Stands for the SHA-256 of such a row where the rows of a state are listed."""
 _MAGIC = b"ESP1"
 _HEADER_LENGTH = struct.Struct("<I")
 _INTEGER = struct.Struct("<cq")
@@ -81,6 +85,11 @@ def decode_part(payload: bytes) -> dict[str, NDArray[Any]]:
     return part
 
 
+def encode_change(part: Part | None) -> bytes:
+    """Payload of a row of the state: an encoded part, or nothing for a part that is removed."""
+    return NO_PAYLOAD if part is None else encode_part(part)
+
+
 def part_sha256(part: str, generation: int, payload: bytes) -> str:
     """SHA-256 of a state row. It includes the part's name and the generation, so that rows cannot be exchanged."""
     digest = hashlib.sha256(f"state\0{part}\0{generation}\0".encode())
@@ -88,15 +97,22 @@ def part_sha256(part: str, generation: int, payload: bytes) -> str:
     return digest.hexdigest()
 
 
+def listed(sha256: str, payload: bytes) -> str:
+    """What a list of rows says of one: its SHA-256, or GONE if it removes its part."""
+    return sha256 if payload != NO_PAYLOAD else GONE
+
+
 def state_sum(rows: Mapping[str, tuple[int, str]]) -> int:
     """Number that identifies the whole state of a generation: the sum modulo 2^256 of one SHA-256 for each part.
 
-    A generation that changes few of many parts changes few terms of the sum.
+    A generation that changes few of many parts changes few terms of the sum. A part that was removed has no term, so
+    that the row that removed it need not be kept when no older row of the part is.
 
     Args:
-        rows: part -> (generation, sha256) of its newest row.
+        rows: part -> (generation, sha256 or GONE) of its newest row.
     """
-    return sum(_row_term(part, generation, sha256) for part, (generation, sha256) in rows.items()) % _SUM_MODULUS
+    terms = (_row_term(part, at, sha256) for part, (at, sha256) in rows.items() if sha256 != GONE)
+    return sum(terms) % _SUM_MODULUS
 
 
 def changed_sum(total: int, old: Mapping[str, tuple[int, str]], new: Mapping[str, tuple[int, str]]) -> int:
@@ -105,8 +121,8 @@ def changed_sum(total: int, old: Mapping[str, tuple[int, str]], new: Mapping[str
 
 
 def state_sha256(total: int) -> str:
-    """Text of a `state_sum`, which is stored with the history row. By it, a missing state row is noticed; otherwise an
-    older row of the part would be used."""
+    """Text of a `state_sum`, which is stored with the history row. By it, a missing state row is noticed, also one that
+    removes a part; otherwise an older row of the part would be used."""
     return f"{total:064x}"
 
 

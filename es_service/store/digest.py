@@ -12,6 +12,7 @@ import hashlib
 import json
 import sqlite3
 from collections.abc import Mapping
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.loop.parts import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.protocol.machine import is_mixed
-from es_service.store.codec import column_bytes, decode_part, leading_values, row_bytes
+from es_service.search.state_parts import PIECE
+from es_service.store.codec import NO_PAYLOAD, column_bytes, decode_part, leading_values, row_bytes
 from es_service.store.connection import reading
 from es_service.store.folder import DATABASE
 from es_service.store.reader import kept_states, platforms, state_payload
@@ -42,8 +44,9 @@ def digest_of(parts: Mapping[str, str]) -> str:
 def digest_parts(folder: Path) -> dict[str, str]:
     """The SHA-256s of which the digest is made, by name.
 
-    `state/<part>` is that of the newest value of a state part, `map` that of all parts of the behaviour map, and
-    `history` that of the deterministic columns of the history, `evaluations` that of the evaluated centres.
+    `state/<part>` is that of the newest value of a state part, or of all of its pieces (`part/number`), `map` that of
+    all parts of the behaviour map, and `history` that of the deterministic columns of the history, `evaluations` that
+    of the evaluated centres.
 
     Raises:
         StoreError: the run cannot be read.
@@ -94,10 +97,20 @@ def _parts(folder: Path, connection: Connection, meta: RunMeta, until: int = NEW
 def _state(connection: Connection, until: int) -> dict[str, str]:
     query = "SELECT part, max(generation) FROM state WHERE generation <= ? GROUP BY part ORDER BY part"
     newest = connection.execute(query, (until,)).fetchall()
-    parts = {part: arrays_sha256(decode_part(state_payload(connection, part, at))) for part, at in newest}
-    of_map = [part for part in parts if part.startswith((GEOMETRY_PART, CELL_PREFIX, ELITE_PREFIX))]
-    together = {"map": hashlib.sha256("".join(f"{part}\0{parts.pop(part)}\n" for part in of_map).encode()).hexdigest()}
-    return {f"state/{part}": sha256 for part, sha256 in parts.items()} | (together if of_map else {})
+    payloads = ((part, state_payload(connection, part, at)) for part, at in newest)
+    parts = {part: arrays_sha256(decode_part(payload)) for part, payload in payloads if payload != NO_PAYLOAD}
+    of_map = {part: parts.pop(part) for part in [*parts] if part.startswith((GEOMETRY_PART, CELL_PREFIX, ELITE_PREFIX))}
+    pieces = {part: parts.pop(part) for part in [*parts] if PIECE in part}
+    found = {f"state/{part}": sha256 for part, sha256 in parts.items()}
+    for whole, its_pieces in groupby(pieces, lambda piece: piece.partition(PIECE)[0]):
+        heads = {whole: parts[whole]} if whole in parts else {}
+        found[f"state/{whole}"] = _together(heads | {piece: pieces[piece] for piece in its_pieces})
+    return found | ({"map": _together(of_map)} if of_map else {})
+
+
+def _together(parts: Mapping[str, str]) -> str:
+    """SHA-256 of several parts, from theirs."""
+    return hashlib.sha256("".join(f"{part}\0{sha256}\n" for part, sha256 in parts.items()).encode()).hexdigest()
 
 
 def arrays_sha256(arrays: dict[str, NDArray[Any]]) -> str:

@@ -1,7 +1,8 @@
 """Which states a run keeps: those of its last two generations, and those of generations that were asked for.
 
 A part of the state has a row for each generation that changed it. A row belongs to the states from its generation on,
-until the next row of the part; it is deleted when none of these states is to be kept.
+until the next row of the part; it is deleted when none of these states is to be kept. A row without payload removes its
+part; it is deleted together with the last of the older rows, from which it protects the states after it.
 """
 
 from __future__ import annotations
@@ -9,18 +10,23 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterable, Sequence
 
-from es_service.store.codec import changed_sum, state_sha256
+from es_service.store.codec import GONE, NO_PAYLOAD, changed_sum, part_sha256, state_sha256
 
 KeptRows = dict[str, dict[int, str]]
-"""Stored state rows: part -> generation -> SHA-256."""
+"""Stored state rows: part -> generation -> SHA-256, or GONE for a row that removes the part."""
 
 
 def kept_rows(connection: sqlite3.Connection) -> KeptRows:
-    """Stored state rows, without their payloads. Those that damage has given values of other types are left out."""
+    """Stored state rows, without their payloads. Those that damage has given values of other types are left out, and
+    those that have lost their payload."""
     kept: KeptRows = {}
     typed = "typeof(part) = 'text' AND typeof(generation) = 'integer' AND typeof(sha256) = 'text'"
-    for part, at, sha256 in connection.execute(f"SELECT part, generation, sha256 FROM state WHERE {typed}"):
-        kept.setdefault(part, {})[at] = sha256
+    query = f"SELECT part, generation, sha256, length(payload) = 0 FROM state WHERE {typed}"
+    for part, at, sha256, is_empty in connection.execute(query):
+        if not is_empty:
+            kept.setdefault(part, {})[at] = sha256
+        elif sha256 == part_sha256(part, at, NO_PAYLOAD):
+            kept.setdefault(part, {})[at] = GONE
     return kept
 
 
@@ -47,6 +53,8 @@ def outdated_rows(
         is_multiple = keep_every is not None and (until - 1) // keep_every * keep_every >= at
         if not is_multiple and not any(at <= generation < until for generation in earlier):
             found.append((part, at))
+            if kept[part][until] == GONE and len(kept[part]) == 2:
+                found.append((part, until))
     return found
 
 
@@ -77,6 +85,7 @@ def whole_states(connection: sqlite3.Connection, kept: KeptRows) -> list[int]:
 
 
 def rows_in_force(kept: KeptRows, generation: int) -> dict[str, tuple[int, str]]:
-    """Rows that make up the state at a generation: part -> (generation, sha256) of its newest row up to then."""
+    """Rows that make up the state at a generation: part -> (generation, sha256) of its newest row up to then. A part
+    that this row removes is left out."""
     newest = {part: max((at for at in rows if at <= generation), default=None) for part, rows in kept.items()}
-    return {part: (at, kept[part][at]) for part, at in newest.items() if at is not None}
+    return {part: (at, kept[part][at]) for part, at in newest.items() if at is not None and kept[part][at] != GONE}

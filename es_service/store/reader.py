@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
 from es_service.loop.history import Column
+from es_service.store import certifications
 from es_service.store.beginning import load_start
+from es_service.store.certifications import CertifiedRow
 from es_service.store.codec import Row, column_bytes, decode_part, part_sha256, row_dict, table_rows
 from es_service.store.columns import Columns, Table
 from es_service.store.connection import reading
@@ -194,6 +196,21 @@ def read_parts(
                 raise Damaged(f"the state of {part!r} at generation {at} does not match its SHA-256")
             parts[part] = decode_part(payload)
         return asked, parts
+
+
+def read_certifications(folder: Path) -> list[CertifiedRow]:
+    """All certified policies, in the order of certification and rank.
+
+    Raises:
+        StoreError: a row does not match its SHA-256.
+    """
+    with reading(folder) as (connection, _):
+        found = []
+        for number, rank, row in certifications.rows(connection):
+            if row is None:
+                raise Damaged(f"row {rank} of certification {number} does not match its SHA-256")
+            found.append(row)
+        return found
 
 
 def read_kept(folder: Path) -> tuple[KeptRows, list[int]]:

@@ -87,6 +87,7 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
     for table in GENERATION_TABLES:
         connection.execute(f"DELETE FROM {table} WHERE generation > ?", (verdict.good,))
     connection.executemany("DELETE FROM state WHERE part IS ? AND generation IS ?", verdict.bad_rows)
+    connection.executemany("DELETE FROM certification WHERE number IS ? AND rank IS ?", verdict.bad_certifications)
     connection.execute("COMMIT")
     if verdict.good == verdict.newest:
         notices.append(

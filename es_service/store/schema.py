@@ -13,8 +13,8 @@ from es_service.errors import StoreError
 from es_service.loop.history import Column
 from es_service.store.codec import text_sha256
 
-SCHEMA_VERSION = 5
-READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0", 4: "0.6.0"}
+SCHEMA_VERSION = 6
+READ_BY = {1: "0.1", 2: "0.1", 3: "0.5.0", 4: "0.6.0", 5: "0.12.0"}
 """Older schema version -> newest version of es-service that reads it."""
 APPLICATION_ID = 0x45535256
 """Number in the header of the file, by which tools recognise the kind of a database."""
@@ -32,6 +32,10 @@ _STATE = (
     "payload BLOB NOT NULL, PRIMARY KEY (part, generation)) WITHOUT ROWID"
 )
 _PLATFORM = "CREATE TABLE platform (generation INTEGER PRIMARY KEY, platform TEXT NOT NULL, sha256 TEXT NOT NULL)"
+_CERTIFICATION = (
+    "CREATE TABLE certification (number INTEGER NOT NULL, rank INTEGER NOT NULL, facts TEXT NOT NULL, "
+    "payload BLOB NOT NULL, sha256 TEXT NOT NULL, PRIMARY KEY (number, rank)) WITHOUT ROWID"
+)
 _OWN_HISTORY_COLUMNS = {"evaluations": "BLOB", "state_sha256": "TEXT", "sha256": "TEXT"}
 """Columns of the table history besides those of the run: the evaluated centres (`codec.table_bytes`), the SHA-256 of
 the state, and that of the row."""
@@ -95,6 +99,7 @@ def table_statements(columns: Sequence[Column]) -> dict[str, str]:
         "state": _STATE,
         "history": f"CREATE TABLE history ({history}, {own})",
         "platform": _PLATFORM,
+        "certification": _CERTIFICATION,
     }
 
 

@@ -6,7 +6,8 @@ import sqlite3
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from es_service.store.codec import column_bytes, decode_part, part_sha256, row_sha256
+from es_service.store.certifications import Key, damaged_rows
+from es_service.store.codec import NO_PAYLOAD, column_bytes, decode_part, listed, part_sha256, row_sha256
 from es_service.store.folder import is_disk_full
 from es_service.store.kept import KeptRows, whole_states
 from es_service.store.platforms import sound_platforms
@@ -40,6 +41,8 @@ class Verdict:
     """Intact state rows."""
     bad_rows: tuple[tuple[str, int], ...] = ()
     """Damaged state rows as (part, generation), which must be deleted."""
+    bad_certifications: tuple[Key, ...] = ()
+    """Damaged rows of the table of certified policies, which must be deleted as well."""
     problems: tuple[str, ...] = field(default=())
     """All problems found, as messages for the user."""
 
@@ -118,7 +121,11 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
         lost = 0 if good is None else good + 1
         which = f"generation {newest} is" if lost == newest else f"generations {lost} to {newest} are"
         problems.append(f"{which} not complete and intact")
-    return Verdict(meta, newest, good, kept, tuple(bad_rows), tuple(problems))
+    bad_certifications = damaged_rows(connection)
+    problems += [
+        f"row {rank} of certification {number} does not match its SHA-256" for number, rank in bad_certifications
+    ]
+    return Verdict(meta, newest, good, kept, tuple(bad_rows), tuple(bad_certifications), tuple(problems))
 
 
 def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems: list[str]) -> tuple[int, int]:
@@ -156,12 +163,12 @@ def _state(connection: sqlite3.Connection, problems: list[str]) -> tuple[KeptRow
     for part, generation, sha256, payload in connection.execute("SELECT part, generation, sha256, payload FROM state"):
         try:
             sound = part_sha256(part, generation, payload) == sha256
-            if sound:
+            if sound and payload != NO_PAYLOAD:
                 decode_part(payload)
         except (ValueError, TypeError):
             sound = False
         if sound:
-            kept.setdefault(part, {})[generation] = sha256
+            kept.setdefault(part, {})[generation] = listed(sha256, payload)
         else:
             problems.append(f"state of {part!r} at generation {generation} does not match its SHA-256")
             bad_rows.append((part, generation))

@@ -20,12 +20,15 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
 from es_service.store.beginning import Beginning, load_start
+from es_service.store.certifications import encoded, next_number
 from es_service.store.codec import (
+    GONE,
     Part,
     changed_sum,
     decode_part,
-    encode_part,
+    encode_change,
     history_row,
+    listed,
     part_sha256,
     row_dict,
     state_sha256,
@@ -149,7 +152,7 @@ class RunStore:
         Raises:
             StoreError: a part has been damaged since the run was opened.
         """
-        names = sorted(self._kept) if self.generation is not None else []
+        names = sorted(rows_in_force(self._kept, self.generation)) if self.generation is not None else []
         return {name: self.part(name) for name in names if without is None or not name.startswith(without)}
 
     def part(self, name: str) -> dict[str, NDArray[Any]]:
@@ -159,12 +162,14 @@ class RunStore:
             KeyError: there is no such part.
             StoreError: the part has been damaged since the run was opened.
         """
-        at = max(self._kept[name])
+        at, sha256 = max(self._kept[name].items())
+        if sha256 == GONE:
+            raise KeyError(name)
         with self._explaining("loading the state"):
             row = self._connection.execute(
                 "SELECT payload FROM state WHERE part = ? AND generation = ?", (name, at)
             ).fetchone()
-            if row is None or part_sha256(name, at, row[0]) != self._kept[name][at]:
+            if row is None or part_sha256(name, at, row[0]) != sha256:
                 raise StoreError(
                     f"{self.folder / DATABASE}: state of {name!r} at generation {at} was damaged after it was opened",
                     run=self.folder,
@@ -173,13 +178,13 @@ class RunStore:
             return decode_part(row[0])
 
     def commit(
-        self, generation: int, parts: Mapping[str, Part], history: Values, evaluations: Sequence[Values] = ()
+        self, generation: int, parts: Mapping[str, Part | None], history: Values, evaluations: Sequence[Values] = ()
     ) -> None:
         """Store a generation in one transaction. If this raises, the store is unchanged and can still be used.
 
         Args:
             generation: the generation after `self.generation`, or 0 if that is None.
-            parts: parts of the state that have changed; the others keep their values.
+            parts: parts of the state that have changed, None for those that are removed; the others keep their values.
             history: value of each column of the run; `generation` may be left out; NaN or None stands for no value.
             evaluations: likewise for each centre that the generation evaluated, in the order of the asks.
 
@@ -189,8 +194,9 @@ class RunStore:
         expected = 0 if self.generation is None else self.generation + 1
         if generation != expected:
             raise StoreError(f"{self.folder}: cannot store generation {generation}; the next generation is {expected}")
-        payloads = {part: encode_part(arrays) for part, arrays in parts.items()}
-        new = {part: (generation, part_sha256(part, generation, payload)) for part, payload in payloads.items()}
+        payloads = {part: encode_change(arrays) for part, arrays in parts.items()}
+        sums = {part: part_sha256(part, generation, payload) for part, payload in payloads.items()}
+        new = {part: (generation, listed(sums[part], payload)) for part, payload in payloads.items()}
         old = {part: max(self._kept[part].items()) for part in new if part in self._kept}
         total = changed_sum(self._state_sum, old, new)
         centres = table_bytes(self.meta.evaluation_columns, evaluations)
@@ -203,7 +209,7 @@ class RunStore:
             for part, at in outdated:
                 execute("DELETE FROM state WHERE part = ? AND generation = ?", (part, at))
             for part, payload in payloads.items():
-                row = (part, *new[part], payload)
+                row = (part, generation, sums[part], payload)
                 execute("INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)", row)
             self._hook("mid_transaction")
             execute(self._insert_history, history_values)
@@ -214,9 +220,11 @@ class RunStore:
         self.generation, self._state_sum = generation, total
         for part, at in outdated:
             del self._kept[part][at]
+            if not self._kept[part]:
+                del self._kept[part]
         for part, (at, sha256) in new.items():
             self._kept.setdefault(part, {})[at] = sha256
-        self._doubled = list(old)
+        self._doubled = [part for part in new if len(self._kept[part]) > 1]
         self._hook("after_commit")
         _LOG.debug("stored generation %d: %d parts", generation, len(payloads))
         self.upkeep.after_commit(sum(map(len, payloads.values())) + 4 * PAGE_BYTES)
@@ -246,6 +254,23 @@ class RunStore:
         with self._transaction("recording the platform") as execute:
             self._recorded = True
             return record(execute, generation, platform)
+
+    @property
+    def next_certification(self) -> int:
+        """Number of the next certification, from 0."""
+        with self._explaining("reading the certifications"):
+            return next_number(self._connection)
+
+    def add_certification(self, policies: Sequence[tuple[Mapping[str, Any], Part]]) -> None:
+        """Store a certification in one transaction: (facts, arrays) of each policy, in the order of rank.
+
+        Raises:
+            StoreError: the disk is full, or the database cannot be written.
+        """
+        rows = encoded(self.next_certification, policies)
+        with self._transaction("storing a certification") as execute:
+            for row in rows:
+                execute("INSERT INTO certification (number, rank, facts, payload, sha256) VALUES (?, ?, ?, ?, ?)", row)
 
     def platform_before(self, generation: int) -> dict[str, Any] | None:
         """The platform recorded for the generation before this one; None if there is none."""

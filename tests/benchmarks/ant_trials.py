@@ -32,10 +32,10 @@ ENV_STEPS = 150_000_000
 SEED = 100
 TRIALS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("ant_maze_me_es", ()),  # sigma 0.02, learning rate 0.01
-    ("ant_maze_me_es", ("search.sigma=0.05", "search.learning_rate=0.03")),
-    ("ant_maze_me_es", ("search.sigma=0.02", "search.learning_rate=0.03")),
+    ("ant_maze_me_es", ("search.sigma=0.05", "search.step.learning_rate=0.03")),
+    ("ant_maze_me_es", ("search.sigma=0.02", "search.step.learning_rate=0.03")),
     # Larger steps were worse, so what follows has the usual ones, or smaller ones.
-    ("ant_maze_me_es", ("search.learning_rate=0.005",)),
+    ("ant_maze_me_es", ("search.step.learning_rate=0.005",)),
     ("ant_maze_me_es", ("search.pairs=32",)),
     ("ant_maze_me_es", ("task.fitness=final",)),
     ("ant_maze_me_es", ("search.cell_sampling=score",)),

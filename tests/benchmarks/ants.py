@@ -30,7 +30,7 @@ from workers.environments import SHIPPED
 
 USUAL = (
     *("policy.hidden=[256,256]", "search.pairs=64", "search.evaluation_episodes=30"),
-    *("search.sigma=0.02", "search.learning_rate=0.01", "search.l2=0.005"),
+    *("search.sigma=0.02", "search.step.learning_rate=0.01", "search.step.l2=0.005"),
 )
 """The usual settings, which the long runs and their trials have, and before version 0.10.0 the configs of AntMaze."""
 POINTS = 60
@@ -54,7 +54,7 @@ def summary(name: str, run: Run) -> dict[str, Any]:
     """The row of a run."""
     config, history = run.config, run.history
     task, last = config["task"]["environment"], history.iloc[-1]
-    search = config["search"]
+    search = config["search"] | config["search"].get("step", {})
     best = history.loc[history.centre_fitness_mean.idxmax()]
     settings = (*SETTINGS, *OWN_SETTINGS.get(search["algorithm"], ()))
     row = {

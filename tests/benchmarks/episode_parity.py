@@ -38,7 +38,7 @@ def walking_centre(task: str) -> tuple[RunConfig, Centre]:
     """The config of a short ES run, and where it ended."""
     config = {
         "task": {"environment": task},
-        "search": {"algorithm": "es", "pairs": 64, "sigma": 0.02, "learning_rate": 0.02},
+        "search": {"algorithm": "es", "pairs": 64, "sigma": 0.02, "step": {"learning_rate": 0.02}},
         "map": {"enabled": False},
         "compute": {"engine": "inline", "rollout": "simd", "chunk_pairs": CHUNK_PAIRS},
         "budget": {"generations": WALKING},

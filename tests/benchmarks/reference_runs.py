@@ -6,7 +6,8 @@
 
 `make` computes ten runs with whatever `es_service` Python finds, by its command line alone, so that it serves every
 version: each algorithm, the three tasks, both engines, both rollouts, two runs that are killed (`kill -9`) and resumed,
-one fork. `compare` shows for each run how many arrays (centres, optimisers, statistics, novelty archive, map, elites)
+one fork. Their configs are frozen in `reference_configs`, in the names of the keys before version 0.13 and in those
+since then. `compare` shows for each run how many arrays (centres, optimisers, statistics, novelty archive, map, elites)
 and how many history values are equal, and exits with 1 if anything is not. Two workers; about two minutes on a Zen 5.
 """
 
@@ -24,7 +25,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-CONFIGS = Path(__file__).parents[2] / "configs"
+CONFIGS = Path(__file__).parent / "reference_configs"
+RENAMED = {"search.step.learning_rate": "search.learning_rate"}
+"""Key of a setting below -> its name before version 0.13."""
 NOT_REPEATED = ("retries", "lost_workers", "workers", "wall_clock_s", "steps_per_second")
 """History columns that two equal runs may differ in; so may those that begin with "seconds_"."""
 ONE_EMITTER = ("search.emitters=1", "search.pairs=64")
@@ -33,7 +36,7 @@ SMALL_ANT = ("search.pairs=16", "search.evaluation_episodes=8", "budget.generati
 
 
 class Reference(NamedTuple):
-    """One run: a shipped config, what is changed of it, and what happens to it."""
+    """One run: a frozen config, what is changed of it, and what happens to it."""
 
     config: str
     engine: str
@@ -59,7 +62,7 @@ REFERENCES = {
         resumed_with="ray",
     ),
     "me_es_fork": Reference(
-        "point_maze_me_es", "inline", ("budget.generations=260", "search.learning_rate=0.02"), parent="me_es"
+        "point_maze_me_es", "inline", ("budget.generations=260", "search.step.learning_rate=0.02"), parent="me_es"
     ),
     "ant_maze_me_es": Reference("ant_maze_me_es", "inline", (*SMALL_ANT, "search.block_generations=2")),
     "ant_maze_nsra_es": Reference("ant_maze_nsra_es", "ray", SMALL_ANT),
@@ -103,15 +106,22 @@ def reached(open_run, folder: Path) -> int:
 
 def make(folder: Path) -> None:
     """Compute all runs into a folder, each beside the arrays that `compare` reads."""
+    from es_service.protocol.machine import VERSION
+
     folder.mkdir(parents=True)
+    is_older = tuple(map(int, VERSION.split(".")[:2])) < (0, 13)
+    configs = CONFIGS / ("before" if is_older else "after")
     for name, reference in REFERENCES.items():
         run, started = folder / name, time.perf_counter()
-        settings = [word for setting in reference.settings for word in ("--set", setting)]
+        settings = []
+        for setting in reference.settings:
+            key, _, value = setting.partition("=")
+            settings += ["--set", f"{RENAMED.get(key, key) if is_older else key}={value}"]
         sizes = ["--workers", "2", "--engine", reference.engine]
         if reference.parent:
             finish(command("fork", folder / reference.parent, "--out", run, *sizes, *settings))
         else:
-            words = command("run", CONFIGS / f"{reference.config}.yaml", "--out", run, *sizes, *settings)
+            words = command("run", configs / f"{reference.config}.yaml", "--out", run, *sizes, *settings)
             if reference.killed_at is None:
                 finish(words)
             else:

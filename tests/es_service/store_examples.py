@@ -49,7 +49,8 @@ def meta(**changes):
 
 
 def parts_of(generation, seed=0):
-    """The parts that this generation changes: the statistics, and one centre of three (all of them at first)."""
+    """The parts that this generation changes: the statistics, one centre of three (all of them at first), and a guest
+    that comes with generations 1, 5, 9, ... and goes with 3, 7, ...; None for a part that goes."""
     centres = range(CENTRES) if generation == 0 else [generation * 7 % 5 % CENTRES]
     parts = {f"centre_{centre}": _centre(seed, generation, centre) for centre in centres}
     parts["observations"] = {
@@ -57,6 +58,8 @@ def parts_of(generation, seed=0):
         "mean_O": np.random.default_rng([seed, generation, 99]).standard_normal(5),
         "steps": np.asarray(generation, np.int64),
     }
+    if generation % 2:
+        parts["guest"] = {"x": np.full(9, generation)} if generation % 4 == 1 else None
     return parts
 
 
@@ -74,7 +77,7 @@ def state_at(generation, seed=0):
     state = {}
     for at in range(generation + 1):
         state.update(parts_of(at, seed))
-    return state
+    return {name: part for name, part in state.items() if part is not None}
 
 
 def history_row(generation):

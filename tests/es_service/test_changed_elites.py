@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("workers_here")
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 20},
     "policy": {"hidden": [8]},
-    "search": {"pairs": 16, "sigma": 0.2, "learning_rate": 0.1},
+    "search": {"pairs": 16, "sigma": 0.2, "step": {"learning_rate": 0.1}},
     "map": {"enabled": True, "cells": [8, 8]},
     "budget": {"generations": 4},
     "compute": {"engine": "inline", "workers": 1, "inline_workers": "threads"},

@@ -11,8 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from es_service.config.changes import changed_constants
+from es_service.config.keys import FIELDS
 from es_service.config.loading import load_config
-from es_service.config.model import RunConfig, worker_spec
+from es_service.config.methods import all_search_fields
+from es_service.config.model import worker_spec
 from es_service.config.presets import PRESETS, preset_table, preset_values
 from es_service.config.resolution import (
     config_warnings,
@@ -22,7 +24,7 @@ from es_service.config.resolution import (
 )
 from es_service.config.yaml_text import dump_yaml, parse_value
 from es_service.errors import ConfigError
-from es_service.search.algorithms import ALGORITHMS
+from es_service.search.algorithms import ALGORITHMS, OURS
 from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS, load
 
 # What a config resolves to
@@ -35,7 +37,7 @@ def test_minimal_config_resolves_every_value():
     assert config.policy.hidden == (64, 64)
     assert (config.policy.init, config.policy.observation_clip) == ("unit_columns", 5.0)
     assert (config.search.pairs, config.search.common_random_numbers) == (512, True)
-    assert (config.search.sigma, config.search.learning_rate, config.search.l2) == (0.02, 0.01, 0.005)
+    assert (config.search.sigma, config.search.step.learning_rate, config.search.step.l2) == (0.02, 0.01, 0.005)
     assert (config.compute.rollout, config.compute.workers, config.compute.engine) == ("simd", "auto", "inline")
     assert (config.compute.chunk_pairs, config.compute.rollout_block_pairs) == (64, 32)
     assert config.compute.gradient_block_pairs == 512
@@ -59,13 +61,17 @@ def test_preset_clips_only_normalised_observations():
 
 
 def test_preset_table_has_a_source_for_every_row_and_differs_in_each():
-    for row in preset_table():
+    table = preset_table(ALGORITHMS)
+    for row in table:
         assert row.literature != row.uber or row.method in ALGORITHMS
         assert "literature:" in row.source
         assert "uber:" in row.source
-    for_all = {row.key for row in preset_table() if row.method is None}
-    assert for_all == set(preset_values("uber")) == set(preset_values("literature"))
     for preset in PRESETS:
+        for name, method in OURS.items():
+            rows = {row.key: getattr(row, preset) for row in table if row.method in (None, name)}
+            values = preset_values(preset, method.settings)
+            assert values == {key: rows[key] for key in values}
+            assert {row.key for row in table if row.method == name} <= values.keys()
         assert load(MINIMAL, f"search.preset={preset}").search.preset == preset
 
 
@@ -210,7 +216,7 @@ POSITIVE = st.floats(min_value=1e-9, max_value=1e9)
             "search.pairs": st.integers(1, 20_000),
             "search.preset": st.sampled_from(["literature", "uber"]),
             "search.sigma": POSITIVE,
-            "search.l2": st.floats(min_value=0, max_value=1),
+            "search.step.l2": st.floats(min_value=0, max_value=1),
             "search.common_random_numbers": st.booleans(),
             "policy.hidden": st.lists(st.integers(1, 512), max_size=4),
             "policy.observation_clip": st.none() | POSITIVE,
@@ -253,7 +259,5 @@ def test_worker_spec_says_what_the_config_says():
 
 
 def test_every_field_says_what_it_means():
-    for section in ("task", "policy", "search", "map", "novelty", "budget", "compute"):
-        fields = RunConfig.model_fields[section].annotation.model_fields
-        for name, field in fields.items():
-            assert field.description, f"{section}.{name}"
+    for key, field in (FIELDS | all_search_fields(ALGORITHMS)).items():
+        assert field.description, key

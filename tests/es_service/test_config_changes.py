@@ -36,16 +36,23 @@ def test_changed_constants_lists_both_values_and_absent_ones():
 
 def test_a_key_that_is_younger_than_the_run_counts_as_its_default():
     now = load().constants()
-    older = {name: value for name, value in now.items() if name != "search.shaping"}
+    older = {name: value for name, value in now.items() if name != "novelty.newest"}
     assert changed_constants(older, now) == []
-    assert changed_constants(older, load(MINIMAL, "search.shaping=signs").constants()) == [
-        ("search.shaping", "ranks", "signs")
+    assert changed_constants(older, load(MINIMAL, "novelty.newest=9").constants()) == [("novelty.newest", None, 9)]
+
+
+def test_keys_of_another_method_or_of_another_part_go_with_it():
+    """A run of another method may have been started with any of them."""
+    assert changes("search.algorithm=nsra_es", config=load(MINIMAL, "search.algorithm=ns_es")) == [
+        "search.algorithm: ns_es -> nsra_es"
     ]
+    ranks = load(MINIMAL, "search.shaping.kind=top_pairs", "search.shaping.count=5")
+    assert changes("search.shaping.kind=ranks", config=ranks) == ["search.shaping.kind: top_pairs -> ranks"]
 
 
 def test_refused_changes_shows_all_and_the_ways_to_make_them():
     changes = [("search.sigma", 0.02, 0.05), ("policy.hidden", [64, 64], [8, 8]), ("task.options.start", "a b", "c d")]
-    error = refused_changes("runs/a", changes, besides={"budget.generations": 9})
+    error = refused_changes("runs/a", changes, ALGORITHMS, besides={"budget.generations": 9})
     assert [(problem.field, problem.suggestion, problem.value) for problem in error.problems] == changes
     assert (error.field, error.value, error.run) == ("search.sigma", 0.05, "runs/a")
     fork, afresh = error.ways_out
@@ -57,7 +64,7 @@ def test_refused_changes_shows_all_and_the_ways_to_make_them():
     assert kept == "a fork cannot change policy.hidden either"
     assert in_python.endswith(f": fork('runs/a', {fork.settings!r})")
     for key in ("search.centres", "search.preset", "map.cells", "task.environment", "task.options.descriptor"):
-        assert [way.action for way in refused_changes("runs/a", [(key, "a", "b")]).ways_out] == ["run"]
+        assert [way.action for way in refused_changes("runs/a", [(key, "a", "b")], ALGORITHMS).ways_out] == ["run"]
 
 
 def test_another_task_has_its_own_default_options():
@@ -65,10 +72,12 @@ def test_another_task_has_its_own_default_options():
     other = {"tasks": SHIPPED, "algorithms": ALGORITHMS}
     loaded = load_config(source, ["task.environment=ant_maze"], **other)
     assert (loaded.task.environment, loaded.task.options) == ("ant_maze", {})
-    assert left_out(source, ["task.environment=ant_maze"]) == ["task.options.start"]
+    assert left_out(source, ["task.environment=ant_maze"], ALGORITHMS) == {
+        "task.options.start": "ant_maze replaces its task"
+    }
     for same in ([], ["task.environment=point_maze"]):
         assert load_config(source, same, **other).task.options == {"start": "corner"}
-        assert left_out(source, same) == []
+        assert left_out(source, same, ALGORITHMS) == {}
     with pytest.raises(ConfigError, match=r"task\.options\.start: unknown option; ant_maze has none"):
         load_config(source, ["task.environment=ant_maze", "task.options.start=corner"], **other)
 

@@ -12,6 +12,7 @@ from es_service.config.loading import load_config
 from es_service.config.model import RunConfig
 from es_service.errors import ConfigError
 from es_service.protocol.messages import TaskSpec
+from es_service.search.algorithms import OURS
 from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS
 from tests.es_service.store_examples import without_root_rights
 
@@ -20,7 +21,7 @@ TASKS = {"point_maze": POINT_MAZE, "no_final": NO_FINAL}
 
 
 def load(source=MINIMAL, *overrides: str) -> RunConfig:
-    return load_config(source, overrides, tasks=TASKS, algorithms={"es": None})
+    return load_config(source, overrides, tasks=TASKS, algorithms={"es": OURS["es"]})
 
 
 def problems(source=MINIMAL, *overrides: str) -> list[str]:
@@ -52,7 +53,7 @@ def problems(source=MINIMAL, *overrides: str) -> list[str]:
         ("search.sigma=true", "true is not allowed"),
         ("search.sigma='1e-3'", "'1e-3' ... must be a number above 0; remove the quotes around 1e-3"),
         ("search.init_from=''","'' ... must be text"),
-        ("search.l2=-1", "-1 ... must be a number, at least 0"),
+        ("search.step.l2=-1", "-1 ... must be a number, at least 0"),
         ("search.max_invalid_fraction=1.5", "1.5 ... must be a number from 0 to 1"),
         ("search.preset=litrature", "litrature ... must be literature or uber; did you mean literature?"),
         ("search.algorithm=ess", "ess is not a known algorithm; must be es, or module:function; did you mean es?"),
@@ -108,24 +109,24 @@ def test_a_bad_value_is_one_line_with_field_value_and_what_is_allowed(override, 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("search.sgima=1", "override search.sgima=1: search.sgima: unknown key; did you mean search.sigma?"),
+        ("search.sgima=1", "search.sgima: unknown key; did you mean search.sigma?"),
         ("serach.sigma=1", "did you mean search.sigma?"),
-        ("sigma=1", "override sigma=1: sigma: unknown key; did you mean search.sigma?"),
+        ("sigma=1", "sigma: unknown key; did you mean search.sigma?"),
         ("search.hidden=[4]", "did you mean policy.hidden?"),
         ("seeed=3", "did you mean seed?"),
         ("search.population=5", "search.population: unknown key; did you mean search.pairs?"),
         ("popsize=5", "did you mean search.pairs?"),
-        ("lr=0.1", "did you mean search.learning_rate?"),
+        ("lr=0.1", "did you mean search.step.learning_rate?"),
         ("search.std=0.1", "did you mean search.sigma?"),
         ("task.option=5", "unknown key; task has options, environment, episode_steps, fitness, episodes_per_member"),
-        ("task.options.start.x=3", "override task.options.start.x=3: task.options.start.x: unknown key"),
+        ("task.options.start.x=3", "task.options.start.x: unknown key"),
         ("qqq.zzz=3", "unknown key; the sections are task, policy, search, novelty, map, budget, compute"),
         ("budget.qqq=3", "unknown key; budget has generations, env_steps, wall_clock_s, target_fitness"),
         ("search.sigma", "override search.sigma: write KEY=VALUE, such as search.sigma=0.05"),
         ("=3", "override =3: write KEY=VALUE"),
         ("search.init_from=", "override search.init_from=: the value is missing; write null"),
-        ("search=3", "override search=3: search is a section; set its keys one by one, such as search.algorithm=..."),
-        ("task.options=3", "task.options is a section; set its keys one by one, such as task.options.NAME=..."),
+        ("search=3", "search: this is a section; set its keys one by one, such as search.algorithm=..."),
+        ("task.options=3", "task.options: this is a section; set its keys one by one, such as task.options.NAME=..."),
         ("policy.hidden=[64,", "override policy.hidden=[64,: line 1, column 5: not YAML"),
         ("compute.chunk_pairs=48", "512 is not a multiple of compute.chunk_pairs (48); try pairs = 528 (or 480)"),
         ("compute.chunk_pairs=600", "512 is not a multiple of compute.chunk_pairs (600); try pairs = 600, or"),
@@ -230,7 +231,7 @@ seed: true
     assert sorted(fields) == sorted(
         [
             "search.sgima",
-            "override budgt.generations=3",
+            "budgt.generations",
             "policy.hidden",
             "search.preset",
             "compute.gradient_block_pairs",
@@ -291,6 +292,8 @@ def test_a_map_that_does_not_fit_the_algorithm_or_its_kind_is_refused():
     (line,) = problems(MINIMAL, "map.kind=cvt", "map.cells=[5000]")
     assert line == "map.cells: [5000] makes 5,000 cells; must be at most 4,096 for a cvt"
     with pytest.raises(ConfigError) as caught:
-        load_config(MINIMAL, ["search.algorithm=me_es", "map.enabled=false"], tasks=TASKS, algorithms={"me_es": None})
+        load_config(
+            MINIMAL, ["search.algorithm=me_es", "map.enabled=false"], tasks=TASKS, algorithms={"me_es": OURS["me_es"]}
+        )
     (line,) = (line.strip() for line in str(caught.value).splitlines()[1:])
     assert line.startswith("map.enabled: false is not allowed for me_es, whose blocks start from elites of the map")

@@ -62,8 +62,8 @@ def test_overrides_by_key_are_those_in_text():
     values = {"search.sigma": 1e-7, "policy.hidden": [64, 64], "budget.env_steps": None, "task.options.start": "off",
               "search.init_from": "a: b"}  # fmt: skip
     assert parse_overrides(values) == (values, [])
-    found, (problem,) = parse_overrides({"search.sigm": 1})
-    assert (found, problem.field, problem.suggestion) == ({}, "search.sigm", "search.sigma")
+    found, (problem,) = parse_overrides(["search.sigma"])
+    assert (found, problem.sentence) == ({}, "override search.sigma: write KEY=VALUE, such as search.sigma=0.05")
 
 
 def test_every_problem_of_a_config_is_there_as_data():
@@ -83,14 +83,14 @@ def test_every_problem_of_a_config_is_there_as_data():
 def test_an_error_of_the_rollouts_names_its_run_and_can_be_acted_on(tmp_path):
     config = SMALL | {"budget": {"generations": 3}}
     with np.errstate(all="ignore"), pytest.raises(EvaluationError, match="centre is not finite") as caught:
-        api.run(api.load_config(config, {"search.learning_rate": 1e38, "search.l2": 1e38}), tmp_path / "run")
+        api.run(api.load_config(config, {"search.step.learning_rate": 1e38, "search.step.l2": 1e38}), tmp_path / "run")
     error = caught.value
     fork, resume = error.ways_out
-    assert (error.field, error.run) == ("search.learning_rate", str(tmp_path / "run"))
+    assert (error.field, error.run) == ("search.step.learning_rate", str(tmp_path / "run"))
     assert (fork.action, fork.run, resume.action, resume.run) == ("fork", error.run, "resume", error.run)
-    assert fork.settings == {"search.learning_rate": pytest.approx(1e37)}
+    assert fork.settings == {"search.step.learning_rate": pytest.approx(1e37)}
     forked = api.fork(
-        fork.run, {**fork.settings, "search.learning_rate": 0.01, "search.l2": 0.0}, out=tmp_path / "fork"
+        fork.run, {**fork.settings, "search.step.learning_rate": 0.01, "search.step.l2": 0.0}, out=tmp_path / "fork"
     )
     assert forked.run.generation == 3
 

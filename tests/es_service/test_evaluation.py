@@ -34,9 +34,8 @@ class Invented:
         fitness_E, descriptor_E_B = invented(number_E)
         if self.wrong is not None:
             fitness_E[number_E == 3] = self.wrong
-        result = EpisodesResult(
-            fitness_E, fitness_E, descriptor_E_B, np.ones(len(number_E), np.int32), descriptor_E_B, None
-        )
+        steps_E, outputs = np.ones(len(number_E), np.int32), {"success": number_E % 3 == 0}
+        result = EpisodesResult(fitness_E, fitness_E, descriptor_E_B, steps_E, descriptor_E_B, None, outputs=outputs)
         weakref.finalize(result, self._gone)
         self.alive += 1
         self.most = max(self.most, self.alive)
@@ -106,6 +105,7 @@ def test_statistics_in_pieces_differ_in_their_last_bits_only(run, monkeypatch):
     for name in ("mean", "standard_error", "descriptor", "descriptor_std"):
         np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), rtol=1e-12)
     assert pieces.cell == whole.cell
+    assert pieces.successes == whole.successes == len(range(0, episodes, 3))
 
 
 @pytest.mark.parametrize("wrong", [np.inf, np.nan])

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from es_service.loop.changes import map_changes
 from es_service.loop.parts import (
     GEOMETRY_PART,
     cell_part,
@@ -15,9 +16,20 @@ from es_service.loop.parts import (
     elite_part,
     elite_to_arrays,
     map_from_parts,
-    map_to_parts,
 )
-from es_service.search.maps.behaviour_map import BehaviourMap, Elite, empty_map, insert, map_statistics, with_score
+from es_service.search.maps.behaviour_map import (
+    BehaviourMap,
+    Elite,
+    changed,
+    empty_map,
+    insert,
+    map_statistics,
+    moved,
+    orders,
+    removed,
+    resampled,
+    with_score,
+)
 from tests.es_service.map_examples import PLANE
 from tests.twins import behaviour_map as twin
 
@@ -33,11 +45,13 @@ def filled(*offers, geometry=PLANE):
 
 
 def columns_of(map_):
-    return {field.name: getattr(map_, field.name) for field in dataclasses.fields(map_) if field.name != "geometry"}
+    found = {field.name: getattr(map_, field.name) for field in dataclasses.fields(map_) if field.name != "geometry"}
+    return {name: values for name, values in found.items() if values is not None}
 
 
 def assert_same_map(map_, other):
     assert map_.geometry == other.geometry
+    assert columns_of(map_).keys() == columns_of(other).keys()
     for name, values in columns_of(map_).items():
         np.testing.assert_array_equal(values, getattr(other, name))
         assert values.dtype == getattr(other, name).dtype
@@ -108,6 +122,59 @@ def test_any_offers_give_the_twin_s_map_and_never_a_worse_one(offers):
     assert columns["qd_score"] == twin.qd_score(other.elites, -2.0)
 
 
+# Entries that change, move and leave
+
+
+def test_a_changed_entry_has_other_values_and_its_place():
+    map_ = filled(((1.0, 0.1), 5.0), ((5.0, 1.9), 1.0))
+    now = changed(map_, 0, fitness=-3.0, score=7.0, samples=9)
+    assert (now.fitness_N.tolist(), now.score_N.tolist(), now.samples_N) == ([-3.0, 1.0], [7.0, 101.0], None)
+    np.testing.assert_array_equal(now.descriptor_N_B, map_.descriptor_N_B)
+    assert changed(map_, 5, fitness=9.0) is map_
+
+
+def test_the_others_keep_their_order_when_an_entry_leaves():
+    map_ = filled(((5.0, 1.9), 1.0), ((0.0, 0.0), 1.0), ((3.0, 1.0), 1.0))  # cells 11, 0, 6
+    without = removed(map_, 0)
+    assert (without.cell_N.tolist(), orders(without).tolist()) == ([11, 6], [0, 2])
+    assert without.generation_N.tolist() == [0, 2]
+    again, _, _ = insert(without, np.array([0.0, 0.0]), -1.0, 9, 0, 0.0)
+    assert (again.cell_N.tolist(), orders(again).tolist()) == ([11, 6, 0], [0, 2, 3])
+    assert removed(map_, 6).order_N is None, "the last one leaves no gap"
+    assert removed(map_, 5) is map_
+    assert removed(removed(removed(map_, 0), 6), 11).size == 0
+
+
+def test_a_moved_entry_wins_its_new_cell_or_leaves_the_map():
+    map_ = filled(((5.0, 1.9), 1.0), ((0.0, 0.0), 2.0), ((3.0, 1.0), 1.0))  # cells 11, 0, 6
+    stays, cell, is_there = moved(map_, 0, np.array([0.4, 0.2]))
+    assert (cell, is_there, stays.cell_N.tolist()) == (0, True, [11, 0, 6])
+    assert stays.descriptor_N_B[1].tolist() == [0.4, 0.2]
+    to_empty, cell, is_there = moved(map_, 11, np.array([0.0, 1.9]))
+    assert (cell, is_there, to_empty.cell_N.tolist()) == (3, True, [0, 6, 3])
+    assert (orders(to_empty).tolist(), to_empty.generation_N.tolist()) == ([1, 2, 3], [1, 2, 0])
+    wins, cell, is_there = moved(map_, 0, np.array([3.0, 1.0]))
+    assert (cell, is_there, wins.cell_N.tolist()) == (6, True, [11, 6])
+    assert (orders(wins).tolist(), wins.generation_N.tolist(), wins.fitness_N.tolist()) == ([0, 2], [0, 1], [1.0, 2.0])
+    leaves, cell, is_there = moved(map_, 11, np.array([3.0, 1.0]))  # as fit as the elite there
+    assert (cell, is_there, leaves.cell_N.tolist(), leaves.generation_N.tolist()) == (6, False, [0, 6], [1, 2])
+    with pytest.raises(KeyError):
+        moved(map_, 5, np.zeros(2))
+
+
+def test_samples_are_counted_and_averaged_where_a_map_counts_them():
+    map_ = empty_map(PLANE, counts_samples=True)
+    map_, _, _ = insert(map_, np.array([0.0, 0.0]), 4.0, 0, 0, 0.0, samples=3)
+    map_, cell, is_there = resampled(map_, 0, np.array([4.0, 0.4]), 8.0, 1)
+    assert map_.samples_N is not None
+    assert (cell, is_there, map_.samples_N.tolist(), map_.fitness_N.tolist()) == (0, True, [4], [5.0])
+    assert map_.descriptor_N_B.tolist() == [[1.0, 0.1]]
+    map_, _, entered = insert(map_, np.array([0.0, 0.0]), 6.0, 1, 0, 0.0, samples=2)
+    assert (entered, map_.samples_N.tolist()) == (True, [2])
+    with pytest.raises(ValueError, match="does not count samples"):
+        resampled(filled(((1.0, 0.1), 5.0)), 0, np.zeros(2), 0.0, 1)
+
+
 # Metrics
 
 
@@ -146,7 +213,7 @@ def test_the_qd_score_does_not_depend_on_the_order_of_its_terms():
 def test_a_map_comes_back_from_its_parts():
     map_ = filled(((5.0, 1.9), 1.0), ((0.0, 0.0), -2.5), ((3.0, 1.0), 1e-300), ((5.5, 1.8), 2.0))
     map_ = with_score(map_, 0, math.nan)
-    parts = map_to_parts(map_, None)
+    parts = map_changes(map_, None)
     assert set(parts) == {GEOMETRY_PART, cell_part(11), cell_part(0), cell_part(6)}
     others = {"centre_0": {"cell": np.asarray(3)}, elite_part(4): {"centre_D": np.zeros(1)}}
     again = map_from_parts(dict(reversed((parts | others).items())))
@@ -155,7 +222,7 @@ def test_a_map_comes_back_from_its_parts():
 
 
 def test_an_empty_map_comes_back_and_no_map_stays_none():
-    again = map_from_parts(map_to_parts(empty_map(PLANE), None))
+    again = map_from_parts(map_changes(empty_map(PLANE), None))
     assert isinstance(again, BehaviourMap)
     assert_same_map(again, empty_map(PLANE))
     assert map_from_parts({"centre_0": {}}) is None
@@ -164,31 +231,43 @@ def test_an_empty_map_comes_back_and_no_map_stays_none():
 def test_only_rows_that_changed_are_written():
     map_ = filled(((5.0, 1.9), 1.0), ((0.0, 0.0), -2.5), ((3.0, 1.0), 3.0))
     map_ = with_score(map_, 0, math.nan)
-    assert map_to_parts(map_, map_) == {}
-    assert map_to_parts(with_score(map_, 0, math.nan), map_) == {}
-    assert set(map_to_parts(with_score(map_, 0, 4.0), map_)) == {cell_part(0)}
-    assert set(map_to_parts(with_score(map_, 11, math.nan), map_)) == {cell_part(11)}
+    assert map_changes(map_, map_) == {}
+    assert map_changes(with_score(map_, 0, math.nan), map_) == {}
+    assert set(map_changes(with_score(map_, 0, 4.0), map_)) == {cell_part(0)}
+    assert set(map_changes(with_score(map_, 11, math.nan), map_)) == {cell_part(11)}
     new, _, _ = insert(map_, np.array([0.0, 1.9]), 0.0, 3, 0, math.nan)
-    assert set(map_to_parts(new, map_)) == {cell_part(3)}
+    assert set(map_changes(new, map_)) == {cell_part(3)}
     replaced, _, _ = insert(with_score(map_, 11, 7.0), np.array([3.0, 1.0]), 4.0, 3, 0, 102.0)
-    assert set(map_to_parts(replaced, map_)) == {cell_part(11), cell_part(6)}
-    assert set(map_to_parts(map_, empty_map(PLANE))) == {cell_part(cell) for cell in (11, 0, 6)}
+    assert set(map_changes(replaced, map_)) == {cell_part(11), cell_part(6)}
+    assert set(map_changes(map_, empty_map(PLANE))) == {cell_part(cell) for cell in (11, 0, 6)}
 
 
 def test_parts_written_one_change_at_a_time_give_the_last_map():
     rng = np.random.default_rng(0)
     map_ = empty_map(PLANE)
-    stored = map_to_parts(map_, None)
+    stored = map_changes(map_, None)
     for generation in range(60):
         before = map_
         if map_.size and rng.random() < 0.5:
             map_ = with_score(map_, int(rng.choice(map_.cell_N)), rng.normal())
         map_, _, _ = insert(map_, rng.uniform([0, 0], [6, 2]), rng.normal(), generation, 0, rng.normal())
-        stored |= map_to_parts(map_, before)
+        stored |= map_changes(map_, before)
     again = map_from_parts(stored)
     assert isinstance(again, BehaviourMap)
     assert_same_map(again, map_)
     assert map_.size == 12
+
+
+def test_cells_that_are_empty_now_are_removed_and_samples_come_back():
+    map_ = filled(((5.0, 1.9), 1.0), ((0.0, 0.0), -2.5), ((3.0, 1.0), 3.0))
+    assert map_changes(removed(map_, 0), map_) == {cell_part(0): None}
+    assert set(map_changes(moved(map_, 11, np.array([0.0, 1.9]))[0], map_)) == {cell_part(11), cell_part(3)}
+    counting = dataclasses.replace(map_, samples_N=np.arange(3))
+    assert set(map_changes(counting, map_)) == {GEOMETRY_PART, *map(cell_part, (11, 0, 6))}
+    for one in (counting, removed(counting, 0), empty_map(PLANE, counts_samples=True)):
+        again = map_from_parts({name: part for name, part in map_changes(one, None).items() if part is not None})
+        assert isinstance(again, BehaviourMap)
+        assert_same_map(again, one)
 
 
 def test_an_elite_comes_back_from_its_arrays():

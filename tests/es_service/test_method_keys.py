@@ -5,30 +5,24 @@
 
 from __future__ import annotations
 
-import re
-
 import pytest
 
 from es_service import api
 from es_service.cli.options import print_config_notes
-from es_service.config.keys import FIELDS
 from es_service.config.loading import left_out
-from es_service.config.method_keys import METHOD_KEYS, SOME_METHODS, keys_without_effect, methods_with
+from es_service.config.methods import all_search_fields, has_effect, methods_with
 from es_service.config.model import flat
 from es_service.config.shipped import shipped_configs
 from es_service.config.yaml_text import dump_yaml, parse_value, read_yaml_file
 from es_service.errors import ConfigError
-from es_service.report.settings import changed_settings
 from es_service.runs.lineage import fork_config
 from es_service.runs.sweep_plan import plan
 from es_service.search.algorithms import OURS
 from tests.es_service.config_examples import MINIMAL, load
 from tests.es_service.test_shipped_configs import ALL
-from workers.environments import SHIPPED
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 
-OWN = "tests.examples.minimal_criterion:minimal_criterion"
 MAP_ELITES = {
     "task": {"environment": "point_maze", "episode_steps": 20},
     "policy": {"hidden": [8]},
@@ -44,11 +38,13 @@ def problems(source, *overrides):
     return [problem.sentence for problem in caught.value.problems]
 
 
-def test_the_table_is_about_the_shipped_methods_and_keys_of_a_config():
-    assert list(METHOD_KEYS) == list(OURS)
-    assert set(SOME_METHODS) <= FIELDS.keys()
-    assert all(0 < len(methods_with(key)) < len(OURS) for key in SOME_METHODS)
-    assert keys_without_effect(OWN) == frozenset()
+def test_every_method_declares_its_keys():
+    for key in all_search_fields(OURS):
+        assert methods_with(key, OURS), key
+    assert methods_with("search.pairs", OURS) == tuple(name for name in OURS if name != "map_elites")
+    assert methods_with("search.block_generations", OURS) == ("me_es",)
+    assert methods_with("compute.chunk_pairs", OURS) == methods_with("search.pairs", OURS)
+    assert methods_with("novelty.newest", OURS) == tuple(OURS)
 
 
 def test_a_key_without_effect_is_refused_with_the_methods_that_have_it():
@@ -57,14 +53,15 @@ def test_a_key_without_effect_is_refused_with_the_methods_that_have_it():
         "(a key of es, ns_es, nsr_es, nsra_es, me_es, memes and ars)"
     ]
     source = MINIMAL | {"search": {"algorithm": "es", "iso_sigma": 0.3, "emitters": "many"}, "seed": "a"}
-    assert problems(source, "search.top_pairs=513") == [
-        "seed: a is not allowed; must be a whole number, at least 0 and below 2**63",
+    assert problems(source, "search.shaping.count=513") == [
         "search.iso_sigma: 0.3 has no effect with es; leave it out (a key of map_elites)",
         "search.emitters: many has no effect with es; leave it out (a key of me_es and memes)",
-        "search.top_pairs: 513 has no effect with es; leave it out (a key of ars)",
+        "search.shaping.count: 513 has no effect with search.shaping.kind = ranks; leave it out "
+        "(a key of kind top_pairs)",
+        "seed: a is not allowed; must be a whole number, at least 0 and below 2**63",
     ]
-    assert problems(MINIMAL, "search.algorithm=ars", "search.top_pairs=513") == [
-        "search.top_pairs: 513 is more than search.pairs (512); try 512, or null for all"
+    assert problems(MINIMAL, "search.algorithm=ars", "search.shaping.count=513") == [
+        "search.shaping.count: 513 is more than search.pairs (512); try 512, or null for all"
     ]
 
 
@@ -72,14 +69,55 @@ def test_each_value_of_a_sweep_is_checked(tmp_path):
     grid = {"search.algorithm": ["es", "map_elites"], "search.sigma": [0.02, 0.3]}
     with pytest.raises(ConfigError) as caught:
         plan(MINIMAL, tmp_path, grid, range(2))
-    (problem,) = caught.value.problems
-    assert problem.sentence.startswith("search.sigma: 0.3 has no effect with map_elites; leave it out")
-    assert (problem.field, problem.value, problem.suggestion) == ("search.sigma", 0.3, 0.02)
+    found = [(problem.field, problem.value, problem.suggestion) for problem in caught.value.problems]
+    assert found == [("search.sigma", 0.02, None), ("search.sigma", 0.3, None)]
+    assert all("has no effect with map_elites; leave it out" in one.sentence for one in caught.value.problems)
 
 
-def test_a_search_of_the_user_may_use_any_key():
-    config = load(MINIMAL, f"search.algorithm={OWN}", "search.iso_sigma=0.3", "search.emitters=3")
-    assert (config.search.iso_sigma, config.search.emitters) == (0.3, 3)
+@pytest.mark.parametrize(
+    ("key", "value", "now"),
+    [
+        ("learning_rate", "0.1", "search.step.learning_rate"),
+        ("l2", "0.1", "search.step.l2"),
+        ("shaping", "signs", "search.shaping.kind"),
+        ("top_pairs", "5", "search.shaping.count"),
+        ("options.reach", "0.2", "search.reach"),
+    ],
+)
+def test_a_renamed_key_is_refused_with_its_name(key, value, now):
+    expected = [f"search.{key}: this key is now {now}"]
+    assert problems(MINIMAL, f"search.{key}={value}") == expected
+    leaf, nested = key.split(".")[-1], parse_value(value)
+    section = {"algorithm": "es", **({"options": {leaf: nested}} if "." in key else {key: nested})}
+    assert problems(MINIMAL | {"search": section}) == expected
+
+
+def test_a_part_is_a_section_of_its_own():
+    assert problems(MINIMAL, "search.step=plain") == [
+        "search.step: this is a section; set its keys one by one, such as search.step.kind=..."
+    ]
+    (line,) = problems(MINIMAL | {"search": {"algorithm": "es", "step": "plain"}})
+    assert line.startswith("search.step: plain is not a mapping of keys; indent its keys below `step:`")
+    assert problems(MINIMAL, "search.step.kind=adma", "search.step.learning_rate=-1", "search.step.learning_rat=1") == [
+        "search.step.learning_rat: unknown key; did you mean search.step.learning_rate?",
+        "search.step.kind: adma is not allowed; must be adam or plain; did you mean adam?",
+    ]
+    config = load(MINIMAL | {"search": {"algorithm": "nsr_es", "step": {"learning_rate": 1}}}, "search.step.kind=plain")
+    assert config.search.step.model_dump() == {"kind": "plain", "learning_rate": 1.0, "l2": 0.005}
+
+
+def test_another_kind_leaves_out_the_keys_of_the_one_it_replaces():
+    source = MINIMAL | {"search": {"algorithm": "ars", "shaping": {"count": 5}}}
+    assert load(source).search.shaping.model_dump() == {"kind": "top_pairs", "count": 5}
+    for wanted, why in (
+        ("search.shaping.kind=signs", "signs replaces its search.shaping.kind"),
+        ("search.algorithm=es", "ranks replaces its search.shaping.kind"),
+    ):
+        assert load(source, wanted).search.shaping.kind == why.split()[0]
+        assert left_out(source, [wanted], OURS) == {"search.shaping.count": why}
+    assert problems(source, "search.shaping.kind=signs", "search.shaping.count=5") == [
+        "search.shaping.count: 5 has no effect with search.shaping.kind = signs; leave it out (a key of kind top_pairs)"
+    ]
 
 
 @pytest.mark.parametrize("method", OURS)
@@ -87,16 +125,17 @@ def test_values_that_a_key_has_anyway_are_accepted_so_that_a_resolved_config_loa
     for preset in ("literature", "uber"):
         config = load(MINIMAL, f"search.algorithm={method}", f"search.preset={preset}")
         assert load(parse_value(config.resolved_yaml())) == config
-    assert load(MINIMAL, f"search.algorithm={method}", "search.sigma=0.02", "compute.chunk_pairs=auto")
+    assert load(MINIMAL, f"search.algorithm={method}", "task.episodes_per_member=1", "compute.chunk_pairs=auto")
 
 
 def test_another_algorithm_leaves_out_the_keys_of_the_one_it_replaces():
     source = MINIMAL | {"search": {"algorithm": "me_es", "emitters": 4, "sigma": 0.3, "block_generations": 5}}
     config = load(source, "search.algorithm=es")
-    assert (config.search.sigma, config.search.emitters, config.search.block_generations) == (0.3, 1, 10)
-    assert left_out(source, ["search.algorithm=es"]) == ["search.emitters", "search.block_generations"]
-    assert left_out(source, ["search.algorithm=memes"]) == ["search.block_generations"]
-    assert left_out(source, ["search.algorithm=me_es", "search.sigma=1"]) == []
+    assert config.search.model_dump().items() >= {"sigma": 0.3, "centres": 1}.items()
+    assert list(left_out(source, ["search.algorithm=es"], OURS)) == ["search.emitters", "search.block_generations"]
+    why = "memes replaces its algorithm"
+    assert left_out(source, ["search.algorithm=memes"], OURS) == {"search.block_generations": why}
+    assert left_out(source, ["search.algorithm=me_es", "search.sigma=1"], OURS) == {}
     assert problems(source, "search.algorithm=es", "search.emitters=3") == [
         "search.emitters: 3 has no effect with es; leave it out (a key of me_es and memes)"
     ]
@@ -112,45 +151,33 @@ def test_keys_that_are_left_out_are_named_on_the_command_line(tmp_path, capsys):
     assert f"note: ignored search.batch of {file}, since es replaces its algorithm" in printed
 
 
-def test_a_run_that_recorded_a_key_without_effect_goes_on_and_may_be_forked(tmp_path):
-    """As versions up to 0.11 did."""
-    config = api.load_config(MAP_ELITES)
-    search = config.search.model_copy(update={"sigma": 0.3})
-    older = config.model_copy(update={"search": search})
-    found = api.run(older, tmp_path / "run").run
-    whole = api.run(api.load_config(MAP_ELITES, ["budget.generations=5"]), tmp_path / "whole").run
-    assert "search.sigma" in {setting.key for setting in changed_settings(found.meta.config, SHIPPED["point_maze"])}
-    resumed = api.resume(tmp_path / "run", ["budget.generations=4", "search.sigma=0.3"]).run
-    assert (resumed.generation, resumed.constants["search.sigma"]) == (4, 0.3)
-    with pytest.raises(ConfigError, match=r"search.sigma: 0.1 has no effect with map_elites"):
-        api.resume(tmp_path / "run", ["search.sigma=0.1"])
-    with pytest.raises(ConfigError, match=r"search.sigma: 0.1 has no effect with map_elites"):
-        fork_config(tmp_path / "run", ["search.sigma=0.1"])
-    assert fork_config(tmp_path / "run", ["search.iso_sigma=0.1"]).search.sigma == 0.3
-    # The error of a new run asks to leave the key out; the same run then goes on.
-    with pytest.raises(ConfigError, match=r"search.sigma: 0.3 has no effect with map_elites; leave it out"):
-        api.load_config(MAP_ELITES, ["search.sigma=0.3"])
-    wanted = api.load_config(MAP_ELITES, ["budget.generations=5"])
-    assert api.run_or_resume(wanted, tmp_path / "run").run.digest() == whole.digest()
+def test_a_run_may_be_told_again_what_has_no_effect_but_nothing_else(tmp_path):
+    """Its config has the values of keys that every config has."""
+    run = api.run(api.load_config(MAP_ELITES), tmp_path / "run").run
+    assert "search.sigma" not in run.constants
+    resumed = api.resume(tmp_path / "run", ["budget.generations=4", "policy.action_noise=0.01"]).run
+    assert resumed.generation == 4
+    for refused in (
+        lambda given: api.resume(tmp_path / "run", given),
+        lambda given: fork_config(tmp_path / "run", given),
+    ):
+        for given in ("policy.action_noise=0.1", "search.sigma=0.02"):
+            with pytest.raises(ConfigError, match=r"has no effect with map_elites; leave it out"):
+                refused([given])
+    assert fork_config(tmp_path / "run", ["search.iso_sigma=0.1"]).constants()["search.iso_sigma"] == 0.1
 
 
 def test_a_fork_to_another_method_gives_up_keys_without_effect_there(tmp_path):
     source = MAP_ELITES | {"search": {"algorithm": "nsra_es", "pairs": 16, "fitness_weight_step": 0.2}}
     api.run(api.load_config(source, ["budget.generations=1"]), tmp_path / "run")
     config = fork_config(tmp_path / "run", ["search.algorithm=ns_es"])
-    assert (config.search.algorithm, config.search.fitness_weight_step) == ("ns_es", 0.05)
+    assert config.search.algorithm == "ns_es"
+    assert not [key for key in config.constants() if "fitness_weight" in key]
 
 
 @pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)
 def test_shipped_configs_have_no_key_without_effect(path):
     written = flat(read_yaml_file(path))
-    assert not written.keys() & keys_without_effect(written["search.algorithm"])
+    settings = OURS[written["search.algorithm"]].settings
+    assert all(has_effect(key, settings) for key in written)
     assert shipped_configs()
-
-
-def test_descriptions_of_keys_of_a_few_methods_name_these():
-    for key in SOME_METHODS:
-        if len(methods := methods_with(key)) <= 3:
-            text = str(FIELDS[key].description)
-            assert {name for name in OURS if re.search(rf"\b{name}\b", text)} == set(methods), key
-            assert re.match(rf"(\w+, )*{methods[0]}\b.*?: ", text), key

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from es_service import api
-from es_service.errors import ConfigError, StoreError
+from es_service.errors import ConfigError, EvaluationError, StoreError
 from es_service.protocol.messages import EpisodesResult
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Ask, CentreEvaluation
-from es_service.search.algorithms.steps import archived, first_state
-from es_service.search.maps.behaviour_map import insert
+from es_service.search.algorithms.common import archived, first_state
+from es_service.search.maps.behaviour_map import COLUMNS, insert
 from es_service.search.novelty import NoveltyArchive
 from es_service.search.observation_statistics import no_observations
 
@@ -23,7 +23,7 @@ EXAMPLE = "tests.examples.minimal_criterion:minimal_criterion"
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 20},
     "policy": {"hidden": [8]},
-    "search": {"algorithm": EXAMPLE, "pairs": 16, "sigma": 0.2, "learning_rate": 0.1},
+    "search": {"algorithm": EXAMPLE, "pairs": 16, "sigma": 0.2, "step": {"learning_rate": 0.1}},
     "budget": {"generations": 6},
     "compute": {"engine": "inline", "workers": 1},
 }
@@ -113,6 +113,39 @@ def emptying(config):
     return _telling(config, lambda state: replace(state, map=_rows(state.map, slice(-1, None))))
 
 
+def shrinking(config):
+    """Three centres at first, and one less after each generation until there are two."""
+    ours = ALGORITHMS["ns_es"](config)
+
+    def tell(state, evaluations):
+        told = ours.tell(state, evaluations)
+        remaining = max(2, len(told.centres) - (evaluations[0].generation > 0))
+        return replace(told, centres=told.centres[:remaining])
+
+    return replace(ours, tell=tell)
+
+
+def double(config):
+    """A cell with two entries."""
+    return _telling(config, lambda state: replace(state, map=_rows(state.map, [0, 0])))
+
+
+def centreless(config):
+    return _telling(config, lambda state: replace(state, centres=()))
+
+
+def ragged(config):
+    """An archive with fewer generations than descriptors."""
+    return _telling(
+        config,
+        lambda state: replace(state, archive=replace(state.archive, generation_N=np.zeros(0, np.int64), room=None)),
+    )
+
+
+def without_map(config):
+    return _telling(config, lambda state: replace(state, map=state.map if state.archive.size < 3 else None))
+
+
 def foreign(config):
     """An elite of a cell far away, which no centre of the run has been to."""
 
@@ -148,23 +181,48 @@ def _newest(archive, count):
 
 
 def _rows(map_, rows):
-    names = [name for name in map_.__dataclass_fields__ if name.endswith(("_N", "_N_B"))]
+    names = ["cell_N", *COLUMNS]
     return replace(map_, **{name: getattr(map_, name)[rows] for name in names})
+
+
+FAR = ["map.cells=[200, 200]", "search.step.learning_rate=1"]
+
+
+@pytest.mark.parametrize("name", ["forgetful", "growing", "shrinking", "emptying"])
+def test_a_search_may_lose_what_it_had(tmp_path, name):
+    settings = [f"search.algorithm={__name__}:{name}", *FAR, f"search.centres={3 if name == 'shrinking' else 1}"]
+    whole = api.run(api.load_config(CONFIG, settings), tmp_path / "whole").run
+    api.run(api.load_config(CONFIG, [*settings, "budget.generations=4"]), tmp_path / "parts")
+    assert api.resume(tmp_path / "parts", ["budget.generations=6"]).run.digest() == whole.digest()
+    assert api.fork(tmp_path / "parts", generation=5, out=tmp_path / "fork").run.digest() == whole.digest()
+    sizes = len(whole.novelty), sum(part.startswith("centre_") for part in whole.parts()[1]), len(whole.map)
+    expected = {"forgetful": (3, 1), "growing": (7, 8), "shrinking": (9, 2), "emptying": (7, 1)}[name]
+    assert sizes[:2] == expected
+    assert (sizes[2] == 1) == (name == "emptying")
+    assert len(whole.elites()[1]) == sizes[2]
 
 
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("forgetful", r"generation 3 cannot be stored: the novelty archive has lost or changed entries; .* 2 is saved"),
-        ("growing", r"generation 1 cannot be stored: the search has 3 centres, but it had 2 before"),
-        ("emptying", r"the behaviour map has lost cells or changed their order"),
-        ("foreign", r"generation 0 cannot be stored: the new elite of cell \d+ is not the centre that was evaluated"),
+        (
+            "foreign",
+            r"generation 0 cannot be stored: the new elite of cell \d+ is centre 0 of generation 1000000, which",
+        ),
+        ("double", r"generation 0 cannot be stored: the map's cells must be different ones from 0 to 39999; "),
+        ("centreless", r"generation 0 cannot be stored: the search has no centre"),
+        ("without_map", r"generation 2 cannot be stored: the behaviour map was added or removed, .* 1 is saved"),
     ],
 )
-def test_a_state_that_the_store_could_not_give_back_ends_the_run(tmp_path, name, reason):
-    settings = [f"search.algorithm={__name__}:{name}", "map.cells=[200, 200]", "search.learning_rate=1"]
+def test_what_is_no_state_ends_the_run(tmp_path, name, reason):
+    settings = [f"search.algorithm={__name__}:{name}", *FAR]
     with pytest.raises(StoreError, match=reason):
         api.run(api.load_config(CONFIG, settings), tmp_path / "run")
+
+
+def test_an_archive_whose_arrays_do_not_fit_ends_the_run(tmp_path):
+    with pytest.raises(EvaluationError, match="generation 0: `tell` returned a state that is none: the arrays"):
+        api.run(api.load_config(CONFIG, [f"search.algorithm={__name__}:ragged"]), tmp_path / "run")
 
 
 def test_elites_are_those_that_the_map_says_entered(tmp_path):
@@ -184,7 +242,7 @@ def test_elites_are_those_that_the_map_says_entered(tmp_path):
 
 def started(folder, name, **settings):
     """A run of an example in which every episode starts in one corner."""
-    search = {"pairs": 32, "sigma": 0.1, "learning_rate": 0.05, "evaluation_episodes": 4, "algorithm": name}
+    search = {"pairs": 32, "sigma": 0.1, "step": {"learning_rate": 0.05}, "evaluation_episodes": 4, "algorithm": name}
     config = CONFIG | {
         "task": {"environment": "point_maze", "episode_steps": 60, "options": {"start": "corner"}},
         "policy": {"hidden": [8], "init": "small_columns"},
@@ -198,7 +256,7 @@ ADAPTIVE = "tests.examples.adaptive_sigma:adaptive_sigma"
 
 def test_sigma_rises_with_success_and_falls_without(tmp_path):
     """And is stored: a run that was stopped has the same one, and the same bits."""
-    settings = {"search.learning_rate": 0.4, "budget.generations": 20}
+    settings = {"search.step.learning_rate": 0.4, "budget.generations": 20}
     whole = started(tmp_path / "whole", ADAPTIVE, **settings)
     started(tmp_path / "parts", ADAPTIVE, **settings | {"budget.generations": 9})
     assert api.resume(tmp_path / "parts", ["budget.generations=20"]).run.digest() == whole.digest()
@@ -242,7 +300,7 @@ def test_repelling_centres_end_apart_where_others_meet(tmp_path):
     apart = distances("apart")
     assert apart[0] < 0.01
     assert apart[10:].min() > 0.5
-    assert distances("together", **{"search.options.reach": 0})[10:].max() < 0.1
+    assert distances("together", **{"search.reach": 0})[10:].max() < 0.1
 
 
 def test_repelling_centres_go_on_where_they_were_with_the_same_bits(tmp_path):

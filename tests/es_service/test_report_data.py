@@ -57,7 +57,7 @@ def test_a_chosen_option_and_another_preset_are_settings(tmp_path):
 def test_all_settings_are_shown_if_the_defaults_are_unknown(folder):
     config = open_run(folder).config
     found = settings.changed_settings(config | {"search": config["search"] | {"forgotten": 3}}, POINT)
-    assert {"search.forgotten", "search.l2"} <= {one.key for one in found}
+    assert {"search.forgotten", "search.step.l2"} <= {one.key for one in found}
     assert {one.default for one in found} == {""}
 
 

@@ -190,10 +190,12 @@ def test_the_state_of_the_last_two_generations_is_kept_and_no_more(tmp_path):
         for generation in range(12):
             advance(run, generation)
             kept = rows(folder, "SELECT part, generation FROM state")
-            for part in state_at(generation):
+            for part in {name for at in range(generation + 1) for name in parts_of(at)}:
                 written = [at for at in range(generation + 1) if part in parts_of(at)]
                 until_before = [at for at in written if at <= generation - 1]
                 expected = until_before[-1:] + [at for at in written if at > generation - 1]
+                if expected and parts_of(expected[0])[part] is None:
+                    del expected[0]  # a row that removes a part is kept only with an older one
                 assert sorted(at for name, at in kept if name == part) == expected
     for generation in (10, 11):
         at, parts = read_parts(folder, generation)

@@ -116,8 +116,8 @@ def test_a_database_that_somebody_locks_is_no_damage(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("version", "message"),
     [
-        (7, r"schema version 7; .* versions up to 5\. Upgrade"),
-        (1, r"use version 0\.1 to read or continue it .* is 1, .* es-service supports 5"),
+        (7, r"schema version 7; .* versions up to 6\. Upgrade"),
+        (1, r"use version 0\.1 to read or continue it .* is 1, .* es-service supports 6"),
     ],
 )
 def test_another_schema_version_names_both_and_says_what_to_use(tmp_path, monkeypatch, version, message):

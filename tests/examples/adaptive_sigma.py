@@ -9,7 +9,7 @@ import numpy as np
 
 from es_service.config.model import RunConfig
 from es_service.search.algorithms.base import Algorithm, Ask, CentreEvaluation, SearchState
-from es_service.search.algorithms.steps import novelty_search
+from es_service.search.algorithms.common import novelty_search
 
 RISE, FALL = 1.5, 1.5**-0.25
 """Factors of sigma after a success and after a failure: with one success in five generations it stays as it is."""

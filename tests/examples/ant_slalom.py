@@ -51,6 +51,10 @@ class AntSlalom:
     def descriptor(self, state):
         return state.q[:2]
 
+    def success(self, state, before):
+        """The ant has passed the finish."""
+        return state.q[0] > self.finish
+
     def viewer(self):
         """What `es-service report` replays episodes with."""
         return ant_viewer(self.ant.system)

@@ -10,7 +10,7 @@ import numpy as np
 from es_service.config.model import RunConfig
 from es_service.protocol.messages import EpisodesResult
 from es_service.search.algorithms.base import Algorithm, Ask, SearchState
-from es_service.search.algorithms.steps import novelty_search
+from es_service.search.algorithms.common import novelty_search
 from es_service.search.novelty import novelty
 from es_service.search.shaping import centred_ranks, pair_weights
 

@@ -26,7 +26,7 @@ def search(trials: int, generations: int, folder: Path, seed: int = 0) -> optuna
     def mean_fitness(trial: optuna.Trial) -> float:
         settings = {
             "search.sigma": trial.suggest_float("sigma", 0.005, 0.5, log=True),
-            "search.learning_rate": trial.suggest_float("learning_rate", 0.001, 0.3, log=True),
+            "search.step.learning_rate": trial.suggest_float("learning_rate", 0.001, 0.3, log=True),
             "budget.generations": generations,
             "seed": seed,
         }

@@ -5,7 +5,6 @@ from functools import cache
 import numpy as np
 
 from es_service.api import load_config
-from es_service.config.method_keys import keys_without_effect
 from es_service.config.model import worker_spec
 from es_service.loop import driver
 from es_service.protocol.messages import EvaluationChunk, PolicyShape
@@ -26,7 +25,7 @@ PRESETS = {
 
 
 def config_of(preset="literature", generations=30, seed=0, neighbours=3, cells=CELLS, **search):
-    idle = keys_without_effect(search.get("algorithm", "me_es"))
+    known = ALGORITHMS[search.get("algorithm", "me_es")].settings.model_fields
     of_blocks = {
         "block_generations": BLOCK,
         "parent_statistics": "elite" if preset == "literature" else "global",  # both, and one for each preset
@@ -40,9 +39,9 @@ def config_of(preset="literature", generations=30, seed=0, neighbours=3, cells=C
                 "preset": preset,
                 "pairs": 32,
                 "sigma": 0.2,
-                "learning_rate": 0.2,
+                "step": {"learning_rate": 0.2},
                 "evaluation_episodes": 20,
-                **{key: value for key, value in of_blocks.items() if f"search.{key}" not in idle},
+                **{key: value for key, value in of_blocks.items() if key in known},
                 **search,
             },
             "novelty": {"neighbours": neighbours},

@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from es_service.config.model import policy_shape, worker_spec
+from es_service.config.parts import PlainStep, TopPairs
 from es_service.protocol.messages import TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys
-from es_service.search.algorithms.ars import top_pair_weights
-from es_service.search.optimizer import plain_ascent
+from es_service.search.shaping import pair_weights, shaped
+from es_service.search.steps import STEPS
 from tests.laws.es_runs import Tampering, run_in_memory, small_config
 from tests.twins import ars as twin
 from workers.environments import SHIPPED
@@ -19,8 +20,13 @@ from workers.policy import initial_parameters
 LINEAR = {"hidden": [], "action_noise": 0.0}
 
 
-def config_of(policy=LINEAR, **search):
-    return small_config(policy, **{"algorithm": "ars", "learning_rate": 0.1, "l2": 0.0, **search})
+def config_of(policy=LINEAR, l2=0.0, **search):
+    return small_config(policy, **{"algorithm": "ars", "step": {"learning_rate": 0.1, "l2": l2}, **search})
+
+
+def top_pair_weights(fitness_P_S, count):
+    """Weight of each pair's noise, [P], with shaping by this number of best pairs."""
+    return pair_weights(shaped(TopPairs(count=count), fitness_P_S))
 
 
 def spoil(chunk, result):
@@ -34,10 +40,10 @@ def spoil(chunk, result):
 @pytest.mark.parametrize(
     ("policy", "search", "tampered"),
     [
-        (LINEAR, {"top_pairs": 12}, False),
-        (LINEAR | {"observation_normalization": False}, {"top_pairs": 1}, False),
+        (LINEAR, {"shaping": {"count": 12}}, False),
+        (LINEAR | {"observation_normalization": False}, {"shaping": {"kind": "top_pairs", "count": 1}}, False),
         (LINEAR, {"l2": 0.05}, False),
-        ({}, {"top_pairs": 20}, True),
+        ({}, {"shaping": {"count": 20}}, True),
     ],
     ids=["V2-t", "V1-t", "V2, all pairs, l2", "two layers, invalid members"],
 )
@@ -49,7 +55,7 @@ def test_twenty_generations_equal_the_twin(policy, search, tampered):
     )
     shape, search = policy_shape(config, task), config.search
     first = initial_parameters(shape, config.policy.init, 0)
-    other = twin.ARS(first, search.learning_rate, search.l2, search.top_pairs or search.pairs)
+    other = twin.ARS(first, search.step.learning_rate, search.step.l2, search.shaping.count or search.pairs)
     for generation in range(1, 21):
         results = {
             chunk.chunk_id: np.where(np.isfinite(result.descriptor).all(axis=-1), result.fitness, np.nan)
@@ -62,7 +68,7 @@ def test_twenty_generations_equal_the_twin(policy, search, tampered):
         other.generation([normals(key, shape.parameters) for key in keys], fitness_P_S)
     (centre,) = state.search.centres
     assert np.linalg.norm(centre.centre_D - other.centre) < 1e-6 * np.linalg.norm(other.centre)
-    assert centre.adam.step == 0, "it has no use for an optimiser"
+    assert centre.step == {}, "a plain step remembers nothing"
     assert np.linalg.norm(centre.centre_D - first) > 0.3
     assert store.rows[-1]["archive_size"] == 21, "kept for comparison, as for es"
 
@@ -102,10 +108,21 @@ def test_only_differences_count_and_neither_scale_nor_shift_of_the_fitness(fitne
 
 
 def test_a_plain_step_by_hand():
-    found = plain_ascent(np.float32([1.0, -2.0]), np.float32([4.0, 0.0]), learning_rate=0.5, l2=0.25)
+    settings = PlainStep(learning_rate=0.5, l2=0.25)
+    state, found = STEPS["plain"].take(settings, {}, np.float32([1.0, -2.0]), np.float32([4.0, 0.0]))
+    assert state == STEPS["plain"].fresh(2) == {}
     np.testing.assert_array_equal(found, np.float32([1.0 + 0.5 * (4.0 - 0.25), -2.0 + 0.5 * 0.5]))
+
+
+def test_es_with_its_parts_is_ars():
+    """But for the name of the method in its config, nothing differs."""
+    config = config_of(shaping={"count": 12})
+    parts = config.search.model_dump(include={"step", "shaping"})
+    other = small_config(LINEAR, algorithm="es", **parts)
+    (one,), (two,) = (run_in_memory(each)[0].search.centres for each in (config, other))
+    np.testing.assert_array_equal(one.centre_D, two.centre_D)
 
 
 def test_by_default_there_is_neither_weight_decay_nor_action_noise():
     config = small_config(algorithm="ars")
-    assert (config.search.l2, config.policy.action_noise) == (0.0, 0.0)
+    assert (config.search.step.l2, config.policy.action_noise) == (0.0, 0.0)

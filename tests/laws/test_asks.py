@@ -60,7 +60,7 @@ def asking(config, *asks):
 
 
 def test_sigma_and_pairs_are_those_of_the_ask():
-    config = config_of(generations=1, algorithm="nsr_es", centres=3, learning_rate=0.05)
+    config = config_of(generations=1, algorithm="nsr_es", centres=3, step={"learning_rate": 0.05})
     sizes = {2: (0.05, 16), 0: (0.4, 48)}
     asks = [lambda s, i=i, said=said: Ask(i, s.centres[i].centre_D, *said, 1.0) for i, said in sizes.items()]
     state, store, evaluator = run_in_memory(config, algorithm=asking(config, *asks))
@@ -70,7 +70,7 @@ def test_sigma_and_pairs_are_those_of_the_ask():
         point, fitness, _ = points(evaluator, TrainingChunk, 1, ask)
         assert (point.sigma, len(fitness)) == (sigma, pairs)
         np.testing.assert_array_equal(point.parameters_D, first[index])
-        other = twin.ES(first[index], 0.05, config.search.l2)
+        other = twin.ES(first[index], 0.05, config.search.step.l2)
         other.generation(noise_of(1, ask, pairs), fitness)
         assert_near(state.search.centres[index].centre_D, other.centre)
     np.testing.assert_array_equal(state.search.centres[1].centre_D, first[1])

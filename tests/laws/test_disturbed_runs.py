@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 
 from es_service import api
-from es_service.config.method_keys import keys_without_effect
+from es_service.config.methods import has_effect
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Failure, Limits, WorkerLost, WorkerUp
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec
@@ -35,7 +35,7 @@ CHANGES = {
     "nsra_es, every centre in each generation": {
         "search": {"algorithm": "nsra_es", "update": "all", "fitness_weight_patience": 1}
     },
-    "ars, a linear policy": {"search": {"algorithm": "ars", "top_pairs": 5}, "policy": {"hidden": []}},
+    "ars, a linear policy": {"search": {"algorithm": "ars", "shaping": {"count": 5}}, "policy": {"hidden": []}},
 }
 """Name -> settings of a run that are none of a method's own."""
 KILLS = ("before_begin", "mid_transaction", "before_commit", "after_commit")
@@ -46,9 +46,9 @@ def config_of(name: str, **compute: object) -> dict:
     """Config of a method, or of what is in CHANGES, whose generations have several chunks and blocks."""
     changes = CHANGES.get(name, {"search": {"algorithm": name}})
     method = changes["search"]["algorithm"]
-    config, idle = config_of_method(method), keys_without_effect(method)
+    config, settings_of_method = config_of_method(method), ALGORITHMS[method].settings
     small = {"chunk_pairs": 4, "gradient_block_pairs": 4}
-    used = {key: value for key, value in small.items() if f"compute.{key}" not in idle}
+    used = {key: value for key, value in small.items() if has_effect(f"compute.{key}", settings_of_method)}
     return config | {
         **{section: config[section] | settings for section, settings in changes.items()},
         "budget": {"generations": GENERATIONS},

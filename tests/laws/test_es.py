@@ -45,7 +45,7 @@ def test_twenty_generations_equal_the_twin(finished):
 
 @pytest.mark.parametrize("shaping", ["signs", "returns"])
 def test_other_shapings_equal_the_twin(finished, shaping):
-    config = small_config(shaping=shaping)
+    config = small_config(shaping={"kind": shaping})
     state, _, evaluator, _ = run_in_memory(config)
     assert_equals_the_twin(config, state, evaluator)
     assert not np.allclose(state.search.centres[0].centre_D, finished[1].search.centres[0].centre_D)
@@ -53,7 +53,8 @@ def test_other_shapings_equal_the_twin(finished, shaping):
 
 def assert_equals_the_twin(config, state, evaluator):
     search = config.search
-    es = twin.ES(initial_parameters(SHAPE, config.policy.init, 0), search.learning_rate, search.l2, search.shaping)
+    first, step = initial_parameters(SHAPE, config.policy.init, 0), search.step
+    es = twin.ES(first, step.learning_rate, step.l2, search.shaping.kind)
     for generation in range(1, 21):
         results = [
             (chunk.chunk_id, result.fitness)
@@ -194,7 +195,7 @@ def test_too_many_invalid_members_stop_the_run_with_a_named_error():
 
 
 def test_a_centre_that_is_not_finite_stops_the_run_before_it_is_kept():
-    config = small_config(learning_rate=1e300)
+    config = small_config(step={"learning_rate": 1e300})
     evaluator, store = DirectEvaluator(worker_spec(config, SHIPPED["point_maze"])), MemoryStore()
     first = initial_parameters(SHAPE, config.policy.init, config.seed)
     search = driver.Search(

@@ -118,6 +118,29 @@ def test_the_loop_knows_no_method_by_name():
     assert not {name for path in files("es_service/loop") for name in imports(path.read_text())} & methods
 
 
+def names_of_methods(source: str) -> list[str]:
+    """The names of methods that a file has as string literals, apart from docstrings and descriptions of keys."""
+    tree = ast.parse(source)
+    texts = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    texts |= {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.keyword) and node.arg == "description"}
+    constants = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in texts]
+    return [node.value for node in constants if node.value in OURS]
+
+
+@pytest.mark.parametrize("path", [*files("es_service"), *files("workers")], ids=module_of)
+def test_no_module_knows_a_method_by_name_but_its_own(path):
+    """What the rest of the service has to know of a method is declared in its settings."""
+    own = path.stem if path.parent.name == "algorithms" else None
+    assert set(names_of_methods(path.read_text())) <= {own}
+
+
+def test_a_name_of_a_method_is_found():
+    source = (
+        '"""memes"""\nif name in ("es", "other"):\n    """ars"""\n    Field(description="ars")\n    f(x={"me_es": 1})'
+    )
+    assert names_of_methods(source) == ["es", "me_es"]
+
+
 @pytest.mark.parametrize(
     "path",
     [path for path in files("es_service") if layer_of(module_of(path)) not in ("cli", "__main__")],

@@ -14,8 +14,8 @@ from es_service.protocol.messages import PolicyChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
+from es_service.search.algorithms.common import first_state
 from es_service.search.algorithms.map_elites import LARGE, PARENT_CHOICE, parent_cells, variation
-from es_service.search.algorithms.steps import first_state
 from es_service.search.maps.behaviour_map import Elite, empty_map, insert
 from es_service.search.maps.geometry import Grid
 from es_service.store.codec import decode_part, encode_part
@@ -245,7 +245,7 @@ def test_a_config_has_one_episode_for_each_policy_and_plain_observations(preset)
 def test_statistics_that_nothing_gathers_and_a_search_without_a_map_are_refused():
     with pytest.raises(ConfigError) as caught:
         load_config(PLAIN, {"policy.observation_normalization": True, "map.enabled": False})
-    assert [problem.field for problem in caught.value.problems] == ["map.enabled", "policy.observation_normalization"]
+    assert [problem.field for problem in caught.value.problems] == ["policy.observation_normalization", "map.enabled"]
     assert "policy.observation_normalization: true is not allowed for map_elites, which has no train" in str(
         caught.value
     )

@@ -38,8 +38,8 @@ def test_thirty_generations_equal_the_twin(preset, mode):
     other = twin.MapElitesES(
         initial_parameters(SHAPE, config.policy.init, 0, 0),
         GridMap(((-1.0, 1.0), (-1.0, 1.0)), CELLS),
-        config.search.learning_rate,
-        config.search.l2,
+        config.search.step.learning_rate,
+        config.search.step.l2,
         mode=mode,
         length=BLOCK,
         neighbours=3,

@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 
 from es_service.api import load_config
-from es_service.config.parallel import parallel_sentence, populations
+from es_service.config.parallel import parallel_sentence
 from es_service.errors import ConfigError
 from es_service.loop.history import history_columns
-from es_service.loop.parts import OWN, elite_part
+from es_service.loop.parts import elite_part
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
+from es_service.search.algorithms.common import first_state
 from es_service.search.algorithms.memes import RESET_CHOICE, STAGNANT
-from es_service.search.algorithms.steps import first_state
 from es_service.search.maps.behaviour_map import Elite, empty_map
 from es_service.search.maps.geometry import Grid
+from es_service.search.state_parts import OWN
 from es_service.store.codec import decode_part, encode_part
 from tests.laws import me_es_runs
 from tests.laws.me_es_runs import (
@@ -40,7 +41,8 @@ EMITTERS, PATIENCE, NEWEST = 4, 2, 30
 
 def config_of(generations=24, **search):
     """A run whose newest entries are soon fewer than all; l2 keeps Adam from dividing rounding by rounding."""
-    named = {"algorithm": "memes", "emitters": EMITTERS, "stagnation_generations": PATIENCE, "l2": 0.005}
+    named = {"algorithm": "memes", "emitters": EMITTERS, "stagnation_generations": PATIENCE}
+    named["step"] = {"learning_rate": 0.2, "l2": 0.005}
     config = me_es_runs.config_of(generations=generations, **{**named, "parent_statistics": "global", **search})
     return config.model_copy(update={"novelty": config.novelty.model_copy(update={"newest": NEWEST})})
 
@@ -52,8 +54,8 @@ def test_twenty_four_generations_equal_the_twin(mode):
     other = twin.Memes(
         first_centres(config),
         GridMap(((-1.0, 1.0), (-1.0, 1.0)), CELLS),
-        config.search.learning_rate,
-        config.search.l2,
+        config.search.step.learning_rate,
+        config.search.step.l2,
         mode=mode,
         patience=PATIENCE,
         neighbours=3,
@@ -133,12 +135,13 @@ def test_an_emitter_is_reset_after_generations_in_which_nothing_of_its_entered_t
 def test_an_emitter_begins_again_with_a_fresh_optimiser_and_a_count_of_its_own():
     search, state = begun(emitters=3)
     state = replace(state, own={STAGNANT: np.array([5, 7, 1])})
-    used = replace(state.centres[1], adam=replace(state.centres[1].adam, step=9))
+    used = replace(state.centres[1], step={"adam_step": np.array(9), "adam_m_D": np.ones(3, np.float32)})
     state = replace(state, centres=(state.centres[0], used, state.centres[2]))
     nothing = np.zeros(0, np.float32)
     after = search.restart(state, 1, 4, Elite(np.full(3, 2, np.float32), nothing, nothing, nothing))
     assert after.own[STAGNANT].tolist() == [5, 0, 1]
-    assert (after.centres[1].adam.step, after.centres[1].cell) == (0, 4)
+    assert (after.centres[1].step["adam_step"], after.centres[1].cell) == (0, 4)
+    assert after.centres[1].step["adam_m_D"].tolist() == [0, 0, 0]
     assert after.centres[1].centre_D.tolist() == [2, 2, 2]
     assert after.centres[0] is state.centres[0]
 
@@ -189,21 +192,22 @@ PLAIN = {"task": {"environment": "point_maze"}, "search": {"algorithm": "memes"}
 def test_a_config_has_the_settings_of_the_paper_but_fewer_emitters_and_pairs(preset):
     config = load_config(PLAIN, {"search.preset": preset})
     search = config.search
-    assert (search.sigma, search.learning_rate, search.l2) == (0.02, 0.01, 0.0)
+    assert (search.sigma, search.step.learning_rate, search.step.l2) == (0.02, 0.01, 0.0)
     assert (search.stagnation_generations, search.evaluation_episodes) == (32, 1)
     assert (config.novelty.newest, config.novelty.neighbours) == (50_000, 10)
     assert (config.policy.observation_normalization, config.policy.action_noise) == (False, 0.0)
     assert (search.emitters, search.centres, search.pairs) == (16, 16, 32)
-    assert populations(config) == 16
+    assert config.search.populations() == 16
     assert "search.pairs and search.emitters change that" in parallel_sentence(config)
-    other = load_config(PLAIN, {"search.preset": preset, "search.emitters": 3, "search.pairs": 8, "search.l2": 0.1})
-    assert (other.search.centres, other.search.pairs, other.search.l2) == (3, 8, 0.1)
+    wanted = {"search.emitters": 3, "search.pairs": 8, "search.step.l2": 0.1}
+    other = load_config(PLAIN, {"search.preset": preset, **wanted})
+    assert (other.search.centres, other.search.pairs, other.search.step.l2) == (3, 8, 0.1)
 
 
 def test_it_has_a_centre_for_each_emitter_and_needs_a_map():
     with pytest.raises(ConfigError) as caught:
         load_config(PLAIN, {"search.centres": 5, "map.enabled": False})
-    assert "search.centres: 5 is not allowed for memes, which has one centre per emitter; must be 16" in str(
+    assert "5 is not allowed for memes, which has one centre for each of search.emitters; must be 16" in str(
         caught.value
     )
     assert "map.enabled: false is not allowed for memes, whose emitters begin again from" in str(caught.value)

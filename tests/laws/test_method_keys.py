@@ -7,8 +7,8 @@ from functools import cache, reduce
 
 import pytest
 
-from es_service.config.loading import changed_config, load_config
-from es_service.config.method_keys import keys_without_effect
+from es_service.config.loading import load_config
+from es_service.config.methods import has_effect as is_declared
 from es_service.config.model import policy_shape, worker_spec
 from es_service.config.tasks import TASKS
 from es_service.loop import driver
@@ -35,7 +35,7 @@ COMMON = {
 WITH_POPULATIONS = {
     "search.pairs": 32,
     "search.sigma": 0.2,
-    "search.learning_rate": 0.2,
+    "search.step.learning_rate": 0.2,
     "policy.observation_normalization": True,
     "policy.action_noise": 0.01,
     "compute.chunk_pairs": 16,
@@ -61,13 +61,14 @@ OTHER = {
     "policy.action_noise": 0.2,
     "search.pairs": 64,
     "search.sigma": 0.3,
-    "search.learning_rate": 0.3,
-    "search.l2": 0.1,
-    "search.shaping": "signs",
+    "search.step.learning_rate": 0.3,
+    "search.step.l2": 0.1,
+    "search.step.kind": "plain",
+    "search.shaping.kind": "signs",
     "search.centres": 4,
     "search.update": "all",
     "search.centre_choice": "round_robin",
-    "search.top_pairs": 4,
+    "search.shaping.count": 4,
     "search.emitters": 3,
     "search.fitness_weight_start": 0.25,
     "search.fitness_weight_step": 0.25,
@@ -111,6 +112,8 @@ ONE_VALUE = {
     "search.centres": ("es", "ars", "me_es", "memes"),
     "policy.observation_normalization": ("map_elites",),
     "map.enabled": ("me_es", "memes", "map_elites"),
+    "search.shaping.count": tuple(name for name in OURS if name != "ars"),  # the others have another kind by default
+    "search.step.kind": ("ars",),  # it is plain by default
 }
 """Key -> methods that allow only one value of it, so that no other can be measured."""
 
@@ -184,15 +187,13 @@ def as_given(settings, changed):
     return load(changed)
 
 
-def as_recorded(settings, changed):
-    """The config of a run that exists and has recorded a value of a key without effect."""
-    mapping = load(settings).model_dump(mode="json")
+def as_it_cannot_be(settings, changed):
+    """A config with another value of a key without effect, which no user can give."""
+    config = load(settings)
     for key in changed.keys() - settings.keys():
         section, leaf = key.split(".")
-        mapping[section][leaf] = changed[key]
-    if "search.pairs" in changed and "search.pairs" not in settings:  # what followed from them
-        mapping["compute"] |= {"chunk_pairs": 16, "rollout_block_pairs": 16, "gradient_block_pairs": 64}
-    return changed_config(mapping, **KNOWN)
+        config = config.model_copy(update={section: getattr(config, section).model_copy(update={leaf: changed[key]})})
+    return config
 
 
 def test_every_constant_is_measured_or_there_is_a_reason():
@@ -202,7 +203,8 @@ def test_every_constant_is_measured_or_there_is_a_reason():
 
 @pytest.mark.parametrize("method", OURS)
 def test_the_table_says_which_keys_have_an_effect(method):
-    idle = keys_without_effect(method)
-    measured = [key for key in OTHER if method not in ONE_VALUE.get(key, ())]
-    found = {key: has_effect(method, key, as_recorded if key in idle else as_given) for key in measured}
-    assert found == {key: key not in idle for key in measured}
+    settings = OURS[method].settings
+    declared = {key: is_declared(key, settings) for key in OTHER if method not in ONE_VALUE.get(key, ())}
+    measured = {key: is_used for key, is_used in declared.items() if is_used or not key.startswith("search.")}
+    found = {key: has_effect(method, key, as_given if measured[key] else as_it_cannot_be) for key in measured}
+    assert found == measured

@@ -14,7 +14,7 @@ from es_service.loop.policies import no_statistics, policy_episodes, policy_work
 from es_service.protocol.messages import PolicyChunk
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Ask, PolicyAsk
-from es_service.search.algorithms.steps import archived, mapped
+from es_service.search.algorithms.common import archived, mapped
 from es_service.search.maps.behaviour_map import insert
 from tests.helpers import workers_in_this_process
 from tests.laws.me_es_runs import SHAPE, Sharing, config_of, run_in_memory

@@ -9,9 +9,9 @@ from es_service.loop.generation import fittest
 from es_service.loop.parts import elite_part, map_from_parts
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk
 from es_service.search.algorithms.base import NO_CELL, CentreEvaluation
+from es_service.search.algorithms.common import archived, first_state, mapped, novelty_of_centres
 from es_service.search.algorithms.me_es import CELL_CHOICE, block_mode
 from es_service.search.algorithms.nsra_es import adapted_weight
-from es_service.search.algorithms.steps import archived, first_state, mapped, novelty_of_centres
 from es_service.search.maps.behaviour_map import empty_map
 from es_service.search.maps.geometry import Grid
 from tests.laws.me_es_runs import (
@@ -43,8 +43,8 @@ def test_blocks_side_by_side_equal_the_twin(preset):
     emitters = me_es_twin.side_by_side(
         first_centres(config),
         GridMap(((-1.0, 1.0), (-1.0, 1.0)), CELLS),
-        config.search.learning_rate,
-        config.search.l2,
+        config.search.step.learning_rate,
+        config.search.step.l2,
         mode="explore_exploit",
         length=BLOCK,
         neighbours=3,
@@ -130,12 +130,14 @@ def test_the_novelty_of_a_centre_is_measured_against_the_newest_entries_by_hand(
 @pytest.mark.parametrize(("algorithm", "weight"), [("ns_es", 0.0), ("nsr_es", 0.5), ("nsra_es", 0.5)])
 def test_every_centre_at_once_equals_the_twin(algorithm, weight):
     rule = NSRA if algorithm == "nsra_es" else {}
-    config = config_of(generations=14, algorithm=algorithm, centres=3, update="all", learning_rate=0.05, **rule)
+    config = config_of(
+        generations=14, algorithm=algorithm, centres=3, update="all", step={"learning_rate": 0.05}, **rule
+    )
     state, store, evaluator = run_in_memory(config)
     other = novelty_twin.NoveltySearch(
         first_centres(config),
-        config.search.learning_rate,
-        config.search.l2,
+        config.search.step.learning_rate,
+        config.search.step.l2,
         neighbours=3,
         weight=weight,
         rule=(0.125, 2, 0.0) if algorithm == "nsra_es" else None,
@@ -157,7 +159,7 @@ def test_every_centre_at_once_equals_the_twin(algorithm, weight):
         assert store.rows[generation]["archive_size"] == len(other.archive) == 3 + 3 * generation
     for ours, theirs in zip(state.search.centres, other.centres, strict=True):
         assert_near(ours.centre_D, theirs.centre)
-        assert ours.adam.step == 14
+        assert ours.step["adam_step"] == 14
     np.testing.assert_allclose(state.search.archive.descriptor_N_B, other.archive, rtol=1e-12)
     assert state.search.archive.centre_N.tolist() == [0, 1, 2] * 15
     weights = [row["fitness_weight"] for row in store.rows]

@@ -8,16 +8,18 @@ from hypothesis.extra import numpy as hnp
 
 from es_service.api import load_config
 from es_service.config.model import worker_spec
+from es_service.config.parts import AdamStep, Ranks, Returns, Signs, TopPairs
 from es_service.loop.generation import estimate_gradients
 from es_service.protocol.messages import GradientResult
 from es_service.protocol.noise import Domain, normals, stream_keys
-from es_service.search.optimizer import adam_ascent, fresh_adam
-from es_service.search.shaping import SHAPINGS, centred_ranks, pair_signs, pair_weights, standardised
+from es_service.search.shaping import centred_ranks, pair_signs, pair_weights, shaped, standardised
+from es_service.search.steps.adam import adam_step, fresh_adam
 from tests.helpers import DirectEvaluator
 from tests.laws.es_runs import SHAPE, small_config
 from tests.twins import es as twin
 from workers.environments import SHIPPED
 
+KINDS = {"ranks": Ranks(), "signs": Signs(), "returns": Returns(), "top_pairs": TopPairs(count=5)}
 fitness_arrays = hnp.arrays(
     np.float64,
     st.tuples(st.integers(1, 12), st.just(2)),
@@ -49,10 +51,10 @@ def test_standardised_returns_by_hand():
 
 @given(fitness_arrays, st.sampled_from(["signs", "returns"]), st.randoms(use_true_random=False))
 def test_other_shapings_equal_the_twin_and_no_order_of_pairs_matters(fitness, shaping, random):
-    utilities = SHAPINGS[shaping](fitness)
+    utilities = shaped(KINDS[shaping], fitness)
     np.testing.assert_allclose(utilities.ravel(), twin.SHAPINGS[shaping](fitness.ravel()), rtol=1e-6, atol=1e-9)
     order = random.sample(range(len(fitness)), len(fitness))
-    np.testing.assert_array_equal(SHAPINGS[shaping](fitness[order]), utilities[order])
+    np.testing.assert_array_equal(shaped(KINDS[shaping], fitness[order]), utilities[order])
 
 
 @given(fitness_arrays)
@@ -68,13 +70,13 @@ def test_an_increasing_map_of_the_fitness_changes_nothing(fitness):
         np.testing.assert_array_equal(centred_ranks(mapped), centred_ranks(fitness))
 
 
-@pytest.mark.parametrize("shaping", SHAPINGS)
+@pytest.mark.parametrize("shaping", KINDS)
 def test_swapping_signs_negates_the_gradient_estimate_exactly(shaping):
     config = small_config()
     evaluator = DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
     fitness = np.random.default_rng(0).normal(size=(48, 2))
     estimates = [
-        estimate_gradients(evaluator, 1, [pair_weights(SHAPINGS[shaping](values))], 20)[0]
+        estimate_gradients(evaluator, 1, [pair_weights(shaped(KINDS[shaping], values))], 20)[0]
         for values in (fitness, fitness[:, ::-1])
     ]
     assert np.abs(estimates[0]).max() > 0
@@ -97,13 +99,14 @@ def test_gradient_by_hand_three_pairs():
 def test_adam_by_hand():
     """First step: m = 0.1 g, v = 0.001 g^2, so the step is lr * sqrt(0.001)/0.1 * 0.1 g / (sqrt(0.001)|g| + 1e-8)."""
     gradient, start = np.float32([2.0, -0.5, 0.0]), np.float32([1.0, 1.0, 1.0])
-    adam, moved = adam_ascent(fresh_adam(3), start, gradient, learning_rate=0.01, l2=0.0)
+    free, decaying = AdamStep(learning_rate=0.01, l2=0.0), AdamStep(learning_rate=0.01, l2=0.005)
+    state, moved = adam_step(free, fresh_adam(3), start, gradient)
     np.testing.assert_allclose(moved, [1.01, 0.99, 1.0], rtol=1e-6)
-    assert adam.step == 1
-    _, pulled = adam_ascent(fresh_adam(3), start, np.zeros(3, np.float32), learning_rate=0.01, l2=0.005)
+    assert state["adam_step"] == 1
+    _, pulled = adam_step(decaying, fresh_adam(3), start, np.zeros(3, np.float32))
     np.testing.assert_allclose(pulled, start - 0.01, rtol=1e-4)  # the penalty alone, through Adam
     tiny = np.float32([1e-7, 0.0, 0.0])  # epsilon sits inside the bias correction: visible for tiny gradients only
-    _, crept = adam_ascent(fresh_adam(3), np.zeros(3, np.float32), tiny, learning_rate=0.01, l2=0.0)
+    _, crept = adam_step(free, fresh_adam(3), np.zeros(3, np.float32), tiny)
     expected = 0.01 * np.sqrt(0.001) / 0.1 * 0.1 * 1e-7 / (np.sqrt(0.001) * 1e-7 + 1e-8)
     assert crept[0] == pytest.approx(expected, rel=1e-4)
 

@@ -12,7 +12,9 @@ from typer.testing import CliRunner
 
 from es_service.cli.main import app
 from es_service.config.keys import FIELDS, GROUPS, RENAMED
+from es_service.config.methods import all_search_fields
 from es_service.loop.history import history_columns
+from es_service.search.algorithms import OURS
 from workers.environments import SHIPPED
 
 ROOT = Path(__file__).parents[2]
@@ -36,11 +38,12 @@ def replaced(text: str) -> list[str]:
 
 def test_keys_and_columns() -> None:
     columns = {column.name for task in SHIPPED.values() for column in history_columns(task, True)}
-    for name in {*FIELDS, *GROUPS, *columns}:
+    known = FIELDS | all_search_fields(OURS)
+    for name in {*known, *GROUPS, *columns}:
         assert replaced(name.replace("_", " ")) == []
         assert "member" not in name or name in MEMBERS
-    assert not RENAMED.keys() & FIELDS.keys()
-    assert set(RENAMED.values()) <= FIELDS.keys()
+    assert not RENAMED.keys() & known.keys()
+    assert set(RENAMED.values()) <= known.keys()
 
 
 @pytest.mark.parametrize("command", [[], *([name] for name in get_command(app).commands)])  # type: ignore[attr-defined]

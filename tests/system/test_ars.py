@@ -19,9 +19,9 @@ CONFIG = SMALL | {
     "search": {
         "algorithm": "ars",
         "pairs": 16,
-        "top_pairs": 5,
+        "shaping": {"count": 5},
         "sigma": 0.2,
-        "learning_rate": 0.1,
+        "step": {"learning_rate": 0.1},
         "evaluation_episodes": 4,
     },
     "budget": {"generations": 14},

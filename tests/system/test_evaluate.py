@@ -31,6 +31,7 @@ def test_evaluate_puts_fresh_values_beside_stored_ones(tmp_path, mapped):
         assert float(row["stored_fitness"]) == fitness
         assert float(row["fresh_fitness"]) == pytest.approx(fitness, abs=1e-3)
         assert float(row["fresh_standard_error"]) == pytest.approx(0.0, abs=1e-4)
+        assert row["successes"] == "0"
     assert (
         f"{len(mapped.map)} elites: the mean descriptor of {len(mapped.map)} still lies in their cell" in result.stdout
     )

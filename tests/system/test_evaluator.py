@@ -39,7 +39,7 @@ CONFIG = {
 }
 D = 2 * 8 + 8 + 8 * 8 + 8 + 8 * 2 + 2
 POLICIES = np.random.default_rng(0).normal(size=(100, D))
-FIELDS = ("fitness", "returns", "descriptor", "steps", "valid")
+FIELDS = ("fitness", "returns", "descriptor", "steps", "valid", "success")
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
@@ -192,7 +192,7 @@ def test_initial_policies_are_those_of_a_run(tmp_path):
     with es_service.evaluator(config) as evaluate:
         np.testing.assert_array_equal(evaluate.initial(1), centres[1])
         moved = np.abs(evaluate.initial() - centres[0]).max()
-        assert 0.0 < moved <= 2.0 * config.search.learning_rate
+        assert 0.0 < moved <= 2.0 * config.search.step.learning_rate
 
 
 @pytest.mark.parametrize(

@@ -264,7 +264,7 @@ def test_scores_of_a_population_that_was_luckier_or_less_are_forgotten(tmp_path)
     assert np.isfinite(parent.behaviour_map.score_N).any()
     known = parent.behaviour_map.score_N
     for override, same in (
-        ("search.learning_rate=0.1", True), ("task.episodes_per_member=3", False), ("search.pairs=32", False),
+        ("search.step.learning_rate=0.1", True), ("task.episodes_per_member=3", False), ("search.pairs=32", False),
         ("search.sigma=0.5", False), ("policy.action_noise=0", False),
     ):  # fmt: skip
         config = lineage.fork_config(parent.folder, [override])

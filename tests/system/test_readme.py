@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from es_service.config.keys import FIELDS
-from es_service.config.method_keys import SOME_METHODS, methods_with
+from es_service.config.methods import all_search_fields, methods_with
 from es_service.config.presets import preset_table
 from es_service.config.resolution import LEFT_OPEN
 from es_service.config.yaml_text import show
@@ -150,29 +150,35 @@ def test_preset_table_is_the_code_s():
     shown = TEXT["configs/README.md"].split("<!-- presets -->")[1].split("<!-- /presets -->")[0].strip()
     rows = [
         f"| `{row.key}`{f' of `{row.method}`' if row.method else ''} | {show(row.literature)} | {show(row.uber)} |"
-        for row in preset_table()
+        for row in preset_table(OURS)
     ]
     assert shown.splitlines()[2:] == rows
 
 
+KEYS = FIELDS | all_search_fields(OURS)
+SOME_METHODS = {key: methods for key in KEYS if len(methods := methods_with(key, OURS)) < len(OURS)}
+"""Key that not every method has -> the methods that have it."""
+
+
 def default(key: str) -> str:
     """A key's default as the guide writes it."""
-    by_preset = {row.key: f"{show(row.literature)} / {show(row.uber)}" for row in preset_table() if row.method is None}
+    by_preset = {
+        row.key: f"{show(row.literature)} / {show(row.uber)}" for row in preset_table(OURS) if row.method is None
+    }
     if key in by_preset:
         return by_preset[key]
     if key in LEFT_OPEN:
         return show(LEFT_OPEN[key])
-    if FIELDS[key].is_required():
+    if KEYS[key].is_required():
         return "required"
-    return show(FIELDS[key].get_default(call_default_factory=True))
+    return show(KEYS[key].get_default(call_default_factory=True))
 
 
 def test_every_key_of_a_config_is_explained_with_its_default():
     tables = TEXT["configs/README.md"].split("\n## Every key\n")[1].split("\n## ")[0]
     shown = re.findall(r"^\| `([\w.]+)` \| (.+?) \| \S.* \|$", tables, re.MULTILINE)
     assert len(shown) == len(dict(shown))
-    options = {"task.options.NAME": "the task's", "search.options.NAME": "the search's"}
-    assert dict(shown) == {key: default(key) for key in FIELDS} | options
+    assert dict(shown) == {key: default(key) for key in KEYS} | {"task.options.NAME": "the task's"}
 
 
 def test_the_table_of_keys_of_methods_is_the_code_s():
@@ -182,13 +188,13 @@ def test_the_table_of_keys_of_methods_is_the_code_s():
         named = re.findall(r"`(\w+)`", methods)
         uses = [name for name in OURS if (name in named) != methods.startswith("all but ")]
         found |= dict.fromkeys(re.findall(r"`([\w.]+)`", keys), tuple(uses))
-    assert found == {key: methods_with(key) for key in SOME_METHODS}
+    assert found == SOME_METHODS
 
 
 def test_keys_of_a_few_methods_begin_with_their_names():
     tables = TEXT["configs/README.md"].split("\n## Every key\n")[1]
-    for key in SOME_METHODS:
-        if len(methods := methods_with(key)) <= 3:
+    for key, methods in SOME_METHODS.items():
+        if len(methods) <= 3:
             (text,) = re.findall(rf"^\| `{key}` \| .*? \| (.*) \|$", tables, re.MULTILINE)
             assert {name for name in OURS if re.search(rf"\b{name}\b", text)} >= set(methods), key
             assert re.match(rf"(\w+, )*{methods[0]}\b.*?: ", text), key

@@ -42,7 +42,7 @@ def undisturbed(request, tmp_path_factory, workers_here):
 def emitters(tmp_path_factory, workers_here):
     """A finished run of ME-ES, for reading only; many elites, and resets that differ."""
     folder = tmp_path_factory.mktemp("emitters") / "run"
-    search = {**SEARCHES["me_es"], "sigma": 0.2, "learning_rate": 0.3}
+    search = {**SEARCHES["me_es"], "sigma": 0.2, "step": {"learning_rate": 0.3}}
     return api.run(api.load_config(config_of("me_es") | {"search": search}), folder).run
 
 

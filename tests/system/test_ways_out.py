@@ -22,6 +22,7 @@ from es_service.config.changes import again_with, refused_changes
 from es_service.config.compute import implied_by
 from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
 from es_service.runs.evaluation import candidates
+from es_service.search.algorithms import ALGORITHMS
 from es_service.store.lock import acquire_lock
 from es_service.store.reader import read_generation
 from es_service.store.writer import RunStore
@@ -55,7 +56,7 @@ def test_a_folder_with_spaces_is_one_word_of_every_command(tmp_path, capsys):
         [verb, str(folder)] for verb in ("status", "report", "evaluate", "digest", "resume", "fork")
     ]
     assert words_after(printed.splitlines()[-1], "resume") == [str(folder), "--set", "budget.generations=2"]
-    refused = error_message(refused_changes(folder, [("seed", 0, 1)]))
+    refused = error_message(refused_changes(folder, [("seed", 0, 1)], ALGORITHMS))
     assert words_after(refused, "fork") == [str(folder), "--set", "seed=1"]
     lock = acquire_lock(folder)
     with pytest.raises(StoreError) as locked:

@@ -35,6 +35,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
         options={"start": choice("default", "corner")},
         walls=(((-0.5, -0.495), (1.0, -0.495)), ((-1.0, 0.205), (0.5, 0.205))),
         goal=(-0.5, 0.8),
+        success="the point is in the goal square of side 0.1",
         least_reward=-2.3431,  # from the corner (1, -1)
         summary="a point must reach a goal in a square; two walls block the direct path",
     ),
@@ -58,6 +59,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
         ),
         wall_clearance=ANT_CLEARANCE,
         goal=(35.0, -25.0),
+        success="the ant is within 5 m of the goal at the end",
         least_reward=-95.6,  # from the corner (-35, 40)
         summary="an ant must go round three walls to a goal 60 m away; the direct path ends in a pocket",
     ),
@@ -72,6 +74,7 @@ SHIPPED: Mapping[str, TaskSpec] = {
         has_goal=False,
         walls=(((12.0, -2.0), (12.0, 2.0)), ((7.0, 3.0), (12.0, 3.0)), ((7.0, -3.0), (12.0, -3.0))),
         wall_clearance=ANT_CLEARANCE,
+        success="the ant has passed x = 20",
         least_reward=-3.38,  # QDax's figure for an episode's mean, not a bound for this ant
         summary="an ant is rewarded for running forward; a trap blocks the direct path, so the ant must go round it",
     ),
@@ -96,6 +99,9 @@ class Environment:
     """Function from a state to the descriptor [B] of an episode that ends in it."""
     goal_distance: Callable[[Any], Any]
     """Function from a state to the distance to the goal, NaN if the task has no goal."""
+    success: Callable[[Any, Any], Any] = lambda state, before: before
+    """Function (state, whether the episode would have succeeded in the state before) -> whether it succeeds if it ends
+    in this state; always False if the task does not declare success."""
     viewer: Viewer | None = None
     """What a replay in three dimensions needs; None if the task has no bodies."""
 

@@ -18,6 +18,8 @@ LOW, HIGH = SHIPPED["ant_maze"].descriptor_bounds[0]
 """Bounds of the arena in x and in y; it is a square."""
 START = (-25.0, -25.0)
 GOAL = (35.0, -25.0)
+NEAR = 5.0
+"""Distance from the goal, in metres, within which an episode that ends there succeeds."""
 MIDDLE, HALF = (LOW + HIGH) / 2.0, (HIGH - LOW) / 2.0
 """Middle of the arena and half of its side; they scale positions in observations to [-1, 1]."""
 
@@ -30,8 +32,10 @@ def make() -> Environment:
         state = ant.step(state, action)
         return state, -_goal_distance(state), jnp.array(False)
 
-    viewer = ant_viewer(ant.system)
-    return Environment(lambda key: ant.reset(key, START), _observe, step, _position, _goal_distance, viewer)
+    def reset(key: Any) -> AntState:
+        return ant.reset(key, START)
+
+    return Environment(reset, _observe, step, _position, _goal_distance, _near_goal, ant_viewer(ant.system))
 
 
 def _position(state: AntState) -> Any:
@@ -45,3 +49,7 @@ def _observe(state: AntState) -> Any:
 def _goal_distance(state: AntState) -> Any:
     dx, dy = state.q[0] - GOAL[0], state.q[1] - GOAL[1]
     return jnp.sqrt(dx * dx + dy * dy)
+
+
+def _near_goal(state: AntState, before: Any) -> Any:
+    return _goal_distance(state) <= NEAR

@@ -19,6 +19,8 @@ START = (0.0, 0.0)
 HEALTHY_Z = (0.2, 1.0)
 """Range of the torso's height, in metres; the episode ends outside of it."""
 SURVIVAL_REWARD = 1.0
+BEYOND_X = 20.0
+"""x of the torso, in metres, beyond which an episode has succeeded."""
 CONTROL_COST, CONTACT_COST = 0.5, 5e-4
 
 
@@ -35,7 +37,10 @@ def make() -> Environment:
         done = (new.q[2] < HEALTHY_Z[0]) | (new.q[2] > HEALTHY_Z[1])
         return new, forward + SURVIVAL_REWARD - control - contact, done
 
-    return Environment(lambda key: ant.reset(key, START), _observe, step, _descriptor, _no_goal, ant_viewer(ant.system))
+    def reset(key: Any) -> AntState:
+        return ant.reset(key, START)
+
+    return Environment(reset, _observe, step, _descriptor, _no_goal, _beyond, ant_viewer(ant.system))
 
 
 def _observe(state: AntState) -> Any:
@@ -48,6 +53,10 @@ def _observe(state: AntState) -> Any:
 def _descriptor(state: AntState) -> Any:
     low, high = (jnp.array(side, jnp.float32) for side in zip(*DESCRIPTOR_BOUNDS, strict=True))
     return jnp.clip(state.q[:2], low, high)
+
+
+def _beyond(state: AntState, before: Any) -> Any:
+    return before | (state.q[0] > BEYOND_X)
 
 
 def _no_goal(state: AntState) -> Any:

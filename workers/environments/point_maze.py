@@ -32,7 +32,8 @@ CORNER = (0.9, -0.9)
 
 def make(start: str = "default") -> Environment:
     """Functions of PointMaze, with the published random start or, for `start="corner"`, the fixed start (0.9, -0.9)."""
-    return Environment(_reset_corner if start == "corner" else _reset, _observe, _step, _observe, _goal_distance)
+    reset = _reset_corner if start == "corner" else _reset
+    return Environment(reset, _observe, _step, _observe, _goal_distance, lambda position, before: _at_goal(position))
 
 
 def _reset(key: Any) -> Any:
@@ -58,9 +59,12 @@ def _goal_distance(position: Any) -> Any:
 def _step(position: Any, action: Any) -> tuple[Any, Any, Any]:
     moved = position + jnp.clip(action, -1.0, 1.0) * STEP
     position = jnp.clip(jnp.stack([moved[0], _stopped_by_walls(position, moved)]), -1.0, 1.0)
+    return position, -_goal_distance(position), _at_goal(position)
+
+
+def _at_goal(position: Any) -> Any:
     inside = jnp.abs(position[0] - GOAL[0]) <= GOAL_HALF_SIDE
-    inside &= jnp.abs(position[1] - GOAL[1]) <= GOAL_HALF_SIDE
-    return position, -_goal_distance(position), inside
+    return inside & (jnp.abs(position[1] - GOAL[1]) <= GOAL_HALF_SIDE)
 
 
 def _stopped_by_walls(old: Any, new: Any) -> Any:

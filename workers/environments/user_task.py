@@ -15,6 +15,9 @@
 It may also have:
 
 - `goal_distance(self, state)`: the distance to a goal;
+- `success(self, state, before)`: whether an episode that ends in this state has succeeded; `before` is the answer for
+  the state before, False in the reset. `return before | (...)` is for a condition that need hold only once. Its
+  docstring's first line says in words which episodes succeed;
 - `final_fitness = True`, if the last reward measures the whole episode;
 - `options`, keyword arguments of the constructor, which must not change any size: by name, `("default", "other")` for a
   few allowed values, or a default with bounds, such as `Option(0.5, low=0.0)`; see `es_service/protocol/options.py`;
@@ -72,7 +75,16 @@ TABLES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "the novelty archive": (("{}",), ("generation", "centre")),
     "evaluate --out": (
         ("{}", "{}_std"),
-        ("run", "policy", "generation", "episodes", "stored_fitness", "fresh_fitness", "fresh_standard_error"),
+        (
+            "run",
+            "policy",
+            "generation",
+            "episodes",
+            "stored_fitness",
+            "fresh_fitness",
+            "fresh_standard_error",
+            "successes",
+        ),
     ),
 }
 """Tables of a run with columns named after the descriptor: (patterns of these columns, other columns)."""
@@ -134,7 +146,15 @@ def describe(path: str) -> TaskSpec:
         wall_clearance=float(getattr(task, "wall_clearance", 0.0)),
         goal=getattr(task, "goal", None),
         least_reward=getattr(task, "least_reward", None),
+        success=_success_in_words(task),
     )
+
+
+def _success_in_words(task: Any) -> str:
+    """The first line of the docstring of a class's method `success`; empty if it has no such method."""
+    if not hasattr(task, "success"):
+        return ""
+    return (task.success.__doc__ or "").strip().partition("\n")[0].rstrip(".") or "as the task's method success says"
 
 
 def _wrong_pairs(bounds: tuple) -> list[str]:
@@ -191,6 +211,7 @@ def _check_shapes(path: str, options: Mapping[str, OptionValue]) -> None:
             "the reward of step": (reward.shape, ()),
             "done of step": (done.shape, ()),
             "goal_distance": (jax.eval_shape(environment.goal_distance, state).shape, ()),
+            "success": (jax.eval_shape(environment.success, state, jax.ShapeDtypeStruct((), bool)).shape, ()),
         }
     except TaskError as error:
         raise TaskError(f"{path}: {error}") from error.__cause__
@@ -230,7 +251,8 @@ def make(path: str, options: Mapping[str, OptionValue]) -> Environment:
             raise
 
     viewer = task.viewer() if hasattr(task, "viewer") else None
-    return Environment(reset, task.observe, step, task.descriptor, goal_distance, viewer)
+    success = getattr(task, "success", lambda state, before: before)
+    return Environment(reset, task.observe, step, task.descriptor, goal_distance, success, viewer)
 
 
 def _wants_jax_key(error: Exception) -> bool:

@@ -26,8 +26,8 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
     console.print(tasks)
 
     algorithms = _table("algorithms (search.algorithm)")
-    for name, factory in ALGORITHMS.items():
-        algorithms.add_row(name, (factory.__doc__ or "").strip().splitlines()[0])
+    for name, method in ALGORITHMS.items():
+        algorithms.add_row(name, method.summary)
     algorithms.add_row("module:function", "A search of your own; see es_service/search/algorithms/own.py.")
     console.print(algorithms)
 
@@ -35,7 +35,7 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
     presets.add_column("key")
     for name in PRESETS:
         presets.add_column(name)
-    for row in preset_table():
+    for row in preset_table(ALGORITHMS):
         key = row.key if row.method is None else f"{row.key} of {row.method}"
         presets.add_row(key, *(_value(getattr(row, name)) for name in PRESETS))
     console.print(presets)
@@ -59,6 +59,7 @@ def _about(task: TaskSpec) -> str:
         task.summary,
         f"observation {task.observation_size}, action {task.action_size}, steps {task.episode_steps}",
         "descriptor: " + ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in bounds),
+        *([f"success: {task.success}"] if task.success else []),
         *(f"option {name}: {_option(option)}" for name, option in task.options.items()),
     ]
     return "\n".join(lines)

@@ -83,16 +83,17 @@ def _explained(path: Path) -> Iterator[None]:
 def print_header(console: Console, run_width: int | None = None) -> None:
     """Print the names of the columns. `run_width`: width of the column with the run; None: there is none."""
     run = "" if run_width is None else f"{'run':<{run_width}}  "
-    head = f"{'policy':<10} {'generation':>10} {'stored':>10} {'fresh':>10} {'± s.e.':>8}  descriptor (± std)"
-    print_line(console, run + head)
+    head = f"{'policy':<10} {'generation':>10} {'stored':>10} {'fresh':>10} {'± s.e.':>8} {'success':>11}  "
+    print_line(console, f"{run}{head}descriptor (± std)")
 
 
 def print_row(console: Console, row: Mapping[str, Any], names: list[str], run_width: int | None = None) -> None:
     """Print the line of a policy, of which `names` are the descriptor's dimensions."""
     run = "" if run_width is None else f"{row['run']:<{run_width}}  "
     values = f"{row['stored_fitness']:>10.2f} {row['fresh_fitness']:>10.2f} {row['fresh_standard_error']:>8.2f}"
+    success = "-" if row["successes"] is None else f"{row['successes']}/{row['episodes']}"
     where = ", ".join(f"{name} {row[name]:.3g} ± {row[f'{name}_std']:.2g}" for name in names)
-    print_line(console, f"{run}{row['policy']:<10} {row['generation']:>10} {values}  {where}")
+    print_line(console, f"{run}{row['policy']:<10} {row['generation']:>10} {values} {success:>11}  {where}")
 
 
 def row_of(fresh: Fresh, names: list[str], run: Path | None = None) -> dict[str, Any]:
@@ -111,6 +112,7 @@ def row_of(fresh: Fresh, names: list[str], run: Path | None = None) -> dict[str,
         "stored_fitness": one.stored_fitness,
         "fresh_fitness": fresh.mean,
         "fresh_standard_error": fresh.standard_error,
+        "successes": fresh.successes,
         **{name: float(value) for name, value in zip(names, fresh.descriptor, strict=True)},
         **{f"{name}_std": float(value) for name, value in zip(names, fresh.descriptor_std, strict=True)},
     }

@@ -8,7 +8,10 @@ from rich.console import Console
 
 from es_service.cli.commands import command, settings, way_command
 from es_service.cli.console import print_line
+from es_service.cli.tables.certified import certified_line
+from es_service.errors import StoreError
 from es_service.report.progress import plain_line
+from es_service.runs.certified import certified_policies, newest_certified
 from es_service.runs.recent import FAULTS_OF, Recent, read_recent
 from es_service.runs.standing import Standing, doing, is_waiting, look, more, population_size, state, way_on
 from es_service.runs.view import Run
@@ -20,17 +23,18 @@ def print_status(console: Console, run: Run) -> None:
     """Print the settings of a run, its state (waiting, running, stopped or finished) and its progress."""
     standing = look(run)
     constants, parent = run.constants, run.meta.parent
+    method = (constants["search.algorithm"], population_size(constants))
     fields = {
         "run": str(run.folder),
         "task": f"{constants['task.environment']}, {constants['task.episode_steps']} steps an episode",
-        "search": f"{constants['search.algorithm']}, {population_size(constants)}, seed {constants['seed']}",
+        "search": ", ".join(filter(None, [*method, f"seed {constants['seed']}"])),
     }
     if parent:
         fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
     fields["state"] = (
         state(standing) if standing.driver else f"{state(standing)}; continue with: {way_command(way_on(standing))}"
     )
-    _print_fields(console, fields | _progress(standing))
+    _print_fields(console, fields | _progress(standing) | _certified(run))
 
 
 def follow_status(console: Console, run: Run) -> None:
@@ -55,15 +59,15 @@ def follow_status(console: Console, run: Run) -> None:
 def print_summary(console: Console, run: Run, reason: str) -> None:
     """Print the summary of a session at its end: the result, the folder and the next commands."""
     standing, folder = look(run), run.folder
-    sigma = "search.iso_sigma" if run.constants["search.algorithm"] == "map_elites" else "search.sigma"
-    doubled = {sigma: float(f"{run.constants[sigma] * 2:g}")}
+    sigma = next((key for key in ("search.sigma", "search.iso_sigma") if key in run.constants), None)
+    doubled = {sigma: float(f"{run.constants[sigma] * 2:g}")} if sigma else {}
     print_line(console, f"\nDone: {reason}.")
-    _print_fields(console, _progress(standing))
+    _print_fields(console, _progress(standing) | _certified(run))
     print_line(console, f"\nThe run is in {folder}. Next:")
     for words in (
         ("status", folder),
         ("report", folder),
-        ("evaluate", folder),
+        ("evaluate", folder, "--certify"),
         ("digest", folder),
         ("resume", folder, *settings(more(standing))),
         ("fork", folder, *settings(doubled | more(standing))),
@@ -87,7 +91,7 @@ def _progress(standing: Standing) -> dict[str, str]:
     target = f" (target: {limits['target_fitness']:g})" if "target_fitness" in limits else ""
     return {
         "generation": f"{last['generation']:,}{of.get('generations', '')}",
-        "best fitness": f"{last['best_fitness']:.2f}{target}",
+        "best fitness": f"{last['best_fitness']:.2f}{target}; selected, not certified",
         "centre fitness": f"{last['centre_fitness_mean']:.2f} ± {last['centre_fitness_std']:.2f}",
         **goal,
         **filled,
@@ -112,6 +116,15 @@ def _objectives(recent: Recent) -> dict[str, str]:
         return {}
     weight = newest.fitness_weight
     return {"weight of fitness": f"{weight:g} (novelty: {1.0 - weight:g})"}
+
+
+def _certified(run: Run) -> dict[str, str]:
+    """The policy of the newest certification, if there is one."""
+    try:
+        found = newest_certified(certified_policies(run.folder))
+    except StoreError as error:
+        return {"certified": f"not known: {error.sentence}"}
+    return {} if found is None else {"certified": f"{found.name}: {certified_line(found.row())}"}
 
 
 def _faults(recent: Recent, generation: int) -> dict[str, str]:

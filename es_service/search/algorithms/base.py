@@ -5,9 +5,8 @@ Axes: D policy parameters, O observation, B descriptor dimensions, P antithetic 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,9 @@ from numpy.typing import NDArray
 
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
-from es_service.search.novelty import NoveltyArchive
-from es_service.search.optimizer import Adam, fresh_adam
+from es_service.search.novelty import NoveltyArchive, sound_archive
+from es_service.search.state_parts import freeze, read_only
+from es_service.search.steps import StepState, restarted
 
 NO_ENTRY = -1
 """Value of `CentreState.entry` for a centre without a valid evaluation so far."""
@@ -26,14 +26,15 @@ NO_CELL = -1
 
 @dataclass(frozen=True)
 class CentreState:
-    """One centre with its optimiser.
+    """One centre with the state of its step.
 
     NS-ES, NSR-ES and NSRA-ES search with several centres side by side (the meta-population of Conti et al. 2018), ME-ES
     with one centre per emitter, ES with one.
     """
 
     centre_D: FloatArray
-    adam: Adam
+    step: StepState
+    """What its step remembers, such as the moments of Adam; empty for a search without steps."""
     entry: int = NO_ENTRY
     """Index of the centre's newest entry in the novelty archive, or NO_ENTRY."""
     cell: int = NO_CELL
@@ -59,11 +60,11 @@ class FitnessWeight:
 class SearchState:
     """Everything that a search remembers between generations.
 
-    The store writes only what a generation has changed. A search of your own may therefore replace centres (but not add
-    or remove one), extend the novelty archive with `novelty.extended` (but not remove entries; if only the newest ones
-    are to count, compare with those), insert into the behaviour map with `behaviour_map.insert` (but not empty a cell),
-    and replace the fitness, the descriptor or the score of an elite. Any other change stops the run with a StoreError.
-    All arrays are read-only, since a change in place would not be stored.
+    A search of your own may change all of it in any way: the store compares contents with the state before and writes
+    what differs. Centres may be replaced, added and removed (one must remain), the novelty archive may lose entries
+    (`novelty.archive_of` makes one of any), and entries of the behaviour map may change, move and leave
+    (`behaviour_map.changed`, `moved`, `removed`). The policy of an elite follows its entry, which is known by its
+    generation and centre. All arrays of a state are read-only.
     """
 
     centres: tuple[CentreState, ...]
@@ -71,42 +72,28 @@ class SearchState:
     weight: FitnessWeight
     map: BehaviourMap | None = None
     """The behaviour map; None if `map.enabled` is false."""
-    own: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """Arrays of the search's own, by name. They are stored and digested with the rest. The mapping and the arrays are
-    read-only; to change one, return a state with another mapping. Names and types of the arrays must stay as they are
-    in `Algorithm.own`, shapes may change."""
+    own: Mapping[str, Any] = field(default_factory=dict)
+    """What else the search remembers, by name: arrays and what `search.state_parts` describes."""
     elites: Mapping[int, Elite] = field(default_factory=dict)
-    """The elites of the cells that `Algorithm.parents` has named for this generation, by cell. Only `ask` sees them:
-    elites are kept in the run store, not in the state."""
-
-
-def read_only(own: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
-    """The same arrays, made read-only, in a read-only mapping; the same mapping if it is read-only already.
-
-    Otherwise a change in place would not be stored, since the store goes by whether the mapping is another one.
-    """
-    _freeze(own.values())
-    return own if isinstance(own, MappingProxyType) else MappingProxyType(dict(own))
+    """Policies of elites by cell, which are not part of the state, since the store keeps them. `ask` sees those of the
+    cells that `Algorithm.parents` has named; `tell` may return policies for entries that it has put into the map by
+    itself, such as one that had left it."""
 
 
 def frozen(state: SearchState) -> SearchState:
     """The same state, all of whose arrays are read-only from now on."""
     for centre in state.centres:
-        _freeze([*vars(centre).values(), *vars(centre.adam).values()])
-    _freeze(vars(state.archive).values())
+        freeze([*vars(centre).values(), *centre.step.values()])
+    archive = sound_archive(state.archive)
+    for values in (archive.descriptor_N_B, archive.generation_N, archive.centre_N):
+        values.flags.writeable = False  # but not the arrays of which they are the first part
     if state.map is not None:
-        _freeze(vars(state.map).values())
-    return replace(state, own=read_only(state.own))
-
-
-def _freeze(values: Iterable[Any]) -> None:
-    for value in values:
-        if isinstance(value, np.ndarray):  # a NumPy scalar is read-only; whatever else there is, the store refuses
-            value.flags.writeable = False
+        freeze([*vars(state.map).values(), *vars(state.map.geometry).values()])
+    return replace(state, archive=archive, own=read_only(state.own))
 
 
 def from_elite(state: SearchState, index: int, cell: int, elite: Elite, *, own_statistics: bool = False) -> SearchState:
-    """The state in which an elite replaces a centre, with a fresh optimiser.
+    """The state in which an elite replaces a centre, whose step begins anew.
 
     Args:
         index: index of the centre.
@@ -114,10 +101,11 @@ def from_elite(state: SearchState, index: int, cell: int, elite: Elite, *, own_s
         own_statistics: whether the centre keeps the observation statistics with which the elite was evaluated; else it
             uses those of the whole run.
     """
+    before = state.centres[index]
     centre = CentreState(
         elite.centre_D,
-        fresh_adam(elite.centre_D.size),
-        state.centres[index].entry,
+        restarted(before.step),
+        before.entry,
         cell,
         elite.observation_mean_O if own_statistics else None,
         elite.observation_std_O if own_statistics else None,
@@ -177,6 +165,12 @@ class CentreEvaluation:
     """Mean descriptor over the episodes."""
     population_max: float = np.nan
     """Highest fitness of a valid member of the population that led to it; NaN for an initial centre."""
+    episodes: int = 1
+    """Number of the episodes."""
+
+
+def _without_populations(*arguments: object) -> Any:
+    raise NotImplementedError("a search that asks for populations needs the functions `weights` and `step`")
 
 
 @dataclass(frozen=True)
@@ -185,15 +179,15 @@ class Algorithm:
 
     ask: Callable[[SearchState, int], tuple[Ask | PolicyAsk, ...]]
     """(state, generation) -> populations and policies to evaluate in that generation, side by side."""
-    weights: Callable[[SearchState, Ask, EpisodesResult], NDArray[np.float32]]
-    """(state, asked, the whole population's results with axes P, S) -> weight of each pair's noise [P]."""
-    step: Callable[[SearchState, Ask, FloatArray], SearchState]
-    """(state, asked, gradient estimate [D]) -> state with the asked centre moved up the gradient. Called for each
-    population asked for, in order."""
     tell: Callable[[SearchState, tuple[CentreEvaluation, ...]], SearchState]
     """(state, evaluations of a generation's centres and policies in the order of the asks) -> state updated with them.
     The first call has all initial centres."""
-    fitness_weight: float
+    weights: Callable[[SearchState, Ask, EpisodesResult], NDArray[np.float32]] = _without_populations
+    """(state, asked, the whole population's results with axes P, S) -> weight of each pair's noise [P]."""
+    step: Callable[[SearchState, Ask, FloatArray], SearchState] = _without_populations
+    """(state, asked, gradient estimate [D]) -> state with the asked centre moved up the gradient. Called for each
+    population asked for, in order."""
+    fitness_weight: float = 1.0
     """Initial value of the state's `weight`."""
     start_cells: Callable[[SearchState, int], Mapping[int, int]] = lambda state, generation: {}
     """(state, generation) -> index of a centre -> cell whose elite takes its place at the start of the generation; the
@@ -202,5 +196,8 @@ class Algorithm:
     """(state, generation) -> cells whose elites `ask` needs; they are then in `SearchState.elites`."""
     restart: Callable[[SearchState, int, int, Elite], SearchState] = from_elite
     """(state, index of a centre, start cell, its elite) -> state in which that centre has restarted."""
-    own: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """Initial arrays of the search's own, by name; `SearchState.own` holds them."""
+    own: Mapping[str, Any] = field(default_factory=dict)
+    """What else the search remembers, by name, with its first values: arrays, and what `search.state_parts` describes.
+    """
+    counts_samples: bool = False
+    """Whether the entries of the map count the episodes of which their values are the mean."""

@@ -8,10 +8,19 @@ depend on the scale of its gradient; the division would only change the ratio to
 from __future__ import annotations
 
 from es_service.config.model import RunConfig
+from es_service.config.search import PopulationConfig
 from es_service.search.algorithms.base import Algorithm
-from es_service.search.algorithms.steps import novelty_search
+from es_service.search.algorithms.common import novelty_search
+from es_service.search.algorithms.method import method
 
 
+class EsSettings(PopulationConfig):
+    """One centre, and no keys of its own."""
+
+    only_centres = 1
+
+
+@method(EsSettings)
 def es(config: RunConfig) -> Algorithm:
     """Plain evolution strategy: one centre climbs fitness. Its novelty archive is kept for comparison only."""
     return novelty_search(config, fitness_weight=1.0)

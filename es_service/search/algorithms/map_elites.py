@@ -22,12 +22,18 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from es_service.config.fields import Count, NotNegative
 from es_service.config.model import RunConfig
+from es_service.config.presets import same
+from es_service.config.search import SearchConfig
 from es_service.protocol.messages import FloatArray
 from es_service.protocol.noise import Domain, Keys, normals, stream_keys, uniforms
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, PolicyAsk, SearchState
-from es_service.search.algorithms.steps import novelty_search
+from es_service.search.algorithms.common import archived_and_mapped
+from es_service.search.algorithms.method import method
+from es_service.search.algorithms.settings import settings_of
 from es_service.search.maps.behaviour_map import insert
 
 PARENT_CHOICE = 3
@@ -36,9 +42,40 @@ LARGE = 1 << 14
 """Number of a policy's parameters from which several threads make a batch sooner than one does."""
 
 
+class MapElitesSettings(SearchConfig):
+    """Policies and their variation. The map begins with 32 random policies unless the config has another number, which
+    is our own choice: the store keeps all of them, and for an ant each takes a megabyte."""
+
+    batch: Count = Field(256, description="Number of policies that a generation makes and evaluates.")
+    iso_sigma: NotNegative = Field(
+        0.005, description="Standard deviation of the noise in each parameter, in parameter units."
+    )
+    line_sigma: NotNegative = Field(
+        0.05,
+        description="Standard deviation of the step along the line through both parents, as a share of the distance "
+        "between them.",
+    )
+
+    presets = (
+        same("policy.observation_normalization", False, "QDax; nothing could gather the statistics"),
+        same("search.evaluation_episodes", 1, "QDax, which evaluates a policy once"),
+    )
+    first_centres = 32
+    needs_map = "whose policies descend from elites of the map"
+
+    def policies(self) -> int:
+        """A batch."""
+        return self.batch
+
+    def spread_keys(self) -> tuple[str, ...]:
+        """The key that makes more policies."""
+        return ("search.batch",)
+
+
+@method(MapElitesSettings)
 def map_elites(config: RunConfig) -> Algorithm:
     """MAP-Elites: mutations of the map's elites, each evaluated as it is and offered to the map."""
-    search, shared = config.search, novelty_search(config, fitness_weight=1.0)
+    search = settings_of(config, MapElitesSettings)
 
     def parents(state: SearchState, generation: int) -> list[int]:
         has_elites = state.map is not None and state.map.size
@@ -62,21 +99,25 @@ def map_elites(config: RunConfig) -> Algorithm:
 
     def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
         if evaluations[0].generation == 0:
-            return shared.tell(state, evaluations)
+            return archived_and_mapped(state, evaluations)
         map_ = state.map
         for one in evaluations:
             if map_ is not None and one.valid:
-                map_, _, _ = insert(map_, one.descriptor_B, one.fitness, one.generation, one.centre, one.population_max)
+                origin = one.generation, one.centre
+                map_, _, _ = insert(map_, one.descriptor_B, one.fitness, *origin, one.population_max, one.episodes)
         return replace(state, map=map_)
 
-    return replace(shared, parents=parents, ask=ask, tell=tell)
+    return Algorithm(ask, tell, parents=parents)
 
 
 def parent_cells(config: RunConfig, state: SearchState, generation: int) -> NDArray[np.int64]:
     """Cells of the two parents of each policy, [N, 2]; while the map is empty, indices of centres."""
     among = state.map.cell_N if state.map is not None and state.map.size else np.arange(len(state.centres))
-    key = stream_keys(config.seed, Domain.SELECTION, generation, PARENT_CHOICE)
-    drawn_N_2 = uniforms(key, np.arange(2 * config.search.batch, dtype=np.uint32)).reshape(-1, 2)
+    key, batch = (
+        stream_keys(config.seed, Domain.SELECTION, generation, PARENT_CHOICE),
+        settings_of(config, MapElitesSettings).batch,
+    )
+    drawn_N_2 = uniforms(key, np.arange(2 * batch, dtype=np.uint32)).reshape(-1, 2)
     return among[(drawn_N_2.astype(np.float64) * among.size).astype(np.int64)]
 
 

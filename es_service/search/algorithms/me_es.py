@@ -31,12 +31,16 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from es_service.config.fields import Count
 from es_service.config.model import NoveltyConfig, RunConfig
-from es_service.config.search import SearchConfig
+from es_service.config.presets import PresetRow
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import Algorithm, Ask, SearchState, from_elite
-from es_service.search.algorithms.steps import novelty_search, population
+from es_service.search.algorithms.common import novelty_search, population
+from es_service.search.algorithms.method import method
+from es_service.search.algorithms.settings import EmittersSettings, settings_of
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.novelty import NoveltyArchive, novelty
 
@@ -48,9 +52,38 @@ ANYWHERE = 0.1
 Mode = Literal["explore", "exploit"]
 
 
+class MeEsSettings(EmittersSettings):
+    """Emitters, and the blocks that each of them runs."""
+
+    alternation: Literal["round_robin", "coin"] = Field(
+        "round_robin",
+        description="How exploring and exploiting blocks follow each other. round_robin: in turn. coin: each block is "
+        "chosen at random, with probability 1/2.",
+    )
+    first_block: Mode = Field(description="What the first block does with alternation round_robin. Set by the preset.")
+    block_generations: Count = Field(
+        10,
+        description="Generations in a block; each block starts from an elite drawn from the map, with a fresh "
+        "optimiser.",
+    )
+    cell_sampling: Literal["top", "score"] = Field(
+        description="How the cell of that elite is drawn: as in QDax (top) or as in the released code (score); "
+        "es_service/search/algorithms/me_es.py describes both. Set by the preset."
+    )
+
+    presets = (
+        PresetRow(
+            "search.first_block", "explore", "exploit", "literature: QDax. uber: ME-ES, which flips its flag first."
+        ),
+        PresetRow("search.cell_sampling", "top", "score", "literature: QDax, which follows the paper. uber: ME-ES."),
+    )
+    needs_map = "whose blocks start from elites of the map"
+
+
+@method(MeEsSettings)
 def me_es(config: RunConfig) -> Algorithm:
     """MAP-Elites with ES: blocks of exploring or exploiting generations that start from elites of the behaviour map."""
-    search = config.search
+    search = settings_of(config, MeEsSettings)
     shared = novelty_search(config, fitness_weight=_weight(block_mode(search, config.seed, 1)))
 
     def block_modes(state: SearchState, generation: int) -> list[Mode]:
@@ -78,7 +111,7 @@ def me_es(config: RunConfig) -> Algorithm:
     return replace(shared, ask=ask, start_cells=start_cells, restart=restart)
 
 
-def block_mode(search: SearchConfig, seed: int, generation: int, emitter: int = 0) -> Mode:
+def block_mode(search: MeEsSettings, seed: int, generation: int, emitter: int = 0) -> Mode:
     """Whether an emitter's block in a generation (counted from 1) explores or exploits."""
     if search.mode != "explore_exploit":
         return search.mode

@@ -19,9 +19,11 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from pydantic import Field
 
+from es_service.config.fields import Count
 from es_service.config.model import RunConfig
-from es_service.config.search import SearchConfig
+from es_service.config.presets import same
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import (
     NO_CELL,
@@ -32,7 +34,9 @@ from es_service.search.algorithms.base import (
     from_elite,
     read_only,
 )
-from es_service.search.algorithms.steps import novelty_search, population
+from es_service.search.algorithms.common import novelty_search, population
+from es_service.search.algorithms.method import method
+from es_service.search.algorithms.settings import EmittersSettings, settings_of
 from es_service.search.maps.behaviour_map import Elite
 
 RESET_CHOICE = 4
@@ -41,9 +45,31 @@ STAGNANT = "stagnant"
 """Name of the search's own array [emitters]: newest generations in which no centre of an emitter entered the map."""
 
 
+class MemesSettings(EmittersSettings):
+    """Emitters, and when they begin again."""
+
+    stagnation_generations: Count = Field(
+        32,
+        description="Generations after which an emitter none of whose centres has entered the map since then begins "
+        "again from an elite, with a fresh optimiser.",
+    )
+
+    presets = (
+        same("policy.observation_normalization", False, "the code of MEMES, which has none"),
+        same("policy.action_noise", 0.0, "the code of MEMES, which has none"),
+        same("search.emitters", 16, "an eighth of the 128 of the code of MEMES, sized for one machine"),
+        same("search.pairs", 32, "an eighth of the 512 members of the code of MEMES, sized for one machine"),
+        same("search.step.l2", 0.0, "the code of MEMES"),
+        same("search.evaluation_episodes", 1, "the code of MEMES, which evaluates a centre once"),
+        same("novelty.newest", 50_000, "the code of MEMES, whose novelty archive keeps no more"),
+    )
+    needs_map = "whose emitters begin again from elites of the map"
+
+
+@method(MemesSettings)
 def memes(config: RunConfig) -> Algorithm:
     """MAP-Elites with many ES: each explores or exploits, until its centres no longer enter the map."""
-    search = config.search
+    search = settings_of(config, MemesSettings)
     shared = novelty_search(config, fitness_weight=emitter_weight(search, 0))
 
     def start_cells(state: SearchState, generation: int) -> dict[int, int]:
@@ -74,7 +100,7 @@ def memes(config: RunConfig) -> Algorithm:
     return replace(shared, start_cells=start_cells, restart=restart, ask=ask, tell=tell, own=own)
 
 
-def emitter_weight(search: SearchConfig, emitter: int) -> float:
+def emitter_weight(search: MemesSettings, emitter: int) -> float:
     """Weight of fitness in the utilities of an emitter: 0 if it explores, 1 if it exploits."""
     if search.mode != "explore_exploit":
         return float(search.mode == "exploit")

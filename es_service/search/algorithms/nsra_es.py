@@ -12,19 +12,50 @@ import math
 from dataclasses import replace
 from functools import partial
 
+from pydantic import Field
+
+from es_service.config.fields import Count, Fraction, NotNegative
 from es_service.config.model import RunConfig
-from es_service.config.search import SearchConfig
+from es_service.config.presets import PresetRow
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, FitnessWeight
-from es_service.search.algorithms.steps import novelty_search
+from es_service.search.algorithms.common import novelty_search
+from es_service.search.algorithms.method import method
+from es_service.search.algorithms.settings import CentresSettings, settings_of
 
 
+class NsraSettings(CentresSettings):
+    """Several centres, and how the weight of fitness adapts."""
+
+    fitness_weight_start: Fraction = Field(
+        description="Weight of fitness beside novelty at the start. Set by the preset."
+    )
+    fitness_weight_step: Fraction = Field(
+        0.05, description="How much the weight of fitness rises after an improvement or falls in stagnation."
+    )
+    fitness_weight_patience: Count = Field(
+        description="Generations without improvement before the weight of fitness falls. Set by the preset."
+    )
+    fitness_weight_min_gain: NotNegative = Field(
+        description="A centre is an improvement if its fitness exceeds the record by more than this fraction of the "
+        "record's absolute value. Set by the preset."
+    )
+
+    presets = (
+        PresetRow("search.fitness_weight_start", 1.0, 0.5, "literature: estorch and MEMES. uber: ME-ES."),
+        PresetRow("search.fitness_weight_patience", 50, 20, "literature: estorch and MEMES. uber: ME-ES."),
+        PresetRow("search.fitness_weight_min_gain", 0.0, 0.1, "literature: any gain counts. uber: ME-ES."),
+    )
+
+
+@method(NsraSettings)
 def nsra_es(config: RunConfig) -> Algorithm:
     """Adaptive novelty search with reward: more weight on fitness after progress, more on novelty in stagnation."""
-    return novelty_search(config, config.search.fitness_weight_start, partial(adapted_weight, config.search))
+    search = settings_of(config, NsraSettings)
+    return novelty_search(config, search.fitness_weight_start, partial(adapted_weight, search))
 
 
 def adapted_weight(
-    search: SearchConfig, weight: FitnessWeight, evaluations: tuple[CentreEvaluation, ...]
+    search: NsraSettings, weight: FitnessWeight, evaluations: tuple[CentreEvaluation, ...]
 ) -> FitnessWeight:
     """The weight of fitness after the centres evaluated in one more generation, in the order of the asks.
 

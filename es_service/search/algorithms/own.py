@@ -2,12 +2,10 @@
 
     def function(config: RunConfig) -> Algorithm: ...
 
-A function may declare options, numbers or texts that a config sets below `search.options`:
+A function may declare keys of its own and what else the service has to know, with the decorator `method`, whose module
+has an example. Without it, it has the keys of `settings.UndeclaredSettings`.
 
-    @has_options(reach=Option(0.5, low=0.0))
-    def function(config: RunConfig) -> Algorithm: ...    # config.search.options["reach"] is its value
-
-`es_service.search.algorithms.base` defines `Algorithm`; `steps` has the functions that the shipped algorithms share.
+`es_service.search.algorithms.base` defines `Algorithm`; `common` has the functions that the shipped algorithms share.
 Most searches of your own are a shipped one with one function replaced. A search remembers between generations only its
 `SearchState`, which the run store keeps; a value kept anywhere else is lost when the process ends. The search runs in
 the driver.
@@ -16,14 +14,17 @@ the driver.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 from es_service.config.model import RunConfig
+from es_service.config.search import SearchConfig
 from es_service.errors import ConfigError
-from es_service.protocol.options import declared_options
 from es_service.protocol.raised import raised, why_not_imported
 from es_service.protocol.user_code import import_user_module, in_no_file
 from es_service.search.algorithms.base import Algorithm
+from es_service.search.algorithms.method import Method, method
+from es_service.search.algorithms.settings import UndeclaredSettings
 
 
 def import_factory(path: str) -> Callable[[RunConfig], object]:
@@ -41,40 +42,42 @@ def import_factory(path: str) -> Callable[[RunConfig], object]:
     return found
 
 
-def own_factory(path: str) -> Callable[[RunConfig], Algorithm]:
-    """What makes the user's search for a run, with the options that its function declares in an attribute `options`.
+def own_method(path: str) -> Method:
+    """The user's search with the settings that it declares, or with those of one that declares none.
 
     Raises:
-        ConfigError: the function cannot be imported, or its options are wrong.
+        ConfigError: the function cannot be imported, or its settings are no class of settings.
     """
-    function = import_factory(path)
-    options, wrong = declared_options(function)
-    if wrong:
-        raise ConfigError(f"{path}: {'; '.join(wrong)}")
-    factory = partial(_make, path, function)
-    factory.options = options  # pyright: ignore[reportAttributeAccessIssue]
-    return factory
+    found = import_factory(path)
+    made = found if isinstance(found, Method) else method(UndeclaredSettings)(found)  # pyright: ignore[reportArgumentType]
+    if not (isinstance(made.settings, type) and issubclass(made.settings, SearchConfig)):
+        raise ConfigError(f"{path}: its settings are {made.settings!r}; they must be a class that derives from "
+                          "es_service.config.search.SearchConfig or PopulationConfig")  # fmt: skip
+    return replace(made, make=partial(_make, path, made), name=path)
 
 
-def _make(path: str, function: Callable[[RunConfig], object], config: RunConfig) -> Algorithm:
+def _make(path: str, made: Method, config: RunConfig) -> Algorithm:
     """Call the user's function for a run.
 
-    Raises ConfigError if this fails or does not return an `Algorithm`, or if the function declares other options than
+    Raises ConfigError if this fails or does not return an `Algorithm`, or if the function declares other settings than
     when the config was loaded, which has values of those.
     """
-    before, now = config.resolved_search_options, declared_options(function)[0]
-    if before is not None and dict(before) != now:
-        raise ConfigError(
-            f"the options of the search {path} have changed since this config was loaded; load the config again",
-            field="search.options",
-            value=path,
-        )
+    before = type(config.search)
+    if before is not made.settings:  # the module was imported anew
+        if str(before.model_fields) != str(made.settings.model_fields):
+            raise ConfigError(
+                f"the settings of the search {path} have changed since this config was loaded; load the config again",
+                field="search.algorithm",
+                value=path,
+            )
+        config = config.model_copy(update={"search": made.settings.model_validate(config.search.model_dump())})
     try:
-        made = function(config)
+        algorithm = made.make(config)
     except Exception as error:  # the user's code can raise anything
         raise ConfigError(f"search.algorithm: {path} raised {raised(error, path)}") from error
-    if not isinstance(made, Algorithm):
+    if not isinstance(algorithm, Algorithm):
         raise ConfigError(
-            f"search.algorithm: {path} returned {made!r}; it must return an es_service.search.algorithms.base.Algorithm"
+            f"search.algorithm: {path} returned {algorithm!r}; it must return an "
+            "es_service.search.algorithms.base.Algorithm"
         )
-    return made
+    return algorithm

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import numpy as np
 
 import workers.rollout
@@ -73,4 +74,4 @@ def by_xla(worker_spec: WorkerSpec, *given: Any) -> Episodes:
     if key not in _XLA:
         environment = make_environment(worker_spec.environment, {})
         _XLA[key] = workers.rollout.make_training_rollout(environment, worker_spec)
-    return Episodes(*map(np.asarray, _XLA[key](*given)))
+    return jax.tree.map(np.asarray, _XLA[key](*given))

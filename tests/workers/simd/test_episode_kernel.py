@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 
@@ -44,7 +45,7 @@ def test_only_the_episodes_that_are_wanted_are_run() -> None:
     given = (weights, 0.0, np.zeros(2, np.float32), np.ones(2, np.float32), None, keys_L, keys_L)
     every, some = kernel.run(*given), kernel.run(*given, wanted_L)
     assert not some.steps[~wanted_L].any()
-    for found, whole in zip(some, every, strict=True):
+    for found, whole in zip(jax.tree.leaves(some), jax.tree.leaves(every), strict=True):
         np.testing.assert_array_equal(found[wanted_L], whole[wanted_L])
     with pytest.raises(ValueError, match="a bool for each lane"):
         kernel.run(*given, wanted_L[1:])

@@ -79,7 +79,8 @@ class EpisodeKernel:
             carries[lane_L // self.network.width, self.alive_word, lane_L % self.network.width] = 0
         go(self.spec.episode_steps)
         # The result of an episode is the last part of a carry.
-        found = Episodes(*unpack(carries[:, -self.episode_words :], self.carry.episode, lanes))
+        leaves, structure = jax.tree.flatten(self.carry.episode)
+        found = structure.unflatten(unpack(carries[:, -self.episode_words :], leaves, lanes))
         if not self.training or len(self.inputs_O) == self.spec.policy.widths[0]:
             return found
         sums = [np.zeros((lanes, self.spec.policy.widths[0]), np.float32) for _ in range(2)]
@@ -187,7 +188,7 @@ def compile_episodes(
             begin=begin,
             alive_word=program.alive_word,
             carry=program.carry,
-            episode_words=sum(map(words_of, program.carry.episode)),
+            episode_words=sum(map(words_of, jax.tree.leaves(program.carry.episode))),
             _call=native.function(*signature),
         )
 

@@ -15,7 +15,7 @@ from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from workers.compilable import Compilable
 from workers.environments import Environment, make_environment
-from workers.episode import Carry, Episodes
+from workers.episode import Carry
 from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import WIDTHS, Target, host_target
 from workers.simd.backend.words import aligned, require
@@ -76,10 +76,8 @@ def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Compila
             by_episode.append(kernel.run(weights, unit, mean_O, std_O, noise_keys_P, *lanes))
         axes = (len(noise_keys_P), 2, spec.episodes_per_member)
         if len(by_episode) == 1:
-            return Episodes(*(leaf.reshape(*axes, *leaf.shape[1:]) for leaf in by_episode[0]))
-        return Episodes(
-            *(np.stack(leaves, axis=1).reshape(*axes, *leaves[0].shape[1:]) for leaves in zip(*by_episode, strict=True))
-        )
+            return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[1:]), by_episode[0])
+        return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1).reshape(*axes, *leaves[0].shape[1:]), *by_episode)
 
     def compile_for(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
         kernels.fitting(mean_O).begin.compile(reset_keys_P_S_E[:, :, 0].reshape(-1, KEY_WORDS))

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.config.model import NoveltyConfig, RunConfig
-from es_service.config.search import SearchConfig
+from es_service.config.parts import Ranks, Shaping
+from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import (
@@ -29,11 +30,13 @@ from es_service.search.algorithms.base import (
     read_only,
     with_centre,
 )
+from es_service.search.algorithms.settings import CentresSettings, settings_of
 from es_service.search.maps.behaviour_map import BehaviourMap, insert, with_score
 from es_service.search.novelty import empty_archive, extended, novelty
-from es_service.search.optimizer import adam_ascent, fresh_adam
-from es_service.search.shaping import SHAPINGS, Shaping, pair_weights
+from es_service.search.shaping import pair_weights, shaped
+from es_service.search.steps import STEPS, fresh_state
 
+RANKS = Ranks()
 CENTRE_CHOICE = 0
 """Last id of the random streams of Domain.SELECTION that choose the centre to update."""
 
@@ -41,39 +44,37 @@ AdaptWeight = Callable[[FitnessWeight, tuple[CentreEvaluation, ...]], FitnessWei
 
 
 def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight | None = None) -> Algorithm:
-    """An algorithm of the family of Conti et al. 2018: ES on the utility (1 - w) * rank(novelty) + w * rank(fitness).
+    """An algorithm of the family of Conti et al. 2018: ES on the utility (1 - w) * shaped novelty + w * shaped fitness.
 
-    With another `search.shaping`, that function takes the place of the ranks.
+    A generation updates one centre, or all, as the keys of `CentresSettings` say; without these, one by novelty.
 
     Args:
         fitness_weight: initial value of w.
         adapt: (weight, evaluations of a generation after 0) -> new weight; None for a constant w.
     """
-    search = config.search
+    search = settings_of(config, PopulationConfig)
+    updates_all = isinstance(search, CentresSettings) and search.update == "all"
 
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
-        every = range(len(state.centres))
-        chosen = every if search.update == "all" else [choose_centre(state, generation, config)]
+        chosen = range(len(state.centres)) if updates_all else [choose_centre(state, generation, config)]
         return tuple(population(state, index, search, state.weight.value) for index in chosen)
 
     def weights(state: SearchState, asked: Ask, population: EpisodesResult) -> NDArray[np.float32]:
         return pair_weights(mixed_utilities(state, asked.fitness_weight, population, config.novelty, search.shaping))
 
     def step(state: SearchState, asked: Ask, gradient_D: FloatArray) -> SearchState:
-        return moved(state, asked, gradient_D, config.search)
+        return moved(state, asked, gradient_D, search)
 
     def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
         weight = state.weight
         if adapt is not None and evaluations[0].generation > 0:
             weight = adapt(weight, evaluations)
-        for evaluation in evaluations:
-            state = mapped(archived(state, evaluation), evaluation)
-        return replace(state, weight=weight)
+        return replace(archived_and_mapped(state, evaluations), weight=weight)
 
-    return Algorithm(ask, weights, step, tell, fitness_weight)
+    return Algorithm(ask, tell, weights, step, fitness_weight)
 
 
-def population(state: SearchState, index: int, search: SearchConfig, fitness_weight: float) -> Ask:
+def population(state: SearchState, index: int, search: PopulationConfig, fitness_weight: float) -> Ask:
     """The population around a centre, with the settings of the config."""
     return Ask(index, state.centres[index].centre_D, search.sigma, search.pairs, fitness_weight)
 
@@ -83,29 +84,32 @@ def first_state(
     dimensions: int,
     fitness_weight: float,
     map_: BehaviourMap | None = None,
-    own: Mapping[str, NDArray[Any]] | None = None,
+    own: Mapping[str, Any] | None = None,
+    search: SearchConfig | None = None,
 ) -> SearchState:
-    """The state before any evaluation: initial centres, fresh optimisers and an empty novelty archive.
+    """The state before any evaluation: initial centres, none of which has made a step, and an empty novelty archive.
 
     Args:
         centres: parameters of each initial centre, [D] each.
         dimensions: number of descriptor dimensions.
         fitness_weight: initial weight of fitness.
         map_: the empty behaviour map; None for a run without one.
-        own: initial arrays of the search's own, by name.
+        own: `Algorithm.own`.
+        search: settings with the kind of the steps; None for a search without steps.
     """
-    states = tuple(CentreState(centre_D, fresh_adam(centre_D.size)) for centre_D in centres)
+    states = tuple(CentreState(centre_D, fresh_state(search, centre_D.size)) for centre_D in centres)
     return SearchState(states, empty_archive(dimensions), FitnessWeight(fitness_weight), map_, read_only(own or {}))
 
 
 def choose_centre(state: SearchState, generation: int, config: RunConfig) -> int:
-    """Index of the centre to update in a generation, by `search.centre_choice`.
+    """Index of the centre to update in a generation, by `search.centre_choice`; without that key, by novelty.
 
     novelty: with probability proportional to the centre's novelty in the present novelty archive; a centre without a
     valid evaluation counts as the most novel one; if all novelties are 0, all have the same probability.
     uniform: all with the same probability. round_robin: in turn, starting with centre 0 in generation 1.
     """
-    count, how = len(state.centres), config.search.centre_choice
+    count, search = len(state.centres), config.search
+    how = search.centre_choice if isinstance(search, CentresSettings) else "novelty"
     if count == 1:
         return 0
     if how == "round_robin":
@@ -143,17 +147,16 @@ def mixed_utilities(
     w: float,
     population: EpisodesResult,
     settings: NoveltyConfig,
-    shaping: Shaping = "ranks",
+    shaping: Shaping = RANKS,
 ) -> NDArray[np.float64]:
-    """Utility of each member of the population, [P, S]: (1 - w) * rank(novelty) + w * rank(fitness).
+    """Utility of each member of the population, [P, S]: (1 - w) * shaped novelty + w * shaped fitness.
 
-    Ranks are those of `centred_ranks`, in [-0.5, 0.5], or another function of SHAPINGS. They are taken for each
-    objective separately, so that the scales of fitness and novelty do not matter. Novelty is computed in the novelty
-    archive as it was before the generation. An invalid member (fitness NaN) has the lowest rank in both.
+    Each objective is shaped by itself, so that the scales of fitness and novelty do not matter. Novelty is computed in
+    the novelty archive as it was before the generation. An invalid member (fitness NaN) is the worst in both.
     """
-    utility_P_S, shaped = np.zeros(population.fitness.shape), SHAPINGS[shaping]
+    utility_P_S = np.zeros(population.fitness.shape)
     if w > 0.0:
-        utility_P_S += w * shaped(population.fitness)
+        utility_P_S += w * shaped(shaping, population.fitness)
     if w < 1.0:
         novelty_P_S = novelty(
             state.archive,
@@ -163,17 +166,22 @@ def mixed_utilities(
             newest=settings.newest,
         )
         novelty_P_S[np.isnan(population.fitness)] = np.nan
-        utility_P_S += (1.0 - w) * shaped(novelty_P_S)
+        utility_P_S += (1.0 - w) * shaped(shaping, novelty_P_S)
     return utility_P_S
 
 
-def moved(state: SearchState, asked: Ask, gradient_D: FloatArray, search: SearchConfig) -> SearchState:
-    """The state after one step of the asked centre up the gradient estimate [D], by its own Adam."""
+def moved(state: SearchState, asked: Ask, gradient_D: FloatArray, search: PopulationConfig) -> SearchState:
+    """The state after one step of the asked centre up the gradient estimate [D], by its own `search.step`."""
     centre = state.centres[asked.centre]
-    adam, centre_D = adam_ascent(
-        centre.adam, centre.centre_D, gradient_D, learning_rate=search.learning_rate, l2=search.l2
-    )
-    return with_centre(state, asked.centre, replace(centre, centre_D=centre_D, adam=adam))
+    step, centre_D = STEPS[search.step.kind].take(search.step, centre.step, centre.centre_D, gradient_D)
+    return with_centre(state, asked.centre, replace(centre, centre_D=centre_D, step=step))
+
+
+def archived_and_mapped(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
+    """The state with the evaluated centres in the novelty archive and in the behaviour map, one after another."""
+    for evaluation in evaluations:
+        state = mapped(archived(state, evaluation), evaluation)
+    return state
 
 
 def archived(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
@@ -206,6 +214,7 @@ def mapped(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
             evaluation.generation,
             evaluation.centre,
             evaluation.population_max,
+            evaluation.episodes,
         )
         cell = offered if entered else NO_CELL
     centres = [replace(one, cell=NO_CELL) if cell != NO_CELL and one.cell == cell else one for one in state.centres]

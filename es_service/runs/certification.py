@@ -1,0 +1,250 @@
+"""Certified values: what a chosen policy returns in episodes that neither training nor any choice has seen.
+
+The stored value of an elite or of a best centre is the highest of many noisy means, so it is partly luck. Candidates
+are therefore reduced by successive halving with *selection* episodes, and only the policies that remain get
+*certification* episodes. Both have a domain of random streams of their own, which no seed of `evaluate` reaches, and
+each certification of a run has new episodes. The certified policy is the one that the selection episodes put first,
+never the one with the best certified value.
+
+Axes: N candidates, E episodes, D policy parameters, O observation.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from numpy.typing import ArrayLike
+
+from es_service.config.loading import Source
+from es_service.config.model import RunConfig, worker_spec
+from es_service.config.tasks import task_of
+from es_service.dispatch.inline_engine import inline_engine
+from es_service.errors import ConfigError
+from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.messages import EpisodesResult, TaskSpec
+from es_service.protocol.noise import Domain
+from es_service.runs.certified import MEASURES, Certified, Measure, arrays_of, certified_policies, stored
+from es_service.runs.compiling import compiling_sentence
+from es_service.runs.evaluation import Candidate, candidates, evaluation_config
+from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of
+from es_service.runs.selection import Parameters, halved, kept, new_episodes
+from es_service.runs.session import dispatch_limits
+from es_service.runs.signals import stop_on_signals
+from es_service.runs.view import Run, open_run
+from es_service.store.writer import RunStore
+
+EPISODES = 256
+"""Default number of certification episodes."""
+TOP = 10
+"""Default number of elites that are candidates beside the best centre."""
+
+
+@dataclass(frozen=True)
+class _Named:
+    """A candidate."""
+
+    name: str
+    policy: Parameters
+    generation: int | None = None
+    stored_fitness: float | None = None
+
+
+def certify_run(
+    folder: str | os.PathLike[str],
+    *,
+    best: bool = True,
+    centre: bool = False,
+    cells: Sequence[Sequence[int]] = (),
+    top: int = TOP,
+    generation: int | None = None,
+    episodes: int = EPISODES,
+    keep: int = 1,
+    by: Measure | None = None,
+    workers: int | None = None,
+    on_notice: Callable[[str], None] = lambda sentence: None,
+) -> list[Certified]:
+    """Certify policies of a run on this machine, and store the results in the run.
+
+    Args:
+        best, centre, cells, top: the candidates: the best centre, the newest centre, elites of cells, and the elites
+            with the highest stored fitness, of which a run without a map has none.
+        generation: one whose state the run keeps, from which the candidates are taken; None: the newest.
+        episodes: number of certification episodes of each policy that remains.
+        keep: number of policies that remain after selection.
+        by: what selection ranks by; None: what the run's `task.fitness` says. Equal ones rank by their return, and then
+            in the order of the candidates.
+        workers: number of worker processes; None: one per core.
+        on_notice: called with a sentence about each repair of the run, and when the workers compile for more than two
+            seconds.
+
+    Returns:
+        The policies that remain, in the order of selection.
+
+    Raises:
+        RunLockedError: a driver is writing to the run; the message names it. NotInRunError: a candidate does not exist.
+        ConfigError: the task does not have what `by` names. EvaluationError: the rollouts cannot continue. Interrupted:
+        SIGINT or SIGTERM arrived. Then nothing is stored.
+    """
+    run = open_run(folder)
+    with RunStore.open(run.folder) as store:
+        for notice in store.notices:
+            on_notice(notice)
+        config = evaluation_config(run, workers)
+        has_map = config.map.enabled
+        chosen = candidates(
+            run,
+            best=best,
+            centre=centre,
+            cells=cells,
+            every=False,
+            top=top if has_map else 0,
+            generation=generation,
+        )
+        with _engine(config, on_notice) as engine:
+            number = store.next_certification
+            found = _certify(engine, config, _different(chosen), number, episodes, keep, by)
+        store.add_certification([stored(one) for one in found])
+    return found
+
+
+def certify(
+    parameters: ArrayLike,
+    config: RunConfig | Source,
+    *,
+    episodes: int = EPISODES,
+    keep: int = 1,
+    by: Measure | None = None,
+    number: int = 0,
+    observation_mean: ArrayLike | None = None,
+    observation_std: ArrayLike | None = None,
+    workers: int | None = None,
+) -> list[Certified]:
+    """Certify policies of another program on this machine, by the rules of `certify_run`; nothing is stored.
+
+    Args:
+        parameters: candidates [N, D].
+        config: a RunConfig, or what `load_config` accepts; its task, policy and seed are used.
+        number: number of the certification. A repeated certification with the same number has the same episodes, so
+            give the next number if the policies have been changed after a look at the results.
+        observation_mean, observation_std: statistics with which observations are normalised, [O] or [N, O]; None: 0 and
+            1.
+
+    Returns:
+        The policies that remain, in the order of selection; `name` is the index of a policy in `parameters`.
+
+    Raises:
+        ConfigError: an argument is wrong. Otherwise as `certify_run`.
+    """
+    config = evaluating_config(config, workers, "inline", None)
+    task = task_of(config)
+    policies_N_D = policies_of(config, task, parameters)
+    statistics = statistics_of(task, len(policies_N_D), observation_mean, observation_std)
+    given = [_Named(str(index), policy) for index, policy in enumerate(zip(policies_N_D, *statistics, strict=True))]
+    with _engine(config) as engine:
+        return _certify(engine, config, given, number, episodes, keep, by)
+
+
+def recomputed(run: Run, workers: int | None = None) -> Iterator[tuple[Certified, tuple[str, ...]]]:
+    """The stored certifications, each with the names of the results that differ if its episodes are run again."""
+    found = certified_policies(run.folder)
+    if not found:
+        return
+    config = evaluation_config(run, workers)
+    with _engine(config) as engine:
+        for one in found:
+            policy = (one.parameters_D, one.observation_mean_O, one.observation_std_O)
+            [result] = _certification_episodes(engine, [policy], one.episodes.count, config.seed, one.number)
+            again, then = arrays_of(kept(result)), arrays_of(one.episodes)
+            yield one, tuple(name for name in then if then[name].tobytes() != again[name].tobytes())
+
+
+def _certify(
+    engine: Evaluator,
+    config: RunConfig,
+    given: Sequence[_Named],
+    number: int,
+    episodes: int,
+    keep: int,
+    by: Measure | None,
+) -> list[Certified]:
+    """Select among candidates, then certify those that remain."""
+    measure = _measure(config, by)
+    ranked, steps = halved(engine, [one.policy for one in given], config.seed, number, keep, measure)
+    policies = [given[one.index].policy for one in ranked]
+    results = _certification_episodes(engine, policies, episodes, config.seed, number)
+    found = []
+    for rank, (one, result) in enumerate(zip(ranked, results, strict=True)):
+        candidate = given[one.index]
+        found.append(
+            Certified(
+                number,
+                rank,
+                candidate.name,
+                candidate.generation,
+                candidate.stored_fitness,
+                measure,
+                one.mean(measure) if one.count else None,
+                one.count,
+                len(given),
+                steps,
+                kept(result),
+                *candidate.policy,
+            )
+        )
+    return found
+
+
+def _certification_episodes(
+    engine: Evaluator, policies: Sequence[Parameters], episodes: int, seed: int, number: int
+) -> list[EpisodesResult]:
+    return new_episodes(engine, policies, episodes, seed, number, 0, Domain.CERTIFICATION_RESET)
+
+
+def _different(chosen: Sequence[Candidate]) -> list[_Named]:
+    """The candidates; of equal policies only the first, since the best centre is often an elite as well."""
+    found: dict[tuple[bytes, ...], _Named] = {}
+    for one in chosen:
+        policy = (one.policy.parameters_D, one.policy.observation_mean_O, one.policy.observation_std_O)
+        key = tuple(array.tobytes() for array in policy)
+        found.setdefault(key, _Named(one.name, policy, one.generation, one.stored_fitness))
+    return list(found.values())
+
+
+@contextmanager
+def _engine(config: RunConfig, on_compile: Callable[[str], None] = lambda sentence: None) -> Iterator[Evaluator]:
+    """Workers on this machine that give what certification keeps."""
+    task = task_of(config)
+    spec = worker_spec(config, task, outputs_of(task))
+
+    def tell_compiling(kind: str) -> None:
+        if kind:
+            on_compile(compiling_sentence(spec, kind, here=True))
+
+    with (
+        stop_on_signals() as should_stop,
+        inline_engine(spec, dispatch_limits(config), should_stop, on_compile=tell_compiling) as engine,
+    ):
+        yield engine
+
+
+def outputs_of(task: TaskSpec) -> tuple[str, ...]:
+    """Outputs that the episodes of a certification name."""
+    return ("last_reward", "success") if task.success else ("last_reward",)
+
+
+def _measure(config: RunConfig, by: Measure | None) -> Measure:
+    """What selection ranks by. Raises ConfigError if the task does not have it."""
+    task = task_of(config)
+    lacking = {"success": not task.success, "goal_distance": not task.has_goal}
+    if by is not None and (by not in MEASURES or lacking.get(by)):
+        allowed = [name for name in MEASURES if not lacking.get(name)]
+        raise ConfigError(
+            f"by = {by}: {config.task.environment} has no such measure; choose {', '.join(allowed)}",
+            field="by",
+            value=by,
+            allowed=", ".join(allowed),
+        )
+    return by or ("return" if config.task.fitness == "sum" else "last_reward")

@@ -1,0 +1,88 @@
+"""Checks of whether a run can be continued with a config: its constants, its task, and the columns of its tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from es_service.config.changes import refused_changes
+from es_service.config.model import RunConfig
+from es_service.config.tasks import task_of
+from es_service.config.yaml_text import show
+from es_service.errors import ConfigError, StoreError, WayOut
+from es_service.loop.budget import REACHED, limits_of, raised
+from es_service.loop.history import Column, evaluated_columns, history_columns
+from es_service.protocol.messages import TaskSpec
+from es_service.runs.checked_config import changes_from
+from es_service.runs.identity import require_unchanged
+from es_service.runs.standing import Standing, look
+from es_service.runs.view import open_run
+from es_service.search.algorithms import ALGORITHMS
+from es_service.store.schema import RunMeta
+from es_service.store.writer import RunStore
+
+KEPT_OF_A_TASK = ("observation_size", "action_size", "descriptor_names", "has_goal")
+"""Fields of a task that the policies and the history of a run depend on."""
+
+
+def require_resumable(store: RunStore, config: RunConfig, *, strict: bool) -> None:
+    """Raise an error if a run cannot be continued with a config.
+
+    Args:
+        strict: whether to refuse other code, other packages and another kind of processor, too.
+
+    Raises:
+        ConfigError: a constant of the run would change (all are listed), the task has changed, or `strict` is set and
+            something has changed. StoreError: the run has other columns than this version writes.
+    """
+    folder = store.folder
+    if changes := changes_from(store.meta.constants, config):
+        raise refused_changes(folder, changes, ALGORITHMS, _budget_of_a_fork(config, look(open_run(folder))))
+    task = task_of(config)
+    if other := _other_task(store.meta.task, task):
+        raise ConfigError(
+            f"{folder}: the task {config.task.environment} has changed since the run was created ({other}), so the "
+            "run's data do not fit it; undo the change, or start a new run",
+            field="task.environment",
+            value=config.task.environment,
+            run=folder,
+        )
+    if not _fits(store.meta, *columns(config, task)):
+        raise StoreError(
+            f"{folder} was written by a version of es-service with other history columns; continue it with that "
+            "version",
+            run=folder,
+            ways_out=[WayOut("fork", "continue from its state in a new run", str(folder))],
+        )
+    if strict:
+        require_unchanged(store, config)
+
+
+def columns(config: RunConfig, task: TaskSpec) -> tuple[tuple[Column, ...], tuple[Column, ...]]:
+    """The columns of a run's history, and those of its evaluated centres."""
+    return history_columns(task, config.map.enabled), evaluated_columns(task, config.map.enabled)
+
+
+def _budget_of_a_fork(config: RunConfig, standing: Standing) -> dict[str, Any]:
+    """Budget settings that a fork needs besides the changed keys: the limits in `config` that differ from those of the
+    run, and larger limits where they are already spent."""
+    limits = limits_of(config.budget)
+    wanted = {key: limits.get(key) for key in REACHED if limits.get(key) != standing.limits.get(key)}
+    wanted |= raised(limits, standing.row) if standing.row else {}
+    return {f"budget.{key}": value for key, value in wanted.items()}
+
+
+def _other_task(recorded: Mapping[str, Any], task: TaskSpec) -> str:
+    """Differences between the recorded task and the present one that the run's data depend on; empty if none."""
+    present = asdict(task) | {"descriptor_names": list(task.descriptor_names)}
+    values = [(name, recorded[name], present[name]) for name in KEPT_OF_A_TASK]
+    return ", ".join(f"{name}: {show(old)} -> {show(new)}" for name, old, new in values if old != new)
+
+
+def _fits(meta: RunMeta, history: tuple[Column, ...], evaluations: tuple[Column, ...]) -> bool:
+    """Whether this version can continue the tables of a run, which may lack columns that are not in the digest."""
+    lacking = [column for column in evaluations if column not in meta.evaluation_columns]
+    kept = tuple(column for column in evaluations if column not in lacking)
+    has_all = not any(column.deterministic for column in lacking)
+    return meta.columns == history and meta.evaluation_columns == kept and has_all

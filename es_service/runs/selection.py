@@ -1,0 +1,138 @@
+"""Episodes by which candidates are chosen, or by which what was chosen is certified.
+
+Axes: E episodes, D policy parameters, O observation, B descriptor dimensions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from es_service.loop.generation import steps_of
+from es_service.loop.policies import policy_episodes, policy_work
+from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.messages import EpisodesResult, FloatArray, Work
+from es_service.protocol.noise import Domain
+from es_service.runs.certified import Episodes, Measure
+
+FIRST_EPISODES = 16
+"""Selection episodes of each candidate in the first round; each later round has twice as many as the one before."""
+Parameters = tuple[FloatArray, FloatArray, FloatArray]
+"""A policy to run: its parameters [D], and mean and standard deviation of its observations, [O] each."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A candidate with its selection episodes so far."""
+
+    index: int
+    rounds: tuple[Episodes, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Number of its selection episodes."""
+        return sum(one.count for one in self.rounds)
+
+    def mean(self, by: Measure) -> float:
+        """Mean of a measure over all its episodes, higher is better; NaN without episodes."""
+        values = {
+            "return": lambda one: one.return_E,
+            "last_reward": lambda one: one.last_reward_E,
+            "success": lambda one: one.success_E,
+            "goal_distance": lambda one: -one.goal_distance_E,
+        }[by]
+        if not self.rounds:
+            return math.nan
+        with np.errstate(invalid="ignore", over="ignore"):
+            return float(np.concatenate([values(one) for one in self.rounds]).mean(dtype=np.float64))
+
+    def order(self, by: Measure) -> tuple[float, float]:
+        """Key by which the best is the first; a mean that is not finite comes last."""
+        means = (self.mean(by), self.mean("return"))
+        first, second = (-mean if math.isfinite(mean) else math.inf for mean in means)
+        return first, second
+
+
+def halved(
+    engine: Evaluator,
+    given: Sequence[Parameters],
+    seed: int,
+    number: int,
+    keep: int,
+    by: Measure,
+) -> tuple[list[Standing], int]:
+    """The `keep` best candidates by successive halving, best first, and the environment steps that it took.
+
+    In each round, every candidate that is left has the same new episodes as the others, twice as many as in the round
+    before; then the worse half leaves. Means are over the episodes of all rounds. Source: Karnin, Koren and Somekh 2013
+    (sequential halving), with doubled instead of equal budgets.
+    """
+    left, episodes, steps, ask = [Standing(index) for index in range(len(given))], FIRST_EPISODES, 0, 0
+    while len(left) > 1:
+        policies = [given[one.index] for one in left]
+        results = new_episodes(engine, policies, episodes, seed, number, ask, Domain.CANDIDATE_RESET)
+        steps += sum(map(steps_of, results))
+        left = [replace(one, rounds=(*one.rounds, kept(result))) for one, result in zip(left, results, strict=True)]
+        ranked = sorted(left, key=lambda one: one.order(by))  # stable: equal ones stay in the order given
+        if len(left) <= keep:
+            return ranked, steps
+        left = ranked[: max(keep, -(-len(left) // 2))]
+        episodes, ask = 2 * episodes, ask + 1
+    return left, steps
+
+
+def new_episodes(
+    engine: Evaluator,
+    policies: Sequence[Parameters],
+    episodes: int,
+    seed: int,
+    number: int,
+    ask: int,
+    domain: Domain,
+) -> list[EpisodesResult]:
+    """Results [E] of new episodes of each policy. All policies have the same resets, which the address (seed, domain,
+    number, ask) determines."""
+    asked = [
+        policy_work(
+            parameters_D[None],
+            (mean_O[None], std_O[None]),
+            episodes,
+            seed=seed,
+            generation=number,
+            ask=ask,
+            domain=domain,
+        )
+        for parameters_D, mean_O, std_O in policies
+    ]
+    work: list[Work] = [one for each in asked for one in each.work]
+    answers = iter([answer for answer in engine.evaluate(work) if isinstance(answer, EpisodesResult)])
+    found = [policy_episodes(each, [next(answers) for _ in each.work]) for each in asked]
+    return [_first(result) for result in found]
+
+
+def kept(result: EpisodesResult) -> Episodes:
+    """What is kept of the results [E] of a policy."""
+    return Episodes(
+        result.returns.astype(np.float64),
+        result.outputs["last_reward"].astype(np.float64),
+        result.goal_distance[:, 1].astype(np.float64),
+        result.outputs.get("success"),
+        result.steps.astype(np.int64),
+        result.descriptor.astype(np.float64),
+    )
+
+
+def _first(result: EpisodesResult) -> EpisodesResult:
+    """Results of the first policy, [E]."""
+    return EpisodesResult(
+        fitness=result.fitness[0],
+        returns=result.returns[0],
+        descriptor=result.descriptor[0],
+        steps=result.steps[0],
+        goal_distance=result.goal_distance[0],
+        moments=None,
+        outputs={name: array[0] for name, array in result.outputs.items()},
+    )
