@@ -9,7 +9,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from es_service.config.fields import Count, NotNegative, Positive, Section
+from es_service.config.fields import Count, Fraction, NotNegative, Positive, Section
 
 
 class AdamStep(Section):
@@ -18,11 +18,13 @@ class AdamStep(Section):
     kind: Literal["adam"] = "adam"
     learning_rate: Positive = Field(
         0.01,
-        description="Length of a step. adam: about how far each parameter moves in a generation, in parameter units. "
-        "plain: factor of the gradient estimate.",
+        description="Length of a step. adam, adamw: about how far each parameter moves in a generation, in parameter "
+        "units. plain: factor of the gradient estimate. clipup: length that a step adds to the velocity.",
     )
     l2: NotNegative = Field(
-        0.005, description="Weight decay, added to the gradient before the step: lambda in -g + lambda x."
+        0.005,
+        description="Weight decay, added to the gradient before the step: lambda in -g + lambda x. adamw: the share of "
+        "a centre, times learning_rate, that each step takes away.",
     )
 
 
@@ -32,6 +34,27 @@ class PlainStep(Section):
     kind: Literal["plain"] = "plain"
     learning_rate: Positive = Field(0.01, description="Factor of the gradient estimate.")
     l2: NotNegative = Field(0.005, description="Weight decay, as for adam.")
+
+
+class AdamWStep(Section):
+    """Adam whose weight decay stays outside of its moments."""
+
+    kind: Literal["adamw"] = "adamw"
+    learning_rate: Positive = Field(0.01, description="As for adam.")
+    l2: NotNegative = Field(0.005, description="Share of a centre, times learning_rate, that each step takes away.")
+
+
+class ClipUpStep(Section):
+    """A momentum along normalised gradient estimates, with a greatest speed."""
+
+    kind: Literal["clipup"] = "clipup"
+    learning_rate: Positive = Field(0.01, description="Length that a step adds to the velocity.")
+    l2: NotNegative = Field(0.005, description="Weight decay, as for adam.")
+    max_speed: Positive | None = Field(
+        None,
+        description="Of kind clipup: greatest length of a step, in parameter units; null: learning_rate / 0.75.",
+    )
+    momentum: Fraction = Field(0.9, description="Of kind clipup: share of the velocity that a step keeps.")
 
 
 class Ranks(Section):
@@ -63,5 +86,5 @@ class TopPairs(Section):
     )
 
 
-Step = AdamStep | PlainStep
+Step = AdamStep | AdamWStep | PlainStep | ClipUpStep
 Shaping = Ranks | Signs | Returns | TopPairs

@@ -92,8 +92,9 @@ class PopulationConfig(SearchConfig):
     step: Step = Field(
         AdamStep(learning_rate=0.01, l2=0.005),
         discriminator="kind",
-        description="How a centre moves along the gradient estimate. adam: by Adam. plain: by the estimate times the "
-        "learning rate.",
+        description="How a centre moves along the gradient estimate. adam: by Adam. adamw: by Adam, with a weight "
+        "decay outside of its moments. plain: by the estimate times the learning rate. clipup: by ClipUp, a momentum "
+        "along normalised estimates with a greatest speed.",
     )
     shaping: Shaping = Field(
         Ranks(),

@@ -100,7 +100,7 @@ def test_a_part_is_a_section_of_its_own():
     assert line.startswith("search.step: plain is not a mapping of keys; indent its keys below `step:`")
     assert problems(MINIMAL, "search.step.kind=adma", "search.step.learning_rate=-1", "search.step.learning_rat=1") == [
         "search.step.learning_rat: unknown key; did you mean search.step.learning_rate?",
-        "search.step.kind: adma is not allowed; must be adam or plain; did you mean adam?",
+        "search.step.kind: adma is not allowed; must be adam, adamw, plain or clipup; did you mean adam?",
     ]
     config = load(MINIMAL | {"search": {"algorithm": "nsr_es", "step": {"learning_rate": 1}}}, "search.step.kind=plain")
     assert config.search.step.model_dump() == {"kind": "plain", "learning_rate": 1.0, "l2": 0.005}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from es_service import api
-from es_service.config.parts import AdamStep, PlainStep
+from es_service.config.parts import AdamStep, AdamWStep, ClipUpStep, PlainStep
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.steps import STEPS, restarted
 
@@ -30,7 +30,7 @@ def step_arrays(run) -> list[dict[str, np.ndarray]]:
     ]
 
 
-@pytest.mark.parametrize("settings", [AdamStep(), PlainStep()])
+@pytest.mark.parametrize("settings", [AdamStep(), AdamWStep(), PlainStep(), ClipUpStep()])
 def test_a_state_is_all_zeros_before_the_first_step_and_when_it_begins_again(settings):
     step, gradient_D = STEPS[settings.kind], np.arange(5, dtype=np.float32)
     fresh = step.fresh(5)

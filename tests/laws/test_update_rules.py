@@ -8,12 +8,13 @@ from hypothesis.extra import numpy as hnp
 
 from es_service.api import load_config
 from es_service.config.model import worker_spec
-from es_service.config.parts import AdamStep, Ranks, Returns, Signs, TopPairs
+from es_service.config.parts import AdamStep, AdamWStep, ClipUpStep, Ranks, Returns, Signs, TopPairs
 from es_service.loop.generation import estimate_gradients
 from es_service.protocol.messages import GradientResult
 from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.shaping import centred_ranks, pair_signs, pair_weights, shaped, standardised
-from es_service.search.steps.adam import adam_step, fresh_adam
+from es_service.search.steps.adam import adam_step, adamw_step, fresh_adam
+from es_service.search.steps.clipup import clipup_step, fresh_clipup
 from tests.helpers import DirectEvaluator
 from tests.laws.es_runs import SHAPE, small_config
 from tests.twins import es as twin
@@ -109,6 +110,47 @@ def test_adam_by_hand():
     _, crept = adam_step(free, fresh_adam(3), np.zeros(3, np.float32), tiny)
     expected = 0.01 * np.sqrt(0.001) / 0.1 * 0.1 * 1e-7 / (np.sqrt(0.001) * 1e-7 + 1e-8)
     assert crept[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_adamw_by_hand():
+    """The first step of Adam is the learning rate, whatever the decay; that takes a share of the centre besides."""
+    gradient, start = np.float32([2.0, -0.5, 0.0]), np.float32([1.0, 2.0, -4.0])
+    step = AdamWStep(learning_rate=0.01, l2=0.5)
+    state, moved = adamw_step(step, fresh_adam(3), start, gradient)
+    np.testing.assert_allclose(moved, [1.01 - 0.005, 1.99 - 0.01, -4.0 + 0.02], rtol=1e-6)
+    alone, _ = adam_step(AdamStep(l2=0.0), fresh_adam(3), start, gradient)
+    for name, values in alone.items():
+        np.testing.assert_array_equal(state[name], values)
+
+
+def test_clipup_by_hand():
+    """Two steps along (3, 4), whose norm is 5; the second would be 0.19 long and is shortened to 0.15."""
+    step = ClipUpStep(learning_rate=0.1, l2=0.0, max_speed=0.15)
+    start = np.zeros(2, np.float32)
+    state, once = clipup_step(step, fresh_clipup(2), start, np.float32([3.0, 4.0]))
+    np.testing.assert_allclose(once, [0.06, 0.08], rtol=1e-6)
+    state, twice = clipup_step(step, state, once, np.float32([300.0, 400.0]))
+    np.testing.assert_allclose(twice - once, [0.09, 0.12], rtol=1e-6)
+    state, without_a_signal = clipup_step(step, state, twice, np.zeros(2, np.float32))
+    np.testing.assert_allclose(without_a_signal - twice, [0.081, 0.108], rtol=1e-6)  # 0.9 of the velocity
+    _, pulled = clipup_step(
+        ClipUpStep(learning_rate=0.1, l2=1.0), fresh_clipup(2), np.float32([3.0, 4.0]), np.zeros(2, np.float32)
+    )
+    np.testing.assert_allclose(pulled, [2.94, 3.92], rtol=1e-6)  # the penalty alone, normalised
+
+
+@given(hnp.arrays(np.float32, 5, elements=st.floats(-1e3, 1e3, width=32)), st.floats(1e-3, 1e3))
+def test_clipup_sees_the_direction_alone_and_keeps_to_its_speed(gradient, factor):
+    step, start = ClipUpStep(learning_rate=0.1, l2=0.0), np.ones(5, np.float32)
+    scaled = gradient * np.float32(factor)
+    if not (np.square(gradient).sum() > 1e-20 and np.square(scaled).sum() > 1e-20):
+        return
+    state, moved = clipup_step(step, fresh_clipup(5), start, gradient)
+    np.testing.assert_allclose(clipup_step(step, fresh_clipup(5), start, scaled)[1], moved, atol=1e-5)
+    for _ in range(20):
+        before = moved
+        state, moved = clipup_step(step, state, moved, gradient)
+        assert np.linalg.norm(moved - before) <= 0.1 / 0.75 + 1e-5
 
 
 def test_blocks_of_the_gradient_are_added_in_the_tree():

@@ -13,7 +13,7 @@ import numpy as np
 
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.protocol.messages import FloatArray
-from es_service.search.steps import adam, plain
+from es_service.search.steps import adam, clipup, plain
 
 StepState = Mapping[str, np.ndarray]
 
@@ -27,7 +27,12 @@ class Step(NamedTuple):
     """(settings of this kind, state, centre [D], gradient estimate [D]) -> (new state, new centre [D])."""
 
 
-STEPS = {"adam": Step(adam.fresh_adam, adam.adam_step), "plain": Step(plain.fresh_plain, plain.plain_step)}
+STEPS = {
+    "adam": Step(adam.fresh_adam, adam.adam_step),
+    "adamw": Step(adam.fresh_adam, adam.adamw_step),
+    "plain": Step(plain.fresh_plain, plain.plain_step),
+    "clipup": Step(clipup.fresh_clipup, clipup.clipup_step),
+}
 
 
 def fresh_state(search: SearchConfig | None, parameters: int) -> StepState:
