@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
@@ -21,18 +21,14 @@ from numpy.typing import ArrayLike
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
-from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import ConfigError
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.messages import EpisodesResult, TaskSpec
 from es_service.protocol.noise import Domain
 from es_service.runs.certified import MEASURES, Certified, Measure, arrays_of, certified_policies, stored
-from es_service.runs.compiling import compiling_sentence
-from es_service.runs.evaluation import Candidate, candidates, evaluation_config
+from es_service.runs.evaluation import Candidate, candidates, evaluation_config, workers_of
 from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of
 from es_service.runs.selection import Parameters, halved, kept, new_episodes
-from es_service.runs.session import dispatch_limits
-from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, open_run
 from es_service.store.writer import RunStore
 
@@ -213,21 +209,12 @@ def _different(chosen: Sequence[Candidate]) -> list[_Named]:
     return list(found.values())
 
 
-@contextmanager
-def _engine(config: RunConfig, on_compile: Callable[[str], None] = lambda sentence: None) -> Iterator[Evaluator]:
+def _engine(
+    config: RunConfig, on_compile: Callable[[str], None] = lambda sentence: None
+) -> AbstractContextManager[Evaluator]:
     """Workers on this machine that give what certification keeps."""
     task = task_of(config)
-    spec = worker_spec(config, task, outputs_of(task))
-
-    def tell_compiling(kind: str) -> None:
-        if kind:
-            on_compile(compiling_sentence(spec, kind, here=True))
-
-    with (
-        stop_on_signals() as should_stop,
-        inline_engine(spec, dispatch_limits(config), should_stop, on_compile=tell_compiling) as engine,
-    ):
-        yield engine
+    return workers_of(config, worker_spec(config, task, outputs_of(task)), None, on_compile)
 
 
 def outputs_of(task: TaskSpec) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ same ones.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import sqrt
 
@@ -17,14 +18,15 @@ from numpy.typing import NDArray
 from es_service.config.compute import ENGINE_IMPLIES
 from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
+from es_service.dispatch.dispatch_log import no_log
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop.generation import evaluate_centres
 from es_service.loop.parts import BEST
 from es_service.protocol.evaluator import Evaluator
-from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, Moments
+from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, Moments, WorkerSpec
 from es_service.runs.checked_config import changed_config
-from es_service.runs.compiling import compiling_sentence
+from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.moment import Policy, make_policy
 from es_service.runs.session import dispatch_limits, require_cores
 from es_service.runs.signals import stop_on_signals
@@ -185,17 +187,8 @@ def evaluate(
     geometry = run.behaviour_map.geometry if config.map.enabled else None
     chunks = -(-episodes // EVALUATION_EPISODES_PER_CHUNK)
     task = task_of(config)
-    limits = dispatch_limits(config, chunks * len(chosen))
     spec = worker_spec(config, task, ("success",) if task.success else ())
-
-    def tell_compiling(kind: str) -> None:
-        if kind:
-            on_compile(compiling_sentence(spec, kind, here=True))
-
-    with (
-        stop_on_signals() as should_stop,
-        inline_engine(spec, limits, should_stop, on_compile=tell_compiling) as engine,
-    ):
+    with workers_of(config, spec, chunks * len(chosen), on_compile) as engine:
         together = max(1, CHUNKS_PER_WORKER * engine.counts.workers // chunks)
         for first in range(0, len(chosen), together):
             group = chosen[first : first + together]
@@ -207,6 +200,34 @@ def evaluate(
                 if geometry is not None and np.isfinite(descriptors.mean_O).all():
                     cell = int(geometry.cells_of(descriptors.mean_O[None])[0])
                 yield Fresh(candidate, fitness, descriptors, successes if task.success else None, cell)
+
+
+@contextmanager
+def workers_of(
+    config: RunConfig, spec: WorkerSpec, chunks: int | None, on_compile: Callable[[str], None]
+) -> Iterator[Evaluator]:
+    """Workers on this machine, until the end of the block or a signal.
+
+    Args:
+        chunks: number of chunks that can be computed at the same time; None: as in a generation of a run.
+        on_compile: called with a sentence when the workers compile for more than two seconds.
+    """
+
+    def tell_compiling(kind: str) -> None:
+        if kind:
+            on_compile(compiling_sentence(spec, kind, here=True))
+
+    with (
+        stop_on_signals() as should_stop,
+        inline_engine(
+            spec,
+            dispatch_limits(config, chunks),
+            should_stop,
+            log=noting(no_log, spec),
+            on_compile=tell_compiling,
+        ) as engine,
+    ):
+        yield engine
 
 
 @np.errstate(invalid="ignore", over="ignore")  # a policy may have an infinite fitness

@@ -217,6 +217,7 @@ def compared(example: Example, folder: Path, digest: bool) -> str:
 def shown(report: RunData) -> set[Any]:
     """What a report shows, except the digest and what the config says."""
     map_ = {} if report.map is None else {field.name: getattr(report.map, field.name) for field in fields(report.map)}
+    map_ = {name: values for name, values in map_.items() if values is not None}
     geometry = map_.pop("geometry", None)
     single = {"best": report.best, "geometry": geometry, "description": report.meta}
     found = {(name, repr(value)) for name, value in single.items() if value is not None}

@@ -102,5 +102,7 @@ def test_a_run_says_that_its_workers_compile(tmp_path, monkeypatch, caplog):
     said.clear()
     run = api.open_run(tmp_path / "run")
     best = evaluation.candidates(run, best=True, centre=False, cells=(), every=False)
-    assert len(list(evaluation.evaluate(run, best, 1, on_compile=said.append))) == 1
-    assert said == ["compiling for point_maze (evaluation episodes, compiled before, about 4 s)"]
+    for known in ("first time, about 10 s", "compiled before, about 4 s"):  # code that also says which succeed
+        said.clear()
+        assert len(list(evaluation.evaluate(run, best, 1, on_compile=said.append))) == 1
+        assert said == [f"compiling for point_maze (evaluation episodes, {known})"]

@@ -161,7 +161,8 @@ def test_list_and_doctor(tmp_path):
     words = " ".join(printed.replace("│", " ").split())
     for wanted in (
         "point_maze a point must reach a goal in a square; two walls block the direct path "
-        "observation 2, action 2, steps 200 descriptor: x in [-1, 1], y in [-1, 1] option start: default | corner",
+        "observation 2, action 2, steps 200 descriptor: x in [-1, 1], y in [-1, 1] "
+        "success: the point is in the goal square of side 0.1 option start: default | corner",
         "brax:NAME any environment",
         "module:Class a task of your own",
         "module:function A search of your own",
