@@ -170,7 +170,7 @@ class CentreEvaluation:
 
 
 def _without_populations(*arguments: object) -> Any:
-    raise NotImplementedError("a search that asks for populations needs the functions `weights` and `step`")
+    raise TypeError("a search that asks for populations needs the functions `weights` and `step`")
 
 
 @dataclass(frozen=True)
