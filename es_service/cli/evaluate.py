@@ -138,7 +138,7 @@ def _certify(
     """Certify policies, with the options of the command."""
     from es_service.cli.certify import certified_rows
     from es_service.cli.tables.evaluations import csv_file
-    from es_service.runs.certification import EPISODES, TOP
+    from es_service.runs.certification import EPISODES
 
     anything = best or centre or cells or top is not None
     problems: list[dict[str, str]] = []
@@ -150,7 +150,7 @@ def _certify(
             best=best or not anything,
             centre=centre,
             cells=cells,
-            top=(top or 0) if anything else TOP,
+            top=(top or 0) if anything else None,
             generation=generation,
             episodes=episodes or EPISODES,
             keep=keep or 1,

@@ -40,9 +40,10 @@ def verify(
         found.append(one)
         if not as_json:
             print_line(console, _line(one))
-    certified = [(one, differences) for one, differences in recomputed_certifications(run, workers)]
-    if not as_json:
-        for one, differences in certified:
+    certified = []
+    for one, differences in recomputed_certifications(run, workers):
+        certified.append((one, differences))
+        if not as_json:
             what = f"differs: {', '.join(differences)}" if differences else "equal"
             print_line(console, f"certification {one.number}, {one.name}: {what}")
     equal = not any(one.differences for one in found) and not any(differences for _, differences in certified)

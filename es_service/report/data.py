@@ -168,7 +168,7 @@ def _certified(folder: Path, problems: list[str]) -> Certified | None:
     try:
         return newest_certified(certified_policies(folder))
     except StoreError as error:
-        if not problems:
+        if error.sentence not in problems:
             problems.append(error.sentence)
         return None
 

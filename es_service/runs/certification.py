@@ -12,16 +12,18 @@ Axes: N candidates, E episodes, D policy parameters, O observation.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
-from es_service.errors import ConfigError
+from es_service.errors import ConfigError, NotInRunError
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.messages import EpisodesResult, TaskSpec
 from es_service.protocol.noise import Domain
@@ -34,8 +36,15 @@ from es_service.store.writer import RunStore
 
 EPISODES = 256
 """Default number of certification episodes."""
+OTHER_PROGRAMS = 2**40
+"""Added to the numbers of certifications of other programs' policies, so that no run has their episodes."""
+NOTHING = np.zeros(0)
 TOP = 10
 """Default number of elites that are candidates beside the best centre."""
+
+
+def _warn(notice: str) -> None:
+    warnings.warn(notice, RuntimeWarning, stacklevel=2)
 
 
 @dataclass(frozen=True)
@@ -54,19 +63,19 @@ def certify_run(
     best: bool = True,
     centre: bool = False,
     cells: Sequence[Sequence[int]] = (),
-    top: int = TOP,
+    top: int | None = None,
     generation: int | None = None,
     episodes: int = EPISODES,
     keep: int = 1,
     by: Measure | None = None,
     workers: int | None = None,
-    on_notice: Callable[[str], None] = lambda sentence: None,
+    on_notice: Callable[[str], None] = _warn,
 ) -> list[Certified]:
     """Certify policies of a run on this machine, and store the results in the run.
 
     Args:
         best, centre, cells, top: the candidates: the best centre, the newest centre, elites of cells, and the elites
-            with the highest stored fitness, of which a run without a map has none.
+            with the highest stored fitness; None: 10 of them, or none in a run without a map.
         generation: one whose state the run keeps, from which the candidates are taken; None: the newest.
         episodes: number of certification episodes of each policy that remains.
         keep: number of policies that remain after selection.
@@ -74,31 +83,36 @@ def certify_run(
             in the order of the candidates.
         workers: number of worker processes; None: one per core.
         on_notice: called with a sentence about each repair of the run, and when the workers compile for more than two
-            seconds.
+            seconds; by default, these are RuntimeWarnings.
 
     Returns:
         The policies that remain, in the order of selection.
 
     Raises:
         RunLockedError: a driver is writing to the run; the message names it. NotInRunError: a candidate does not exist.
-        ConfigError: the task does not have what `by` names. EvaluationError: the rollouts cannot continue. Interrupted:
-        SIGINT or SIGTERM arrived. Then nothing is stored.
+        ConfigError: a number is wrong, or the task does not have what `by` names. EvaluationError: the rollouts cannot
+        continue. Interrupted: SIGINT or SIGTERM arrived. Then nothing is stored.
     """
+    _require_numbers(episodes=(episodes, 1), keep=(keep, 1), top=(top or 0, 0))
     run = open_run(folder)
     with RunStore.open(run.folder) as store:
         for notice in store.notices:
             on_notice(notice)
         config = evaluation_config(run, workers)
-        has_map = config.map.enabled
+        _measure(config, by)  # refuses a wrong one before workers start
+        if top is None:
+            top = TOP if config.map.enabled else 0
         chosen = candidates(
             run,
             best=best,
             centre=centre,
             cells=cells,
             every=False,
-            top=top if has_map else 0,
+            top=top,
             generation=generation,
         )
+        if not chosen:
+            raise NotInRunError(f"{run.folder}: there is no policy to certify; its map is empty", run=run.folder)
         with _engine(config, on_notice) as engine:
             number = store.next_certification
             found = _certify(engine, config, _different(chosen), number, episodes, keep, by)
@@ -123,8 +137,8 @@ def certify(
     Args:
         parameters: candidates [N, D].
         config: a RunConfig, or what `load_config` accepts; its task, policy and seed are used.
-        number: number of the certification. A repeated certification with the same number has the same episodes, so
-            give the next number if the policies have been changed after a look at the results.
+        number: number of the certification. Another one with the same number has the same episodes, so give the next
+            number if the policies have been changed after a look at the results.
         observation_mean, observation_std: statistics with which observations are normalised, [O] or [N, O]; None: 0 and
             1.
 
@@ -134,13 +148,15 @@ def certify(
     Raises:
         ConfigError: an argument is wrong. Otherwise as `certify_run`.
     """
+    _require_numbers(episodes=(episodes, 1), keep=(keep, 1), number=(number, 0))
     config = evaluating_config(config, workers, "inline", None)
+    _measure(config, by)
     task = task_of(config)
     policies_N_D = policies_of(config, task, parameters)
     statistics = statistics_of(task, len(policies_N_D), observation_mean, observation_std)
     given = [_Named(str(index), policy) for index, policy in enumerate(zip(policies_N_D, *statistics, strict=True))]
     with _engine(config) as engine:
-        return _certify(engine, config, given, number, episodes, keep, by)
+        return _certify(engine, config, given, OTHER_PROGRAMS + number, episodes, keep, by)
 
 
 def recomputed(run: Run, workers: int | None = None) -> Iterator[tuple[Certified, tuple[str, ...]]]:
@@ -154,7 +170,10 @@ def recomputed(run: Run, workers: int | None = None) -> Iterator[tuple[Certified
             policy = (one.parameters_D, one.observation_mean_O, one.observation_std_O)
             [result] = _certification_episodes(engine, [policy], one.episodes.count, config.seed, one.number)
             again, then = arrays_of(kept(result)), arrays_of(one.episodes)
-            yield one, tuple(name for name in then if then[name].tobytes() != again[name].tobytes())
+            yield (
+                one,
+                tuple(name for name in then if name not in again or then[name].tobytes() != again[name].tobytes()),
+            )
 
 
 def _certify(
@@ -191,6 +210,14 @@ def _certify(
             )
         )
     return found
+
+
+def _require_numbers(**numbers: tuple[int, int]) -> None:
+    """Raise ConfigError for a value that is no whole number, or below its least one; (value, least) by name."""
+    for name, (value, least) in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            allowed = f"a whole number of at least {least}"
+            raise ConfigError(f"{name} is {value!r}; must be {allowed}", field=name, value=value, allowed=allowed)
 
 
 def _certification_episodes(

@@ -104,8 +104,9 @@ def certified_policies(folder: Path) -> list[Certified]:
 
 
 def newest_certified(policies: list[Certified]) -> Certified | None:
-    """The policy that the newest certification has put first; None if there is none."""
-    return max((one for one in policies if one.rank == 0), key=lambda one: one.number, default=None)
+    """The policy that the newest certification has put first; None if there is none, or if damage has removed it."""
+    newest = max((one.number for one in policies), default=None)
+    return next((one for one in policies if (one.number, one.rank) == (newest, 0)), None)
 
 
 def arrays_of(episodes: Episodes) -> dict[str, NDArray[Any]]:

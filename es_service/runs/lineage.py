@@ -39,6 +39,7 @@ from es_service.search.observation_statistics import no_observations
 from es_service.search.steps import fresh_state
 from es_service.store import reader
 from es_service.store.beginning import Beginning
+from es_service.store.certifications import CERTIFICATIONS
 from es_service.store.codec import Part
 from es_service.store.digest import digest_at
 
@@ -233,4 +234,5 @@ def _lineage(origin: Run, generation: int) -> dict[str, Any]:
         "folder": str(origin.folder.absolute()),
         "generation": generation,
         "digest": digest_at(origin.folder, generation),
+        CERTIFICATIONS: reader.next_certification(origin.folder),
     }

@@ -130,7 +130,9 @@ def sound_archive(archive: NoveltyArchive) -> NoveltyArchive:
     """
     if archive.room is not None and (archive.tree is None or archive.tree.entries <= archive.size):
         in_room = (archive.room.descriptor_B, archive.room.generation, archive.room.centre)
-        if all(_address(ours) == _address(given) for ours, given in zip(in_room, _columns(archive), strict=True)):
+        pairs = list(zip(in_room, _columns(archive), strict=True))
+        are_first = all(_address(ours) == _address(it) and ours.strides == it.strides for ours, it in pairs)
+        if are_first and all(len(it) == archive.size for _, it in pairs):
             return archive
     columns = [np.array(given, kind, order="C") for given, kind in zip(_columns(archive), "dqq", strict=True)]
     if columns[0].ndim != 2 or any(len(given) != len(columns[0]) for given in columns):

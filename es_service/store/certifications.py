@@ -17,6 +17,10 @@ from numpy.typing import NDArray
 
 from es_service.store.codec import Part, decode_part, encode_part
 
+CERTIFICATIONS = "certifications"
+"""Key of a run's `RunMeta.parent`: number of the next certification of the parent when this run began."""
+_REMOVED = ""
+"""Facts of a row that was damaged."""
 Key = tuple[int, int]
 """(number of a certification of the run, from 0; rank in it)."""
 
@@ -50,9 +54,26 @@ def encoded(number: int, policies: Iterable[tuple[Mapping[str, Any], Part]]) -> 
     return found
 
 
-def next_number(connection: sqlite3.Connection) -> int:
-    """Number of the next certification of a run."""
-    return connection.execute("SELECT coalesce(max(number) + 1, 0) FROM certification").fetchone()[0]
+def next_number(connection: sqlite3.Connection, parent: Mapping[str, Any] | None) -> int:
+    """Number after the greatest one that has been stored, removed rows included.
+
+    That of a fork begins after those of its parent, whose episodes may have decided about it.
+
+    Args:
+        parent: `RunMeta.parent`.
+    """
+    stored = connection.execute("SELECT coalesce(max(number) + 1, 0) FROM certification").fetchone()[0]
+    return max(stored, (parent or {}).get(CERTIFICATIONS, 0))
+
+
+def remove(connection: sqlite3.Connection, keys: Iterable[Key]) -> None:
+    """Empty damaged rows. Their numbers remain, since another certification with one would have the same episodes."""
+    for number, rank in keys:
+        sha256 = row_sha256(number, rank, _REMOVED, b"")
+        connection.execute(
+            "UPDATE certification SET facts = ?, payload = ?, sha256 = ? WHERE number IS ? AND rank IS ?",
+            (_REMOVED, b"", sha256, number, rank),
+        )
 
 
 def damaged_rows(connection: sqlite3.Connection) -> list[Key]:
@@ -61,9 +82,16 @@ def damaged_rows(connection: sqlite3.Connection) -> list[Key]:
 
 
 def rows(connection: sqlite3.Connection) -> list[tuple[int, int, CertifiedRow | None]]:
-    """Number, rank and content of all rows, in the order of number and rank; None for the content of a damaged one."""
+    """Number, rank and content of all rows that were not removed, in the order of number and rank; None for the content
+    of a damaged one."""
     query = "SELECT number, rank, facts, payload, sha256 FROM certification ORDER BY number, rank"
-    return [(row[0], row[1], _decoded(row)) for row in connection.execute(query)]
+    found = connection.execute(query)
+    return [(row[0], row[1], _decoded(row)) for row in found if not _is_removed(row)]
+
+
+def _is_removed(row: Sequence[Any]) -> bool:
+    number, rank, facts, payload, sha256 = row
+    return facts == _REMOVED and payload == b"" and sha256 == row_sha256(number, rank, _REMOVED, b"")
 
 
 def _decoded(row: Sequence[Any]) -> CertifiedRow | None:

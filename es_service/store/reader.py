@@ -198,6 +198,12 @@ def read_parts(
         return asked, parts
 
 
+def next_certification(folder: Path) -> int:
+    """Number of the next certification of a run."""
+    with reading(folder) as (connection, meta):
+        return certifications.next_number(connection, meta.parent)
+
+
 def read_certifications(folder: Path) -> list[CertifiedRow]:
     """All certified policies, in the order of certification and rank.
 

@@ -13,6 +13,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from es_service.errors import StoreError
+from es_service.store import certifications
 from es_service.store.connection import connected_to
 from es_service.store.folder import COPY, DAMAGED, DATABASE, explained, remove_database, sync_file, sync_folder
 from es_service.store.schema import GENERATION_TABLES, Damaged, history_shared, load_meta
@@ -87,7 +88,7 @@ def _made_sound(connection: sqlite3.Connection, file: Path, notices: list[str], 
     for table in GENERATION_TABLES:
         connection.execute(f"DELETE FROM {table} WHERE generation > ?", (verdict.good,))
     connection.executemany("DELETE FROM state WHERE part IS ? AND generation IS ?", verdict.bad_rows)
-    connection.executemany("DELETE FROM certification WHERE number IS ? AND rank IS ?", verdict.bad_certifications)
+    certifications.remove(connection, verdict.bad_certifications)
     connection.execute("COMMIT")
     if verdict.good == verdict.newest:
         notices.append(

@@ -257,9 +257,9 @@ class RunStore:
 
     @property
     def next_certification(self) -> int:
-        """Number of the next certification, from 0."""
+        """Number of the next certification."""
         with self._explaining("reading the certifications"):
-            return next_number(self._connection)
+            return next_number(self._connection, self.meta.parent)
 
     def add_certification(self, policies: Sequence[tuple[Mapping[str, Any], Part]]) -> None:
         """Store a certification in one transaction: (facts, arrays) of each policy, in the order of rank.
@@ -271,6 +271,7 @@ class RunStore:
         with self._transaction("storing a certification") as execute:
             for row in rows:
                 execute("INSERT INTO certification (number, rank, facts, payload, sha256) VALUES (?, ?, ?, ?, ?)", row)
+        self.upkeep.after_commit(sum(len(row[3]) for row in rows) + PAGE_BYTES)
 
     def platform_before(self, generation: int) -> dict[str, Any] | None:
         """The platform recorded for the generation before this one; None if there is none."""

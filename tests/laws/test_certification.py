@@ -20,7 +20,7 @@ from es_service.loop.policies import policy_episodes, policy_work
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.runs import certification
-from es_service.runs.certification import certify, certify_run, outputs_of
+from es_service.runs.certification import OTHER_PROGRAMS, certify, certify_run, outputs_of
 from es_service.runs.certified import certified_policies
 from es_service.runs.evaluation import FRESH_GENERATION
 from es_service.runs.intervals import mean_interval, share_interval
@@ -89,12 +89,12 @@ def test_selection_is_that_of_the_reference(count, keep):
     policies = rng.normal(size=(count, 2 * 8 + 8 + 8 * 2 + 2)).astype(np.float32)
     found = certify(policies, CONFIG, keep=keep, number=3, episodes=20)
     given = [(policy_D, np.zeros(2, np.float32), np.ones(2, np.float32)) for policy_D in policies]
-    wanted, steps = selected(config, given, 3, keep)
+    wanted, steps = selected(config, given, OTHER_PROGRAMS + 3, keep)
     assert [int(one.name) for one in found] == wanted
     assert [one.rank for one in found] == list(range(len(wanted)))
     assert {one.selection_steps for one in found} == {steps}
     for one in found:
-        result = episodes_of(config, given[int(one.name)], 20, 3, 0, Domain.CERTIFICATION_RESET)
+        result = episodes_of(config, given[int(one.name)], 20, OTHER_PROGRAMS + 3, 0, Domain.CERTIFICATION_RESET)
         np.testing.assert_array_equal(one.episodes.return_E, result.returns[0])
         np.testing.assert_array_equal(one.episodes.goal_distance_E, result.goal_distance[0, :, 1])
         row = one.row()
@@ -147,6 +147,7 @@ def test_it_changes_no_digest_and_a_fork_has_none(finished, tmp_path):
     with pytest.raises(NotInRunError, match="no certified policy") as raised:
         child.policy("certified")
     assert raised.value.ways_out[0].call() == f"certify_run('{child.folder}')"
+    assert [one.number for one in certify_run(child.folder, episodes=16)] == [2], "those of its parent have been seen"
 
 
 def test_a_run_goes_on_with_its_certifications(finished, tmp_path):
@@ -178,6 +179,28 @@ def test_a_changed_bit_is_seen_and_its_row_removed(finished, tmp_path):
         assert "row 1 of certification 1" in store.notices[0]
     assert len(damaged.certified) == 3
     assert damaged.digest() == run.digest()
+    with sqlite3.connect(file) as connection:
+        connection.execute("UPDATE certification SET facts = 'x' WHERE number = 1 AND rank = 0")
+    with RunStore.open(tmp_path / "run") as store:
+        assert store.next_certification == 2, "its episodes have been seen"
+    again = certify_run(tmp_path / "run", top=5, episodes=40)
+    assert [one.number for one in again] == [2]
+    assert not any(differences for _, differences in certification.recomputed(damaged))
+
+
+def test_another_policy_does_not_take_the_place_of_a_damaged_first(finished, tmp_path):
+    run, _ = finished
+    shutil.copytree(run.folder, tmp_path / "run")
+    with sqlite3.connect(tmp_path / "run" / "run.db") as connection:
+        connection.execute("UPDATE certification SET facts = 'x' WHERE number = 1 AND rank = 0")
+    RunStore.open(tmp_path / "run").close()
+    assert open_run(tmp_path / "run").certified[["certification", "rank"]].to_numpy().tolist() == [
+        [0, 0],
+        [0, 1],
+        [1, 1],
+    ]
+    with pytest.raises(NotInRunError, match="no certified policy"):
+        open_run(tmp_path / "run").policy("certified")
 
 
 def test_nothing_is_stored_of_a_certification_that_fails(finished, monkeypatch):
@@ -248,6 +271,21 @@ def test_the_command_line_certifies_and_shows_it(finished, tmp_path):
     exported = CliRunner().invoke(app, ["export", str(folder), "--to", "csv", "--out", str(tmp_path / "out")])
     assert exported.exit_code == 0, exported.output
     assert len((tmp_path / "out" / "certified.csv").read_text().splitlines()) == 1 + 5
+
+
+def test_there_must_be_something_to_certify(finished):
+    run, _ = finished
+    with pytest.raises(NotInRunError, match="no policy to certify"):
+        certify_run(run.folder, best=False, top=0)
+    assert len(run.certified) == 4
+
+
+@pytest.mark.parametrize("wrong", [{"episodes": 0}, {"keep": 0}, {"top": -1}, {"keep": 1.5}, {"by": "luck"}])
+def test_wrong_numbers_are_refused_before_anything_runs(finished, monkeypatch, wrong):
+    run, _ = finished
+    monkeypatch.delattr(certification, "workers_of")
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        certify_run(run.folder, **wrong)
 
 
 def test_wrong_arguments_are_named():
