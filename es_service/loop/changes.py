@@ -150,12 +150,30 @@ def _malformed(search: SearchState, earlier: SearchState | None) -> str:
     """What of a search's state is none that can be stored; empty if all is."""
     if not search.centres:
         return "the search has no centre; one must remain"
+    if wrong := _malformed_centres(search, earlier):
+        return wrong
     if earlier is not None and (search.map is None) != (earlier.map is None):
         return "the behaviour map was added or removed, which only `map.enabled` decides"
     if (earlier is None or search.own is not earlier.own) and (wrong := state_parts.problem(search.own)):
         return wrong
     map_before = earlier.map if earlier is not None else None
     return _malformed_map(search.map, map_before) if search.map is not None and search.map is not map_before else ""
+
+
+def _malformed_centres(search: SearchState, earlier: SearchState | None) -> str:
+    """Which new centre is none from which a generation could go on; empty if none is."""
+    known = earlier.centres if earlier is not None else ()
+    shape = (known or search.centres)[0].centre_D.shape
+    for index, centre in enumerate(search.centres):
+        if index < len(known) and centre is known[index]:
+            continue
+        centre_D = centre.centre_D
+        if not isinstance(centre_D, np.ndarray) or centre_D.dtype != np.float32 or centre_D.shape != shape:
+            now = f"{centre_D.dtype} {centre_D.shape}" if isinstance(centre_D, np.ndarray) else type(centre_D).__name__
+            return f"centre {index} is {now}; it must be float32 {shape}"
+        if not np.isfinite(centre_D).all():
+            return f"centre {index} has {np.count_nonzero(~np.isfinite(centre_D))} values that are not finite"
+    return ""
 
 
 def _malformed_map(map_: BehaviourMap, before: BehaviourMap | None) -> str:

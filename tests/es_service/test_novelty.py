@@ -1,6 +1,7 @@
 """The novelty archive against a brute-force twin and by hand; the tree changes no bit, nor does the store."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,16 @@ from hypothesis import strategies as st
 
 from es_service.loop.parts import BLOCK_ENTRIES, archive_from_parts, archive_to_parts, block_part
 from es_service.search import novelty as search_novelty
-from es_service.search.novelty import COPIES, TREE_STEP, NoveltyArchive, empty_archive, extended, novelty
+from es_service.search.novelty import (
+    COPIES,
+    TREE_STEP,
+    NoveltyArchive,
+    empty_archive,
+    extended,
+    novelty,
+    same_entries,
+    sound_archive,
+)
 from tests.twins import novelty_search as twin
 
 coordinates = st.integers(-3, 3).map(float) | st.floats(-1e3, 1e3, allow_subnormal=False)
@@ -244,3 +254,17 @@ def test_parts_hold_all_of_it_and_only_changed_blocks_are_written(before, more):
         np.testing.assert_array_equal(getattr(again, name), getattr(new, name))
     queries = rng.normal(size=(20, 2))
     assert of(again, queries, 10) == of(new, queries, 10)
+
+
+def test_an_archive_that_a_search_has_cut_is_one_of_its_own_entries():
+    """Its arrays may begin where those of the archive before do, and still be others."""
+    whole = empty_archive(2)
+    for entry in range(100):
+        whole = extended(whole, [float(entry), 0.0], entry, 0)
+    assert sound_archive(whole) is whole
+    columns = {name: getattr(whole, name)[::2] for name in ("descriptor_N_B", "generation_N", "centre_N")}
+    thinned = sound_archive(replace(whole, **columns, tree=None))
+    np.testing.assert_array_equal(thinned.generation_N, np.arange(0, 100, 2))
+    assert same_entries(thinned, whole) == 1
+    with pytest.raises(ValueError, match="arrays of the novelty archive"):
+        sound_archive(replace(whole, generation_N=whole.generation_N[:50]))

@@ -134,6 +134,18 @@ def centreless(config):
     return _telling(config, lambda state: replace(state, centres=()))
 
 
+def _with_first_centre(state, centre_D):
+    return replace(state, centres=(replace(state.centres[0], centre_D=centre_D), *state.centres[1:]))
+
+
+def broken(config):
+    return _telling(config, lambda state: _with_first_centre(state, state.centres[0].centre_D * np.float32(np.nan)))
+
+
+def doubled(config):
+    return _telling(config, lambda state: _with_first_centre(state, state.centres[0].centre_D.astype(np.float64)))
+
+
 def ragged(config):
     """An archive with fewer generations than descriptors."""
     return _telling(
@@ -210,6 +222,8 @@ def test_a_search_may_lose_what_it_had(tmp_path, name):
             r"generation 0 cannot be stored: the new elite of cell \d+ is centre 0 of generation 1000000, which",
         ),
         ("double", r"generation 0 cannot be stored: the map's cells must be different ones from 0 to 39999; "),
+        ("broken", r"generation 0 cannot be stored: centre 0 has \d+ values that are not finite"),
+        ("doubled", r"generation 0 cannot be stored: centre 0 is float64 \(\d+,\); it must be float32 \(\d+,\)"),
         ("centreless", r"generation 0 cannot be stored: the search has no centre"),
         ("without_map", r"generation 2 cannot be stored: the behaviour map was added or removed, .* 1 is saved"),
     ],
