@@ -41,11 +41,12 @@ def verify(
         if not as_json:
             print_line(console, _line(one))
     certified = []
-    for one, differences in recomputed_certifications(run, workers):
+    for one, differences, changes in recomputed_certifications(run, workers):
         certified.append((one, differences))
         if not as_json:
             what = f"differs: {', '.join(differences)}" if differences else "equal"
-            print_line(console, f"certification {one.number}, {one.name}: {what}")
+            since = f"; since it was made: {', '.join(changes)}" if changes else ""
+            print_line(console, f"certification {one.number}, {one.name}: {what}{since}")
     equal = not any(one.differences for one in found) and not any(differences for _, differences in certified)
     if as_json:
         print_json(

@@ -16,8 +16,8 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from es_service.config.loading import Source
@@ -25,11 +25,13 @@ from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, NotInRunError
 from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import EpisodesResult, TaskSpec
 from es_service.protocol.noise import Domain
 from es_service.runs.certified import MEASURES, Certified, Measure, arrays_of, certified_policies, stored
 from es_service.runs.evaluation import Candidate, candidates, evaluation_config, workers_of
 from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of
+from es_service.runs.identity import changes_since, code_of
 from es_service.runs.selection import Parameters, halved, kept, new_episodes
 from es_service.runs.view import Run, open_run
 from es_service.store.writer import RunStore
@@ -38,7 +40,6 @@ EPISODES = 256
 """Default number of certification episodes."""
 OTHER_PROGRAMS = 2**40
 """Added to the numbers of certifications of other programs' policies, so that no run has their episodes."""
-NOTHING = np.zeros(0)
 TOP = 10
 """Default number of elites that are candidates beside the best centre."""
 
@@ -159,21 +160,21 @@ def certify(
         return _certify(engine, config, given, OTHER_PROGRAMS + number, episodes, keep, by)
 
 
-def recomputed(run: Run, workers: int | None = None) -> Iterator[tuple[Certified, tuple[str, ...]]]:
-    """The stored certifications, each with the names of the results that differ if its episodes are run again."""
+def recomputed(run: Run, workers: int | None = None) -> Iterator[tuple[Certified, tuple[str, ...], list[str]]]:
+    """The stored certifications, each with the names of the results that differ if its episodes are run again, and with
+    what has changed in packages, processor and code since it was made, in words."""
     found = certified_policies(run.folder)
     if not found:
         return
     config = evaluation_config(run, workers)
+    now = _platform(config)
     with _engine(config) as engine:
         for one in found:
             policy = (one.parameters_D, one.observation_mean_O, one.observation_std_O)
             [result] = _certification_episodes(engine, [policy], one.episodes.count, config.seed, one.number)
             again, then = arrays_of(kept(result)), arrays_of(one.episodes)
-            yield (
-                one,
-                tuple(name for name in then if name not in again or then[name].tobytes() != again[name].tobytes()),
-            )
+            equal = {name for name in then if name in again and then[name].tobytes() == again[name].tobytes()}
+            yield one, tuple(name for name in then if name not in equal), changes_since(one.platform, now)
 
 
 def _certify(
@@ -188,7 +189,7 @@ def _certify(
     """Select among candidates, then certify those that remain."""
     measure = _measure(config, by)
     ranked, steps = halved(engine, [one.policy for one in given], config.seed, number, keep, measure)
-    policies = [given[one.index].policy for one in ranked]
+    policies, platform = [given[one.index].policy for one in ranked], _platform(config)
     results = _certification_episodes(engine, policies, episodes, config.seed, number)
     found = []
     for rank, (one, result) in enumerate(zip(ranked, results, strict=True)):
@@ -205,6 +206,7 @@ def _certify(
                 one.count,
                 len(given),
                 steps,
+                platform,
                 kept(result),
                 *candidate.policy,
             )
@@ -224,6 +226,11 @@ def _certification_episodes(
     engine: Evaluator, policies: Sequence[Parameters], episodes: int, seed: int, number: int
 ) -> list[EpisodesResult]:
     return new_episodes(engine, policies, episodes, seed, number, 0, Domain.CERTIFICATION_RESET)
+
+
+def _platform(config: RunConfig) -> dict[str, Any]:
+    """What computes episodes in this process, as it is stored."""
+    return {**platform_info(), CODE: code_of(config)}
 
 
 def _different(chosen: Sequence[Candidate]) -> list[_Named]:

@@ -5,6 +5,7 @@ Axes: E episodes, D policy parameters, O observation, B descriptor dimensions.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -75,6 +76,8 @@ class Certified:
     """Number of policies from which it was chosen."""
     selection_steps: int
     """Environment steps of all selection episodes of the certification, which belong to the cost of the result."""
+    platform: Mapping[str, Any]
+    """Packages, processor and code that computed it; see `runs.identity.changes_since`."""
     episodes: Episodes
     parameters_D: FloatArray
     observation_mean_O: FloatArray
@@ -124,6 +127,7 @@ _FACTS = (
     "selection_episodes",
     "candidates",
     "selection_steps",
+    "platform",
 )
 
 

@@ -17,6 +17,7 @@ from es_service.cli.main import app
 from es_service.config.tasks import task_of
 from es_service.errors import ConfigError, NotInRunError, RunLockedError, StoreError
 from es_service.loop.policies import policy_episodes, policy_work
+from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import EpisodesResult
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.runs import certification
@@ -161,7 +162,14 @@ def test_a_run_goes_on_with_its_certifications(finished, tmp_path):
 
 def test_the_same_episodes_again_have_the_same_bits(finished):
     run, _ = finished
-    assert [differences for _, differences in certification.recomputed(run)] == [()] * 4
+    assert [found[1:] for found in certification.recomputed(run)] == [((), [])] * 4
+
+
+def test_what_has_changed_since_is_named(finished, monkeypatch):
+    run, _ = finished
+    monkeypatch.setattr(certification, "platform_info", lambda: {**platform_info(), "numpy": "99.0"})
+    [(_, _, changes), *_] = certification.recomputed(run)
+    assert changes == [f"numpy {platform_info()['numpy']} -> 99.0"]
 
 
 def test_a_changed_bit_is_seen_and_its_row_removed(finished, tmp_path):
@@ -185,7 +193,7 @@ def test_a_changed_bit_is_seen_and_its_row_removed(finished, tmp_path):
         assert store.next_certification == 2, "its episodes have been seen"
     again = certify_run(tmp_path / "run", top=5, episodes=40)
     assert [one.number for one in again] == [2]
-    assert not any(differences for _, differences in certification.recomputed(damaged))
+    assert not any(differences for _, differences, _ in certification.recomputed(damaged))
 
 
 def test_another_policy_does_not_take_the_place_of_a_damaged_first(finished, tmp_path):
