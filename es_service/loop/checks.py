@@ -148,10 +148,13 @@ def require_finite(centres: Sequence[Centre], search: SearchConfig, generation: 
     """Raise an EvaluationError if a centre is not finite after its update."""
     if all(np.isfinite(centre.parameters_D).all() for centre in centres):
         return
-    learning_rate = search.step.learning_rate if isinstance(search, PopulationConfig) else 0.0
+    saved = f"so it is not kept. Everything up to generation {generation - 1} is saved."
+    if not isinstance(search, PopulationConfig):  # a search of the user's, with a step of its own
+        raise EvaluationError(f"generation {generation}: a centre is not finite after its update, {saved}")
+    learning_rate = search.step.learning_rate
     raise EvaluationError(
         f"generation {generation}: a centre is not finite after its update with {LEARNING_RATE} = {learning_rate:g}, "
-        f"so it is not kept. Everything up to generation {generation - 1} is saved.",
+        f"{saved}",
         field=LEARNING_RATE,
         value=learning_rate,
         ways_out=[

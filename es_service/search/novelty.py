@@ -1,8 +1,8 @@
 """Novelty: mean distance of a descriptor to its nearest entries of the novelty archive.
 
-Source: Conti et al. 2018 (arXiv:1712.06560). The novelty archive only grows: it gets one entry for each valid evaluated
-centre, in order. In a large archive a k-d tree proposes the candidates, but distances are always computed by the same
-float64 expression, so the tree does not change any bit of the result.
+Source: Conti et al. 2018 (arXiv:1712.06560). With our searches the novelty archive only grows: it gets one entry for
+each valid evaluated centre, in order. In a large archive a k-d tree proposes the candidates, but distances are always
+computed by the same float64 expression, so the tree does not change any bit of the result.
 
 Axes: N entries of the novelty archive, Q queries, K nearest candidates, B descriptor dimensions.
 """
@@ -57,7 +57,7 @@ class _Room:
 
 @dataclass(frozen=True)
 class NoveltyArchive:
-    """Descriptors of all valid centres evaluated so far, in order. It is immutable: `extended` returns a new one."""
+    """Descriptors of the valid centres evaluated so far, in order. It is immutable: `extended` returns a new one."""
 
     descriptor_N_B: NDArray[np.float64]
     generation_N: NDArray[np.int64]
