@@ -31,7 +31,7 @@ OBSERVATIONS, COUNTERS, WEIGHT, BEST, GEOMETRY_PART = "observations", "counters"
 CENTRE_PREFIX, CELL_PREFIX, ELITE_PREFIX, BLOCK_PREFIX = "centre_", "cell_", "elite_", "novelty_"
 """Prefixes of the names of numbered parts."""
 BLOCK_ENTRIES = 256
-"""Entries of the novelty archive in one part. A generation that only adds entries rewrites only the last of these parts."""
+"""Entries of the novelty archive in one part. A generation that only adds entries rewrites the last of these parts."""
 
 
 def centre_part(index: int) -> str:
