@@ -78,7 +78,9 @@ def _defaults(config: Mapping[str, Any], values: Mapping[str, Any], task: TaskSp
     except ConfigError:
         return {}
     first = {TASK_OPTIONS + name: option.default for name, option in task.options.items()}
-    return plain | {key: followed[key] for key in LEFT_OPEN} | first | {PRESET: "literature"}
+    fields = search_fields(method.settings)  # a key of a part's kind that is not the default has a default of its own
+    kinds = {key: fields[key].default for key in values.keys() & fields.keys() if not fields[key].is_required()}
+    return kinds | plain | {key: followed[key] for key in LEFT_OPEN} | first | {PRESET: "literature"}
 
 
 def _plain(value: Any) -> Any:

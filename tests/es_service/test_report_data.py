@@ -54,6 +54,13 @@ def test_a_chosen_option_and_another_preset_are_settings(tmp_path):
     }
 
 
+def test_a_key_of_another_kind_of_part_has_its_own_default(tmp_path):
+    wanted = {"search.shaping.kind": "top_pairs", "search.shaping.count": 2, "search.algorithm": "es"}
+    config = open_run(write_run(tmp_path / "run", wanted)).config
+    found = {one.key: (one.value, one.default) for one in settings.changed_settings(config, POINT)}
+    assert found == {"search.shaping.kind": ("top_pairs", "ranks"), "search.shaping.count": ("2", "null")}
+
+
 def test_all_settings_are_shown_if_the_defaults_are_unknown(folder):
     config = open_run(folder).config
     found = settings.changed_settings(config | {"search": config["search"] | {"forgotten": 3}}, POINT)
