@@ -64,8 +64,6 @@ OTHER = {
     "search.step.learning_rate": 0.3,
     "search.step.l2": 0.1,
     "search.step.kind": "plain",
-    "search.step.max_speed": 0.001,
-    "search.step.momentum": 0.1,
     "search.shaping.kind": "signs",
     "search.centres": 4,
     "search.update": "all",
@@ -116,8 +114,6 @@ ONE_VALUE = {
     "map.enabled": ("me_es", "memes", "map_elites"),
     "search.shaping.count": tuple(name for name in OURS if name != "ars"),  # the others have another kind by default
     "search.step.kind": ("ars",),  # it is plain by default
-    "search.step.max_speed": tuple(OURS),  # none has the kind clipup by default
-    "search.step.momentum": tuple(OURS),
 }
 """Key -> methods that allow only one value of it, so that no other can be measured."""
 

@@ -133,6 +133,8 @@ def test_clipup_by_hand():
     np.testing.assert_allclose(twice - once, [0.09, 0.12], rtol=1e-6)
     state, without_a_signal = clipup_step(step, state, twice, np.zeros(2, np.float32))
     np.testing.assert_allclose(without_a_signal - twice, [0.081, 0.108], rtol=1e-6)  # 0.9 of the velocity
+    _, braked = clipup_step(step.model_copy(update={"momentum": 0.5}), state, twice, np.zeros(2, np.float32))
+    np.testing.assert_allclose(braked - twice, [0.0405, 0.054], rtol=1e-6)  # half of the velocity after that step
     _, pulled = clipup_step(
         ClipUpStep(learning_rate=0.1, l2=1.0), fresh_clipup(2), np.float32([3.0, 4.0]), np.zeros(2, np.float32)
     )
