@@ -30,7 +30,7 @@ from es_service.protocol.messages import EpisodesResult, TaskSpec
 from es_service.protocol.noise import Domain
 from es_service.runs.certified import MEASURES, Certified, Measure, arrays_of, certified_policies, stored
 from es_service.runs.evaluation import Candidate, candidates, evaluation_config, workers_of
-from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of
+from es_service.runs.evaluator import evaluating_config, policies_of, statistics_of, whole
 from es_service.runs.identity import changes_since, code_of
 from es_service.runs.selection import Parameters, halved, kept, new_episodes
 from es_service.runs.view import Run, open_run
@@ -94,7 +94,8 @@ def certify_run(
         ConfigError: a number is wrong, or the task does not have what `by` names. EvaluationError: the rollouts cannot
         continue. Interrupted: SIGINT or SIGTERM arrived. Then nothing is stored.
     """
-    _require_numbers(episodes=(episodes, 1), keep=(keep, 1), top=(top or 0, 0))
+    for name, value, least in (("episodes", episodes, 1), ("keep", keep, 1), ("top", top or 0, 0)):
+        whole(name, value, least)
     run = open_run(folder)
     with RunStore.open(run.folder) as store:
         for notice in store.notices:
@@ -149,7 +150,8 @@ def certify(
     Raises:
         ConfigError: an argument is wrong. Otherwise as `certify_run`.
     """
-    _require_numbers(episodes=(episodes, 1), keep=(keep, 1), number=(number, 0))
+    for name, value, least in (("episodes", episodes, 1), ("keep", keep, 1), ("number", number, 0)):
+        whole(name, value, least)
     config = evaluating_config(config, workers, "inline", None)
     _measure(config, by)
     task = task_of(config)
@@ -212,14 +214,6 @@ def _certify(
             )
         )
     return found
-
-
-def _require_numbers(**numbers: tuple[int, int]) -> None:
-    """Raise ConfigError for a value that is no whole number, or below its least one; (value, least) by name."""
-    for name, (value, least) in numbers.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            allowed = f"a whole number of at least {least}"
-            raise ConfigError(f"{name} is {value!r}; must be {allowed}", field=name, value=value, allowed=allowed)
 
 
 def _certification_episodes(

@@ -66,7 +66,7 @@ class PolicyEvaluator:
 
     def initial(self, number: int = 0) -> FloatArray:
         """Parameters [D] with which a run of this config would begin, those of centre `number`: see `policy.init`."""
-        return initial_policy(self.config, _whole("number", number, 0))
+        return initial_policy(self.config, whole("number", number, 0))
 
     def __call__(
         self,
@@ -103,9 +103,9 @@ class PolicyEvaluator:
         asked = policy_work(
             policies_N_D,
             statistics,
-            _whole("episodes", episodes, 1),
-            seed=self.config.seed if seed is None else _whole("seed", seed, 0),
-            generation=_whole("generation", generation, 0),
+            whole("episodes", episodes, 1),
+            seed=self.config.seed if seed is None else whole("seed", seed, 0),
+            generation=whole("generation", generation, 0),
         )
         try:
             answers = self._engine.evaluate(asked.work)
@@ -255,8 +255,8 @@ def _floats(name: str, given: ArrayLike, allowed: str) -> FloatArray:
         return np.ascontiguousarray(array, dtype=np.float32)
 
 
-def _whole(name: str, given: int, least: int) -> int:
-    """An argument that must be an integer in a range."""
+def whole(name: str, given: int, least: int) -> int:
+    """An argument that must be an integer from `least` on. Raises ConfigError if it is not."""
     if isinstance(given, bool) or not isinstance(given, int | np.integer) or not least <= given <= LARGEST:
         raise _wrong(name, f"is {given!r}", given, f"an integer from {least} to 2**63 - 1")
     return int(given)
