@@ -13,7 +13,8 @@ RESOURCES = "compute.worker_resources."
 """Prefixes of the keys in two groups inside sections; a task declares those of the first."""
 
 
-def _tuple(value: Any) -> Any:
+def as_tuple(value: Any) -> Any:
+    """A list as a tuple, since a file has lists and a config has none."""
     return tuple(value) if isinstance(value, list) else value
 
 
@@ -35,6 +36,7 @@ Patience = Annotated[float, Field(ge=20), "a number, at least 20"]
 NotNegative = Annotated[float, Field(ge=0), "a number, at least 0"]
 Number = Annotated[float, "a number"]
 Fraction = Annotated[float, Field(ge=0, le=1), "a number from 0 to 1"]
+Share = Annotated[float, Field(gt=0, le=1), "a number above 0, at most 1"]
 Seed = Annotated[int, Field(ge=0, lt=2**63), "a whole number, at least 0 and below 2**63"]
 Switch = Annotated[bool, "true or false"]
 Text = Annotated[str, Field(min_length=1), "text"]
@@ -42,14 +44,15 @@ Options = dict[Text, bool | int | float | str]
 """Values of options by name; `config/options.py` checks them against what is declared."""
 Widths = Annotated[
     tuple[Count, ...],
-    BeforeValidator(_tuple),
+    BeforeValidator(as_tuple),
     "a list of whole numbers, each at least 1, such as [64, 64]",
 ]
+Point = Annotated[tuple[float, ...], BeforeValidator(as_tuple), "a list of numbers, such as [35, -25]"]
 BoundPairs = Annotated[Bounds, BeforeValidator(_tuples), "a list of pairs [low, high], such as [[-1, 1], [-1, 1]]"]
 CellCounts = Annotated[
     tuple[Count, ...],
     Field(min_length=1),
-    BeforeValidator(_tuple),
+    BeforeValidator(as_tuple),
     "a list of whole numbers, each at least 1, such as [20, 20]",
 ]
 

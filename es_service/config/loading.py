@@ -29,7 +29,8 @@ from es_service.config.methods import (
     search_fields,
 )
 from es_service.config.model import RunConfig
-from es_service.config.options import read_options
+from es_service.config.objective_rules import objective_problems
+from es_service.config.options import options_of, read_options
 from es_service.config.problems import nearest, not_allowed, one_of, unfit, wrong_value
 from es_service.config.resolution import (
     LEFT_OPEN,
@@ -45,7 +46,7 @@ from es_service.config.shipped import read_config
 from es_service.config.start import folder_problems
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, Problem
-from es_service.protocol.messages import TaskSpec
+from es_service.protocol.messages import TaskSpec, with_options
 from es_service.protocol.user_code import in_no_file
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
@@ -179,6 +180,7 @@ def _load(
     if task is not None:
         problems += task_problems(values, task) + policy_problems(values, task)
         problems += map_problems(values, task) + rollout_problems(values, task)
+        problems += objective_problems(values, with_options(task, options_of(values)))
     if settings is not None:
         problems += _idle_problems(idle, values, algorithms) + method_problems(values, settings)
     problems += shape_problems(values) + engine_problems(values)

@@ -136,6 +136,9 @@ def method_problems(values: Mapping[str, Any], settings: type[SearchConfig]) -> 
     if not settings.gathers_statistics and values.get("policy.observation_normalization") is True:
         why = f" for {method}, which has no training episodes to gather statistics from"
         problems.append(not_allowed("policy.observation_normalization", True, "false", why=why))
+    if settings.needs_start and not values.get("search.init_from"):
+        why = f" for {method}, {settings.needs_start}"
+        problems.append(not_allowed("search.init_from", values.get("search.init_from"), "the folder of a run", why=why))
     if settings.needs_map and values.get("map.enabled", True) is False:
         problems.append(not_allowed("map.enabled", False, "true", why=f" for {method}, {settings.needs_map}"))
     return problems

@@ -1,15 +1,16 @@
-"""Parts of a search that every method with a gradient can take, each chosen by its `kind`: the step and the shaping.
+"""Parts of a search, each chosen by its `kind`: the step, the shaping, and what members are ranked by (objectives).
 
-A kind is a class here, whose other fields are its keys, and a function in `search/steps/` or `search/shaping.py`.
+A kind is a class here, whose other fields are its keys, and a function in `search/steps/`, `search/shaping.py` or
+`search/objectives.py`.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
-from es_service.config.fields import Count, Fraction, NotNegative, Positive, Section
+from es_service.config.fields import Count, Fraction, NotNegative, Point, Positive, Section, as_tuple
 
 
 class AdamStep(Section):
@@ -86,5 +87,52 @@ class TopPairs(Section):
     )
 
 
+class FitnessObjective(Section):
+    """Fitness, which `task.fitness` defines."""
+
+    kind: Literal["fitness"] = "fitness"
+
+
+class ReturnObjective(Section):
+    """The sum of the rewards, whatever `task.fitness` is."""
+
+    kind: Literal["return"] = "return"
+
+
+class GoalObjective(Section):
+    """How near to the goal an episode ends, in a task that has one."""
+
+    kind: Literal["goal_distance"] = "goal_distance"
+
+
+class NoveltyObjective(Section):
+    """Novelty in the novelty archive."""
+
+    kind: Literal["novelty"] = "novelty"
+
+
+class MixtureObjective(Section):
+    """Fitness and novelty, each shaped by itself."""
+
+    kind: Literal["mixture"] = "mixture"
+    weight: Fraction = Field(0.5, description="Of kind mixture: weight of fitness beside novelty.")
+
+
+class TargetObjective(Section):
+    """Fitness among the members that end in a ball of descriptors; all others rank below these, by their distance."""
+
+    kind: Literal["target"] = "target"
+    descriptor: Point = Field((), description="Of kind target: middle of the set, one number for each dimension.")
+    radius: Positive = Field(1.0, description="Of kind target: greatest distance from the middle inside of the set.")
+
+
 Step = AdamStep | AdamWStep | PlainStep | ClipUpStep
 Shaping = Ranks | Signs | Returns | TopPairs
+Objective = FitnessObjective | ReturnObjective | GoalObjective | NoveltyObjective | MixtureObjective | TargetObjective
+Objectives = Annotated[
+    tuple[Annotated[Objective, Field(discriminator="kind")], ...],
+    Field(min_length=1),
+    BeforeValidator(as_tuple),
+    "a list of objectives, such as [{kind: novelty}, {kind: fitness}, {kind: mixture, weight: 0.5}, {kind: target, "
+    "descriptor: [35, -25], radius: 5}], also of kind return or goal_distance",
+]

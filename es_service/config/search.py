@@ -10,8 +10,8 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from es_service.config.fields import Count, Fraction, Positive, Section, Switch, Text
-from es_service.config.parts import AdamStep, Ranks, Shaping, Step
+from es_service.config.fields import Count, Fraction, NotNegative, Positive, Section, Share, Switch, Text
+from es_service.config.parts import AdamStep, FitnessObjective, Objective, Ranks, Shaping, Step
 from es_service.config.presets import PresetRow
 
 
@@ -52,6 +52,8 @@ class SearchConfig(Section):
     """What `centres: auto` stands for."""
     only_centres: ClassVar[int | str | None] = None
     """The only number of centres that is allowed, or the key that has it; None: any number."""
+    needs_start: ClassVar[str] = ""
+    """What the method needs `init_from` for, as a clause about it; empty if it can start from random weights."""
     needs_map: ClassVar[str] = ""
     """What the method needs a behaviour map for, as a clause about it: "whose ..."; empty if it needs none."""
     gathers_statistics: ClassVar[bool] = False
@@ -89,12 +91,25 @@ class PopulationConfig(SearchConfig):
         "population, or one for each centre with search.emitters and search.update: all. Set by the preset."
     )
     sigma: Positive = Field(0.02, description="Standard deviation of the parameter noise, in parameter units.")
+    sigma_decay: Share = Field(
+        1.0, description="Factor by which sigma changes in each generation; 1 keeps it. EvoJAX has 0.999."
+    )
+    sigma_limit: NotNegative = Field(0.0, description="Sigma never falls below this.")
     step: Step = Field(
         AdamStep(learning_rate=0.01, l2=0.005),
         discriminator="kind",
         description="How a centre moves along the gradient estimate. adam: by Adam. adamw: by Adam, with a weight "
         "decay outside of its moments. plain: by the estimate times the learning rate. clipup: by ClipUp, a momentum "
         "along normalised estimates with a greatest speed.",
+    )
+    learning_rate_decay: Share = Field(
+        1.0, description="Factor by which the learning rate changes in each generation; 1 keeps it. EvoJAX has 0.999."
+    )
+    learning_rate_limit: NotNegative = Field(0.0, description="The learning rate never falls below this.")
+    step_gate: Switch = Field(
+        False,
+        description="Whether each step is shortened to the agreement of the two halves of the pairs: the learning rate "
+        "is multiplied by the cosine between their gradient estimates, or by 0 if that is negative.",
     )
     shaping: Shaping = Field(
         Ranks(),
@@ -119,3 +134,38 @@ class PopulationConfig(SearchConfig):
     def populations(self) -> int:
         """One population, unless a method has several."""
         return 1
+
+
+class CandidatesConfig(PopulationConfig):
+    """A search that starts from several policies of another run: its best centre, and elites of its map."""
+
+    screened: Count = Field(
+        16,
+        description="Policies of the run that search.init_from names, from which the search starts: the best centre "
+        "and elites. Their first evaluation chooses search.candidates of them.",
+    )
+    candidates: Count = Field(4, description="Policies that remain after the first evaluation.")
+    candidate_choice: Literal["fitness", "novelty", "place"] = Field(
+        "fitness",
+        description="Which elites these are. fitness: the fittest. novelty: the most novel, in the novelty archive of "
+        "that run. place: those nearest to the middle of the target set of search.objective.",
+    )
+    objective: Objective = Field(
+        FitnessObjective(),
+        discriminator="kind",
+        description="What members are ranked by, and candidates. fitness: what task.fitness says. return: the sum of "
+        "the rewards. goal_distance: how near to the goal an episode ends. novelty, mixture: novelty, alone or beside "
+        "fitness. target: fitness among those that end in a set of descriptors, before all others, which rank by their "
+        "distance from it.",
+    )
+
+    only_centres = "search.screened"
+    needs_start = "which improves policies of another run"
+
+    def populations(self) -> int:
+        """One for each candidate."""
+        return self.candidates
+
+    def spread_keys(self) -> tuple[str, ...]:
+        """The key that makes more populations."""
+        return ("search.candidates",)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.config.model import BudgetConfig
+from es_service.config.search import PopulationConfig
 from es_service.loop import budget as budgets
 from es_service.loop.changes import changed_parts
 from es_service.loop.checks import (
@@ -42,6 +43,7 @@ from es_service.loop.generation import (
     evaluate_centres,
     evaluate_populations,
     fittest,
+    halves,
     initial_state,
     make_centre,
     tell,
@@ -143,7 +145,7 @@ def propose(search: Search, store: Store, state: RunState) -> Proposal:
     config, algorithm, generation = search.config, search.algorithm, state.generation + 1
     begun = state.search
     if generation == 0:
-        points = [make_centre(config, 0, centre.centre_D, state.observations) for centre in begun.centres]
+        points = [make_centre(config, 0, one.centre_D, state.observations, one) for one in begun.centres]
         return Proposal(0, begun, {}, (), points, ())
     start_cells = algorithm.start_cells(begun, generation)
     for index, cell in start_cells.items():
@@ -218,7 +220,12 @@ def _step(
         weights.append(algorithm.weights(proposal.search, ask, population))
         require_weights(weights[-1], ask, generation)
     clock.lap("seconds_driver")
-    gradients = estimate_gradients(evaluator, generation, weights, config.compute.gradient_block_pairs)
+    block_pairs = config.compute.gradient_block_pairs
+    if isinstance(config.search, PopulationConfig) and config.search.step_gate:
+        gradients, agreements = halves(evaluator, generation, weights, block_pairs)
+        asks = [replace(ask, rate=ask.rate * one) for ask, one in zip(asks, agreements, strict=True)]
+    else:
+        gradients = estimate_gradients(evaluator, generation, weights, block_pairs)
     clock.lap("seconds_gradient")
     moved = proposal.search
     for ask, gradient_D in zip(asks, gradients, strict=True):

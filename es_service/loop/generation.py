@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import islice
 from typing import Literal, TypeVar
 
@@ -35,7 +36,7 @@ from es_service.protocol.messages import (
     around,
     evaluation_chunks,
 )
-from es_service.search.algorithms.base import Algorithm, CentreEvaluation, CentreState, SearchState, frozen
+from es_service.search.algorithms.base import Algorithm, CentreEvaluation, CentreState, SearchState, frozen, with_centre
 from es_service.search.algorithms.common import first_state
 from es_service.search.maps.behaviour_map import Elite, empty_map, make_elite
 from es_service.search.maps.geometry import make_geometry
@@ -51,6 +52,9 @@ def initial_state(search: Search) -> RunState:
         map_ = empty_map(make_geometry(search.config.map), counts_samples=algorithm.counts_samples)
     dimensions, settings = len(search.task.descriptor_names), search.config.search
     learned = first_state(centres, dimensions, algorithm.fitness_weight, map_, algorithm.own, settings)
+    for index, (mean_O, std_O) in enumerate(search.statistics()):
+        centre = replace(learned.centres[index], own_mean_O=mean_O, own_std_O=std_O)
+        learned = with_centre(learned, index, centre)
     first = make_centre(search.config, 0, centres[0], observations)
     best = Best(0, -math.inf, centres[0], first.observation_mean_O, first.observation_std_O)
     return RunState(-1, learned, observations, best, env_steps=0, episodes=0, wall_clock_s=0.0)
@@ -67,7 +71,7 @@ def make_centre(
     """The centre as it is sent to the workers: its parameters and the observation statistics that it runs with.
 
     Args:
-        state: it may have statistics of its own; None for an initial centre.
+        state: it may have statistics of its own; None for those of the whole run.
         sigma: of its population; 0 for an initial centre, which has none.
     """
     mean_O, std_O = statistics_in_force(observations, state, config.policy.observation_normalization)
@@ -155,6 +159,31 @@ def estimate_gradients(
     ]
 
 
+def halves(
+    evaluator: Evaluator, generation: int, weights: Sequence[FloatArray], block_pairs: int
+) -> tuple[list[FloatArray], list[float]]:
+    """As `estimate_gradients`, and how well the two halves of each population agree, from 0 to 1.
+
+    Each half's estimate is from its own pairs; the agreement is the cosine between them, or 0 if that is negative or
+    one of them is 0.
+    """
+    parts = []
+    for is_first in (True, False):
+        half = [np.where((np.arange(one.size) < one.size // 2) == is_first, one, np.float32(0.0)) for one in weights]
+        parts.append(estimate_gradients(evaluator, generation, half, block_pairs))
+    pairs = list(zip(*parts, strict=True))
+    return [first_D + second_D for first_D, second_D in pairs], [_agreement(*one) for one in pairs]
+
+
+def _agreement(first_D: FloatArray, second_D: FloatArray) -> float:
+    first, second, both = (
+        float(np.sum(np.multiply(one, other, dtype=np.float64)))
+        for one, other in ((first_D, first_D), (second_D, second_D), (first_D, second_D))
+    )
+    length = math.sqrt(first) * math.sqrt(second)
+    return max(0.0, both / length) if length > 0.0 else 0.0
+
+
 def _evaluate(kind: type[Result], evaluator: Evaluator, asked: Sequence[Sequence[Work]]) -> list[list[Result]]:
     """The results of each ask's chunks; all are computed side by side."""
     results = evaluator.evaluate([one for work in asked for one in work])
@@ -181,6 +210,7 @@ def centre_evaluation(
         evaluation.descriptor.astype(np.float64).mean(axis=0),
         _highest(population.fitness) if population is not None else math.nan,
         len(evaluation.fitness),
+        evaluation,
     )
 
 

@@ -52,3 +52,6 @@ class Search:
     """Returns the initial centres [D] and their observation statistics, which are empty unless the centres are from
     another run."""
     task: TaskSpec
+    statistics: Callable[[], Sequence[tuple[FloatArray, FloatArray]]] = lambda: ()
+    """Returns mean and standard deviation of observations, [O] each, that each initial centre keeps as its own; none if
+    they all use those of the whole run."""

@@ -11,6 +11,8 @@ import numpy as np
 from es_service.config.changes import START_KEYS, does_not_fit, start_afresh
 from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.model import RunConfig, policy_shape
+from es_service.config.parts import TargetObjective
+from es_service.config.search import CandidatesConfig
 from es_service.config.start import start_of
 from es_service.config.tasks import task_of
 from es_service.config.yaml_text import show
@@ -24,6 +26,7 @@ from es_service.loop.parts import (
     WEIGHT,
     Arrays,
     Parts,
+    archive_from_parts,
     moments_from_arrays,
     moments_to_arrays,
     weight_from_arrays,
@@ -32,13 +35,16 @@ from es_service.loop.parts import (
 )
 from es_service.protocol.messages import Moments
 from es_service.runs.checked_config import changed_config, changes_from
+from es_service.runs.moment import Moment, Policy, make_policy
 from es_service.runs.view import Run, is_no_elite, open_run
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import NO_CELL, FitnessWeight
+from es_service.search.algorithms.starts import elite_novelty
+from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.search.observation_statistics import no_observations
 from es_service.search.steps import fresh_state
 from es_service.store import reader
-from es_service.store.beginning import Beginning
+from es_service.store.beginning import SEVERAL, Beginning
 from es_service.store.certifications import CERTIFICATIONS
 from es_service.store.codec import Part
 from es_service.store.digest import digest_at
@@ -189,6 +195,8 @@ def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> t
             value=init_from,
             run=origin.folder,
         )
+    if isinstance(config.search, CandidatesConfig):
+        return _several(origin, config, config.search, which, tell)
     moment = origin.at(wanted=is_no_elite)
     moments, own = moments_from_arrays(moment.parts[OBSERVATIONS]), None
     if which == "centre":
@@ -205,13 +213,64 @@ def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> t
         # The statistics that the policy runs with, weighted by the run's number of observations.
         mean_O, std_O = (values.astype(np.float64) for values in own)
         moments = Moments(moments.count, mean_O, moments.count * np.square(std_O))
+    _tell_otherwise(origin, config, tell)
+    start = {"centre_D": centre_D, **moments_to_arrays(moments)}
+    return _lineage(origin, moment.generation), Beginning(start=start)
+
+
+def _several(
+    origin: Run, config: RunConfig, search: CandidatesConfig, which: object, tell: Callable[[str], None]
+) -> tuple[dict[str, Any], Beginning]:
+    """As `started`, for a search that starts from several policies: the best centre of another run, then elites."""
+    if which != "centre":
+        raise ConfigError(
+            f"search.init_from: {search.init_from} names one policy, but {search.algorithm} chooses "
+            f"{search.screened} of a run by itself; name the folder {origin.folder} alone",
+            field="search.init_from",
+            value=search.init_from,
+            suggestion=str(origin.folder),
+            run=origin.folder,
+        )
+    moment = origin.at()
+    policies = [moment.policy("best")]
+    if origin.constants["map.enabled"]:
+        map_, elites = moment.elites()
+        for row in _by_choice(moment, map_, config, search):
+            elite = elites[int(map_.cell_N[row])]
+            policies.append(make_policy(origin.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O))
+    different: dict[bytes, Policy] = {}
+    for one in policies:  # the best centre is often an elite
+        different.setdefault(one.parameters_D.tobytes() + one.observation_mean_O.tobytes(), one)
+    chosen = list(different.values())[: search.screened]
+    _tell_otherwise(origin, config, tell)
+    start = {
+        SEVERAL: np.stack([one.parameters_D for one in chosen]),
+        "mean_K_O": np.stack([one.observation_mean_O for one in chosen]),
+        "std_K_O": np.stack([one.observation_std_O for one in chosen]),
+        **moments_to_arrays(no_observations(origin.policy_shape.widths[0])),
+    }
+    return _lineage(origin, moment.generation), Beginning(start=start)
+
+
+def _by_choice(moment: Moment, map_: BehaviourMap, config: RunConfig, search: CandidatesConfig) -> list[int]:
+    """Rows of the map in the order of `search.candidate_choice`, the older one of equal ones first."""
+    if search.candidate_choice == "novelty":
+        archive = archive_from_parts(moment.parts, map_.descriptor_N_B.shape[1])
+        key_N = -elite_novelty(map_, archive, config.novelty)
+    elif search.candidate_choice == "place":
+        middle = search.objective.descriptor if isinstance(search.objective, TargetObjective) else ()
+        key_N = np.linalg.norm(map_.descriptor_N_B - np.asarray(middle), axis=1)
+    else:
+        key_N = -map_.fitness_N
+    return np.argsort(key_N, kind="stable").tolist()
+
+
+def _tell_otherwise(origin: Run, config: RunConfig, tell: Callable[[str], None]) -> None:
     if other := _seen_otherwise(origin, config):
         tell(
             f"search.init_from: this run processes observations differently from {origin.folder} ({other}), so the "
             "policy taken from there may act differently"
         )
-    start = {"centre_D": centre_D, **moments_to_arrays(moments)}
-    return _lineage(origin, moment.generation), Beginning(start=start)
 
 
 def _seen_otherwise(origin: Run, config: RunConfig) -> str:

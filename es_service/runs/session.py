@@ -31,6 +31,7 @@ from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run, open_run
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
+from es_service.store.beginning import SEVERAL
 from es_service.store.codec import Part
 from es_service.store.writer import RunStore
 from workers.actor import WorkerActor
@@ -114,6 +115,7 @@ def work(
         algorithm=ALGORITHMS[config.search.algorithm](config),
         initial=lambda: initial_centres(config, store.start),
         task=task,
+        statistics=lambda: initial_statistics(store.start),
     )
     code = code_of(config)
     tell_of_other_code(store, code, tell)
@@ -236,7 +238,7 @@ def make_engine(
 
 def initial_centres(config: RunConfig, start: Part | None) -> tuple[list[FloatArray], Moments]:
     """The initial centres and observation statistics: random centres without statistics, or copies of the policy of
-    `search.init_from` with its statistics, which the run has stored as its start.
+    `search.init_from` with its statistics, or several policies, which the run has stored as its start.
 
     Raises StoreError if the run should have a start and has none.
     """
@@ -247,8 +249,17 @@ def initial_centres(config: RunConfig, start: Part | None) -> tuple[list[FloatAr
         )
     task, centres = task_of(config), range(config.search.centres)
     if start is not None:
-        return [start["centre_D"] for _ in centres], moments_from_arrays(start)
+        several = start.get(SEVERAL)
+        points = list(several) if several is not None else [start["centre_D"] for _ in centres]
+        return points, moments_from_arrays(start)
     return [initial_policy(config, centre) for centre in centres], no_observations(task.observation_size)
+
+
+def initial_statistics(start: Part | None) -> list[tuple[FloatArray, FloatArray]]:
+    """Observation statistics of each initial centre that starts from one of several policies; else none."""
+    if start is None or SEVERAL not in start:
+        return []
+    return list(zip(start["mean_K_O"], start["std_K_O"], strict=True))
 
 
 def initial_policy(config: RunConfig, centre: int) -> FloatArray:

@@ -23,7 +23,7 @@ from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info
 from es_service.runs.checked_config import changed_config
 from es_service.runs.identity import changes_since, code_of
-from es_service.runs.session import dispatch_limits, initial_centres
+from es_service.runs.session import dispatch_limits, initial_centres, initial_statistics
 from es_service.runs.signals import stop_on_signals
 from es_service.runs.view import Run
 from es_service.search.algorithms import ALGORITHMS
@@ -87,6 +87,7 @@ def _verify(run: Run, generations: int, workers: int | None) -> Iterator[Recompu
         algorithm=ALGORITHMS[config.search.algorithm](config),
         initial=lambda: initial_centres(config, reader.read_start(run.folder)),
         task=task,
+        statistics=lambda: initial_statistics(reader.read_start(run.folder)),
     )
     with (
         stop_on_signals() as should_stop,

@@ -28,6 +28,8 @@ from es_service.store.codec import (
 )
 from es_service.store.schema import RunMeta, history_insert
 
+SEVERAL = "centre_K_D"
+"""Array of a start from several policies, instead of "centre_D"; "mean_K_O" and "std_K_O" are their statistics."""
 _START = "start"
 """Key of the start in the table `meta`."""
 

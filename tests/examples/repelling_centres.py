@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from es_service.config.model import RunConfig
+from es_service.config.parts import FitnessObjective
 from es_service.config.search import PopulationConfig
 from es_service.protocol.messages import EpisodesResult
 from es_service.search.algorithms.base import NO_ENTRY, Algorithm, Ask, SearchState
@@ -38,7 +39,9 @@ def repelling_centres(config: RunConfig) -> Algorithm:
     search = settings_of(config, RepellingSettings)
 
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
-        return tuple(population(state, index, search, 1.0) for index in range(len(state.centres)))
+        return tuple(
+            population(state, index, search, FitnessObjective(), generation) for index in range(len(state.centres))
+        )
 
     def weights(state: SearchState, asked: Ask, results: EpisodesResult) -> np.ndarray:
         utility_P_S = centred_ranks(results.fitness)

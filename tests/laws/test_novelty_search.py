@@ -18,10 +18,10 @@ from es_service.search.algorithms.common import (
     archived,
     choose_centre,
     first_state,
-    mixed_utilities,
     novelty_of_centres,
 )
 from es_service.search.algorithms.nsra_es import adapted_weight
+from es_service.search.objectives import utilities, weighted
 from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
 from tests.twins import novelty_search as twin
@@ -290,7 +290,8 @@ def test_invalid_members_are_last_whatever_is_climbed(weight, shaping):
     (population,) = invalidate([population], 0.5, 1)
     assert np.isnan(population.fitness).sum() == 2
     state = archived(first_state([np.zeros(1, np.float32)], 2, weight), CentreEvaluation(0, 0, True, 0.0, np.zeros(2)))
-    utility = mixed_utilities(state, weight, population, config_of("nsr_es").novelty, KINDS[shaping])
+    novelty = config_of("nsr_es").novelty
+    utility = utilities(weighted(weight), population, state.archive, novelty, KINDS[shaping])
     assert utility[0, 1] == utility[1, 0] == utility.min() <= utility[0, 0] < utility[1, 1] == utility.max()
     assert (utility.min() < utility[0, 0]) == (shaping == "ranks")  # with returns, as low as the worst valid member
 

@@ -20,8 +20,9 @@ from es_service.search.algorithms.ns_es import ns_es
 from es_service.search.algorithms.nsr_es import nsr_es
 from es_service.search.algorithms.nsra_es import nsra_es
 from es_service.search.algorithms.own import own_method
+from es_service.search.algorithms.polish import polish
 
-OURS: dict[str, Method] = {one.name: one for one in (es, ns_es, nsr_es, nsra_es, me_es, memes, map_elites, ars)}
+OURS: dict[str, Method] = {one.name: one for one in (es, ns_es, nsr_es, nsra_es, me_es, memes, map_elites, ars, polish)}
 """The shipped methods, the simplest first: a config that no search uses may leave `search.algorithm` out."""
 
 

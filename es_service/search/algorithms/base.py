@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.config.parts import Objective
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.novelty import NoveltyArchive, sound_archive
@@ -131,6 +132,10 @@ class Ask:
     """Number of antithetic pairs: a multiple of `compute.chunk_pairs`."""
     fitness_weight: float
     """Weight of fitness relative to novelty in this generation, from 0 to 1."""
+    objective: Objective | None = None
+    """What members are ranked by; None: fitness and novelty by `fitness_weight`."""
+    rate: float = 1.0
+    """Factor of the learning rate in this generation."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +172,8 @@ class CentreEvaluation:
     """Highest fitness of a valid member of the population that led to it; NaN for an initial centre."""
     episodes: int = 1
     """Number of the episodes."""
+    results: EpisodesResult | None = None
+    """Results of each episode, [E]."""
 
 
 def _without_populations(*arguments: object) -> Any:

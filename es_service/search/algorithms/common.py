@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.config.model import NoveltyConfig, RunConfig
-from es_service.config.parts import Ranks, Shaping
+from es_service.config.parts import Objective
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.protocol.noise import Domain, stream_keys, uniforms
@@ -33,10 +33,10 @@ from es_service.search.algorithms.base import (
 from es_service.search.algorithms.settings import CentresSettings, settings_of
 from es_service.search.maps.behaviour_map import BehaviourMap, insert, with_score
 from es_service.search.novelty import empty_archive, extended, novelty
-from es_service.search.shaping import pair_weights, shaped
+from es_service.search.objectives import utilities, weight_of_fitness, weighted
+from es_service.search.shaping import pair_weights
 from es_service.search.steps import STEPS, fresh_state
 
-RANKS = Ranks()
 CENTRE_CHOICE = 0
 """Last id of the random streams of Domain.SELECTION that choose the centre to update."""
 
@@ -57,10 +57,12 @@ def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight 
 
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
         chosen = range(len(state.centres)) if updates_all else [choose_centre(state, generation, config)]
-        return tuple(population(state, index, search, state.weight.value) for index in chosen)
+        objective = weighted(state.weight.value)
+        return tuple(population(state, index, search, objective, generation) for index in chosen)
 
     def weights(state: SearchState, asked: Ask, population: EpisodesResult) -> NDArray[np.float32]:
-        return pair_weights(mixed_utilities(state, asked.fitness_weight, population, config.novelty, search.shaping))
+        objective = asked.objective or weighted(asked.fitness_weight)
+        return pair_weights(utilities(objective, population, state.archive, config.novelty, search.shaping))
 
     def step(state: SearchState, asked: Ask, gradient_D: FloatArray) -> SearchState:
         return moved(state, asked, gradient_D, search)
@@ -74,9 +76,26 @@ def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight 
     return Algorithm(ask, tell, weights, step, fitness_weight)
 
 
-def population(state: SearchState, index: int, search: PopulationConfig, fitness_weight: float) -> Ask:
-    """The population around a centre, with the settings of the config."""
-    return Ask(index, state.centres[index].centre_D, search.sigma, search.pairs, fitness_weight)
+def population(state: SearchState, index: int, search: PopulationConfig, objective: Objective, generation: int) -> Ask:
+    """The population around a centre, with the settings of the config and the values of its schedules in a generation.
+
+    Args:
+        objective: what its members are ranked by.
+        generation: counted from 1.
+    """
+    sigma = scheduled(search.sigma, search.sigma_decay, search.sigma_limit, generation)
+    rate = search.step.learning_rate
+    share = scheduled(rate, search.learning_rate_decay, search.learning_rate_limit, generation) / rate
+    centre_D = state.centres[index].centre_D
+    return Ask(index, centre_D, sigma, search.pairs, weight_of_fitness(objective), objective, share)
+
+
+def scheduled(start: float, decay: float, limit: float, generation: int) -> float:
+    """Value of a schedule in a generation, counted from 1: start * decay^(generation - 1), but never below the limit.
+
+    A limit above the start has no effect. Source: the schedules of evosax and EvoJAX.
+    """
+    return max(start * decay ** (generation - 1), min(start, limit))
 
 
 def first_state(
@@ -142,38 +161,13 @@ def novelty_of_centres(state: SearchState, settings: NoveltyConfig) -> NDArray[n
     return novelty_M
 
 
-def mixed_utilities(
-    state: SearchState,
-    w: float,
-    population: EpisodesResult,
-    settings: NoveltyConfig,
-    shaping: Shaping = RANKS,
-) -> NDArray[np.float64]:
-    """Utility of each member of the population, [P, S]: (1 - w) * shaped novelty + w * shaped fitness.
-
-    Each objective is shaped by itself, so that the scales of fitness and novelty do not matter. Novelty is computed in
-    the novelty archive as it was before the generation. An invalid member (fitness NaN) is the worst in both.
-    """
-    utility_P_S = np.zeros(population.fitness.shape)
-    if w > 0.0:
-        utility_P_S += w * shaped(shaping, population.fitness)
-    if w < 1.0:
-        novelty_P_S = novelty(
-            state.archive,
-            population.descriptor,
-            neighbours=settings.neighbours,
-            distance=settings.distance,
-            newest=settings.newest,
-        )
-        novelty_P_S[np.isnan(population.fitness)] = np.nan
-        utility_P_S += (1.0 - w) * shaped(shaping, novelty_P_S)
-    return utility_P_S
-
-
 def moved(state: SearchState, asked: Ask, gradient_D: FloatArray, search: PopulationConfig) -> SearchState:
     """The state after one step of the asked centre up the gradient estimate [D], by its own `search.step`."""
     centre = state.centres[asked.centre]
-    step, centre_D = STEPS[search.step.kind].take(search.step, centre.step, centre.centre_D, gradient_D)
+    settings = search.step
+    if asked.rate != 1.0:
+        settings = settings.model_copy(update={"learning_rate": settings.learning_rate * asked.rate})
+    step, centre_D = STEPS[settings.kind].take(settings, centre.step, centre.centre_D, gradient_D)
     return with_centre(state, asked.centre, replace(centre, centre_D=centre_D, step=step))
 
 

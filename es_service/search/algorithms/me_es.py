@@ -8,7 +8,10 @@ entered the map. A block either explores, which climbs novelty, or exploits, whi
 the map and the novelty archive as they were before the generation. Block b of emitter e has the mode of block b + e of
 a single one, so that with `alternation: round_robin` half of the emitters explore at any time.
 
-The sources differ in how the elite is drawn (`cell_sampling`):
+With `objectives`, the blocks of an emitter take these in turn instead; a block whose objective is not novelty counts as
+exploiting where an elite is drawn.
+
+The sources differ in how the elite is drawn (`cell_sampling`; its other values are those of `starts.py`):
 
 * `top`, as in QDax, whose authors say they follow the paper. Exploring: one of the 5 most novel elites. Exploiting:
   with probability 1/2 one of the 2 fittest elites, else one of the 2 fittest of the 5 elites that entered last.
@@ -34,15 +37,24 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from es_service.config.fields import Count
-from es_service.config.model import NoveltyConfig, RunConfig
+from es_service.config.model import RunConfig
+from es_service.config.parts import FitnessObjective, NoveltyObjective, Objective
 from es_service.config.presets import PresetRow
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import Algorithm, Ask, SearchState, from_elite
 from es_service.search.algorithms.common import novelty_search, population
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import EmittersSettings, settings_of
+from es_service.search.algorithms.starts import (
+    TRIED,
+    counted_starts,
+    counting,
+    drawn_cell,
+    elite_novelty,
+    start_shares,
+)
 from es_service.search.maps.behaviour_map import BehaviourMap
-from es_service.search.novelty import NoveltyArchive, novelty
+from es_service.search.objectives import weight_of_fitness
 
 MODE_CHOICE, CELL_CHOICE = 1, 2
 """Last ids of the random streams of Domain.SELECTION: for what a block does, and for the cell where it starts."""
@@ -66,9 +78,9 @@ class MeEsSettings(EmittersSettings):
         description="Generations in a block; each block starts from an elite drawn from the map, with a fresh "
         "optimiser.",
     )
-    cell_sampling: Literal["top", "score"] = Field(
-        description="How the cell of that elite is drawn: as in QDax (top) or as in the released code (score); "
-        "es_service/search/algorithms/me_es.py describes both. Set by the preset."
+    cell_sampling: Literal["top", "score", "uniform", "novelty", "least_tried", "fitness"] = Field(
+        description="How the cell of that elite is drawn: as in QDax (top), as in the released code (score), or as "
+        "search.starts of MEMES says; es_service/search/algorithms/me_es.py describes the first two. Set by the preset."
     )
 
     presets = (
@@ -84,31 +96,49 @@ class MeEsSettings(EmittersSettings):
 def me_es(config: RunConfig) -> Algorithm:
     """MAP-Elites with ES: blocks of exploring or exploiting generations that start from elites of the behaviour map."""
     search = settings_of(config, MeEsSettings)
-    shared = novelty_search(config, fitness_weight=_weight(block_mode(search, config.seed, 1)))
+    shared = novelty_search(config, fitness_weight=weight_of_fitness(block_objective(search, config.seed, 1)))
 
-    def block_modes(state: SearchState, generation: int) -> list[Mode]:
-        return [block_mode(search, config.seed, generation, emitter) for emitter in range(len(state.centres))]
+    def objectives(state: SearchState, generation: int) -> list[Objective]:
+        return [block_objective(search, config.seed, generation, emitter) for emitter in range(len(state.centres))]
 
     def start_cells(state: SearchState, generation: int) -> dict[int, int]:
         if (generation - 1) % search.block_generations or state.map is None or not state.map.size:
             return {}
-        map_, found = state.map, {}
-        modes = block_modes(state, generation)
-        novelty_N = elite_novelty(map_, state.archive, config.novelty) if "explore" in modes else np.zeros(map_.size)
+        map_, found, how = state.map, {}, search.cell_sampling
+        modes: list[Mode] = [
+            "exploit" if weight_of_fitness(one) else "explore" for one in objectives(state, generation)
+        ]
+        share_N = novelty_N = np.zeros(map_.size)
+        if not (how == "top" or how == "score"):
+            share_N = start_shares(how, map_, state.archive, config.novelty, state.own.get(TRIED))
+        elif "explore" in modes:
+            novelty_N = elite_novelty(map_, state.archive, config.novelty)
         for emitter, mode in enumerate(modes):
             key = stream_keys(config.seed, Domain.SELECTION, generation, CELL_CHOICE, *_emitter_id(emitter))
             first, second = (float(u) for u in uniforms(key, np.arange(2, dtype=np.uint32)))
-            share_N = cell_shares(map_, novelty_N, mode, search.cell_sampling, first)
-            cumulative_N = np.add.accumulate(share_N)
-            found[emitter] = int(map_.cell_N[np.searchsorted(cumulative_N, second * cumulative_N[-1], side="right")])
+            if how == "top" or how == "score":
+                share_N = cell_shares(map_, novelty_N, mode, how, first)
+            found[emitter] = drawn_cell(map_, share_N, second)
         return found
 
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
-        modes = block_modes(state, generation)
-        return tuple(population(state, emitter, search, _weight(mode)) for emitter, mode in enumerate(modes))
+        return tuple(
+            population(state, emitter, search, objective, generation)
+            for emitter, objective in enumerate(objectives(state, generation))
+        )
 
-    restart = partial(from_elite, own_statistics=search.parent_statistics == "elite")
-    return replace(shared, ask=ask, start_cells=start_cells, restart=restart)
+    restart = counting(partial(from_elite, own_statistics=search.parent_statistics == "elite"))
+    own = counted_starts(config) if search.cell_sampling == "least_tried" else {}
+    return replace(shared, ask=ask, start_cells=start_cells, restart=restart, own=own)
+
+
+def block_objective(search: MeEsSettings, seed: int, generation: int, emitter: int = 0) -> Objective:
+    """What an emitter's block in a generation (counted from 1) maximises."""
+    if not search.objectives:
+        return NoveltyObjective() if block_mode(search, seed, generation, emitter) == "explore" else FitnessObjective()
+    block, several = (generation - 1) // search.block_generations, len(search.objectives)
+    turn = int(several * _coin(seed, block, emitter)) if search.alternation == "coin" else block + emitter
+    return search.objectives[turn % several]
 
 
 def block_mode(search: MeEsSettings, seed: int, generation: int, emitter: int = 0) -> Mode:
@@ -117,10 +147,15 @@ def block_mode(search: MeEsSettings, seed: int, generation: int, emitter: int = 
         return search.mode
     block = (generation - 1) // search.block_generations
     if search.alternation == "coin":
-        key = stream_keys(seed, Domain.SELECTION, block, MODE_CHOICE, *_emitter_id(emitter))
-        return "explore" if float(uniforms(key, np.zeros(1, np.uint32))[0]) < 0.5 else "exploit"
+        return "explore" if _coin(seed, block, emitter) < 0.5 else "exploit"
     other: Mode = "exploit" if search.first_block == "explore" else "explore"
     return other if (block + emitter) % 2 else search.first_block
+
+
+def _coin(seed: int, block: int, emitter: int) -> float:
+    """A uniform random number in [0, 1) for an emitter's block."""
+    key = stream_keys(seed, Domain.SELECTION, block, MODE_CHOICE, *_emitter_id(emitter))
+    return float(uniforms(key, np.zeros(1, np.uint32))[0])
 
 
 def _emitter_id(emitter: int) -> tuple[int, ...]:
@@ -167,34 +202,6 @@ def cell_shares(
             two = newest[_best(score_N[newest], FITTEST)]
             share_N[two] = np.maximum(score_N[two], lowest) - lowest + 1.0
     return share_N
-
-
-def elite_novelty(map_: BehaviourMap, archive: NoveltyArchive, settings: NoveltyConfig) -> NDArray[np.float64]:
-    """Novelty of each elite's descriptor in the novelty archive without the elite's own entry, [N]."""
-    return novelty(
-        archive,
-        map_.descriptor_N_B,
-        neighbours=settings.neighbours,
-        distance=settings.distance,
-        newest=settings.newest,
-        exclude_Q=_own_entries(map_, archive),
-    )
-
-
-def _own_entries(map_: BehaviourMap, archive: NoveltyArchive) -> NDArray[np.int64]:
-    """Index of each elite's own entry in the novelty archive, [N]; -1 for an elite without one.
-
-    The search relies on the order of the entries: by generation and, within a generation, by centre.
-    """
-    centres = 1 + max(map_.centre_N.max(initial=0), archive.centre_N.max(initial=0))
-    entry_N, elite_N = (one.generation_N * centres + one.centre_N for one in (archive, map_))
-    found_N = np.searchsorted(entry_N, elite_N)
-    is_there_N = np.append(entry_N, -1)[found_N] == elite_N
-    return np.where(is_there_N, found_N, -1)
-
-
-def _weight(mode: Mode) -> float:
-    return 1.0 if mode == "exploit" else 0.0
 
 
 def _best(values: NDArray, count: int) -> NDArray[np.intp]:

@@ -4,13 +4,14 @@
 every second emitter, beginning with the first, explores, which climbs novelty, and the others exploit, which climb
 fitness. There are no blocks of a fixed length. An emitter is reset at the start of a generation if none of its centres
 has entered the map in the last `stagnation_generations` generations: an elite replaces its centre, with a fresh
-optimiser, and the count of its generations begins again. The elite is drawn with equal probability from all filled
-cells. A centre that another centre of its generation replaced at once has not entered.
+optimiser, and the count of its generations begins again. The elite is drawn as `starts` says, by default with equal
+probability from all filled cells. A centre that another centre of its generation replaced at once has not entered.
 
 This follows the released code (adaptive-intelligent-robotics/MEMES), with two differences: its emitters of one
 objective come first and the others after them, and it resets one generation later (it compares with >).
 
-Our own choice: while the map is empty, no emitter is reset.
+Our own choices: while the map is empty, no emitter is reset; `objectives` gives emitters others than novelty and
+fitness.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from pydantic import Field
 
 from es_service.config.fields import Count
 from es_service.config.model import RunConfig
+from es_service.config.parts import FitnessObjective, NoveltyObjective, Objective
 from es_service.config.presets import same
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import (
@@ -37,12 +39,16 @@ from es_service.search.algorithms.base import (
 from es_service.search.algorithms.common import novelty_search, population
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import EmittersSettings, settings_of
+from es_service.search.algorithms.starts import TRIED, Starts, counted_starts, counting, drawn_cell, start_shares
 from es_service.search.maps.behaviour_map import Elite
+from es_service.search.objectives import weight_of_fitness
 
 RESET_CHOICE = 4
 """Last id of the random stream of Domain.SELECTION that draws the cells from which emitters begin again."""
 STAGNANT = "stagnant"
 """Name of the search's own array [emitters]: newest generations in which no centre of an emitter entered the map."""
+AGE = "age"
+"""Name of the search's own array [emitters]: generations since an emitter began, if `exploit_generations` is given."""
 
 
 class MemesSettings(EmittersSettings):
@@ -52,6 +58,16 @@ class MemesSettings(EmittersSettings):
         32,
         description="Generations after which an emitter none of whose centres has entered the map since then begins "
         "again from an elite, with a fresh optimiser.",
+    )
+    exploit_generations: Count | None = Field(
+        None,
+        description="Generations after which an emitter that does not climb novelty begins again even if its centres "
+        "still enter the map, so that small gains at one place do not hold it there for ever; null: never.",
+    )
+    starts: Starts = Field(
+        "uniform",
+        description="How the elite is drawn. uniform: any. novelty: in proportion to its novelty. least_tried: one of "
+        "the cells from which the fewest emitters have begun. fitness: in proportion to its fitness above the lowest.",
     )
 
     presets = (
@@ -70,38 +86,55 @@ class MemesSettings(EmittersSettings):
 def memes(config: RunConfig) -> Algorithm:
     """MAP-Elites with many ES: each explores or exploits, until its centres no longer enter the map."""
     search = settings_of(config, MemesSettings)
-    shared = novelty_search(config, fitness_weight=emitter_weight(search, 0))
+    shared = novelty_search(config, fitness_weight=weight_of_fitness(emitter_objective(search, 0)))
 
     def start_cells(state: SearchState, generation: int) -> dict[int, int]:
         if state.map is None or not state.map.size:
             return {}
         key = stream_keys(config.seed, Domain.SELECTION, generation, RESET_CHOICE)
         drawn_M = uniforms(key, np.arange(len(state.centres), dtype=np.uint32)).astype(np.float64)
-        cell_M = state.map.cell_N[(drawn_M * state.map.size).astype(np.int64)]
-        reset = np.flatnonzero(state.own[STAGNANT] >= search.stagnation_generations)
-        return {int(emitter): int(cell_M[emitter]) for emitter in reset}
+        is_reset_M = state.own[STAGNANT] >= search.stagnation_generations
+        if search.exploit_generations is not None:
+            is_reset_M = is_reset_M | (exploits_M & (state.own[AGE] >= search.exploit_generations))
+        if not is_reset_M.any():
+            return {}
+        share_N = start_shares(search.starts, state.map, state.archive, config.novelty, state.own.get(TRIED))
+        return {
+            int(emitter): drawn_cell(state.map, share_N, drawn_M[emitter]) for emitter in np.flatnonzero(is_reset_M)
+        }
 
     def restart(state: SearchState, index: int, cell: int, elite: Elite) -> SearchState:
-        stagnant_M = np.where(np.arange(len(state.centres)) == index, 0, state.own[STAGNANT])
-        return replace(elite_restart(state, index, cell, elite), own=read_only({STAGNANT: stagnant_M}))
+        counts = {name: counts_M for name, counts_M in state.own.items() if name in (STAGNANT, AGE)}
+        zeroed = {name: np.where(np.arange(counts_M.size) == index, 0, counts_M) for name, counts_M in counts.items()}
+        return elite_restart(replace(state, own=read_only({**state.own, **zeroed})), index, cell, elite)
 
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
         return tuple(
-            population(state, emitter, search, emitter_weight(search, emitter)) for emitter in range(len(state.centres))
+            population(state, emitter, search, emitter_objective(search, emitter), generation)
+            for emitter in range(len(state.centres))
         )
 
     def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
         state = shared.tell(state, evaluations)
         entered_M = np.array([centre.cell != NO_CELL for centre in state.centres])
-        return replace(state, own=read_only({STAGNANT: np.where(entered_M, 0, state.own[STAGNANT] + 1)}))
+        counts = {STAGNANT: np.where(entered_M, 0, state.own[STAGNANT] + 1)}
+        if AGE in state.own:
+            counts[AGE] = state.own[AGE] + 1
+        return replace(state, own=read_only({**state.own, **counts}))
 
-    elite_restart = partial(from_elite, own_statistics=search.parent_statistics == "elite")
+    exploits_M = np.array([weight_of_fitness(emitter_objective(search, one)) > 0.0 for one in range(search.emitters)])
+    elite_restart = counting(partial(from_elite, own_statistics=search.parent_statistics == "elite"))
     own = {STAGNANT: np.zeros(search.emitters, np.int64)}
+    if search.exploit_generations is not None:
+        own[AGE] = np.zeros(search.emitters, np.int64)
+    if search.starts == "least_tried":
+        own |= counted_starts(config)
     return replace(shared, start_cells=start_cells, restart=restart, ask=ask, tell=tell, own=own)
 
 
-def emitter_weight(search: MemesSettings, emitter: int) -> float:
-    """Weight of fitness in the utilities of an emitter: 0 if it explores, 1 if it exploits."""
-    if search.mode != "explore_exploit":
-        return float(search.mode == "exploit")
-    return float(emitter % 2)
+def emitter_objective(search: MemesSettings, emitter: int) -> Objective:
+    """What an emitter maximises."""
+    if search.objectives:
+        return search.objectives[emitter % len(search.objectives)]
+    explores = emitter % 2 == 0 if search.mode == "explore_exploit" else search.mode == "explore"
+    return NoveltyObjective() if explores else FitnessObjective()

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from es_service.config.fields import Count
 from es_service.config.model import RunConfig
+from es_service.config.parts import Objectives
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.errors import ConfigError
 
@@ -85,6 +86,11 @@ class EmittersSettings(PopulationConfig):
         "explore_exploit",
         description="What an emitter, or a block, maximises. explore: novelty. exploit: fitness. explore_exploit: one "
         "of the two, by turns unless search.alternation says otherwise.",
+    )
+    objectives: Objectives | None = Field(
+        None,
+        description="What emitters, or blocks, maximise, in turn: emitter or block k the (k modulo their number)-th. "
+        "null: what search.mode says, which is ignored otherwise.",
     )
     parent_statistics: Literal["global", "elite"] = Field(
         "global",

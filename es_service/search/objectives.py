@@ -1,0 +1,114 @@
+"""What members are ranked by: an objective gives each member a value, and shaping makes utilities of the values.
+
+Axes: P pairs, S signs [+, -], E episodes, B descriptor dimensions. The functions take results with any leading axes,
+[P, S] of a population or [E] of a centre's evaluation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from es_service.config.model import NoveltyConfig
+from es_service.config.parts import (
+    FitnessObjective,
+    MixtureObjective,
+    NoveltyObjective,
+    Objective,
+    Shaping,
+    TargetObjective,
+)
+from es_service.protocol.messages import EpisodesResult
+from es_service.search.novelty import NoveltyArchive, novelty
+from es_service.search.shaping import centred_ranks, shaped
+
+
+def weight_of_fitness(objective: Objective) -> float:
+    """Weight of fitness beside novelty, for the history: 0 for novelty, 1 for what does not look at novelty."""
+    if isinstance(objective, MixtureObjective):
+        return objective.weight
+    return 0.0 if isinstance(objective, NoveltyObjective) else 1.0
+
+
+def weighted(weight: float) -> Objective:
+    """The objective with a weight of fitness beside novelty, from 0 to 1."""
+    plain = {0.0: NoveltyObjective(), 1.0: FitnessObjective()}
+    return plain.get(weight) or MixtureObjective(weight=weight)
+
+
+def utilities(
+    objective: Objective,
+    results: EpisodesResult,
+    archive: NoveltyArchive,
+    settings: NoveltyConfig,
+    shaping: Shaping,
+) -> NDArray[np.float64]:
+    """Utility of each member of a population, [P, S].
+
+    A mixture is (1 - weight) * shaped novelty + weight * shaped fitness, each shaped by itself, so that their scales do
+    not matter. An invalid member (fitness NaN) is the worst by any objective.
+
+    Args:
+        results: results of the population, [P, S].
+        archive: the novelty archive as it was before the generation.
+        settings: how novelty is computed.
+        shaping: how values become utilities.
+    """
+    weight = weight_of_fitness(objective)
+    utility_P_S = np.zeros(results.fitness.shape)
+    if weight > 0.0:
+        utility_P_S += weight * shaped(shaping, values(objective, results))
+    if weight < 1.0:
+        novelty_P_S = novelty(
+            archive,
+            results.descriptor,
+            neighbours=settings.neighbours,
+            distance=settings.distance,
+            newest=settings.newest,
+        )
+        novelty_P_S[np.isnan(results.fitness)] = np.nan
+        utility_P_S += (1.0 - weight) * shaped(shaping, novelty_P_S)
+    return utility_P_S
+
+
+def values(objective: Objective, results: EpisodesResult) -> NDArray:
+    """Value of each episode or member by an objective, with the leading axes of the results; higher is better.
+
+    Of a mixture it is that of fitness; novelty has none without an archive, and counts as fitness too. Invalid ones
+    (fitness NaN) have NaN.
+    """
+    if isinstance(objective, TargetObjective):
+        return target_values(objective, results.fitness, results.descriptor)
+    of: dict[str, Callable[[], NDArray]] = {
+        "return": lambda: results.returns,
+        "goal_distance": lambda: -results.goal_distance[..., 0],
+    }
+    found = of.get(objective.kind, lambda: results.fitness)()
+    return np.where(np.isnan(results.fitness), np.nan, found)
+
+
+def target_values(target: TargetObjective, fitness: ArrayLike, descriptor_B: ArrayLike) -> NDArray[np.float64]:
+    """Ranks from -0.5 to 0.5 by a target set: inside, by fitness; outside, below all of those, by distance from it.
+
+    So the first aim is that as many members as possible end in the set, and fitness decides only among those that do.
+    Ranks and not values, since the scales of fitness and of distances have nothing to do with each other. Equal ones
+    share the mean of their ranks. Members whose fitness or descriptor is not finite are NaN.
+
+    Args:
+        target: the set, a ball of descriptors; its border is inside.
+        fitness: fitness of every member, any shape.
+        descriptor_B: their descriptors, the same shape with a last axis B.
+
+    Source: ARIA, Grillotti et al. 2023 (arXiv:2304.03672), whose set is a cell and which adds a large constant to the
+    fitness inside.
+    """
+    fitness = np.asarray(fitness, np.float64)
+    distance = np.linalg.norm(np.asarray(descriptor_B, np.float64) - np.asarray(target.descriptor), axis=-1)
+    is_valid = np.isfinite(fitness) & np.isfinite(distance)
+    is_inside = is_valid & (distance <= target.radius)
+    keys = np.stack([is_inside.astype(np.float64), np.where(is_inside, fitness, -distance)], axis=-1)
+    keys[~is_valid] = -np.inf
+    _, place = np.unique(keys.reshape(-1, 2), axis=0, return_inverse=True)  # in the order of the first, then the second
+    return np.where(is_valid, centred_ranks(place.reshape(fitness.shape)), np.nan)
