@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from es_service.report import plots
     from es_service.report.write import write_comparison, write_report
     from es_service.runs.certification import certify, certify_run
+    from es_service.runs.polishing import polish_config
     from es_service.runs.sweep import sweep
 
     __version__: str
@@ -27,6 +28,7 @@ __all__ = [
     "load_config",
     "open_run",
     "plots",
+    "polish_config",
     "resume",
     "run",
     "run_or_resume",
@@ -37,6 +39,7 @@ __all__ = [
 _MODULES = {
     "certify": "es_service.runs.certification",
     "certify_run": "es_service.runs.certification",
+    "polish_config": "es_service.runs.polishing",
     "sweep": "es_service.runs.sweep",
     "write_comparison": "es_service.report.write",
     "write_report": "es_service.report.write",

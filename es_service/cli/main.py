@@ -1,5 +1,5 @@
-"""The command line: `es-service run | resume | fork | sweep | status | digest | config | list | evaluate | export |
-report | verify | submit | jobs | logs | stop | bench | doctor`.
+"""The command line: `es-service run | resume | fork | polish | sweep | status | digest | config | list | evaluate |
+export | report | verify | submit | jobs | logs | stop | bench | doctor`.
 
 Exit codes: 0 done, 1 failed, 2 bad usage or config, 3 cannot be checked now (`verify` of a running run), 130 or 143
 interrupted by SIGINT or SIGTERM.
@@ -10,18 +10,17 @@ from __future__ import annotations
 import contextlib
 import io
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from es_service import api
 from es_service.cli.bench import bench
-from es_service.cli.commands import command
-from es_service.cli.console import console, errors, print_line
+from es_service.cli.console import console, print_line
 from es_service.cli.evaluate import evaluate
 from es_service.cli.jobs import job_commands
 from es_service.cli.options import (
@@ -41,23 +40,19 @@ from es_service.cli.options import (
     overrides,
     print_config_notes,
     print_error,
-    print_note,
 )
+from es_service.cli.polish import polish
 from es_service.cli.report import export, report
+from es_service.cli.session import session, told_to_user
 from es_service.cli.show import config_, digest_, list_, status
 from es_service.cli.sweep import SeedsOption, run_seeds, sweep
-from es_service.cli.tables.status import print_summary
 from es_service.cli.verify import verify
 from es_service.config.changes import again_with
 from es_service.config.keys import parse_overrides
 from es_service.config.parallel import parallel_sentence
 from es_service.errors import ConfigError, Interrupted, NotInRunError, ServiceError, WayOut
 from es_service.logs import logger
-from es_service.loop.history import Row
 from es_service.protocol.machine import VERSION
-from es_service.protocol.raised import users_error
-from es_service.report.progress import show_progress
-from es_service.runs.tracking import tracked
 from es_service.store.folder import holds_run
 
 _LOG = logger(__name__)
@@ -111,7 +106,7 @@ def run(
         print_line(console, parallel_sentence(loaded))
     folder = out if out is not None else api.default_folder(loaded)
     with _naming(config, wanted):
-        _session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder), log)
+        session(folder, partial(api.run_or_resume if or_resume else api.run, loaded, folder), log)
 
 
 @app.command()
@@ -127,7 +122,7 @@ def resume(
 ) -> None:
     """Continue a run; only budget, engine, workers and time limits may change."""
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
-    _session(folder, partial(api.resume, folder, wanted, strict=strict), log)
+    session(folder, partial(api.resume, folder, wanted, strict=strict), log)
 
 
 @app.command()
@@ -148,7 +143,7 @@ def fork(
     """Start a new run from another run's state, with changed settings."""
     wanted = overrides(set_, workers=workers, engine=engine, address=address)
     folder = out if out is not None else api.default_folder(api.fork_config(parent, wanted))
-    _session(folder, partial(api.fork, parent, wanted, generation=generation, out=folder), log)
+    session(folder, partial(api.fork, parent, wanted, generation=generation, out=folder), log)
 
 
 app.command()(status)
@@ -158,6 +153,7 @@ app.command(name="list")(list_)
 
 
 app.command()(evaluate)
+app.command()(polish)
 app.command()(sweep)
 app.command()(export)
 app.command()(report)
@@ -199,19 +195,11 @@ def main() -> None:
         print_error(f"not enough memory: {error}. Reduce policy.hidden or search.pairs.")
         sys.exit(1)
     except Exception as error:
-        if (told := _told(error)) is None:
+        if (told := told_to_user(error)) is None:
             raise  # a bug, of which the traceback is all that is known
         print_error(told)
         _LOG.debug("the traceback of this error", exc_info=error)
         sys.exit(2 if isinstance(told, ConfigError | NotInRunError) else 1)
-
-
-def _told(error: Exception, ways_out: Sequence[WayOut] = ()) -> ServiceError | None:
-    """An error for the user: one of this package, or what the user's code raised; None if it is a bug of ours."""
-    if isinstance(error, ServiceError):
-        return error
-    text = users_error(error)
-    return ServiceError(text, ways_out=ways_out) if text else None
 
 
 @contextlib.contextmanager
@@ -227,45 +215,3 @@ def _naming(config: Path, wanted: Sequence[str]) -> Iterator[None]:
             for way in error.ways_out
         )
         raise
-
-
-def _session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] | None) -> None:
-    """Show the progress of a run, send it to trackers, and show a summary at its end. The run continues if the output
-    is closed."""
-    began = False
-
-    def tell(show: Callable[[Any], None], what: Row | str) -> None:
-        try:
-            show(what)
-        except SystemExit:  # raised by rich for a broken pipe; from then on rich prints nothing
-            print_note(f"the output was closed; the run continues. Watch: {command('status', folder, '--follow')}")
-
-    def tell_generation(show: Callable[[Row], None], row: Row) -> None:
-        nonlocal began
-        began = True  # remembered, since the folder may be renamed later
-        tell(show, row)
-        send(row)
-
-    try:
-        with (
-            show_progress(console, errors, str(folder)) as (show, note),
-            tracked(folder, log or (), partial(tell, note)) as send,
-        ):
-            outcome = work(
-                on_generation=partial(tell_generation, show),
-                on_notice=partial(tell, note),
-                on_compile=partial(tell, note),
-            )
-    except Interrupted:
-        if began or holds_run(folder):
-            print_note(f"interrupted; every finished generation is saved. Continue with: {command('resume', folder)}")
-        else:
-            print_note("interrupted before the run began; nothing was written")
-        raise
-    except Exception as error:
-        goes_on = WayOut("resume", "continue from the last finished generation after the cause is fixed", str(folder))
-        if (told := _told(error, [goes_on] if holds_run(folder) else ())) in (None, error):
-            raise
-        raise told from error
-    with contextlib.suppress(SystemExit):
-        print_summary(console, outcome.run, outcome.reason)

@@ -49,6 +49,7 @@ _FOLLOWERS = {
     "policy.observation_normalization": ("policy.observation_clip",),
     "search.algorithm": ("search.centres",),
     "search.emitters": ("search.centres",),
+    "search.screened": ("search.centres",),
     "search.pairs": _SHAPES,
     "compute.chunk_pairs": _SHAPES[1:],
 }

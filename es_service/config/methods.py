@@ -147,4 +147,4 @@ def method_problems(values: Mapping[str, Any], settings: type[SearchConfig]) -> 
 def _only_centres(values: Mapping[str, Any], settings: type[SearchConfig]) -> int | None:
     """The only number of centres that a method supports; None if it supports any, or if its key has no valid value."""
     only = settings.only_centres
-    return values.get(only) if isinstance(only, str) else only
+    return values.get(only, search_fields(settings)[only].default) if isinstance(only, str) else only

@@ -50,7 +50,7 @@ def test_every_method_declares_its_keys():
 def test_a_key_without_effect_is_refused_with_the_methods_that_have_it():
     assert problems(MINIMAL, "search.algorithm=map_elites", "search.sigma=0.3") == [
         "search.sigma: 0.3 has no effect with map_elites; leave it out "
-        "(a key of es, ns_es, nsr_es, nsra_es, me_es, memes and ars)"
+        "(a key of es, ns_es, nsr_es, nsra_es, me_es, memes, ars and polish)"
     ]
     source = MINIMAL | {"search": {"algorithm": "es", "iso_sigma": 0.3, "emitters": "many"}, "seed": "a"}
     assert problems(source, "search.shaping.count=513") == [
@@ -122,10 +122,11 @@ def test_another_kind_leaves_out_the_keys_of_the_one_it_replaces():
 
 @pytest.mark.parametrize("method", OURS)
 def test_values_that_a_key_has_anyway_are_accepted_so_that_a_resolved_config_loads(method):
+    chosen = [f"search.algorithm={method}", *(["search.init_from=."] if OURS[method].settings.needs_start else [])]
     for preset in ("literature", "uber"):
-        config = load(MINIMAL, f"search.algorithm={method}", f"search.preset={preset}")
+        config = load(MINIMAL, *chosen, f"search.preset={preset}")
         assert load(parse_value(config.resolved_yaml())) == config
-    assert load(MINIMAL, f"search.algorithm={method}", "task.episodes_per_member=1", "compute.chunk_pairs=auto")
+    assert load(MINIMAL, *chosen, "task.episodes_per_member=1", "compute.chunk_pairs=auto")
 
 
 def test_another_algorithm_leaves_out_the_keys_of_the_one_it_replaces():

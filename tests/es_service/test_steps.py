@@ -75,7 +75,10 @@ def test_the_shaping_of_a_fork_may_be_another(tmp_path):
 
 @pytest.mark.parametrize("algorithm", [name for name in ALGORITHMS if name != "map_elites"])
 def test_every_method_with_a_gradient_takes_every_part(algorithm, tmp_path):
-    source = CONFIG | {"search": {"algorithm": algorithm, "pairs": 16, "evaluation_episodes": 2}}
+    search = {"algorithm": algorithm, "pairs": 16, "evaluation_episodes": 2}
+    if ALGORITHMS[algorithm].settings.needs_start:
+        search["init_from"] = str(api.run(api.load_config(CONFIG), tmp_path / "parent").run.folder)
+    source = CONFIG | {"search": search}
     for step in STEPS:
         for shaping in ("ranks", "signs", "returns", "top_pairs"):
             config = api.load_config(source, [f"search.step.kind={step}", f"search.shaping.kind={shaping}"])

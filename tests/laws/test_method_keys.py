@@ -35,7 +35,9 @@ COMMON = {
 WITH_POPULATIONS = {
     "search.pairs": 32,
     "search.sigma": 0.2,
+    "search.sigma_decay": 0.9,
     "search.step.learning_rate": 0.2,
+    "search.learning_rate_decay": 0.9,
     "policy.observation_normalization": True,
     "policy.action_noise": 0.01,
     "compute.chunk_pairs": 16,
@@ -45,7 +47,8 @@ BASES = {
     "ns_es": [{}, {"search.update": "all"}],
     "nsra_es": [{"search.update": update, "search.fitness_weight_patience": 2} for update in ("one", "all")],
     "me_es": [{"search.block_generations": 2, "search.emitters": 2}],
-    "memes": [{"search.emitters": 2, "search.stagnation_generations": 2, "budget.generations": 8}],
+    "memes": [{"search.emitters": 2, "search.stagnation_generations": 2, "budget.generations": 12}],
+    "polish": [{"search.init_from": ".", "search.screened": 4, "search.candidates": 3, "search.round_generations": 2}],
     "map_elites": [{"search.batch": 16, "search.centres": 8, "search.iso_sigma": 0.2}],
 }
 """Method -> settings of runs, besides those of all; a key has an effect if it changes one of these runs."""
@@ -61,9 +64,14 @@ OTHER = {
     "policy.action_noise": 0.2,
     "search.pairs": 64,
     "search.sigma": 0.3,
+    "search.sigma_decay": 0.8,
+    "search.sigma_limit": 0.19,
     "search.step.learning_rate": 0.3,
     "search.step.l2": 0.1,
     "search.step.kind": "plain",
+    "search.step_gate": True,
+    "search.learning_rate_decay": 0.8,
+    "search.learning_rate_limit": 0.19,
     "search.shaping.kind": "signs",
     "search.centres": 4,
     "search.update": "all",
@@ -75,6 +83,13 @@ OTHER = {
     "search.fitness_weight_patience": 1,
     "search.fitness_weight_min_gain": 9.0,
     "search.mode": "exploit",
+    "search.objectives": [{"kind": "mixture", "weight": 0.3}],
+    "search.starts": "fitness",
+    "search.exploit_generations": 1,
+    "search.objective.kind": "novelty",
+    "search.screened": 3,
+    "search.candidates": 2,
+    "search.round_generations": 1,
     "search.alternation": "coin",
     "search.first_block": "exploit",
     "search.block_generations": 3,
@@ -104,16 +119,21 @@ NOT_MEASURED = {
     "search.algorithm": "the table is about it",
     "search.preset": "chooses values of other keys",
     "search.init_from": "names a folder, of which the functions of a search know nothing",
+    "search.candidate_choice": "chooses among the elites of that folder, which `test_polish.py` checks",
     "search.max_invalid_fraction": "stops a run, which `test_es.py` and `test_policies.py` check",
     "compute.rollout": "the other one is XLA",
     "compute.rollout_block_pairs": "only XLA uses it",
 }
+WITH_TOP_PAIRS = ("ars", "polish")
+"""Methods whose shaping is top_pairs and whose step is plain by default."""
 ONE_VALUE = {
-    "search.centres": ("es", "ars", "me_es", "memes"),
+    "search.centres": ("es", "ars", "me_es", "memes", "polish"),
     "policy.observation_normalization": ("map_elites",),
     "map.enabled": ("me_es", "memes", "map_elites"),
-    "search.shaping.count": tuple(name for name in OURS if name != "ars"),  # the others have another kind by default
-    "search.step.kind": ("ars",),  # it is plain by default
+    "search.shaping.count": tuple(
+        name for name in OURS if name not in ("ars", "polish")
+    ),  # others have another kind by default
+    "search.step.kind": ("ars", "polish"),  # it is plain by default
 }
 """Key -> methods that allow only one value of it, so that no other can be measured."""
 

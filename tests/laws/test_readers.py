@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import shutil
+import tempfile
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -16,6 +20,7 @@ from es_service.errors import NotInRunError
 from es_service.runs.lineage import started
 from es_service.runs.replay import record
 from es_service.search.algorithms import ALGORITHMS
+from tests.helpers import workers_in_this_process
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 GENERATIONS, EPISODES = 3, 3
@@ -36,11 +41,24 @@ SETTINGS = {
     "tests.laws.test_policies:mixed": {**OF_POPULATIONS, "centres": 2},
 }
 """Settings of a method; others have those of populations."""
+POLISHED = {**OF_POPULATIONS, "screened": 3, "candidates": 2, "round_generations": 2}
 METHODS = [*ALGORITHMS, "tests.laws.test_policies:mixed"]
 
 
+@cache
+def parent():
+    """Folder of a finished run, for methods that start from policies of another one."""
+    with workers_in_this_process():
+        folder = Path(tempfile.mkdtemp()) / "parent"
+        atexit.register(shutil.rmtree, folder.parent)
+        return str(api.run(config_of("memes"), folder).run.folder)
+
+
 def config_of(method, **more):
-    search = {**CONFIG["search"], "algorithm": method, **SETTINGS.get(method, OF_POPULATIONS)}
+    settings = SETTINGS.get(method, OF_POPULATIONS)
+    if ALGORITHMS[method].settings.needs_start:
+        settings = POLISHED | {"init_from": parent()}
+    search = {**CONFIG["search"], "algorithm": method, **settings}
     return CONFIG | {"search": search} | more
 
 

@@ -52,6 +52,8 @@ class PolishSettings(CandidatesConfig):
         same("search.step.l2", 0.0, "Mania et al. 2018, which has no weight decay"),
         same("search.shaping.kind", "top_pairs", "Mania et al. 2018"),
         same("policy.action_noise", 0.0, "Mania et al. 2018, which adds no noise to actions"),
+        same("search.sigma", 0.025, "Mania et al. 2018, for the ant"),
+        same("search.step.learning_rate", 0.015, "Mania et al. 2018, for the ant"),
         same("search.pairs", 32, "our choice, sized for one machine"),
         same("search.evaluation_episodes", 16, "our choice: one chunk"),
     )

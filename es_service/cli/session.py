@@ -1,0 +1,71 @@
+"""A session of a run on the command line: its progress, its end, and its errors."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from es_service import api
+from es_service.cli.commands import command
+from es_service.cli.console import console, errors
+from es_service.cli.options import print_note
+from es_service.cli.tables.status import print_summary
+from es_service.errors import Interrupted, ServiceError, WayOut
+from es_service.loop.history import Row
+from es_service.protocol.raised import users_error
+from es_service.report.progress import show_progress
+from es_service.runs.tracking import tracked
+from es_service.store.folder import holds_run
+
+
+def told_to_user(error: Exception, ways_out: Sequence[WayOut] = ()) -> ServiceError | None:
+    """An error for the user: one of this package, or what the user's code raised; None if it is a bug of ours."""
+    if isinstance(error, ServiceError):
+        return error
+    text = users_error(error)
+    return ServiceError(text, ways_out=ways_out) if text else None
+
+
+def session(folder: Path, work: Callable[..., api.Outcome], log: Sequence[str] | None) -> None:
+    """Show the progress of a run, send it to trackers, and show a summary at its end. The run continues if the output
+    is closed."""
+    began = False
+
+    def tell(show: Callable[[Any], None], what: Row | str) -> None:
+        try:
+            show(what)
+        except SystemExit:  # raised by rich for a broken pipe; from then on rich prints nothing
+            print_note(f"the output was closed; the run continues. Watch: {command('status', folder, '--follow')}")
+
+    def tell_generation(show: Callable[[Row], None], row: Row) -> None:
+        nonlocal began
+        began = True  # remembered, since the folder may be renamed later
+        tell(show, row)
+        send(row)
+
+    try:
+        with (
+            show_progress(console, errors, str(folder)) as (show, note),
+            tracked(folder, log or (), partial(tell, note)) as send,
+        ):
+            outcome = work(
+                on_generation=partial(tell_generation, show),
+                on_notice=partial(tell, note),
+                on_compile=partial(tell, note),
+            )
+    except Interrupted:
+        if began or holds_run(folder):
+            print_note(f"interrupted; every finished generation is saved. Continue with: {command('resume', folder)}")
+        else:
+            print_note("interrupted before the run began; nothing was written")
+        raise
+    except Exception as error:
+        goes_on = WayOut("resume", "continue from the last finished generation after the cause is fixed", str(folder))
+        if (told := told_to_user(error, [goes_on] if holds_run(folder) else ())) in (None, error):
+            raise
+        raise told from error
+    with contextlib.suppress(SystemExit):
+        print_summary(console, outcome.run, outcome.reason)

@@ -1,0 +1,70 @@
+"""A run that polishes policies of another one: its config, and certified values before and after it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+from es_service.config.keys import Overrides
+from es_service.config.model import RunConfig
+from es_service.config.parts import TargetObjective
+from es_service.config.search import CandidatesConfig
+from es_service.config.tasks import task_of
+from es_service.errors import NotInRunError
+from es_service.runs.certification import certify_run
+from es_service.runs.certified import Certified, Measure, certified_policies
+from es_service.runs.checked_config import load_config
+from es_service.runs.view import Run, open_run
+from es_service.search.algorithms import ALGORITHMS
+
+METHOD = next(name for name, one in ALGORITHMS.items() if issubclass(one.settings, CandidatesConfig))
+"""The method that starts from several policies of another run."""
+
+
+def polish_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> RunConfig:
+    """The config of a run that polishes policies of another one.
+
+    It has the task, the policy and the map of that run, its number of environment steps so far as its budget, and
+    defaults for everything else.
+
+    Args:
+        parent: folder of the other run.
+        overrides: changes, as for `load_config`.
+
+    Raises:
+        ConfigError: lists every problem found. NotInRunError: the run has no finished generation.
+    """
+    run = open_run(parent)
+    if run.generation is None:
+        raise NotInRunError(f"{run.folder} has no finished generation yet, and so no policies", run=run.folder)
+    present = run.present_config
+    sections = {name: present[name] for name in ("task", "policy", "map", "seed")}
+    steps = int(run.history_rows(run.generation)[-1]["env_steps"])
+    search = {"algorithm": METHOD, "init_from": str(run.folder)}
+    return load_config({**sections, "search": search, "budget": {"env_steps": steps}}, overrides)
+
+
+def certify_both(
+    parent: Run, polished: Run, config: RunConfig, workers: int | None, on_notice: Callable[[str], None]
+) -> tuple[list[Certified], list[Certified]]:
+    """Newest certified policies before and after polishing; what is not certified yet is certified now.
+
+    With a target set in a task that declares success, policies are selected by success.
+
+    Raises:
+        RunLockedError: a driver writes to one of the runs. Otherwise as `certify_run`.
+    """
+    search, by = config.search, None
+    if isinstance(search, CandidatesConfig) and isinstance(search.objective, TargetObjective):
+        by = "success" if task_of(config).success else None
+    return _certified(parent, by, False, workers, on_notice), _certified(polished, by, True, workers, on_notice)
+
+
+def _certified(
+    run: Run, by: Measure | None, centre: bool, workers: int | None, on_notice: Callable[[str], None]
+) -> list[Certified]:
+    found = [one for one in certified_policies(run.folder) if by in (None, one.selected_by)]
+    if found:
+        newest = max(one.number for one in found)
+        return [one for one in found if one.number == newest]
+    return certify_run(run.folder, centre=centre, by=by, workers=workers, on_notice=on_notice)
