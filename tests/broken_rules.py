@@ -156,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 NOVELTY, COMMON = "es_service/search/novelty.py", "es_service/search/algorithms/common.py"
-ME_ES, NSRA = "es_service/search/algorithms/me_es.py", "es_service/search/algorithms/nsra_es.py"
+NSRA, STARTS = "es_service/search/algorithms/nsra_es.py", "es_service/search/algorithms/starts.py"
 MAP_ELITES, BASE = "es_service/search/algorithms/map_elites.py", "es_service/search/algorithms/base.py"
 ADAM, SHAPING = "es_service/search/steps/adam.py", "es_service/search/shaping.py"
 BEHAVIOUR_MAP, PARTS = "es_service/search/maps/behaviour_map.py", "es_service/loop/parts.py"
@@ -184,10 +184,10 @@ CASES = [
     *cases(
         "novelty counts the own entry",
         f"{OF_ME_ES} tests/laws/test_me_es_blocks.py",
-        ("of an elite to draw", ME_ES, "exclude_Q=_own_entries(map_, archive)", "exclude_Q=None"),
+        ("of an elite to draw", STARTS, "exclude_Q=_own_entries(map_, archive)", "exclude_Q=None"),
         (
             "of another centre of the same generation",
-            ME_ES,
+            STARTS,
             "one.generation_N * centres + one.centre_N",
             "one.generation_N * centres",
         ),
@@ -417,9 +417,9 @@ CASES = [
         ),
         (
             "is that of novelty",
-            COMMON,
-            "+= w * shaped(shaping, population.fitness)",
-            "+= (1.0 - w) * shaped(shaping, population.fitness)",
+            "es_service/search/objectives.py",
+            "+= weight * shaped(shaping, values(objective, results))",
+            "+= (1.0 - weight) * shaped(shaping, values(objective, results))",
         ),
     ),
     *cases(

@@ -27,6 +27,7 @@ from es_service.config.methods import (
     no_effect,
     parts_of,
     search_fields,
+    start_problems,
 )
 from es_service.config.model import RunConfig
 from es_service.config.objective_rules import objective_problems
@@ -183,6 +184,7 @@ def _load(
         problems += objective_problems(values, with_options(task, options_of(values)))
     if settings is not None:
         problems += _idle_problems(idle, values, algorithms) + method_problems(values, settings)
+        problems += start_problems(values, settings) if new else []
     problems += shape_problems(values) + engine_problems(values)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):

@@ -136,12 +136,17 @@ def method_problems(values: Mapping[str, Any], settings: type[SearchConfig]) -> 
     if not settings.gathers_statistics and values.get("policy.observation_normalization") is True:
         why = f" for {method}, which has no training episodes to gather statistics from"
         problems.append(not_allowed("policy.observation_normalization", True, "false", why=why))
-    if settings.needs_start and not values.get("search.init_from"):
-        why = f" for {method}, {settings.needs_start}"
-        problems.append(not_allowed("search.init_from", values.get("search.init_from"), "the folder of a run", why=why))
     if settings.needs_map and values.get("map.enabled", True) is False:
         problems.append(not_allowed("map.enabled", False, "true", why=f" for {method}, {settings.needs_map}"))
     return problems
+
+
+def start_problems(values: Mapping[str, Any], settings: type[SearchConfig]) -> list[Problem]:
+    """The problem of a new run without `search.init_from` whose method needs it. A fork has its parent's state."""
+    if not settings.needs_start or values.get("search.init_from"):
+        return []
+    why = f" for {values['search.algorithm']}, {settings.needs_start}"
+    return [not_allowed("search.init_from", values.get("search.init_from"), "the folder of a run", why=why)]
 
 
 def _only_centres(values: Mapping[str, Any], settings: type[SearchConfig]) -> int | None:

@@ -1,6 +1,7 @@
 """MEMES against its twin; when an emitter is reset and from where, interruption, and what a config may say."""
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,9 +16,11 @@ from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
 from es_service.search.algorithms.common import first_state
-from es_service.search.algorithms.memes import RESET_CHOICE, STAGNANT
-from es_service.search.maps.behaviour_map import Elite, empty_map
+from es_service.search.algorithms.memes import AGE, RESET_CHOICE, STAGNANT
+from es_service.search.algorithms.starts import TRIED, Starts, drawn_cell, start_shares
+from es_service.search.maps.behaviour_map import Elite, empty_map, insert
 from es_service.search.maps.geometry import Grid
+from es_service.search.novelty import empty_archive, extended
 from es_service.search.state_parts import OWN
 from es_service.store.codec import decode_part, encode_part
 from tests.laws import me_es_runs
@@ -211,3 +214,77 @@ def test_it_has_a_centre_for_each_emitter_and_needs_a_map():
         caught.value
     )
     assert "map.enabled: false is not allowed for memes, whose emitters begin again from" in str(caught.value)
+
+
+# Objectives and starts
+
+
+def test_each_emitter_has_one_of_the_objectives_in_turn():
+    target = {"kind": "target", "descriptor": [0.5, 0.1], "radius": 0.2}
+    search, state = begun(emitters=4, objectives=[{"kind": "novelty"}, target, {"kind": "mixture", "weight": 0.25}])
+    asked = search.ask(state, 1)
+    assert [one.objective.kind for one in asked] == ["novelty", "target", "mixture", "novelty"]
+    assert [one.fitness_weight for one in asked] == [0.0, 1.0, 0.25, 0.0]
+
+
+def told(search, state, generation, places):
+    """The state after every emitter has found a new cell, or None for the old one."""
+    found = [evaluated(generation, emitter, float(generation), place) for emitter, place in enumerate(places)]
+    return search.tell(state, tuple(found))
+
+
+def test_an_emitter_that_exploits_begins_again_after_its_generations_although_its_centres_enter_the_map():
+    search, state = begun(stagnation_generations=99, exploit_generations=3)  # the first explores, the second exploits
+    ages = []
+    for generation in range(8):
+        for emitter in (reset := search.start_cells(state, generation)):
+            nothing = np.zeros(0, np.float32)
+            state = search.restart(state, emitter, 3, Elite(np.ones(3, np.float32), nothing, nothing, nothing))
+        ages.append((sorted(reset), state.own[AGE].tolist()))
+        state = told(search, state, generation, (1.5, 5.5))  # each generation is fitter than the one before
+    assert ages == [
+        ([], [0, 0]),
+        ([], [1, 1]),
+        ([], [2, 2]),
+        ([1], [3, 0]),
+        ([], [4, 1]),
+        ([], [5, 2]),
+        ([1], [6, 0]),
+        ([], [7, 1]),
+    ]
+
+
+def test_starts_are_drawn_in_these_proportions():
+    config = config_of()
+    map_, archive = empty_map(Grid(((0.0, 9.0),), (9,))), empty_archive(1)
+    for place, fitness in ((0.5, -9.0), (1.5, -3.0), (7.5, -7.0)):
+        map_, _, _ = insert(map_, np.array([place]), fitness, 0, int(place), 0.0)
+        archive = extended(archive, np.array([place]), 0, int(place))
+    nearest = config.novelty.model_copy(update={"neighbours": 1})
+    tried_C = np.array([2, 1, 0, 0, 0, 0, 0, 1, 0])
+    shares = {how: start_shares(how, map_, archive, nearest, tried_C).tolist() for how in get_args(Starts)}
+    assert shares == {
+        "uniform": [1.0, 1.0, 1.0],
+        "novelty": [1.0, 1.0, 6.0],
+        "least_tried": [0.0, 1.0, 1.0],
+        "fitness": [0.0, 6.0, 2.0],
+    }
+    assert [drawn_cell(map_, np.array([0.0, 6.0, 2.0]), drawn) for drawn in (0.0, 0.74, 0.76, 0.999)] == [1, 1, 7, 7]
+    same = replace(map_, fitness_N=np.full(3, -1.0))
+    assert start_shares("fitness", same, archive, nearest, None).tolist() == [1.0, 1.0, 1.0]
+
+
+def test_starts_are_counted_where_the_least_tried_is_wanted():
+    search, state = begun(starts="least_tried", stagnation_generations=1)
+    state = told(search, state, 0, (1.5, 5.5))
+    nothing = np.zeros(0, np.float32)
+    elite, drawn = Elite(np.ones(3, np.float32), nothing, nothing, nothing), []
+    for generation in range(1, 5):
+        state = told(search, state, -generation, (1.5, 5.5))  # nothing is fitter than before
+        for emitter, cell in search.start_cells(state, generation).items():
+            state = search.restart(state, emitter, cell, elite)
+            drawn.append(cell)
+    counts_C = state.own[TRIED]
+    assert len(drawn) == 8
+    assert [counts_C[1], counts_C[5], counts_C.sum()] == [drawn.count(1), drawn.count(5), 8]
+    assert TRIED not in begun()[1].own

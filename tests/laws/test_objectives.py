@@ -15,11 +15,12 @@ from es_service.config.parts import (
 )
 from es_service.loop.generation import halves
 from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult
-from es_service.search.algorithms.common import scheduled
+from es_service.search.algorithms import ALGORITHMS
+from es_service.search.algorithms.common import first_state, scheduled
 from es_service.search.novelty import empty_archive, extended
 from es_service.search.objectives import target_values, utilities, values, weight_of_fitness, weighted
 from es_service.search.shaping import SHAPINGS, centred_ranks
-from tests.laws.es_runs import small_config
+from tests.laws.es_runs import run_in_memory, small_config
 
 INF, NAN = np.inf, np.nan
 
@@ -104,6 +105,41 @@ def test_a_schedule_falls_by_its_factor_to_its_limit():
     assert [scheduled(0.5, 0.5, 0.1, generation) for generation in (1, 2, 3, 4, 90)] == [0.5, 0.25, 0.125, 0.1, 0.1]
     assert scheduled(0.02, 1.0, 0.5, 7) == 0.02  # a limit above the start has no effect
     assert scheduled(0.02, 0.5, 0.5, 7) == 0.02
+
+
+def test_a_generation_has_the_sigma_and_the_rate_of_its_schedules_and_a_step_heeds_the_rate():
+    config = small_config(
+        sigma_decay=0.5,
+        sigma_limit=0.03,
+        learning_rate_decay=0.25,
+        step={"kind": "plain", "learning_rate": 0.4, "l2": 0},
+    )
+    method, search = ALGORITHMS["es"](config), config.search
+    state = first_state([np.zeros(3, np.float32)], 2, 1.0, search=search)
+    asked = [method.ask(state, generation)[0] for generation in (1, 2, 3)]
+    assert [one.sigma for one in asked] == [0.1, 0.05, 0.03]
+    assert [one.rate for one in asked] == [1.0, 0.25, 0.0625]
+    ones_D = np.ones(3, np.float32)
+    steps = [method.step(state, one, ones_D).centres[0].centre_D[0] for one in asked]
+    assert np.allclose(steps, [0.4, 0.1, 0.025])
+
+
+def test_a_gated_run_takes_steps_as_long_as_the_halves_agree():
+    def first_step(**settings):
+        config = small_config(step={"kind": "plain", "learning_rate": 0.4, "l2": 0}, **settings)
+        config = config.model_copy(update={"budget": config.budget.model_copy(update={"generations": 1})})
+        _, store, evaluator, _ = run_in_memory(config)
+        gradients = [one for _, chunk, one in evaluator.recorded if isinstance(chunk, GradientChunk)]
+        return store.rows[-1]["update_norm"], [one.sum_D for one in gradients if one.sum_D is not None]
+
+    whole, _ = first_step()
+    gated, sums = first_step(step_gate=True)
+    blocks = len(sums) // 2  # of each half
+    halves_D = [np.sum(of, axis=0, dtype=np.float64) for of in (sums[:blocks], sums[blocks:])]
+    lengths = [np.linalg.norm(one) for one in halves_D]
+    cosine = float(halves_D[0] @ halves_D[1] / np.prod(lengths))
+    assert gated == pytest.approx(whole * max(0.0, cosine), rel=1e-4)
+    assert gated < whole
 
 
 class Noise:

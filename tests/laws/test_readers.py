@@ -51,7 +51,7 @@ def parent():
     with workers_in_this_process():
         folder = Path(tempfile.mkdtemp()) / "parent"
         atexit.register(shutil.rmtree, folder.parent)
-        return str(api.run(config_of("memes"), folder).run.folder)
+        return str(api.run(config_of("nsr_es"), folder).run.folder)
 
 
 def config_of(method, **more):
