@@ -3,7 +3,7 @@
 PYTHON ?= python3
 UV ?= $(shell command -v uv 2>/dev/null)
 BIN := .venv/bin
-CONFIG ?= configs/point_maze_me_es.yaml
+CONFIG ?= configs/point_maze_memes.yaml
 START := $(shell date +%s)
 # The downloads of `run` and of `test`, as of 25 November 2026 on Linux x86-64 with Python 3.11 (sizes of the wheels).
 PACKAGES := 75 packages, about 375 MB

@@ -24,6 +24,8 @@ from es_service.errors import StartError, WayOut
 from es_service.logs import in_run
 from es_service.loop.interfaces import Stop as Stop
 from es_service.report.progress import in_notebook, show_in_notebook
+from es_service.runs import targets
+from es_service.runs.certified import target_reached
 from es_service.runs.checked_config import accepted, changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.lineage import fork_config, forked, started
@@ -175,11 +177,35 @@ def _go_on(
     *,
     strict: bool = False,
 ) -> Outcome:
-    """Open a run, check that the config of this session fits it, and continue it.
+    """Continue a run, in as many sessions as `budget.target_certified` makes of it.
 
     Args:
         asked: settings of the call, which ways out repeat.
     """
+    config, outcome = _session(folder, make_config, listener, asked, strict=strict)
+    return _to_target(config, outcome, listener, strict=strict)
+
+
+def _to_target(config: RunConfig, outcome: Outcome, listener: _Listener, *, strict: bool = False) -> Outcome:
+    """Certify the best centre whenever a session has ended for that, and continue if it does not reach the target."""
+    while outcome.reason == targets.TO_CERTIFY:
+        folder = outcome.run.folder
+        targets.certify_best(folder, config, listener.on_notice)
+        if reason := target_reached(folder, config.budget.target_certified):
+            return Outcome(open_run(folder), reason)
+        _, outcome = _session(folder, lambda store: config, listener, strict=strict)
+    return outcome
+
+
+def _session(
+    folder: Path,
+    make_config: Callable[[RunStore], RunConfig],
+    listener: _Listener,
+    asked: Mapping[str, Any] = MappingProxyType({}),
+    *,
+    strict: bool = False,
+) -> tuple[RunConfig, Outcome]:
+    """Open a run, check that the config of this session fits it, and work on it."""
     with RunStore.open(folder, hook=listener.hook) as store, in_run(store.meta.run_id):
         # Repairs remain even if the config is refused below, so they are reported now; `work` reports later notices.
         for notice in store.notices:
@@ -192,8 +218,11 @@ def _go_on(
             write_config(folder, config.resolved_yaml())
         except OSError as error:
             raise explained(error, folder, f"writing {CONFIG}") from error
+        if reason := target_reached(folder, config.budget.target_certified):
+            return config, Outcome(open_run(folder), reason)
         with listener.shown(folder) as on_generation:
-            return work(config, store, on_generation, listener.on_notice, listener.on_compile, strict=strict)
+            until = targets.until_due(on_generation, folder, config)
+            return config, work(config, store, until, listener.on_notice, listener.on_compile, strict=strict)
 
 
 def fork(
@@ -293,7 +322,8 @@ def _create_and_work(
     ):
         begun = store.generation
         try:
-            return work(config, store, on_generation, listener.on_notice, listener.on_compile)
+            until = targets.until_due(on_generation, folder, config)
+            outcome = work(config, store, until, listener.on_notice, listener.on_compile)
         except StartError as error:
             if store.generation != begun:
                 raise  # of something else that the caller started in a callback: this run has computed generations
@@ -307,3 +337,4 @@ def _create_and_work(
                 if way.action != "resume" or way.settings
             )
             raise
+    return _to_target(config, outcome, listener)

@@ -120,6 +120,11 @@ class BudgetConfig(Section):
     env_steps: Count | None = Field(None, description="Number of environment steps, evaluations included.")
     wall_clock_s: Positive | None = Field(None, description="Running time in seconds, summed over all sessions.")
     target_fitness: Number | None = Field(None, description="Mean evaluation fitness of a centre that ends the run.")
+    target_certified: Number | None = Field(
+        None,
+        description="Mean fitness in certified episodes that ends the run: the best centre is certified when its "
+        "evaluation reaches this, and the run continues if its new episodes do not.",
+    )
 
 
 class StoreConfig(Section):

@@ -275,8 +275,10 @@ def config_warnings(config: RunConfig, task: TaskSpec, no_vectors: str = "") -> 
         warnings.append(f"compute.chunk_pairs: {what}; {hint}")
     budget = config.budget
     if budget.generations is None and budget.env_steps is None and budget.wall_clock_s is None:
+        targets = {"target_fitness": budget.target_fitness, "target_certified": budget.target_certified}
+        named = " or ".join(f"{key} ({target})" for key, target in targets.items() if target is not None)
         warnings.append(
-            f"budget: this run ends only when it reaches target_fitness ({budget.target_fitness}), which may never "
-            "happen; consider setting budget.generations as well"
+            f"budget: this run ends only when it reaches {named}, which may never happen; consider setting "
+            "budget.generations as well"
         )
     return warnings

@@ -112,6 +112,20 @@ def newest_certified(policies: list[Certified]) -> Certified | None:
     return next((one for one in policies if (one.number, one.rank) == (newest, 0)), None)
 
 
+def target_reached(folder: Path, target: float | None) -> str:
+    """Why a run is over whose `budget.target_certified` is this, in words; empty if no certified policy reaches it."""
+    if target is None:
+        return ""
+    for one in certified_policies(folder):
+        mean = one.row()[f"{one.selected_by}_mean"]
+        if mean is not None and mean >= target:
+            return (
+                f"the target {target:g} is reached: a policy of generation {one.generation} has {mean:.6g} in "
+                f"{one.episodes.count} certified episodes"
+            )
+    return ""
+
+
 def arrays_of(episodes: Episodes) -> dict[str, NDArray[Any]]:
     """The arrays of episodes by name, for the store."""
     return {name: array for name, array in vars(episodes).items() if array is not None}

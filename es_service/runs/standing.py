@@ -10,13 +10,17 @@ from typing import Any
 from pydantic import ValidationError
 
 from es_service.config.model import BudgetConfig
-from es_service.errors import ConfigError, WayOut
+from es_service.errors import ConfigError, StoreError, WayOut
 from es_service.loop.budget import REACHED, limits_of, raised, spent
 from es_service.loop.history import Row
+from es_service.runs.certified import target_reached
 from es_service.runs.view import Run
 from es_service.store.folder import CONFIG, DATABASE, runs_inside
 from es_service.store.lock import lock_holder
 from es_service.store.reader import read_newest
+
+TARGET = "target_certified"
+"""Key of the budget that certified policies reach."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +36,14 @@ class Standing:
     """Limits of the run's present budget by key; empty if the budget cannot be read."""
     problem: str = ""
     """Why the budget cannot be read; empty if it can."""
+    certified: str = ""
+    """Why the run is over by `budget.target_certified`; empty if it is not."""
 
     @property
     def reasons(self) -> dict[str, str]:
         """Why the run is finished, by key of the budget; empty if it is not."""
-        return spent(self.limits, self.row) if self.row else {}
+        reached = {TARGET: self.certified} if self.certified else {}
+        return reached | (spent(self.limits, self.row) if self.row else {})
 
 
 def population_size(constants: Mapping[str, Any]) -> str:
@@ -61,13 +68,18 @@ def look(run: Run) -> Standing:
 def standing_at(run: Run, driver: Mapping[str, Any] | None, row: Row | None) -> Standing:
     """The standing of a run whose driver and newest history row were read before; see `Standing`."""
     try:
-        return Standing(run, driver, row, limits_of(BudgetConfig.model_validate(run.present_config["budget"])))
+        budget = BudgetConfig.model_validate(run.present_config["budget"])
     except ConfigError as error:
         return Standing(run, driver, row, {}, " ".join(error.sentence.split()))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, ("budget", *first["loc"])))
         return Standing(run, driver, row, {}, f"{run.folder / CONFIG}: {key}: {first['msg']}")
+    try:
+        certified = target_reached(run.folder, budget.target_certified)
+    except StoreError:
+        certified = ""  # damage of a certification, which `verify` names
+    return Standing(run, driver, row, limits_of(budget), certified=certified)
 
 
 def is_waiting(standing: Standing) -> bool:
@@ -104,7 +116,8 @@ def more(standing: Standing) -> dict[str, float | None]:
     """Settings with which a finished run can continue; empty if it is not finished."""
     if standing.row is None:
         return {}
-    return {f"budget.{key}": value for key, value in raised(standing.limits, standing.row).items()}
+    reached = {TARGET: None} if standing.certified else {}
+    return {f"budget.{key}": value for key, value in (reached | raised(standing.limits, standing.row)).items()}
 
 
 def to_go(standing: Standing) -> str:

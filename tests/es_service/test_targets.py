@@ -1,0 +1,71 @@
+"""`budget.target_certified`: a run ends when new episodes, and not the evaluation alone, reach the target."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from es_service import api
+from es_service.runs import standing
+from es_service.runs.certified import certified_policies
+
+pytestmark = pytest.mark.usefixtures("workers_here")
+CONFIG = {
+    "task": {"environment": "point_maze", "episode_steps": 30},
+    "policy": {"hidden": [4]},
+    "search": {"algorithm": "es", "pairs": 16, "sigma": 0.2, "step": {"learning_rate": 0.2}, "evaluation_episodes": 2},
+    "map": {"enabled": False},
+    "budget": {"generations": 40},
+    "compute": {"engine": "inline", "workers": 1},
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, workers_here):
+    """The run without a target."""
+    return api.run(api.load_config(CONFIG), tmp_path_factory.mktemp("run") / "whole").run
+
+
+def test_it_ends_at_the_first_best_centre_that_new_episodes_confirm_and_its_bits_are_those_of_the_whole(
+    whole, tmp_path
+):
+    target = float(whole.history["best_fitness"].iloc[0]) - 0.5
+    outcome = api.run(api.load_config(CONFIG, [f"budget.target_certified={target}"]), tmp_path / "run")
+    run, tested = outcome.run, certified_policies(tmp_path / "run")
+    assert f"the target {target:g} is reached: a policy of generation {tested[-1].generation}" in outcome.reason
+    assert run.generation < 40
+    means = [one.row()["return_mean"] for one in tested]
+    assert means[-1] >= target > max(means[:-1], default=-np.inf)
+    assert [one.stored_fitness for one in tested] == sorted({one.stored_fitness for one in tested})
+    until = run.generation
+    assert run.history["centre_fitness_mean"].tolist() == whole.history["centre_fitness_mean"].tolist()[: until + 1]
+    assert standing.state(standing.look(run)) == f"finished: {outcome.reason}"
+    again = api.resume(run.folder)
+    assert (again.reason, again.run.generation) == (outcome.reason, until)
+    further = api.resume(run.folder, standing.more(standing.look(run)))
+    assert further.run.generation == 40
+    assert further.run.digest() == whole.digest()
+
+
+def test_lucky_evaluations_do_not_end_a_run(whole, tmp_path):
+    target = float(np.quantile(whole.history["best_fitness"], 0.4))
+    outcome = api.run(api.load_config(CONFIG, [f"budget.target_certified={target}"]), tmp_path / "run")
+    tested = certified_policies(tmp_path / "run")
+    assert len(tested) > 1
+    assert all(one.row()["return_mean"] < target <= one.stored_fitness for one in tested)
+    assert outcome.reason == "the budget of 40 generations is spent"
+    assert outcome.run.digest() == whole.digest()
+
+
+def test_a_target_out_of_reach_certifies_nothing_and_the_budget_ends_the_run(whole, tmp_path):
+    outcome = api.run(api.load_config(CONFIG, ["budget.target_certified=0"]), tmp_path / "run")
+    assert outcome.reason == "the budget of 40 generations is spent"
+    assert certified_policies(tmp_path / "run") == []
+    assert outcome.run.digest() == whole.digest()
+
+
+def test_a_stop_of_the_caller_comes_first(whole, tmp_path):
+    target = float(whole.history["best_fitness"].iloc[1])
+    config = api.load_config(CONFIG, [f"budget.target_certified={target}"])
+    outcome = api.run(config, tmp_path / "run", on_generation=lambda row: api.Stop("enough"))
+    assert (outcome.reason, outcome.run.generation) == ("enough", 0)
