@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from es_service import api
+from es_service.cli.main import app
 from es_service.errors import ConfigError
 from es_service.protocol.messages import EpisodesResult
+from es_service.runs.polishing import certify_both, polish_config
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
 from es_service.search.algorithms.common import first_state
@@ -138,3 +141,30 @@ def test_a_policy_of_a_cell_is_refused_and_so_are_objectives_that_do_not_fit(par
         config_of(parent, task={"environment": "ant_trap"}, objective={"kind": "goal_distance"})
     with pytest.raises(ConfigError, match="null is not allowed for polish, which improves policies of another run"):
         api.load_config(PARENT | {"search": {"algorithm": "polish"}})
+
+
+def test_the_command_polishes_a_run_and_shows_certified_values_before_and_after(parent, tmp_path):
+    words = ["polish", parent.folder, "--candidates", 2, "--out", tmp_path / "run"]
+    settings = ["search.screened=4", "search.pairs=16", "budget.generations=3"]
+    result = CliRunner().invoke(app, [*map(str, words), *(word for one in settings for word in ("--set", one))])
+    assert result.exit_code == 0, (result.output, result.exception)
+    before, after = result.stdout.split("certified before polishing:")[1].split("certified after polishing:")
+    run = api.open_run(tmp_path / "run")
+    for lines, of in ((before, parent), (after, run)):
+        [row] = of.certified.to_dict("records")
+        assert f"return {row['return_mean']:,.2f}" in lines
+    assert run.constants["search.candidates"] == 2
+    assert run.config["task"] == parent.config["task"]
+    assert run.config["policy"] == parent.config["policy"]
+    assert run.config["map"] == parent.config["map"]
+    assert run.config["budget"]["env_steps"] == parent.history["env_steps"].iloc[-1]
+
+
+def test_with_a_target_set_policies_are_selected_by_success(parent, tmp_path):
+    target = {"kind": "target", "descriptor": [-0.5, 0.8], "radius": 0.1}
+    config = polish_config(parent.folder, {f"search.objective.{key}": value for key, value in target.items()})
+    run = api.run(
+        config.model_copy(update={"budget": config.budget.model_copy(update={"generations": 1})}), tmp_path / "run"
+    ).run
+    _, after = certify_both(parent, run, config, 1, lambda notice: None)
+    assert [one.selected_by for one in after] == ["success"]
