@@ -22,7 +22,7 @@ CONFIG = {
     "compute": {"engine": "inline", "workers": 2},
 }
 ES = {"algorithm": "es", "pairs": 8, "sigma": 0.1, "evaluation_episodes": 3}
-MAP_ELITES = {"algorithm": "map_elites", "batch": 10, "centres": 3, "iso_sigma": 0.2}
+MAP_ELITES = {"algorithm": "map_elites", "batch": 20, "centres": 3, "iso_sigma": 0.2}
 
 
 @pytest.fixture
