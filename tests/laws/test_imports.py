@@ -33,8 +33,6 @@ JOINERS = {
 """Modules of es_service that know both sides: they may import `workers`."""
 RAY_USERS = {"es_service.dispatch.ray_cluster", "es_service.runs.jobs"}
 """Modules of es_service that import Ray, inside the functions that need it: all others are given the module."""
-
-
 NAMES_OF_FOLDERS = {"workers.xla_cache": {"xla"}}
 """Module -> words that are folders of its cache, and not the rollouts of these names."""
 
@@ -145,6 +143,7 @@ def test_a_name_is_found():
         '"""memes"""\nif name in ("es", "other"):\n    """ars"""\n    Field(description="ars")\n    f(x={"me_es": 1})'
     )
     assert names_in(source, OURS) == ["es", "me_es"]
+    assert names_in('run if spec.rollout == "simd" else "xla"', BACKENDS) == ["simd", "xla"]
 
 
 @pytest.mark.parametrize("path", [*files("es_service"), *files("workers")], ids=module_of)

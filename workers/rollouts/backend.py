@@ -66,8 +66,8 @@ class ChunkFunctions(NamedTuple):
     without action noise. The parameters are a list of arrays [N, D]; policy_L is the row of each lane among the rows of
     all."""
     gradient_sum: Compilable
-    """Function (weights_P, noise_keys_P_4) -> sum over pairs of weight x standard normal noise, [D]. Pairs are added in
-    the order of their ids, so that the float32 bits depend on nothing else."""
+    """Function (weights_P, noise_keys_P_4) -> sum over pairs of weight x standard normal noise, [D]. Pairs are added one
+    by one in the order of their ids, so that the float32 bits depend on nothing else."""
 
 
 class RolloutBackend(Rollout, Protocol):
@@ -79,6 +79,10 @@ class RolloutBackend(Rollout, Protocol):
         Called where the task is described, in a process of its own; the answer is kept in `TaskSpec.unsupported`, so
         that the driver need not find it.
         """
+        return ""
+
+    def device(self) -> str:
+        """Kind of the GPU that it computes on, which belongs to a worker's platform; called only where there is one."""
         return ""
 
     @abstractmethod

@@ -18,6 +18,12 @@ class Xla(RolloutBackend):
     runs_on_gpus = True
     compile_s = (15, 6)
 
+    def device(self) -> str:
+        """The kind of JAX's first device."""
+        import jax
+
+        return jax.devices()[0].device_kind
+
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """The functions of `workers.rollout`."""
         from workers import rollout
