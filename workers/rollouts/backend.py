@@ -66,8 +66,8 @@ class ChunkFunctions(NamedTuple):
     without action noise. The parameters are a list of arrays [N, D]; policy_L is the row of each lane among the rows of
     all."""
     gradient_sum: Compilable
-    """Function (weights_P, noise_keys_P_4) -> sum over pairs of weight x standard normal noise, [D]. Pairs are added one
-    by one in the order of their ids, so that the float32 bits depend on nothing else."""
+    """Function (weights_P, noise_keys_P_4) -> sum over pairs of weight x standard normal noise, [D]. Pairs are added
+    one by one in the order of their ids, so that the float32 bits depend on nothing else."""
 
 
 class RolloutBackend(Rollout, Protocol):
