@@ -143,7 +143,7 @@ def test_a_name_is_found():
         '"""memes"""\nif name in ("es", "other"):\n    """ars"""\n    Field(description="ars")\n    f(x={"me_es": 1})'
     )
     assert names_in(source, OURS) == ["es", "me_es"]
-    assert names_in('run if spec.rollout == "simd" else "xla"', BACKENDS) == ["simd", "xla"]
+    assert names_in('run if spec.rollout == "simd" else "other"', BACKENDS) == ["simd"]
 
 
 @pytest.mark.parametrize("path", [*files("es_service"), *files("workers")], ids=module_of)
