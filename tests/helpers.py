@@ -35,6 +35,7 @@ SPEC = WorkerSpec(
     chunk_pairs=8,
     rollout_block_pairs=4,
     gradient_block_pairs=8,
+    rollout="xla",
 )
 PARAMETERS = SPEC.policy.parameters
 

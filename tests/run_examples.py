@@ -25,6 +25,7 @@ from es_service.store.beginning import Beginning
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
 from workers.environments import SHIPPED
+from workers.rollouts import BACKENDS
 
 
 def write_run(
@@ -44,7 +45,7 @@ def write_run(
         parent: `RunMeta.parent`.
     """
     source = {"task.environment": task.name, "search.algorithm": "me_es", "budget.generations": generations or 1}
-    config = load_config({}, source | (settings or {}), tasks={task.name: task}, algorithms=OURS)
+    config = load_config({}, source | (settings or {}), tasks={task.name: task}, algorithms=OURS, rollouts=BACKENDS)
     enabled, shape = config.map.enabled, policy_shape(config, task)
     meta = RunMeta(
         run_id=f"run-{config.seed}",

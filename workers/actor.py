@@ -60,15 +60,14 @@ class WorkerActor:
             del os.environ[name]
         os.environ.update(environment | xla_cache_settings())
         from workers.cores import make_worker_with_cores
+        from workers.rollouts import BACKENDS
 
         self._environment = spec.environment
         with sendable(self._environment):
             self._run_chunks = make_worker_with_cores(spec, self._cores)
         if not self._gpus:
             return platform_text(platform_info())
-        import jax
-
-        return platform_text(platform_info() | {"device": jax.devices()[0].device_kind})
+        return platform_text(platform_info() | {"device": BACKENDS[spec.rollout].device()})
 
     def compile(self, chunks: bytes, *subjects: bytes) -> float:
         """Compile for chunks without running them; returns the seconds that it took. The arguments are those of `run`.

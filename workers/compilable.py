@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import jax
-
 
 @dataclass(frozen=True)
 class Compilable:
@@ -31,5 +29,7 @@ class Compilable:
 
 def jitted(function: Callable[..., Any]) -> Compilable:
     """The function compiled by XLA, once for each shape of its arguments. What `compile` made is what a call runs."""
+    import jax  # here, since a worker without JAX tasks does not load it
+
     run = jax.jit(function)
     return Compilable(run, lambda *arguments: run.lower(*arguments).compile())

@@ -1,8 +1,8 @@
 """A worker with several cores, among which the chunks of each work item are divided.
 
-With simd the cores are threads, because kernels run without the interpreter's lock. With xla each core is a child
-process with a JAX of its own, whose thread pool has one thread like that of any other worker. Results do not depend on
-the number of cores.
+The cores are threads if the rollout runs in threads. With any other each core is a child process, with a JAX of its
+own if it has one, whose thread pool has one thread like that of any other worker. Results do not depend on the number
+of cores.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from es_service.protocol.messages import ChunkResult, Work, WorkerSpec
 from es_service.protocol.parent import end_with
 from es_service.protocol.raised import sendable
 from workers.compilable import Compilable
+from workers.rollouts import BACKENDS
 from workers.worker import make_worker
 
 PARTS_PER_CORE = 2
@@ -49,7 +50,7 @@ def make_worker_with_cores(spec: WorkerSpec, cores: int) -> Compilable:
     """
     if cores == 1:
         return make_worker(spec)
-    if spec.rollout == "simd":
+    if BACKENDS[spec.rollout].runs_in_threads:
         worker, pool = make_worker(spec), ThreadPoolExecutor(cores)
         return Compilable(lambda work: divided(pool, worker.run, work, cores), worker.compile)
     context = get_context("spawn")  # a forked JAX would not work

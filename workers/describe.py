@@ -11,15 +11,26 @@ import dataclasses
 import json
 import sys
 
+from es_service.protocol.messages import TaskSpec
 from workers.environments import TaskError, describe_environment
-from workers.simd.episodes.rollout import why_not
+from workers.rollouts import BACKENDS
+
+
+def described(name: str) -> TaskSpec:
+    """Description of a task that is no shipped one, with the reasons of the rollouts that cannot run it.
+
+    Raises:
+        TaskError: the task does not exist or cannot be used.
+    """
+    task = describe_environment(name)
+    reasons = {rollout: why for rollout, one in BACKENDS.items() if (why := one.examine(task))}
+    return dataclasses.replace(task, unsupported=reasons)
 
 
 def main(name: str) -> None:
     """Print the description of a task, or the problem with it, as JSON."""
     try:
-        task = describe_environment(name)
-        answer = {"task": dataclasses.asdict(dataclasses.replace(task, no_simd=why_not(task)))}
+        answer = {"task": dataclasses.asdict(described(name))}
     except TaskError as error:
         answer = {"problem": str(error)}
     print(json.dumps(answer))

@@ -18,31 +18,7 @@ from es_service.protocol.noise import NORMAL_STD, normal_integers
 from workers.environments import Environment
 from workers.outputs import OUTPUTS
 from workers.policy import normalise
-
-
-class Episodes(NamedTuple):
-    """Results of an episode, or of a batch of episodes with the leading axes of the caller."""
-
-    fitness: Any
-    returns: Any
-    descriptor: Any
-    steps: Any
-    goal_distance: Any
-    """[..., 2]: distance to the goal at the end, and the least distance during the episode."""
-    shifted_sum_O: Any
-    """Sum over counted steps of (observation - mean of the statistics), float32; empty in evaluations, which do not
-    update the statistics.
-
-    It is accurate enough for one episode if that mean is close to the mean of the observations. Where no statistics
-    exist yet (in generation 1, or in blocks with an elite's statistics from random weights) the mean of the
-    observations must be less than a thousand of their standard deviations from 0."""
-    shifted_square_sum_O: Any
-    """Sum over counted steps of (observation - mean of the statistics) squared, float32; empty in evaluations."""
-    trace_T_B: Any
-    """Descriptor along an evaluation episode; empty in training. Point k is the descriptor after k / (points - 1) of
-    the episode's maximal number of steps, or at its end if it ended before."""
-    outputs: dict[str, Any]
-    """Outputs of an evaluation episode that the run names, by name; empty in training."""
+from workers.rollouts.backend import Episodes
 
 
 class Carry(NamedTuple):

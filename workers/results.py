@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import jax
 import numpy as np
 
 from es_service.protocol.messages import EpisodesResult, Moments
-from workers.episode import Episodes
+from workers.rollouts.backend import Episodes
 
 
 def training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
@@ -18,7 +17,7 @@ def training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
     They are means over the episodes, except the least goal distance, which is the minimum, and the steps, which are the
     sum.
     """
-    host = jax.tree.map(np.asarray, episodes)
+    host = episodes.map(np.asarray)
 
     def mean(x_P_S_E: Any) -> Any:
         return x_P_S_E.mean(axis=2) if x_P_S_E.shape[2] > 1 else x_P_S_E[:, :, 0].copy()
@@ -36,7 +35,7 @@ def training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
 
 def evaluation_result(episodes: Episodes, wanted: int) -> EpisodesResult:
     """Results of each of the first `wanted` evaluation episodes and the trace of the first."""
-    result = _episodes_result(jax.tree.map(lambda leaf: np.asarray(leaf)[:wanted], episodes))
+    result = _episodes_result(episodes.map(lambda array: np.asarray(array)[:wanted]))
     return replace(result, trace_T_B=np.asarray(episodes.trace_T_B)[0].copy())
 
 
@@ -48,7 +47,7 @@ def policies_result(episodes: Episodes, traced_L: Any) -> EpisodesResult:
 
 def _episodes_result(episodes: Episodes) -> EpisodesResult:
     """Results of single episodes without traces; arrays are copied out of JAX's memory."""
-    host = jax.tree.map(np.array, episodes)
+    host = episodes.map(np.array)
     return EpisodesResult(
         fitness=host.fitness,
         returns=host.returns,

@@ -25,12 +25,9 @@ from workers.policy import act, split_layers
 
 
 def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
-    """Rollout of one training chunk.
+    """Rollout of one training chunk, see `ChunkFunctions.training`.
 
-    Returns:
-        f(centre_D, unit, mean_O, std_O, noise_keys_P_4, reset_keys_P_S_E_4, action_keys_P_S_E_4) -> Episodes with
-        leading axes [P, S, E]; `unit` is sigma / NORMAL_STD. Pairs step in blocks of `rollout_block_pairs`, one block
-        after the other, so that a block's weights stay in cache.
+    Pairs step in blocks of `rollout_block_pairs`, one block after the other, so that a block's weights stay in cache.
     """
     episodes = _make_member_episodes(environment, spec)
     block_pairs = spec.rollout_block_pairs
@@ -60,12 +57,9 @@ def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Compila
 
 
 def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
-    """Rollout of one evaluation chunk, with episodes of the centre without action noise.
+    """Rollout of one evaluation chunk, see `ChunkFunctions.evaluation`.
 
-    Returns:
-        f(centre_D, mean_O, std_O, reset_keys_E_4, wanted_E) -> Episodes with leading axis [E]. Those that are not
-        wanted need not be computed, and their results may be anything; here all are, since a program that stopped
-        earlier could have other bits.
+    Episodes that are not wanted are computed all the same, since a program that stopped earlier could have other bits.
     """
     episodes = jitted(_make_episodes(environment, spec, training=False))
     return Compilable(
@@ -75,12 +69,9 @@ def make_evaluation_rollout(environment: Environment, spec: WorkerSpec) -> Compi
 
 
 def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
-    """Rollout of one policy chunk, with episodes of explicit policies without action noise.
+    """Rollout of one policy chunk, see `ChunkFunctions.policies`, for at most POLICY_SLOTS lanes.
 
-    Returns:
-        f(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L_4) -> Episodes with leading axis [L], for at most
-        POLICY_SLOTS lanes. The parameters are a list of arrays [N, D]; policy_L is the row of each lane among the rows
-        of all. Lanes repeat to fill the chunk, whose shape never changes.
+    Lanes repeat to fill the chunk, whose shape never changes.
     """
     episodes = jitted(_make_episodes(environment, spec, training=False, own_weights=True))
 
@@ -124,12 +115,9 @@ def make_watched_rollout(environment: Environment, spec: WorkerSpec, *, own_weig
 
 
 def make_gradient_sum(parameters: int) -> Compilable:
-    """Sum of weighted noise of one block of pairs.
+    """Sum of weighted noise of one block of pairs, see `ChunkFunctions.gradient_sum`.
 
-    Returns:
-        f(weights_P, noise_keys_P_4) -> sum over pairs of weight x standard normal noise, [D]. Pairs are added one by
-        one in the order of their ids, so the float32 bits depend on nothing else. The noise is made of integers, and
-        the sum is scaled to standard normal once, at the end.
+    The noise is made of integers, and the sum is scaled to standard normal once, at the end.
     """
     coordinates_D = np.arange(parameters, dtype=np.uint32)
 

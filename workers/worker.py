@@ -10,7 +10,6 @@ from functools import partial
 from itertools import accumulate
 from typing import Any, NamedTuple, TypeVar
 
-import jax
 import numpy as np
 
 from es_service.protocol.gradient_tree import with_neighbours_added
@@ -33,9 +32,9 @@ from es_service.protocol.messages import (
 from es_service.protocol.noise import NORMAL_STD, Domain, Keys, evaluation_reset_keys, stream_keys
 from es_service.protocol.policies import slots
 from workers.compilable import Compilable
-from workers.environments import make_environment
-from workers.episode import Episodes
 from workers.results import evaluation_result, policies_result, training_result
+from workers.rollouts import BACKENDS
+from workers.rollouts.backend import ChunkFunctions, Episodes
 
 AnyChunk = TypeVar("AnyChunk", TrainingChunk, EvaluationChunk, GradientChunk)
 POLICY_CHUNKS_TOGETHER = 8
@@ -55,14 +54,13 @@ class _Kind(NamedTuple):
 def make_worker(spec: WorkerSpec) -> Compilable:
     """Function from the chunks of a work item to their results; `compile` compiles what their kind uses.
 
-    With simd the episodes of neighbouring chunks around one centre run in one call of the kernel, and so do those of a
-    few neighbouring policy chunks, since an episode's bits do not depend on the others. With xla they might, so each
-    chunk runs alone. A note on an exception names the chunk that raised it. Gradient blocks are added as far as the
-    work item has the neighbours.
+    If the rollout takes chunks together, the episodes of neighbouring chunks around one centre run in one call of its
+    function, and so do those of a few neighbouring policy chunks; else each chunk runs alone. A note on an exception
+    names the chunk that raised it. Gradient blocks are added as far as the work item has the neighbours.
     """
-    kinds = _kinds(spec)
-
-    groups = partial(_groups, together=spec.rollout == "simd")
+    backend = BACKENDS[spec.rollout]
+    kinds = _kinds(spec, backend.chunk_functions(spec))
+    groups = partial(_groups, together=backend.takes_chunks_together)
 
     def compile_group(kind: _Kind, work: Sequence[Work]) -> list[ChunkResult]:
         kind.function.compile(*kind.arguments(work))
@@ -88,14 +86,9 @@ def make_worker(spec: WorkerSpec) -> Compilable:
     return Compilable(run, lambda work: [named(compile_group, group) for group in groups(work)])
 
 
-def _kinds(spec: WorkerSpec) -> dict[type[Chunk], _Kind]:
+def _kinds(spec: WorkerSpec, functions: ChunkFunctions) -> dict[type[Chunk], _Kind]:
     """How a run's chunks of each kind are computed."""
-    environment = make_environment(spec.environment, spec.environment_options)
-    if spec.rollout == "simd":
-        from workers.simd.episodes import rollout as made_by
-    else:
-        from workers import rollout as made_by
-    gradient_sum = made_by.make_gradient_sum(spec.policy.parameters)
+    gradient_sum = functions.gradient_sum
 
     def training_arguments(work: Sequence[tuple[Centre, TrainingChunk]]) -> tuple[Any, ...]:
         centre, chunks = _around_one(work)
@@ -145,12 +138,10 @@ def _kinds(spec: WorkerSpec) -> dict[type[Chunk], _Kind]:
         return [GradientResult(np.array(sum_D)) for sum_D in sums_C_D]
 
     return {
-        TrainingChunk: _Kind(made_by.make_training_rollout(environment, spec), training_arguments, training_results),
-        EvaluationChunk: _Kind(
-            made_by.make_evaluation_rollout(environment, spec), evaluation_arguments, evaluation_results
-        ),
+        TrainingChunk: _Kind(functions.training, training_arguments, training_results),
+        EvaluationChunk: _Kind(functions.evaluation, evaluation_arguments, evaluation_results),
         GradientChunk: _Kind(Compilable(gradient_sums, compile_gradient_sum), gradient_arguments, gradient_results),
-        PolicyChunk: _Kind(made_by.make_policy_rollout(environment, spec), _policy_arguments, _policy_results),
+        PolicyChunk: _Kind(functions.policies, _policy_arguments, _policy_results),
     }
 
 
@@ -179,7 +170,7 @@ def _policy_results(work: Sequence[tuple[Policies, PolicyChunk]], episodes: Epis
     for one, chunk in work:
         _, episode_L = slots(one, chunk)
         of_chunk = slice(start, start + len(episode_L))
-        part = jax.tree.map(lambda leaf, of=of_chunk: leaf[of], episodes)
+        part = episodes.map(lambda array, of=of_chunk: array[of])
         results.append(policies_result(part, episode_L == 0 if one.traces else None))
         start += len(episode_L)
     return results
@@ -222,7 +213,7 @@ def _split(episodes: Episodes, size: int) -> list[Episodes]:
     count = len(episodes.fitness) // size
     if count == 1:
         return [episodes]
-    return [jax.tree.map(lambda leaf, of=slice(i * size, (i + 1) * size): leaf[of], episodes) for i in range(count)]
+    return [episodes.map(lambda array, of=slice(i * size, (i + 1) * size): array[of]) for i in range(count)]
 
 
 def population_id(chunk: Chunk) -> tuple[int, ...]:

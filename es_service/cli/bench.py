@@ -28,8 +28,8 @@ def rollouts(
         str | None, typer.Option("--policy", help="With a policy (on), without (off); default: both.")
     ] = None,
     rollout: Annotated[
-        str, typer.Option("--rollout", help="xla, simd (this project's compiler) or xla,simd.")
-    ] = "xla,simd",
+        str | None, typer.Option("--rollout", help="xla, simd (this project's compiler) or xla,simd; default: all.")
+    ] = None,
     batch: Annotated[
         list[int] | None, typer.Option("--batch", min=2, help="Number of episodes that step together; must be even.")
     ] = None,
@@ -42,11 +42,11 @@ def rollouts(
     from es_service.cli import bench_rollouts as measured
 
     policies = {None: (False, True), "on": (True,), "off": (False,)}.get(policy)
-    rollouts = rollout.split(",")
+    rollouts = rollout.split(",") if rollout else []
     if policies is None:
         raise ConfigError(f"--policy {policy}: must be on or off")
     if not set(rollouts) <= set(measured.ROLLOUTS):
-        raise ConfigError(f"--rollout {rollout}: must be {one_of(measured.ROLLOUTS)}, or both separated by a comma")
+        raise ConfigError(f"--rollout {rollout}: must be {one_of(measured.ROLLOUTS)}, or several separated by commas")
     if odd := [number for number in batch or () if number % 2]:
         raise ConfigError(f"--batch {odd[0]}: must be even, so that it consists of whole pairs")
     rows = measured.bench_rollouts(

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from es_service.config.problems import did_you_mean, one_of
-from es_service.config.tasks import TASKS
+from es_service.config.tasks import ROLLOUTS, TASKS
 from es_service.dispatch.cores import cores
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.process_environment import child_environment
@@ -20,7 +20,6 @@ BATCHES = {"point_maze": (64,)}
 ANT_BATCHES = (8, 16, 64)
 PAPER = {"point_maze": 1_520_000, "ant_maze": 4_480, "ant_trap": 7_470}
 """Steps a second on one CPU, without a policy (Chalumeau et al. 2022): other physics, another machine."""
-ROLLOUTS = ("xla", "simd")
 HIDDEN = {"point_maze": [64, 64]}
 ANT_HIDDEN = [256, 256]
 
@@ -29,19 +28,19 @@ def bench_rollouts(
     tasks: Sequence[str] = (),
     *,
     policies: Sequence[bool] = (False, True),
-    rollouts: Sequence[str] = ROLLOUTS,
+    rollouts: Sequence[str] = (),
     batches: Sequence[int] = (),
     seconds: float = 3.0,
 ) -> Iterator[dict[str, Any]]:
     """Yield one row per task, policy (on, off), rollout, batch and number of cores (one, all), as each is measured.
 
     The hidden layers are the paper's: 64x64 for PointMaze, else 256x256. Each core has a process like a worker's; the
-    rates of several, measured at the same time, are added. If simd cannot compile a task, its simd rows are replaced
-    by one row {"task", "rollout", "note"}.
+    rates of several, measured at the same time, are added. If a rollout cannot run a task, its rows are replaced by
+    one row {"task", "rollout", "note"}.
 
     Raises:
-        ConfigError: a task is unknown. EvaluationError: a task cannot be run, or simd cannot compile it and no other
-            rollout was requested.
+        ConfigError: a task is unknown. EvaluationError: a task cannot be measured, or a rollout cannot run it and no
+            other was requested.
     """
     for task in tasks:
         if task not in TASKS:
@@ -49,7 +48,7 @@ def bench_rollouts(
                 f"--task {task}: unknown task; must be {one_of(TASKS)}, or brax:NAME, or module:Class"
                 f"{did_you_mean(task, TASKS)}"
             )
-    every = sorted({1, cores()})
+    every, rollouts = sorted({1, cores()}), rollouts or tuple(ROLLOUTS)
     for task in tasks or TASKS:
         cannot: set[str] = set()
         for policy, rollout in itertools.product(policies, rollouts):
@@ -66,7 +65,7 @@ def bench_rollouts(
                     "rollout": rollout,
                 }
                 row = _row(arguments, count)
-                if "note" in row and set(rollouts) == {"simd"}:
+                if "note" in row and set(rollouts) == {rollout}:
                     raise EvaluationError(f"{task}: {row['note']}")
                 yield row
                 if "note" in row:
@@ -94,7 +93,7 @@ def _row(arguments: Mapping[str, Any], count: int) -> dict[str, Any]:
             found.append(json.loads(printed.splitlines()[-1]))
     named = {"task": arguments["task"], "rollout": arguments["rollout"]}
     if "problem" in found[0]:
-        return named | {"note": f"simd cannot compile it: {found[0]['problem']}; it runs on xla"}
+        return named | {"note": f"{arguments['rollout']} cannot run it: {found[0]['problem']}"}
     return named | {
         "policy": "on" if arguments["policy"] else "off",
         "batch": arguments["batch"],

@@ -17,7 +17,7 @@ from es_service.config.keys import Overrides
 from es_service.config.loading import left_out
 from es_service.config.model import RunConfig
 from es_service.config.resolution import config_warnings
-from es_service.config.tasks import no_vectors, task_of
+from es_service.config.tasks import ROLLOUTS, task_of
 from es_service.errors import ConfigError, ServiceError
 from es_service.logs import FORMAT
 from es_service.search.algorithms import ALGORITHMS
@@ -129,7 +129,7 @@ def print_config_notes(source: Path, configs: Sequence[tuple[Overrides, RunConfi
         for why in dict.fromkeys(foreign.values()):
             keys = [key for key in foreign if foreign[key] == why]
             notes[f"ignored {', '.join(keys)} of {source}, since {why}"] = None
-        notes |= dict.fromkeys(config_warnings(config, task_of(config), no_vectors()))
+        notes |= dict.fromkeys(config_warnings(config, task_of(config), ROLLOUTS))
     for note in notes:
         print_note(f"note: {note}")
 

@@ -57,7 +57,7 @@ class ComputeConfig(Section):
         default_factory=lambda: WorkerResources(cpu="auto", gpu=0.0),
         description="With engine ray: resources that Ray reserves for one actor.",
     )
-    rollout: Literal["xla", "simd"] = Field(
+    rollout: Text = Field(
         description="How episodes are computed. simd: by code compiled for this kind of processor, about twenty times "
         "faster. xla: by JAX, for GPUs and for tasks that simd cannot compile. auto: simd where it is possible."
     )

@@ -48,6 +48,7 @@ from es_service.config.start import folder_problems
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError, Problem
 from es_service.protocol.messages import TaskSpec, with_options
+from es_service.protocol.rollouts import Rollouts
 from es_service.protocol.user_code import in_no_file
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
@@ -60,7 +61,7 @@ def load_config(
     *,
     tasks: Mapping[str, TaskSpec],
     algorithms: Methods,
-    no_vectors: str = "",
+    rollouts: Rollouts,
     new: bool = True,
     searches: bool = True,
 ) -> RunConfig:
@@ -73,7 +74,7 @@ def load_config(
             own one are dropped; `left_out` returns those.
         tasks: the tasks that `task.environment` may name.
         algorithms: the methods that `search.algorithm` may name, of which the first is the simplest.
-        no_vectors: why this machine's processor cannot run the code that simd compiles; empty if it can.
+        rollouts: the rollouts that `compute.rollout` may name.
         new: whether the run that `search.init_from` names, if any, must exist.
         searches: whether a search uses the config; if none does, `search.algorithm` and the budget may be left out.
 
@@ -81,7 +82,7 @@ def load_config(
         ConfigError: names the file, then lists every problem on a line of its own.
     """
     defaults = {} if searches else {"search.algorithm": next(iter(algorithms)), "budget.generations": 1}
-    return _load(source, overrides, tasks, algorithms, no_vectors, defaults, new=new, resolved=False)
+    return _load(source, overrides, tasks, algorithms, rollouts, defaults, new=new, resolved=False)
 
 
 def left_out(source: Source, overrides: Overrides, algorithms: Methods) -> dict[str, str]:
@@ -102,7 +103,7 @@ def changed_config(
     *,
     tasks: Mapping[str, TaskSpec],
     algorithms: Methods,
-    no_vectors: str = "",
+    rollouts: Rollouts,
 ) -> RunConfig:
     """The config of an existing run with some keys changed.
 
@@ -113,7 +114,7 @@ def changed_config(
     Raises:
         ConfigError: as for `load_config`.
     """
-    return _load(source, overrides, tasks, algorithms, no_vectors, {}, new=False, resolved=True)
+    return _load(source, overrides, tasks, algorithms, rollouts, {}, new=False, resolved=True)
 
 
 def _load(
@@ -121,7 +122,7 @@ def _load(
     overrides: Overrides,
     tasks: Mapping[str, TaskSpec],
     algorithms: Methods,
-    no_vectors: str,
+    rollouts: Rollouts,
     defaults: Mapping[str, Any],
     *,
     new: bool,
@@ -177,15 +178,15 @@ def _load(
         read, more = read_options(values, task)
         values = {key: value for key, value in values.items() if not key.startswith(TASK_OPTIONS)} | read
         problems += more
-    values = resolve(values, left_open, task, settings, no_vectors)
+    values = resolve(values, left_open, task, settings, rollouts)
     if task is not None:
         problems += task_problems(values, task) + policy_problems(values, task)
-        problems += map_problems(values, task) + rollout_problems(values, task)
+        problems += map_problems(values, task)
         problems += objective_problems(values, with_options(task, options_of(values)))
     if settings is not None:
         problems += _idle_problems(idle, values, algorithms) + method_problems(values, settings)
         problems += start_problems(values, settings) if new else []
-    problems += shape_problems(values) + engine_problems(values)
+    problems += rollout_problems(values, task, rollouts) + shape_problems(values) + engine_problems(values, rollouts)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):
         problems.append(unfit("budget", None, f"this run has no limit; set at least one of {one_of(BUDGET)}"))

@@ -1,9 +1,9 @@
 """Resolves the values that a config leaves open, and checks its sections against each other.
 
 Every rule here depends only on the config and the task and never on the machine, because the resolved shapes affect the
-floating-point results of a run. (The one exception is `compute.rollout: auto`, which is xla if the processor cannot run
-simd's code; the choice is stored with the run.) Values are passed as one flat mapping, "search.sigma" -> 0.02. A key
-that is missing from it was invalid and has been reported already, so rules that need it report nothing.
+floating-point results of a run. (The one exception is `compute.rollout: auto`, which also asks what this machine can
+run; the choice is stored with the run.) Values are passed as one flat mapping, "search.sigma" -> 0.02. A key that is
+missing from it was invalid and has been reported already, so rules that need it report nothing.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from es_service.config.fields import RESOURCES
 from es_service.config.keys import FIELDS
 from es_service.config.map_rules import default_cells, default_kind, default_qd_offset
 from es_service.config.methods import default_centres
-from es_service.config.model import RunConfig
+from es_service.config.model import RunConfig, policy_shape
 from es_service.config.options import options_of
-from es_service.config.problems import not_allowed, unfit
+from es_service.config.problems import not_allowed, one_of, unfit, wrong_value
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
 from es_service.protocol.messages import PolicyShape, TaskSpec, with_options
+from es_service.protocol.rollouts import CHUNK_PAIRS, Rollouts, choose, why_not
 
 LEFT_OPEN: dict[str, str | None] = {
     "task.episode_steps": None,
@@ -38,10 +39,7 @@ LEFT_OPEN: dict[str, str | None] = {
     "compute.gradient_block_pairs": "auto",
 }
 """Keys that this module resolves -> the value that asks for it. Leaving the key out has the same effect."""
-MOST_CHUNK_PAIRS = 64
-"""Upper limit: enough pairs to fill vector units and outweigh the cost of a message; a lost chunk costs little."""
-LEAST_CHUNK_PAIRS = 16
-"""Lower limit: with smaller chunks the cost of messages exceeds the gain from distributing a small population."""
+MOST_CHUNK_PAIRS = CHUNK_PAIRS[1]
 CHUNKS = 8
 """Number of chunks for 128 to 512 pairs, so that several workers can share the population."""
 MOST_PARAMETERS = 80_000_000
@@ -60,12 +58,13 @@ FEW_CHUNK_PAIRS = 8
 """A chunk with fewer pairs is likely to cost more to send and start than to compute."""
 
 
-def default_chunk_pairs(pairs: int) -> int:
-    """The largest divisor of `pairs` up to pairs / 8 (a limit of at least 16, at most 64); a multiple of 8 if possible.
+def default_chunk_pairs(pairs: int, limits: tuple[int, int] = CHUNK_PAIRS) -> int:
+    """The largest divisor of `pairs` up to pairs / 8, within the limits (16 to 64); a multiple of 8 if possible.
 
     512 -> 64, 5000 -> 40, 64 -> 16, 7 -> 7.
     """
-    most = min(MOST_CHUNK_PAIRS, max(LEAST_CHUNK_PAIRS, pairs // CHUNKS))
+    least, most = limits
+    most = min(most, max(least, pairs // CHUNKS))
     divisors = [size for size in range(1, most + 1) if pairs % size == 0]
     return max([size for size in divisors if size % 8 == 0] or divisors)
 
@@ -94,7 +93,7 @@ def resolve(
     left_open: Collection[str],
     task: TaskSpec | None,
     settings: type[SearchConfig] | None,
-    no_vectors: str,
+    rollouts: Rollouts,
 ) -> dict[str, Any]:
     """Fill in the values that were left open, if the values from which they are derived are present.
 
@@ -103,7 +102,7 @@ def resolve(
         left_open: keys of LEFT_OPEN that are to be resolved.
         task: the task that `task.environment` names, or None where that is invalid.
         settings: those of the method that `search.algorithm` names, or None where that is invalid.
-        no_vectors: why this machine's processor cannot run the code that simd compiles; empty if it can.
+        rollouts: the rollouts that `compute.rollout` may name.
     """
     values = dict(values)
     if task is not None:
@@ -126,11 +125,13 @@ def resolve(
         for_ray = _value(values, "compute.address") is not None or has_actor_cores or _on_gpu(values)
         values["compute.engine"] = "ray" if for_ray else "inline"
     if "compute.rollout" in left_open and task is not None:
-        values["compute.rollout"] = "xla" if _on_gpu(values) or _why_no_simd(values, task, no_vectors) else "simd"
+        shape, gpu, here = _policy_shape(values, task), _on_gpu(values), _is_here(values)
+        values["compute.rollout"] = choose(rollouts, task, shape, gpu=gpu, here=here)
     has_pairs = settings is None or issubclass(settings, PopulationConfig)
     pairs = values.get("search.pairs") if has_pairs else WITHOUT_PAIRS
     if pairs is not None and "compute.chunk_pairs" in left_open:
-        values["compute.chunk_pairs"] = default_chunk_pairs(pairs)
+        rollout = rollouts.get(values.get("compute.rollout", ""))
+        values["compute.chunk_pairs"] = default_chunk_pairs(pairs, rollout.chunk_pairs if rollout else CHUNK_PAIRS)
     chunk_pairs = values.get("compute.chunk_pairs")
     if chunk_pairs is not None and task is not None:
         parameters = _policy_shape(values, task).parameters
@@ -193,8 +194,9 @@ def shape_problems(values: Mapping[str, Any]) -> list[Problem]:
     return problems
 
 
-def engine_problems(values: Mapping[str, Any]) -> list[Problem]:
-    """Problems of a cluster or GPU without Ray, threads without simd, and a share of GPUs that Ray cannot assign."""
+def engine_problems(values: Mapping[str, Any], rollouts: Rollouts) -> list[Problem]:
+    """Problems of a cluster or GPU without Ray, of threads with a rollout that has none, and of a share of GPUs that
+    Ray cannot assign."""
     problems = []
     if _value(values, "compute.engine") != "ray":
         problems = [
@@ -208,9 +210,11 @@ def engine_problems(values: Mapping[str, Any]) -> list[Problem]:
             if _value(values, name) not in (FIELDS[name].default, *([1] if name == f"{RESOURCES}cpu" else []))
         ]
     inline, threads = values.get("compute.engine") == "inline", values.get("compute.inline_workers") == "threads"
-    if threads and not (inline and values.get("compute.rollout", "simd") == "simd"):
+    rollout = rollouts.get(values.get("compute.rollout", ""))
+    if threads and not (inline and (rollout is None or rollout.runs_in_threads)):
+        able = one_of([name for name, one in rollouts.items() if one.runs_in_threads])
         what = (
-            "threads needs compute.engine = inline and compute.rollout = simd, because only simd's code runs in "
+            f"threads needs compute.engine = inline and compute.rollout = {able}, because only its code runs in "
             "several threads at once; must be processes"
         )
         problems.append(unfit("compute.inline_workers", "threads", what, allowed="processes"))
@@ -233,34 +237,40 @@ def _value(values: Mapping[str, Any], key: str) -> Any:
     return values.get(key, FIELDS[key].default)
 
 
-def _why_no_simd(values: Mapping[str, Any], task: TaskSpec, no_vectors: str) -> str:
-    """Why a new run cannot use simd; empty if it can. In a cluster this machine's processor is not considered."""
-    return task.no_simd or (no_vectors if values.get("compute.address") is None else "")
+def _is_here(values: Mapping[str, Any]) -> bool:
+    """Whether the workers run on this machine; in a cluster it does not matter what this machine can run."""
+    return values.get("compute.address") is None
 
 
-def rollout_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
-    """The problem of a config that asks for simd where simd cannot be used."""
-    if values.get("compute.rollout") != "simd":
+def rollout_problems(values: Mapping[str, Any], task: TaskSpec | None, rollouts: Rollouts) -> list[Problem]:
+    """The problem of a rollout that does not exist, or that cannot be used for this config."""
+    if (name := values.get("compute.rollout")) is None:
         return []
-    if _on_gpu(values):
-        why = f"simd runs only on CPUs, but {RESOURCES}gpu is {show(_value(values, f'{RESOURCES}gpu'))}"
-    elif task.no_simd:
-        why = f"simd cannot run {task.name}: {task.no_simd}"
+    if (rollout := rollouts.get(name)) is None:
+        return [wrong_value("compute.rollout", name, f"auto or {one_of(rollouts)}", [*rollouts])]
+    if _on_gpu(values) and not rollout.runs_on_gpus:
+        why = f"{name} runs only on CPUs, but {RESOURCES}gpu is {show(_value(values, f'{RESOURCES}gpu'))}"
+    elif task is not None and (reason := rollout.why_not(task, _policy_shape(values, task))):
+        why = f"{name} cannot run {task.name}: {reason}"
     else:
         return []
-    return [unfit("compute.rollout", "simd", f"{why}; must be auto or xla", allowed="auto or xla")]
+    allowed = f"auto or {one_of([other for other in rollouts if other != name])}"
+    return [unfit("compute.rollout", name, f"{why}; must be {allowed}", allowed=allowed)]
 
 
-def config_warnings(config: RunConfig, task: TaskSpec, no_vectors: str = "") -> list[str]:
+def config_warnings(config: RunConfig, task: TaskSpec, rollouts: Rollouts) -> list[str]:
     """Warnings about settings that are valid but probably not intended; the command line prints them before the run.
 
     Args:
-        no_vectors: as for `resolve`.
+        rollouts: as for `resolve`.
     """
-    warnings = []
-    values = {"compute.address": config.compute.address}
-    if config.compute.rollout == "xla" and (why := _why_no_simd(values, task, no_vectors)):
-        warnings.append(f"compute.rollout: xla is used because simd cannot run {task.name}: {why}")
+    shape, here, names = policy_shape(config, task), config.compute.address is None, [*rollouts]
+    faster = names[names.index(chosen := config.compute.rollout) + 1 :]
+    warnings = [
+        f"compute.rollout: {chosen} is used because {name} cannot run {task.name}: {why}"
+        for name in faster
+        if (why := why_not(rollouts[name], task, shape, here=here))
+    ]
     pairs = config.search.pairs if isinstance(config.search, PopulationConfig) else WITHOUT_PAIRS
     chunk = config.compute.chunk_pairs
     if chunk < FEW_CHUNK_PAIRS and pairs > MOST_CHUNK_PAIRS:

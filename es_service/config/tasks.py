@@ -20,9 +20,10 @@ from es_service.errors import ConfigError
 from es_service.protocol.messages import TaskSpec, with_options
 from es_service.protocol.options import Option, choice
 from es_service.protocol.process_environment import child_environment
+from es_service.protocol.rollouts import Rollouts
 from es_service.protocol.sources import user_sources
 from workers import environments
-from workers.simd.backend.target import NoVectorsError, host_target
+from workers.rollouts import BACKENDS
 
 DESCRIBE_S = 120.0
 """Longest wait for a description, in seconds; the first import of Brax from a slow disk can take long."""
@@ -44,6 +45,8 @@ class Tasks(Mapping[str, TaskSpec]):
 
 TASKS = Tasks()
 """Tasks of the command line and the Python interface; the workers' own table has only the shipped tasks."""
+ROLLOUTS: Rollouts = BACKENDS
+"""Rollouts that `compute.rollout` may name."""
 
 
 def task_of(config: RunConfig) -> TaskSpec:
@@ -71,19 +74,6 @@ def _changes(before: TaskSpec, now: TaskSpec) -> list[str]:
 
 
 @cache
-def no_vectors() -> str:
-    """Why this machine's processor cannot run the code that simd compiles; empty if it can.
-
-    Decides about `compute.rollout: auto`.
-    """
-    try:
-        host_target()
-    except NoVectorsError as error:
-        return str(error)
-    return ""
-
-
-@cache
 def _described(name: str, code: tuple[tuple[str, str], ...]) -> TaskSpec:
     """Description of a task whose code has these hashes."""
     try:
@@ -107,7 +97,11 @@ def _described(name: str, code: tuple[tuple[str, str], ...]) -> TaskSpec:
 
 
 def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
-    """A TaskSpec from its fields as JSON has them, also those that a run stores, with tuples in place of lists."""
+    """A TaskSpec from its fields as JSON has them, also those that a run stores, with tuples in place of lists.
+
+    Fields that only older versions had are left out.
+    """
+    known = {one.name for one in dataclasses.fields(TaskSpec)}
 
     def bounds(pairs: list) -> tuple[tuple[float, float], ...]:
         return tuple((float(low), float(high)) for low, high in pairs)
@@ -118,7 +112,7 @@ def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
         return Option(**{**found, "choices": tuple(found["choices"])})
 
     return TaskSpec(
-        **dict(fields)
+        **{name: value for name, value in fields.items() if name in known}
         | {
             "descriptor_names": tuple(fields["descriptor_names"]),
             "descriptor_bounds": bounds(fields["descriptor_bounds"]),

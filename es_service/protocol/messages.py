@@ -63,8 +63,8 @@ class TaskSpec:
     lower bound: short episodes of AntTrap can be below it. None if it is not specified."""
     success: str = ""
     """Which episodes succeed, in words; empty if the task does not say."""
-    no_simd: str = ""
-    """Reason why simd cannot compile episodes of this task; empty if it can."""
+    unsupported: dict[str, str] = field(default_factory=dict)
+    """Rollouts that were found to be unable to compute episodes of this task, by name, each with the reason."""
 
 
 def with_options(task: TaskSpec, options: Mapping[str, OptionValue]) -> TaskSpec:
@@ -115,8 +115,8 @@ class WorkerSpec:
     stay in the processor's cache."""
     gradient_block_pairs: int
     """Pairs whose weighted noise is summed into one partial gradient."""
-    rollout: Literal["xla", "simd"] = "xla"
-    """Implementation that computes episodes and gradients."""
+    rollout: str
+    """What computes episodes and gradients: a name in `workers.rollouts.BACKENDS`."""
     outputs: tuple[str, ...] = ()
     """Outputs of evaluation and policy episodes besides those of every result; names of `workers.outputs.OUTPUTS`."""
     sources: dict[str, str] = field(default_factory=dict)

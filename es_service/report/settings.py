@@ -12,6 +12,7 @@ from es_service.config.model import flat
 from es_service.config.options import options_of
 from es_service.config.resolution import LEFT_OPEN
 from es_service.config.search import SearchConfig
+from es_service.config.tasks import ROLLOUTS
 from es_service.config.yaml_text import in_line
 from es_service.errors import ConfigError
 from es_service.protocol.messages import TaskSpec
@@ -70,9 +71,9 @@ def _defaults(config: Mapping[str, Any], values: Mapping[str, Any], task: TaskSp
     ).keys()
     following = {key: values[key] for key in values if key not in LEFT_OPEN and key not in unknown}
     try:
-        known: dict[str, Any] = {"tasks": {environment: task}, "algorithms": {algorithm: method}, "new": False}
+        known: dict[str, Any] = {"tasks": {environment: task}, "algorithms": {algorithm: method}, "rollouts": ROLLOUTS}
         plain, followed = (
-            flat(load_config(source, overrides, **known).model_dump(mode="json"))
+            flat(load_config(source, overrides, **known, new=False).model_dump(mode="json"))
             for source, overrides in ((least, {}), (least, following))
         )
     except ConfigError:

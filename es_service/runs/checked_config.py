@@ -15,7 +15,7 @@ from es_service.config.keys import Overrides
 from es_service.config.loading import Source
 from es_service.config.methods import search_fields
 from es_service.config.model import RunConfig
-from es_service.config.tasks import TASKS, no_vectors
+from es_service.config.tasks import ROLLOUTS, TASKS
 from es_service.search.algorithms import ALGORITHMS
 
 
@@ -35,7 +35,7 @@ def load_config(source: Source, overrides: Overrides = (), *, new: bool = True, 
             overrides,
             tasks=TASKS,
             algorithms=ALGORITHMS,
-            no_vectors=no_vectors(),
+            rollouts=ROLLOUTS,
             new=new,
             searches=searches,
         )
@@ -48,9 +48,7 @@ def changed_config(source: Source, overrides: Overrides = ()) -> RunConfig:
     Raises:
         ConfigError: lists every problem found.
     """
-    return accepted(
-        loading.changed_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, no_vectors=no_vectors())
-    )
+    return accepted(loading.changed_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, rollouts=ROLLOUTS))
 
 
 def changes_from(constants: Mapping[str, Any], config: RunConfig) -> list[tuple[str, Any, Any]]:

@@ -15,11 +15,9 @@ from es_service.dispatch.dispatch_log import Entry, Log
 from es_service.dispatch.events import Compiled
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import WorkerSpec
+from workers.rollouts import BACKENDS
 from workers.simd.backend.cache import cache_folder
 
-SECONDS = {"simd": (10, 4), "xla": (15, 6)}
-"""Rollout -> about how many seconds a worker takes to start and to compile for a kind of chunk, the first time and with
-the code on disk, for tasks with physics (tests/benchmarks/README.md). Other tasks have compiled before it is said."""
 CONTENTS = {
     "TrainingChunk": "training episodes",
     "EvaluationChunk": "evaluation episodes",
@@ -36,7 +34,7 @@ def compiling_sentence(spec: WorkerSpec, kind: str, *, here: bool) -> str:
     Args:
         here: whether they are on this machine; of others it is not known what they have on disk.
     """
-    first_s, again_s = SECONDS[spec.rollout]
+    first_s, again_s = BACKENDS[spec.rollout].compile_s
     if not here:
         how_long = f"about {first_s} s the first time"
     elif was_compiled(spec, kind):

@@ -10,6 +10,7 @@ from es_service.config.loading import load_config
 from es_service.config.model import RunConfig
 from es_service.search.algorithms import ALGORITHMS
 from workers import environments
+from workers.rollouts import BACKENDS
 
 POINT_MAZE = environments.SHIPPED["point_maze"]
 TASKS = {"point_maze": POINT_MAZE}
@@ -19,4 +20,4 @@ WORDS = st.text(string.ascii_letters + string.digits + " .:#'\"-_+~/&*!%[]{}", m
 
 
 def load(source=MINIMAL, *overrides: str) -> RunConfig:
-    return load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+    return load_config(source, overrides, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS)

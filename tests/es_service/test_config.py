@@ -26,6 +26,8 @@ from es_service.config.yaml_text import dump_yaml, parse_value
 from es_service.errors import ConfigError
 from es_service.search.algorithms import ALGORITHMS, OURS
 from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS, load
+from workers.rollouts import BACKENDS
+from workers.rollouts.simd import Simd
 
 # What a config resolves to
 
@@ -105,25 +107,30 @@ def test_default_rollout_block_pairs(chunk, parameters, block):
 
 
 def test_awkward_populations_load_with_a_warning():
-    assert config_warnings(load(), POINT_MAZE) == []
-    (warning,) = config_warnings(load(MINIMAL, "search.pairs=127"), POINT_MAZE)
+    assert config_warnings(load(), POINT_MAZE, BACKENDS) == []
+    (warning,) = config_warnings(load(MINIMAL, "search.pairs=127"), POINT_MAZE, BACKENDS)
     assert warning.startswith("compute.chunk_pairs: 1 makes 127 small chunks")
     assert "search.pairs = 128" in warning
-    (warning,) = config_warnings(load(MINIMAL, "compute.chunk_pairs=4"), POINT_MAZE)
+    (warning,) = config_warnings(load(MINIMAL, "compute.chunk_pairs=4"), POINT_MAZE, BACKENDS)
     assert "auto would choose 64" in warning
     endless = load(MINIMAL, "budget.generations=null", "budget.target_fitness=-25")
-    (warning,) = config_warnings(endless, POINT_MAZE)
+    (warning,) = config_warnings(endless, POINT_MAZE, BACKENDS)
     assert "target_fitness (-25.0)" in warning
 
 
 def test_auto_chooses_simd_by_this_machine_unless_a_cluster_runs_the_workers():
-    why, of = "the processor (i486) has no AVX2", {"tasks": {"point_maze": POINT_MAZE}, "algorithms": ALGORITHMS}
-    here = load_config(MINIMAL, no_vectors=why, **of)
+    class OnAnOldProcessor(Simd):
+        def why_not_here(self):
+            return why
+
+    why, rollouts = "the processor (i486) has no AVX2", BACKENDS | {"simd": OnAnOldProcessor()}
+    of = {"tasks": {"point_maze": POINT_MAZE}, "algorithms": ALGORITHMS, "rollouts": rollouts}
+    here = load_config(MINIMAL, **of)
     assert here.compute.rollout == "xla"
-    (warning,) = config_warnings(here, POINT_MAZE, why)
+    (warning,) = config_warnings(here, POINT_MAZE, rollouts)
     assert warning == f"compute.rollout: xla is used because simd cannot run point_maze: {why}"
-    there = load_config(MINIMAL, {"compute.address": "auto", "compute.engine": "ray"}, no_vectors=why, **of)
-    assert (there.compute.rollout, config_warnings(there, POINT_MAZE, why)) == ("simd", [])
+    there = load_config(MINIMAL, {"compute.address": "auto", "compute.engine": "ray"}, **of)
+    assert (there.compute.rollout, config_warnings(there, POINT_MAZE, rollouts)) == ("simd", [])
 
 
 def test_the_engine_is_ray_where_something_needs_it():
@@ -145,15 +152,14 @@ def test_simd_is_what_auto_chooses_where_it_can_be_had():
     assert load(MINIMAL, "compute.worker_resources.gpu=1").compute.rollout == "xla"
     with pytest.raises(ConfigError, match=r"simd runs only on CPUs, but compute.worker_resources.gpu is 1;"):
         load(MINIMAL, "compute.worker_resources.gpu=1", "compute.rollout=simd")
-    no_simd = replace(POINT_MAZE, no_simd="the processor (i486) has no AVX2")
+    no_simd = replace(POINT_MAZE, unsupported={"simd": "the primitive sort"})
     here = {"point_maze": no_simd}
-    config = load_config(MINIMAL, tasks=here, algorithms=ALGORITHMS)
+    config = load_config(MINIMAL, tasks=here, algorithms=ALGORITHMS, rollouts=BACKENDS)
     assert config.compute.rollout == "xla"
-    (warning,) = config_warnings(config, no_simd)
-    why = "the processor (i486) has no AVX2"
-    assert warning == f"compute.rollout: xla is used because simd cannot run point_maze: {why}"
-    with pytest.raises(ConfigError, match=r"simd cannot run point_maze: the processor .* must be auto or xla"):
-        load_config(MINIMAL, ("compute.rollout=simd",), tasks=here, algorithms=ALGORITHMS)
+    (warning,) = config_warnings(config, no_simd, BACKENDS)
+    assert warning == "compute.rollout: xla is used because simd cannot run point_maze: the primitive sort"
+    with pytest.raises(ConfigError, match=r"simd cannot run point_maze: the primitive sort; must be auto or xla"):
+        load_config(MINIMAL, ("compute.rollout=simd",), tasks=here, algorithms=ALGORITHMS, rollouts=BACKENDS)
 
 
 def test_threads_are_for_simd_inside_one_process():

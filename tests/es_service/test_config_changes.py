@@ -12,6 +12,7 @@ from es_service.errors import ConfigError
 from es_service.search.algorithms import ALGORITHMS
 from tests.es_service.config_examples import MINIMAL, TASKS, load
 from workers.environments import SHIPPED
+from workers.rollouts import BACKENDS
 
 
 def test_constants_name_what_fixes_the_results():
@@ -69,7 +70,7 @@ def test_refused_changes_shows_all_and_the_ways_to_make_them():
 
 def test_another_task_has_its_own_default_options():
     source = MINIMAL | {"task": {"environment": "point_maze", "options": {"start": "corner"}}}
-    other = {"tasks": SHIPPED, "algorithms": ALGORITHMS}
+    other = {"tasks": SHIPPED, "algorithms": ALGORITHMS, "rollouts": BACKENDS}
     loaded = load_config(source, ["task.environment=ant_maze"], **other)
     assert (loaded.task.environment, loaded.task.options) == ("ant_maze", {})
     assert left_out(source, ["task.environment=ant_maze"], ALGORITHMS) == {
@@ -85,7 +86,7 @@ def test_another_task_has_its_own_default_options():
 def changed(*overrides: str, config: RunConfig | None = None) -> RunConfig:
     stored = parse_value((config or load()).resolved_yaml())
     assert isinstance(stored, dict)
-    return changed_config(stored, overrides, tasks=TASKS, algorithms=ALGORITHMS)
+    return changed_config(stored, overrides, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS)
 
 
 def changes(*overrides: str, config: RunConfig | None = None) -> list[str]:
@@ -136,7 +137,8 @@ def test_a_run_outlives_the_run_it_started_from(tmp_path):
     (tmp_path / "old").mkdir()
     stored = parse_value(load(MINIMAL, f"search.init_from={tmp_path / 'old'}").resolved_yaml())
     (tmp_path / "old").rmdir()
-    assert changed_config(stored, tasks=TASKS, algorithms=ALGORITHMS).search.init_from == str(tmp_path / "old")
+    changed = changed_config(stored, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS)
+    assert changed.search.init_from == str(tmp_path / "old")
     with pytest.raises(ConfigError, match="old does not exist; must be the folder of another run, or null"):
         load(stored)
 

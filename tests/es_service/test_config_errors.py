@@ -15,13 +15,14 @@ from es_service.protocol.messages import TaskSpec
 from es_service.search.algorithms import OURS
 from tests.es_service.config_examples import MINIMAL, MINIMAL_TEXT, POINT_MAZE, WORDS
 from tests.es_service.store_examples import without_root_rights
+from workers.rollouts import BACKENDS
 
 NO_FINAL = TaskSpec("no_final", 2, 2, 50, ("x",), ((0.0, 1.0),), final_fitness=False, has_goal=False)
 TASKS = {"point_maze": POINT_MAZE, "no_final": NO_FINAL}
 
 
 def load(source=MINIMAL, *overrides: str) -> RunConfig:
-    return load_config(source, overrides, tasks=TASKS, algorithms={"es": OURS["es"]})
+    return load_config(source, overrides, tasks=TASKS, algorithms={"es": OURS["es"]}, rollouts=BACKENDS)
 
 
 def problems(source=MINIMAL, *overrides: str) -> list[str]:
@@ -293,7 +294,11 @@ def test_a_map_that_does_not_fit_the_algorithm_or_its_kind_is_refused():
     assert line == "map.cells: [5000] makes 5,000 cells; must be at most 4,096 for a cvt"
     with pytest.raises(ConfigError) as caught:
         load_config(
-            MINIMAL, ["search.algorithm=me_es", "map.enabled=false"], tasks=TASKS, algorithms={"me_es": OURS["me_es"]}
+            MINIMAL,
+            ["search.algorithm=me_es", "map.enabled=false"],
+            tasks=TASKS,
+            algorithms={"me_es": OURS["me_es"]},
+            rollouts=BACKENDS,
         )
     (line,) = (line.strip() for line in str(caught.value).splitlines()[1:])
     assert line.startswith("map.enabled: false is not allowed for me_es, whose blocks start from elites of the map")

@@ -15,6 +15,7 @@ from es_service.errors import ConfigError
 from es_service.protocol.options import Option, choice, declared_options
 from es_service.search.algorithms import ALGORITHMS
 from tests.es_service.config_examples import MINIMAL, POINT_MAZE
+from workers.rollouts import BACKENDS
 
 OPTIONS = {
     "start": choice("default", "corner"),
@@ -24,7 +25,7 @@ OPTIONS = {
     "gap": Option(2.0, low=0.5),
     "note": Option("plain"),
 }
-KNOWN = {"tasks": {"point_maze": replace(POINT_MAZE, options=OPTIONS)}, "algorithms": ALGORITHMS}
+KNOWN = {"tasks": {"point_maze": replace(POINT_MAZE, options=OPTIONS)}, "algorithms": ALGORITHMS, "rollouts": BACKENDS}
 
 
 def load(*overrides, source=MINIMAL):
@@ -135,7 +136,10 @@ def test_a_task_keeps_its_options_in_the_run_store_and_those_of_older_versions_a
     task = replace(POINT_MAZE, options=OPTIONS)
     stored = json.loads(json.dumps(asdict(task)))
     assert task_from_fields(stored) == task
-    older = stored | {"options": {"start": ["default", "corner"]}}
+    older = stored | {
+        "options": {"start": ["default", "corner"]},
+        "no_simd": "only older ones had it",
+    }
     assert task_from_fields(older).options == {"start": choice("default", "corner")}
 
 

@@ -13,6 +13,7 @@ from es_service.config.presets import preset_table
 from es_service.config.resolution import config_warnings
 from es_service.config.tasks import TASKS
 from es_service.search.algorithms import ALGORITHMS
+from workers.rollouts import BACKENDS
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 ALL = sorted(CONFIGS.rglob("*.yaml"))
@@ -26,15 +27,15 @@ def each(paths: list[Path]) -> pytest.MarkDecorator:
 
 @each(ALL)
 def test_shipped_configs_load_and_are_named_after_task_and_algorithm(path):
-    config = load_config(path, tasks=TASKS, algorithms=ALGORITHMS)
+    config = load_config(path, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS)
     assert path.stem == f"{config.task.environment.replace(':', '_')}_{config.search.algorithm}"
-    assert config_warnings(config, TASKS[config.task.environment]) == []
+    assert config_warnings(config, TASKS[config.task.environment], BACKENDS) == []
 
 
 @each(COMMENTED)
 def test_shipped_configs_hide_no_preset_key(path):
     """But the size of the population: or `--set search.preset=uber` would do nothing."""
-    config = load_config(path, ["search.preset=uber"], tasks=TASKS, algorithms=ALGORITHMS)
+    config = load_config(path, ["search.preset=uber"], tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS)
     constants = config.constants()
     uber = {row.key: row.uber for row in preset_table(ALGORITHMS) if row.method is None and row.key in constants}
     assert len(uber) >= 3
@@ -43,7 +44,7 @@ def test_shipped_configs_hide_no_preset_key(path):
 
 @each(COMMENTED)
 def test_comments_of_shipped_configs_say_the_numbers_that_are_used(path):
-    config = load_config(path, tasks=TASKS, algorithms=ALGORITHMS)
+    config = load_config(path, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS)
     spec, compute = worker_spec(config, TASKS[config.task.environment]), config.compute
     said = dict(re.findall(r"^ *(\w+):.*?# (.*)$", path.read_text(), re.MULTILINE))
     inputs, *_, outputs = spec.policy.widths

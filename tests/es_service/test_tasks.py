@@ -19,6 +19,7 @@ from es_service.protocol.options import Option
 from es_service.search.algorithms import ALGORITHMS
 from tests.helpers import SPEC, centre, random_parameters
 from workers.environments import TaskError, describe_environment, make_environment
+from workers.rollouts import BACKENDS
 
 HERE = __name__
 
@@ -126,5 +127,5 @@ def test_what_is_defined_in_a_notebook_belongs_into_a_file(key, known):
     ):
         section, name = key.split(".")
         with pytest.raises(ConfigError, match=told) as caught:
-            load_config({section: {name: given}}, tasks=TASKS, algorithms=ALGORITHMS)
+            load_config({section: {name: given}}, tasks=TASKS, algorithms=ALGORITHMS, rollouts=BACKENDS)
         assert caught.value.problems[0].field == key

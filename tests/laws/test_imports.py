@@ -7,11 +7,13 @@ import ast
 import re
 import subprocess
 import sys
+from collections.abc import Collection
 from pathlib import Path
 
 import pytest
 
 from es_service.search.algorithms import OURS
+from workers.rollouts import BACKENDS
 
 ROOT = Path(__file__).parents[2]
 LAYERS = ("cli", "api", "report", "runs", "dispatch", "store", "loop", "search", "config", "protocol", "errors", "logs")
@@ -31,6 +33,8 @@ JOINERS = {
 """Modules of es_service that know both sides: they may import `workers`."""
 RAY_USERS = {"es_service.dispatch.ray_cluster", "es_service.runs.jobs"}
 """Modules of es_service that import Ray, inside the functions that need it: all others are given the module."""
+NAMES_OF_FOLDERS = {"workers.xla_cache": {"xla"}}
+"""Module -> words that are folders of its cache, and not the rollouts of these names."""
 
 
 def module_of(path: Path) -> str:
@@ -118,27 +122,36 @@ def test_the_loop_knows_no_method_by_name():
     assert not {name for path in files("es_service/loop") for name in imports(path.read_text())} & methods
 
 
-def names_of_methods(source: str) -> list[str]:
-    """The names of methods that a file has as string literals, apart from docstrings and descriptions of keys."""
+def names_in(source: str, names: Collection[str]) -> list[str]:
+    """The names that a file has as string literals, apart from docstrings and descriptions of keys."""
     tree = ast.parse(source)
     texts = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     texts |= {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.keyword) and node.arg == "description"}
     constants = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in texts]
-    return [node.value for node in constants if node.value in OURS]
+    return [node.value for node in constants if node.value in names]
 
 
 @pytest.mark.parametrize("path", [*files("es_service"), *files("workers")], ids=module_of)
 def test_no_module_knows_a_method_by_name_but_its_own(path):
     """What the rest of the service has to know of a method is declared in its settings."""
     own = path.stem if path.parent.name == "algorithms" else None
-    assert set(names_of_methods(path.read_text())) <= {own}
+    assert set(names_in(path.read_text(), OURS)) <= {own}
 
 
-def test_a_name_of_a_method_is_found():
+def test_a_name_is_found():
     source = (
         '"""memes"""\nif name in ("es", "other"):\n    """ars"""\n    Field(description="ars")\n    f(x={"me_es": 1})'
     )
-    assert names_of_methods(source) == ["es", "me_es"]
+    assert names_in(source, OURS) == ["es", "me_es"]
+    assert names_in('run if spec.rollout == "simd" else "other"', BACKENDS) == ["simd"]
+
+
+@pytest.mark.parametrize("path", [*files("es_service"), *files("workers")], ids=module_of)
+def test_no_module_knows_a_rollout_by_name_but_its_own(path):
+    """What the rest of the service has to know of a rollout is declared in its object."""
+    module = module_of(path)
+    own = {name for name in BACKENDS if f"{module}.".startswith((f"workers.rollouts.{name}.", f"workers.{name}."))}
+    assert set(names_in(path.read_text(), BACKENDS)) <= own | NAMES_OF_FOLDERS.get(module, set())
 
 
 @pytest.mark.parametrize(

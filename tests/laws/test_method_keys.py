@@ -20,9 +20,10 @@ from tests.helpers import DirectEvaluator
 from tests.laws.me_es_runs import Remembering
 from workers.environments import SHIPPED
 from workers.policy import initial_parameters
+from workers.rollouts import BACKENDS
 
 TASK = SHIPPED["point_maze"]
-KNOWN = {"tasks": TASKS, "algorithms": ALGORITHMS}
+KNOWN = {"tasks": TASKS, "algorithms": ALGORITHMS, "rollouts": BACKENDS}
 COMMON = {
     "task.environment": "point_maze",
     "task.episode_steps": 20,

@@ -56,7 +56,7 @@ def test_bench_rollouts_prints_a_row_per_policy_batch_and_rollout(one_core):
         (("--batch", 7), "must be even"),
         (("--policy", "maybe"), "--policy maybe: must be on or off"),
         (("--task", "ant_maz"), "did you mean ant_maze?"),
-        (("--rollout", "gpu"), "--rollout gpu: must be xla or simd, or both"),
+        (("--rollout", "gpu"), "--rollout gpu: must be xla or simd, or several"),
     ):
         code, printed = es("bench", "rollouts", *wrong)
         assert code == 2
@@ -90,11 +90,11 @@ def test_what_simd_cannot_compile_is_said_in_one_line_and_runs_on_xla():
     assert code == 0, printed
     lines = [line for line in printed.splitlines() if line.startswith(task)]
     assert [line.split()[2] for line in lines[:-1]] == ["xla"] * len({1, cores()})
-    assert "simd cannot compile it: the primitive sort (at " in lines[-1]
+    assert "simd cannot run it: the primitive sort (at " in lines[-1]
     assert "sorting.py:" in lines[-1]
     code, printed = es("bench", "rollouts", "--task", task, "--policy", "on", "--rollout", "simd", "--seconds", 0)
     assert code == 1
-    assert "simd cannot compile it: the primitive sort" in printed
+    assert "simd cannot run it: the primitive sort" in printed
 
 
 def test_options_stand_for_keys(config, tmp_path):

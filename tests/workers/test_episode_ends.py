@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import workers.worker
 from es_service.protocol.messages import EpisodesResult, TrainingChunk
 from tests.helpers import centre, chunk_runner, random_parameters
+from workers import environments
 from workers.environments import Environment
 from workers.worker import episode_keys
 
@@ -40,7 +40,7 @@ def counting_environment(lifetimes, poison_after_done: bool, gets_up: bool = Fal
 def test_steps_after_done_never_count(spec, monkeypatch, fitness):
     """Nothing after `done` reaches return, descriptor, distances or statistics, even if it is NaN, or not done."""
     environment = counting_environment([1, 5, 17, 1000], poison_after_done=True, gets_up=True)
-    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: environment)
+    monkeypatch.setattr(environments, "make_environment", lambda name, options: environment)
     result = chunk_runner(spec(episode_steps=30, fitness=fitness))(centre(random_parameters()), TrainingChunk(1, 0))
     assert isinstance(result, EpisodesResult)
     n = result.steps.astype(float)
@@ -59,7 +59,7 @@ def test_steps_after_done_never_count(spec, monkeypatch, fitness):
 
 def test_a_chunk_stops_when_all_its_members_are_done(spec, monkeypatch):
     environment = counting_environment([1, 5, 17], poison_after_done=False)
-    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: environment)
+    monkeypatch.setattr(environments, "make_environment", lambda name, options: environment)
     endless = spec(episode_steps=2_000_000_000)  # hours, if it did not
     result = chunk_runner(endless)(centre(random_parameters()), TrainingChunk(1, 0))
     assert isinstance(result, EpisodesResult)
@@ -75,7 +75,7 @@ def test_a_member_that_returns_nan_is_seen_and_does_not_poison_the_statistics(sp
         descriptor=environment.descriptor,
         goal_distance=environment.goal_distance,
     )
-    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: broken)
+    monkeypatch.setattr(environments, "make_environment", lambda name, options: broken)
     result = chunk_runner(spec(episode_steps=30))(centre(random_parameters()), TrainingChunk(1, 0))
     assert isinstance(result, EpisodesResult)
     assert result.moments is not None
@@ -103,7 +103,7 @@ def test_what_an_invalid_episode_saw_is_left_out_though_it_is_finite(spec, monke
         step=step,
         descriptor=descriptor,
     )
-    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: blows_up)
+    monkeypatch.setattr(environments, "make_environment", lambda name, options: blows_up)
     run_chunk = chunk_runner(spec(episode_steps=30, episodes_per_member=3))
     result = run_chunk(centre(random_parameters()), TrainingChunk(1, 0))
     assert isinstance(result, EpisodesResult)

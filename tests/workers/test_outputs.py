@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import workers.worker
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicyShape, TrainingChunk
 from tests.helpers import DirectEvaluator, centre, chunk_runner, random_parameters
 from tests.workers.simd.rollouts import task_spec
 from tests.workers.steps import environment_of, resets_of
 from tests.workers.test_policies import bits, evaluate
+from workers import environments
 from workers.environments import SHIPPED, Environment
 from workers.policy import initial_parameters
 
@@ -42,7 +42,7 @@ def counting(success) -> Environment:
 )
 def test_success_is_that_of_the_last_valid_state(spec, monkeypatch, success, wanted):
     """A finished episode goes on in its lane, and what it does there must not count."""
-    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: counting(success))
+    monkeypatch.setattr(environments, "make_environment", lambda name, options: counting(success))
     run = chunk_runner(spec(episode_steps=8, outputs=("success",)))
     result = run(centre(random_parameters()), EvaluationChunk(1, 0))
     assert isinstance(result, EpisodesResult)

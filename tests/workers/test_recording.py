@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import workers.recording
 from es_service.loop.policies import policy_episodes, policy_work
 from es_service.protocol.messages import EvaluationChunk, PolicyShape
 from es_service.protocol.recordings import RecordRequest
 from tests import helpers
 from tests.workers.test_episode_ends import counting_environment
+from workers import environments
 from workers.environments import SHIPPED
 from workers.recording import record
 from workers.viewer import shapes
@@ -61,7 +61,7 @@ def test_a_recording_is_the_worker_s_own_episode(name, steps, rollout):
 def test_a_recording_ends_with_its_episode(monkeypatch, rollout):
     """Each step's reward is its number; nothing after `done` is recorded."""
     environment = counting_environment([5], poison_after_done=False)
-    monkeypatch.setattr(workers.recording, "make_environment", lambda name, options: environment)
+    monkeypatch.setattr(environments, "make_environment", lambda name, options: environment)
     spec = helpers.spec(episode_steps=30, rollout=rollout)
     [found] = record(spec, [RecordRequest(helpers.centre(helpers.random_parameters()), seed=0)]).recordings
     assert found.returns_T.tolist() == [0, 1, 3, 6, 10, 15]

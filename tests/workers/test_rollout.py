@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import workers.worker
 from es_service.protocol.messages import (
     EpisodesResult,
     EvaluationChunk,
@@ -22,6 +21,7 @@ from tests import helpers
 from tests.helpers import PARAMETERS, centre, chunk_runner, random_parameters
 from tests.twins import noise as noise_twin
 from tests.twins import point_maze as maze_twin
+from workers import environments
 from workers.environments import Environment, make_environment
 from workers.rollout import make_training_rollout
 from workers.worker import episode_keys
@@ -188,7 +188,7 @@ def test_every_function_is_traced_once(spec, monkeypatch):
         return original.step(state, action)
 
     counted = dataclasses.replace(original, step=step)
-    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: counted)
+    monkeypatch.setattr(environments, "make_environment", lambda name, options: counted)
     worker = chunk_runner(spec())
     for generation in range(1, 4):
         for chunk in (0, 1):
@@ -208,7 +208,7 @@ def test_numpy_policy_equals_the_rollout_s(spec, monkeypatch):
         descriptor=lambda state: state,
         goal_distance=lambda state: jnp.float32(jnp.nan),
     )
-    monkeypatch.setattr(workers.worker, "make_environment", lambda name, options: one_step)
+    monkeypatch.setattr(environments, "make_environment", lambda name, options: one_step)
     parameters_D = random_parameters(5)
     result = run(EvaluationChunk(1, 0), spec(), parameters_D)
     assert isinstance(result, EpisodesResult)

@@ -52,6 +52,7 @@ def why_not(task: TaskSpec) -> str:
         chunk_pairs=1,
         rollout_block_pairs=1,
         gradient_block_pairs=1,
+        rollout="simd",
     )
     environment, inputs_O = make_environment(task.name, options), np.arange(task.observation_size)
     try:

@@ -1,0 +1,66 @@
+"""What the driver knows of a rollout, which is a way to compute episodes: the declarations that config asks.
+
+`workers/rollouts` has all rollouts by name, and what else they do where they run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from es_service.protocol.messages import PolicyShape, TaskSpec
+
+CHUNK_PAIRS = (16, 64)
+"""Fewest pairs of a chunk, so that the cost of messages does not exceed the gain from distributing a small population,
+and most: enough to fill vector units and to outweigh the cost of a message; a lost chunk costs little."""
+
+
+class Rollout(Protocol):
+    """A way to compute episodes, as the driver sees it. Nothing here imports JAX."""
+
+    name: str
+    """The value of `compute.rollout`."""
+    runs_in_threads: bool = False
+    """Whether threads of one process compute side by side, without the interpreter's lock. If not, each core has a
+    process."""
+    runs_on_gpus: bool = False
+    takes_chunks_together: bool = False
+    """Whether an episode's bits do not depend on the others of its call, so that neighbouring chunks may share one."""
+    compile_s: tuple[int, int]
+    """About how many seconds a worker takes to start and to compile for a kind of chunk, the first time and with the
+    code on disk, for tasks with physics (tests/benchmarks/README.md). Other tasks have compiled before it is said."""
+    chunk_pairs: tuple[int, int] = CHUNK_PAIRS
+    """Limits within which `compute.chunk_pairs: auto` chooses the largest divisor of the pairs."""
+
+    def why_not(self, task: TaskSpec, policy: PolicyShape) -> str:
+        """Reason why it cannot compute episodes of a task with a policy; empty if it can.
+
+        Unless a rollout says otherwise, the reason is what the description of the task has found.
+        """
+        return task.unsupported.get(self.name, "")
+
+    def why_not_here(self) -> str:
+        """Reason why it cannot run on this machine; empty if it can."""
+        return ""
+
+
+Rollouts = Mapping[str, Rollout]
+"""Rollouts by name, from the slowest to the fastest."""
+
+
+def choose(rollouts: Rollouts, task: TaskSpec, policy: PolicyShape, *, gpu: bool, here: bool) -> str:
+    """Name of the rollout that `compute.rollout: auto` means: the fastest that can run; the slowest if none can, whose
+    reason is then reported.
+
+    Args:
+        gpu: whether the workers use GPUs.
+        here: whether the workers run on this machine; what other machines can run is not known.
+    """
+    fits = {name: one for name, one in rollouts.items() if one.runs_on_gpus or not gpu}
+    able = [name for name, one in fits.items() if not why_not(one, task, policy, here=here)]
+    return able[-1] if able else next(iter(rollouts))
+
+
+def why_not(rollout: Rollout, task: TaskSpec, policy: PolicyShape, *, here: bool) -> str:
+    """Reason why a rollout cannot compute episodes of a new run; empty if it can. Arguments are as for `choose`."""
+    return rollout.why_not(task, policy) or (rollout.why_not_here() if here else "")

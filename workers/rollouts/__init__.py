@@ -1,0 +1,11 @@
+"""The rollouts by name. Importing them imports neither JAX nor a compiler, so the driver may ask what they declare."""
+
+from __future__ import annotations
+
+from workers.rollouts.backend import RolloutBackend
+from workers.rollouts.simd import Simd
+from workers.rollouts.xla import Xla
+
+BACKENDS: dict[str, RolloutBackend] = {one.name: one for one in (Xla(), Simd())}
+"""Name, as in `compute.rollout` -> rollout, from the slowest to the fastest. `protocol.rollouts.choose` is what `auto`
+means."""

@@ -1,0 +1,107 @@
+"""What a rollout has to do where it runs: the functions of a worker, recordings and measurements.
+
+A rollout is one object of this protocol in the registry of `workers.rollouts`. No other module knows it by name.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from es_service.protocol.messages import TaskSpec, WorkerSpec
+from es_service.protocol.options import OptionValue
+from es_service.protocol.recordings import Recordings, RecordRequest
+from es_service.protocol.rollouts import Rollout
+from workers.compilable import Compilable
+
+
+class Episodes(NamedTuple):
+    """Results of an episode, or of a batch of episodes with the leading axes of the caller."""
+
+    fitness: Any
+    returns: Any
+    descriptor: Any
+    steps: Any
+    goal_distance: Any
+    """[..., 2]: distance to the goal at the end, and the least distance during the episode."""
+    shifted_sum_O: Any
+    """Sum over counted steps of (observation - mean of the statistics), float32; empty in evaluations, which do not
+    update the statistics.
+
+    It is accurate enough for one episode if that mean is close to the mean of the observations. Where no statistics
+    exist yet (in generation 1, or in blocks with an elite's statistics from random weights) the mean of the
+    observations must be less than a thousand of their standard deviations from 0."""
+    shifted_square_sum_O: Any
+    """Sum over counted steps of (observation - mean of the statistics) squared, float32; empty in evaluations."""
+    trace_T_B: Any
+    """Descriptor along an evaluation episode; empty in training. Point k is the descriptor after k / (points - 1) of
+    the episode's maximal number of steps, or at its end if it ended before."""
+    outputs: dict[str, Any]
+    """Outputs of an evaluation episode that the run names, by name; empty in training."""
+
+    def map(self, function: Callable[[Any], Any]) -> Episodes:
+        """The episodes with a function of each array in its place."""
+        outputs = {name: function(array) for name, array in self.outputs.items()}
+        return Episodes._make([*map(function, self[:-1]), outputs])
+
+
+class ChunkFunctions(NamedTuple):
+    """How a worker computes the chunks of a run; several threads may call these functions if the rollout declares so.
+
+    Keys are stream keys (uint32 [4]), arrays are NumPy's; `mean` and `std` are the observation statistics. Results are
+    pure functions of the arguments. `compile` of each is called before the first chunk of its kind, and computes no
+    episode. If the rollout takes chunks together, the leading axis may have that of several chunks in a row.
+    """
+
+    training: Compilable
+    """Function (centre_D, unit, mean_O, std_O, noise_keys_P_4, reset_keys_P_S_E_4, action_keys_P_S_E_4) -> Episodes
+    with leading axes [P, S, E], of the members centre + sign * unit * noise with action noise; `unit` is
+    sigma / NORMAL_STD, and the noise is that of `protocol.noise.normal_integers`."""
+    evaluation: Compilable
+    """Function (centre_D, mean_O, std_O, reset_keys_E_4, wanted_E) -> Episodes with leading axis [E], without action
+    noise. Those that are not wanted need not be computed, and their results may be anything."""
+    policies: Compilable
+    """Function (parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L_4) -> Episodes with leading axis [L],
+    without action noise. The parameters are a list of arrays [N, D]; policy_L is the row of each lane among the rows of
+    all."""
+    gradient_sum: Compilable
+    """Function (weights_P, noise_keys_P_4) -> sum over pairs of weight x standard normal noise, [D]. Pairs are added
+    one by one in the order of their ids, so that the float32 bits depend on nothing else."""
+
+
+class RolloutBackend(Rollout, Protocol):
+    """A rollout, as the processes see it that compute with it. They import JAX only if these functions do."""
+
+    def examine(self, task: TaskSpec) -> str:
+        """Reason why it cannot compute episodes of a task that is no shipped one; empty if it can.
+
+        Called where the task is described, in a process of its own; the answer is kept in `TaskSpec.unsupported`, so
+        that the driver need not find it.
+        """
+        return ""
+
+    def device(self) -> str:
+        """Kind of the GPU that it computes on, which belongs to a worker's platform; called only where there is one."""
+        return ""
+
+    @abstractmethod
+    def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
+        """The functions of a worker; makes the task."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
+        """Recordings of evaluation episodes, in the order of the requests, with the bits of a worker's own."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def random_steps(
+        self, task: TaskSpec, options: Mapping[str, OptionValue], batch: int, steps: int
+    ) -> Callable[[int], int]:
+        """For measurements: function from the number of a call to the number of environment steps that it did.
+
+        Each call does `steps` steps with random actions in a batch of environments, which have been reset before, and
+        computes observations and rewards; the first call may compile.
+        """
+        raise NotImplementedError

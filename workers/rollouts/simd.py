@@ -1,0 +1,70 @@
+"""The rollout `simd`: our compiler makes machine code of a task's functions (`workers/simd`), for CPUs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+
+from es_service.protocol.messages import TaskSpec, WorkerSpec
+from es_service.protocol.options import OptionValue
+from es_service.protocol.recordings import Recordings, RecordRequest
+from workers import environments
+from workers.rollouts.backend import ChunkFunctions, RolloutBackend
+
+
+class Simd(RolloutBackend):
+    """Whole episodes as vector code, in which each lane is one environment."""
+
+    name = "simd"
+    runs_in_threads = True
+    takes_chunks_together = True
+    compile_s = (10, 4)
+
+    def why_not_here(self) -> str:
+        """What the processor lacks."""
+        return _why_not_here()
+
+    def examine(self, task: TaskSpec) -> str:
+        """What of the task's steps cannot be compiled."""
+        from workers.simd.episodes.rollout import why_not
+
+        return why_not(task)
+
+    def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
+        """The functions of `workers.simd.episodes.rollout`."""
+        from workers.simd.episodes import rollout
+
+        environment = environments.make_environment(spec.environment, spec.environment_options)
+        return ChunkFunctions(
+            rollout.make_training_rollout(environment, spec),
+            rollout.make_evaluation_rollout(environment, spec),
+            rollout.make_policy_rollout(environment, spec),
+            rollout.make_gradient_sum(spec.policy.parameters),
+        )
+
+    def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
+        """Recordings by the kernels of the evaluations."""
+        from workers.rollouts.jax_tasks import record
+        from workers.simd.episodes.rollout import make_watched_rollout
+
+        return record(make_watched_rollout, spec, requests)
+
+    def random_steps(
+        self, task: TaskSpec, options: Mapping[str, OptionValue], batch: int, steps: int
+    ) -> Callable[[int], int]:
+        """Steps of one kernel."""
+        from workers.rollouts.jax_tasks import random_steps
+        from workers.simd.episodes.kernel import compile_kernel
+
+        return random_steps(compile_kernel, task, options, batch, steps)
+
+
+@cache
+def _why_not_here() -> str:
+    from workers.simd.backend.target import NoVectorsError, host_target
+
+    try:
+        host_target()
+    except NoVectorsError as error:
+        return str(error)
+    return ""

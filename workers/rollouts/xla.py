@@ -1,0 +1,54 @@
+"""The rollout `xla`: JAX runs a task's functions, on CPUs and GPUs. It is the reference, and runs every JAX task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+from es_service.protocol.messages import TaskSpec, WorkerSpec
+from es_service.protocol.options import OptionValue
+from es_service.protocol.recordings import Recordings, RecordRequest
+from workers import environments
+from workers.rollouts.backend import ChunkFunctions, RolloutBackend
+
+
+class Xla(RolloutBackend):
+    """Batched episodes compiled by XLA (`workers/rollout.py`)."""
+
+    name = "xla"
+    runs_on_gpus = True
+    compile_s = (15, 6)
+
+    def device(self) -> str:
+        """The kind of JAX's first device."""
+        import jax
+
+        return jax.devices()[0].device_kind
+
+    def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
+        """The functions of `workers.rollout`."""
+        from workers import rollout
+
+        environment = environments.make_environment(spec.environment, spec.environment_options)
+        return ChunkFunctions(
+            rollout.make_training_rollout(environment, spec),
+            rollout.make_evaluation_rollout(environment, spec),
+            rollout.make_policy_rollout(environment, spec),
+            rollout.make_gradient_sum(spec.policy.parameters),
+        )
+
+    def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
+        """Recordings by the loop of the evaluations, in the slots of whole chunks."""
+        from workers.rollout import make_watched_rollout
+        from workers.rollouts.jax_tasks import record
+
+        return record(make_watched_rollout, spec, requests)
+
+    def random_steps(
+        self, task: TaskSpec, options: Mapping[str, OptionValue], batch: int, steps: int
+    ) -> Callable[[int], int]:
+        """Steps of one compiled loop."""
+        import jax
+
+        from workers.rollouts.jax_tasks import random_steps
+
+        return random_steps(lambda episode, *_: jax.jit(jax.vmap(episode)), task, options, batch, steps)
