@@ -11,6 +11,8 @@ from es_service.errors import Problem
 from es_service.protocol.messages import TaskSpec
 
 OBJECTIVE, OBJECTIVES = "search.objective", "search.objectives"
+PLACES = ("target", "nearness")
+"""Kinds with a place among the descriptors."""
 
 
 def objective_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
@@ -24,7 +26,7 @@ def objective_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Proble
     for key, objective in _objectives(values):
         names, kind = task.descriptor_names, objective.get("kind")
         middle = list(objective.get("descriptor") or ())
-        if kind == "target" and len(middle) != len(names):
+        if kind in PLACES and len(middle) != len(names):
             what = (
                 f"{show(middle)} has {len(middle)} numbers, but the descriptor of {task.name} has {len(names)}, "
                 f"{', '.join(names)}; give descriptor one number for each"
@@ -45,6 +47,6 @@ def _objectives(values: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, A
     if f"{OBJECTIVE}.kind" in values:
         prefix = f"{OBJECTIVE}."
         content = {key.removeprefix(prefix): value for key, value in values.items() if key.startswith(prefix)}
-        yield f"{prefix}descriptor" if content["kind"] == "target" else f"{prefix}kind", content
+        yield f"{prefix}descriptor" if content["kind"] in PLACES else f"{prefix}kind", content
     for objective in values.get(OBJECTIVES) or ():
         yield OBJECTIVES, objective

@@ -115,24 +115,48 @@ class MixtureObjective(Section):
     """Fitness and novelty, each shaped by itself."""
 
     kind: Literal["mixture"] = "mixture"
-    weight: Fraction = Field(0.5, description="Of kind mixture: weight of fitness beside novelty.")
+    weight: Fraction = Field(
+        0.5,
+        description="Of kind mixture: weight of fitness beside novelty; of kind nearness: weight of nearness beside "
+        "fitness.",
+    )
 
 
 class TargetObjective(Section):
     """Fitness among the members that end in a ball of descriptors; all others rank below these, by their distance."""
 
     kind: Literal["target"] = "target"
-    descriptor: Point = Field((), description="Of kind target: middle of the set, one number for each dimension.")
+    descriptor: Point = Field(
+        (),
+        description="Of kind target: middle of the set; of kind nearness: the descriptor to be near to; one number for "
+        "each dimension.",
+    )
     radius: Positive = Field(1.0, description="Of kind target: greatest distance from the middle inside of the set.")
+
+
+class NearnessObjective(Section):
+    """Nearness to a descriptor and fitness, each scaled to the range that it has in the population."""
+
+    kind: Literal["nearness"] = "nearness"
+    descriptor: Point = Field((), description="Of kind nearness: the descriptor, one number for each dimension.")
+    weight: Fraction = Field(0.5, description="Of kind nearness: weight of nearness beside fitness.")
 
 
 Step = AdamStep | AdamWStep | PlainStep | ClipUpStep
 Shaping = Ranks | Signs | Returns | TopPairs
-Objective = FitnessObjective | ReturnObjective | GoalObjective | NoveltyObjective | MixtureObjective | TargetObjective
+Objective = (
+    FitnessObjective
+    | ReturnObjective
+    | GoalObjective
+    | NoveltyObjective
+    | MixtureObjective
+    | TargetObjective
+    | NearnessObjective
+)
 Objectives = Annotated[
     tuple[Annotated[Objective, Field(discriminator="kind")], ...],
     Field(min_length=1),
     BeforeValidator(as_tuple),
     "a list of objectives, such as [{kind: novelty}, {kind: fitness}, {kind: mixture, weight: 0.5}, {kind: target, "
-    "descriptor: [35, -25], radius: 5}], also of kind return or goal_distance",
+    "descriptor: [35, -25], radius: 5}], also of kind return, goal_distance or nearness",
 ]

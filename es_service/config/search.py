@@ -156,7 +156,7 @@ class CandidatesConfig(PopulationConfig):
         description="What members are ranked by, and candidates. fitness: what task.fitness says. return: the sum of "
         "the rewards. goal_distance: how near to the goal an episode ends. novelty, mixture: novelty, alone or beside "
         "fitness. target: fitness among those that end in a set of descriptors, before all others, which rank by their "
-        "distance from it.",
+        "distance from it. nearness: nearness to a descriptor beside fitness.",
     )
 
     only_centres = "search.screened"

@@ -15,6 +15,7 @@ from es_service.config.model import NoveltyConfig
 from es_service.config.parts import (
     FitnessObjective,
     MixtureObjective,
+    NearnessObjective,
     NoveltyObjective,
     Objective,
     Shaping,
@@ -81,6 +82,8 @@ def values(objective: Objective, results: EpisodesResult) -> NDArray:
     """
     if isinstance(objective, TargetObjective):
         return target_values(objective, results.fitness, results.descriptor)
+    if isinstance(objective, NearnessObjective):
+        return nearness_values(objective, results.fitness, results.descriptor)
     of: dict[str, Callable[[], NDArray]] = {
         "return": lambda: results.returns,
         "goal_distance": lambda: -results.goal_distance[..., 0],
@@ -112,3 +115,30 @@ def target_values(target: TargetObjective, fitness: ArrayLike, descriptor_B: Arr
     keys[~is_valid] = -np.inf
     _, place = np.unique(keys.reshape(-1, 2), axis=0, return_inverse=True)  # in the order of the first, then the second
     return np.where(is_valid, centred_ranks(place.reshape(fitness.shape)), np.nan)
+
+
+def nearness_values(near: NearnessObjective, fitness: ArrayLike, descriptor_B: ArrayLike) -> NDArray[np.float64]:
+    """weight * nearness to a descriptor + (1 - weight) * fitness, each scaled to 0 to 1 in its range among the members.
+
+    Nearness is 1 for the nearest and 0 for the farthest member. What is equal for all is 0. Members whose fitness or
+    descriptor is not finite are NaN.
+
+    Args:
+        near: the descriptor, and the weight of nearness.
+        fitness: fitness of every member, any shape.
+        descriptor_B: their descriptors, the same shape with a last axis B.
+
+    Source: the weighted target fitness score of JEDi, Templier et al. 2024 (arXiv:2405.04308).
+    """
+    fitness = np.asarray(fitness, np.float64)
+    distance = np.linalg.norm(np.asarray(descriptor_B, np.float64) - np.asarray(near.descriptor), axis=-1)
+    is_valid = np.isfinite(fitness) & np.isfinite(distance)
+    scaled = [_scaled(np.where(is_valid, one, np.nan)) for one in (-distance, fitness)]
+    return near.weight * scaled[0] + (1.0 - near.weight) * scaled[1]
+
+
+def _scaled(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values from 0 for the lowest to 1 for the highest; all 0 if they are equal; NaN stays."""
+    known = values[~np.isnan(values)]
+    low, width = (known.min(), np.ptp(known)) if known.size else (0.0, 0.0)
+    return (values - low) / (width or 1.0)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pandas as pd
 import pytest
 
+from es_service.api import load_config
 from es_service.cli.commands import error_message
 from es_service.errors import ConfigError, WayOut
 from es_service.runs import export
@@ -29,6 +30,14 @@ def test_an_export_without_its_package_says_how_to_get_it(tmp_path, monkeypatch,
     command = f"pip install -c constraints.txt -e '.[{to}]'"
     assert error_message(error.value).endswith(f"  to install it: in a clone of es-service: {command}")
     assert to in EXTRAS
+
+
+def test_a_search_without_its_package_says_how_to_get_it(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    source = {"task": {"environment": "point_maze"}, "search": {"algorithm": "jedi"}, "budget": {"generations": 1}}
+    with pytest.raises(ConfigError, match="needs scikit-learn") as error:
+        load_config(source)
+    assert error.value.way_out.extra in EXTRAS
 
 
 @pytest.mark.parametrize("folder", ["es_service", "workers", "docker"])

@@ -50,6 +50,7 @@ BASES = {
     "me_es": [{"search.block_generations": 2, "search.emitters": 2}],
     "memes": [{"search.emitters": 2, "search.stagnation_generations": 2, "budget.generations": 12}],
     "polish": [{"search.init_from": ".", "search.screened": 4, "search.candidates": 3, "search.round_generations": 2}],
+    "jedi": [{"search.emitters": 2, "search.target_generations": 2}],
     "map_elites": [{"search.batch": 16, "search.centres": 8, "search.iso_sigma": 0.2}],
 }
 """Method -> settings of runs, besides those of all; a key has an effect if it changes one of these runs."""
@@ -91,6 +92,10 @@ OTHER = {
     "search.screened": 3,
     "search.candidates": 2,
     "search.round_generations": 1,
+    "search.target_generations": 3,
+    "search.target_weight_start": 0.5,
+    "search.target_weight": 0.9,
+    "search.model_noise": 5.0,
     "search.alternation": "coin",
     "search.first_block": "exploit",
     "search.block_generations": 3,
@@ -128,9 +133,9 @@ NOT_MEASURED = {
 WITH_TOP_PAIRS = ("ars", "polish")
 """Methods whose shaping is top_pairs and whose step is plain by default."""
 ONE_VALUE = {
-    "search.centres": ("es", "ars", "me_es", "memes", "polish"),
+    "search.centres": ("es", "ars", "me_es", "memes", "polish", "jedi"),
     "policy.observation_normalization": ("map_elites",),
-    "map.enabled": ("me_es", "memes", "map_elites"),
+    "map.enabled": ("me_es", "memes", "map_elites", "jedi"),
     "search.shaping.count": tuple(
         name for name in OURS if name not in ("ars", "polish")
     ),  # others have another kind by default

@@ -38,6 +38,7 @@ SETTINGS = {
     "map_elites": {"batch": 20, "iso_sigma": 0.2, "centres": 3},
     "me_es": {**OF_POPULATIONS, "emitters": 2, "block_generations": 2},
     "memes": {**OF_POPULATIONS, "emitters": 3, "stagnation_generations": 1},
+    "jedi": {**OF_POPULATIONS, "emitters": 2, "target_generations": 2},
     "tests.laws.test_policies:mixed": {**OF_POPULATIONS, "centres": 2},
 }
 """Settings of a method; others have those of populations."""

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 
 from es_service.search.algorithms.ars import ars
 from es_service.search.algorithms.es import es
+from es_service.search.algorithms.jedi import jedi
 from es_service.search.algorithms.map_elites import map_elites
 from es_service.search.algorithms.me_es import me_es
 from es_service.search.algorithms.memes import memes
@@ -22,7 +23,9 @@ from es_service.search.algorithms.nsra_es import nsra_es
 from es_service.search.algorithms.own import own_method
 from es_service.search.algorithms.polish import polish
 
-OURS: dict[str, Method] = {one.name: one for one in (es, ns_es, nsr_es, nsra_es, me_es, memes, map_elites, ars, polish)}
+OURS: dict[str, Method] = {
+    one.name: one for one in (es, ns_es, nsr_es, nsra_es, me_es, memes, map_elites, ars, polish, jedi)
+}
 """The shipped methods, the simplest first: a config that no search uses may leave `search.algorithm` out."""
 
 

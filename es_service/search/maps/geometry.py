@@ -64,6 +64,14 @@ class Grid:
             cell_N = cell_N * cells + np.searchsorted(edges[1:-1], descriptor_N_B[:, b], side="right")
         return cell_N
 
+    def middles_of(self, cell_N: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Descriptor in the middle of each cell, [N, B]."""
+        places = np.unravel_index(cell_N, self.shape)
+        return np.stack(
+            [0.5 * (edges[place_N] + edges[place_N + 1]) for edges, place_N in zip(self.edges, places, strict=True)],
+            axis=1,
+        )
+
     def index_of(self, cell: int) -> tuple[int, ...]:
         """Index of a cell along each dimension, as users write it: `--cell 3,17`."""
         return tuple(int(i) for i in np.unravel_index(cell, self.shape))
@@ -109,6 +117,10 @@ class Cvt:
                 squared += difference * difference
             cell_N[rows] = squared.argmin(axis=1)
         return cell_N
+
+    def middles_of(self, cell_N: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Centroid of each cell, [N, B]."""
+        return self.centroid_C_B[cell_N]
 
     def index_of(self, cell: int) -> tuple[int, ...]:
         """The cell's number, as an index with one element."""
