@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -76,7 +76,12 @@ def evaluate(
         for option, value in (("--all", every or None), ("--seed", seed)):
             if value is not None:
                 raise ConfigError(f"{option} and --certify cannot be combined; leave one of them out")
-        _certify(folders, out, as_json, best, centre, cells, top, generation, episodes, keep, by, workers)
+        anything = best or centre or cells or top is not None
+        which = {"best": best or not anything, "centre": centre, "cells": cells}
+        which |= {"top": (top or 0) if anything else None, "generation": generation}
+        given = {"episodes": episodes, "keep": keep, "by": by, "workers": workers}
+        asked = which | {name: value for name, value in given.items() if value is not None}
+        _certify(folders, out, asked, as_json=as_json)
         return
     for option, value in (("--keep", keep), ("--by", by)):
         if value is not None:
@@ -121,42 +126,14 @@ def evaluate(
         raise typer.Exit(1)
 
 
-def _certify(
-    folders: list[Path],
-    out: Path | None,
-    as_json: bool,
-    best: bool,
-    centre: bool,
-    cells: Sequence[Sequence[int]],
-    top: int | None,
-    generation: int | None,
-    episodes: int | None,
-    keep: int | None,
-    by: str | None,
-    workers: int | None,
-) -> None:
-    """Certify policies, with the options of the command."""
+def _certify(folders: list[Path], out: Path | None, asked: Mapping[str, Any], *, as_json: bool) -> None:
+    """Certify policies; `asked` are arguments of `certify_run`."""
     from es_service.cli.certify import certified_rows
     from es_service.cli.tables.evaluations import csv_file
-    from es_service.runs.certification import EPISODES
 
-    anything = best or centre or cells or top is not None
     problems: list[dict[str, str]] = []
     with csv_file(out, print_note) as write:
-        rows = certified_rows(
-            folders,
-            problems,
-            as_json=as_json,
-            best=best or not anything,
-            centre=centre,
-            cells=cells,
-            top=(top or 0) if anything else None,
-            generation=generation,
-            episodes=episodes or EPISODES,
-            keep=keep or 1,
-            by=by,
-            workers=workers,
-        )
+        rows = certified_rows(folders, problems, as_json=as_json, **asked)
         for row in rows:
             write(row)
     if as_json:
