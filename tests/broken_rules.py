@@ -507,8 +507,8 @@ CASES = [
         (
             "descriptors of episodes",
             RESULTS,
-            "host = jax.tree.map(np.array, episodes)",
-            "host = jax.tree.map(np.asarray, episodes)",
+            "host = episodes.map(np.array)",
+            "host = episodes.map(np.asarray)",
         ),
         ("traces", RESULTS, "np.asarray(episodes.trace_T_B)[0].copy()", "np.asarray(episodes.trace_T_B)[0]"),
     ),

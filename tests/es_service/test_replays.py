@@ -9,6 +9,7 @@ from es_service.loop import evaluated
 from es_service.report.write import write_report
 from es_service.runs.replay import record
 
+pytestmark = pytest.mark.usefixtures("workers_here")
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 30},
     "policy": {"hidden": [8]},
@@ -20,7 +21,7 @@ CONFIG = {
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(tmp_path_factory, workers_here):
     return api.run(CONFIG, tmp_path_factory.mktemp("run") / "run").run
 
 

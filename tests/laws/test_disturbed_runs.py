@@ -185,6 +185,14 @@ def test_a_fork_of_any_kept_generation_that_changes_nothing_has_the_same_bits(wh
         pd.testing.assert_frame_equal(fork.evaluations, run.evaluations)
 
 
+def test_a_fork_of_ars_with_other_top_pairs_differs_from_its_first_step_on(tmp_path):
+    run = api.run(api.load_config(config_of("ars, a linear policy")), tmp_path / "run").run
+    changes = [f"budget.generations={GENERATIONS}", "search.shaping.count=3"]
+    fork = api.fork(run.folder, changes, out=tmp_path / "fork", generation=KEPT).run
+    same = fork.history["centre_return_mean"] == run.history["centre_return_mean"]
+    assert same.index[~same].tolist() == [*range(KEPT + 1, GENERATIONS + 1)]
+
+
 def test_another_seed_gives_other_bits(whole, tmp_path):
     """Or equal digests would say nothing."""
     name, run, _ = whole

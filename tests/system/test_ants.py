@@ -20,10 +20,10 @@ pytestmark = pytest.mark.slow
 
 def run(folder: Path, environment: str, workers: int, on_generation=lambda row: None, on_notice=pytest.fail):
     config = {
-        "task": {"environment": environment, "episode_steps": 1000},
+        "task": {"environment": environment, "episode_steps": 200},
         "policy": {"hidden": [64, 64]},
         "search": {"algorithm": "nsra_es", "pairs": 32, "evaluation_episodes": 4, "centres": 2},
-        "budget": {"generations": 6},
+        "budget": {"generations": 4},
         "compute": {
             "engine": "inline",
             "workers": workers,

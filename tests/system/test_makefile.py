@@ -107,14 +107,18 @@ def test_half_a_virtual_environment_is_not_taken_for_a_whole_one(project):
 
 @pytest.mark.parametrize("installer", ["pip", "uv"])
 def test_a_command_says_what_it_installs_and_how_long_it_takes_and_an_interruption_leaves_nothing_half(
-    project, installer, request
+    project, installer, request, monkeypatch
 ):
     path = request.getfixturevalue("uv") if installer == "uv" else ""
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
     first = make(project, f"UV={path}", "run")
     assert first.returncode == 0, first.stderr
     assert re.search(rf"installing \d+ packages, about \d+ MB with {installer}, as constraints\.txt pins", first.stdout)
     assert re.search(r"^installed in \d+ s$", first.stdout, re.MULTILINE)
-    assert "it runs run configs/point_maze_me_es.yaml\n" in first.stdout
+    config = re.search(r"^CONFIG \?= (\S+)$", MAKEFILE.read_text(), re.MULTILINE)
+    assert config is not None
+    assert f"it runs run {config[1]}\n" in first.stdout
+    assert list(project.glob(".venv/lib/*/site-packages/__pycache__/small.*.pyc")), "bytecode is kept"
     assert re.search(r"^make run: installing \d+ s, running \d+ s$", first.stdout, re.MULTILINE)
     again = make(project, f"UV={path}", "run")
     assert "packages" not in again.stdout

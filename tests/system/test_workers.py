@@ -167,7 +167,6 @@ def test_workers_that_cannot_start_end_the_run_with_their_last_words(tmp_path, m
     assert children() == []
 
 
-@pytest.mark.alone
 def test_a_killed_driver_leaves_no_workers(tmp_path):
     script = f"""
 from es_service import load_config, run
@@ -178,4 +177,4 @@ run(load_config({CONFIG | {"budget": {"generations": 100_000}}!r}), {str(tmp_pat
         workers = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         assert len(workers) == 2
         assert all(map(is_running, workers))
-    wait_for(lambda: not any(map(is_running, workers)), timeout_s=5.0)
+    wait_for(lambda: not any(map(is_running, workers)), timeout_s=60.0)

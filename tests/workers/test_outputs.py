@@ -65,10 +65,19 @@ def test_an_output_changes_no_bit_of_the_other_results_of_a_small_task(spec):
     assert bits(without) == bits(with_success)
 
 
-@pytest.mark.parametrize("task", ["ant_trap", pytest.param("ant_maze", marks=pytest.mark.long)])
-def test_an_output_changes_no_bit_of_the_other_results_of_an_ant(task):
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "rollout"),
+    [
+        ("ant_trap", "simd"),
+        pytest.param("ant_maze", "simd", marks=pytest.mark.long),
+        pytest.param("ant_trap", "xla", marks=pytest.mark.long),
+        pytest.param("ant_maze", "xla", marks=pytest.mark.long),
+    ],
+)
+def test_an_output_changes_no_bit_of_the_other_results_of_an_ant(task, rollout):
     shape = PolicyShape((SHIPPED[task].observation_size, 8, SHIPPED[task].action_size))
-    worker_spec = replace(task_spec(task), policy=shape, episode_steps=50)
+    worker_spec = replace(task_spec(task), policy=shape, episode_steps=50, rollout=rollout)
     parameters_D = initial_parameters(shape, "unit_columns", 3)
     size = SHIPPED[task].observation_size
     ant = replace(

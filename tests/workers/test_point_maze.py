@@ -10,6 +10,7 @@ import pytest
 
 from es_service.protocol.noise import Domain, stream_keys
 from tests.twins import point_maze as twin
+from tests.workers.steps import resets_of
 from workers.environments import SHIPPED, make_environment
 
 ENVIRONMENT = make_environment("point_maze", {})
@@ -93,9 +94,13 @@ def test_task_table_tells_the_truth(name):
     defaults = {option: declared.default for option, declared in task.options.items()}
     assert defaults == {x.name: x.default for x in takes.values()}
     environment = make_environment(name, defaults)
-    state = environment.reset(stream_keys(0, Domain.TRAINING_RESET, 0))
+    state = jax.tree.map(lambda leaf: leaf[0], resets_of(name)(stream_keys(0, Domain.TRAINING_RESET, 0)[None]))
     assert np.isfinite(environment.goal_distance(state)) == task.has_goal
-    assert environment.observe(state).shape == (task.observation_size,)
-    assert environment.descriptor(state).shape == (len(task.descriptor_names),) == (len(task.descriptor_bounds),)
-    _, reward, done = environment.step(state, jnp.zeros(task.action_size))
-    assert reward.shape == done.shape == environment.goal_distance(state).shape == ()
+
+    def shape(function, *arguments):
+        return jax.tree.map(lambda one: one.shape, jax.eval_shape(function, *arguments))
+
+    assert shape(environment.observe, state) == (task.observation_size,)
+    assert shape(environment.descriptor, state) == (len(task.descriptor_names),) == (len(task.descriptor_bounds),)
+    _, reward, done = shape(environment.step, state, jnp.zeros(task.action_size))
+    assert reward == done == shape(environment.goal_distance, state) == ()

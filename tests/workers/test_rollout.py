@@ -142,15 +142,17 @@ def test_episodes_per_member_average(spec):
         assert three.steps[p, 0] == sum(singles[e][p][1] for e in range(3))
 
 
-def test_results_do_not_alias_each_other(spec):
-    """The fault this guards: descriptors that are views of memory which the next rollout overwrites."""
+@pytest.mark.parametrize("kind", [TrainingChunk, EvaluationChunk])
+def test_results_do_not_alias_each_other(spec, kind):
+    """The fault this guards: descriptors or traces that are views of memory which the next rollout overwrites."""
     worker = chunk_runner(spec())
-    first = worker(centre(random_parameters(1)), TrainingChunk(1, 0))
-    assert isinstance(first, EpisodesResult)
-    kept = first.descriptor.copy()
-    worker(centre(random_parameters(2)), TrainingChunk(2, 1))
-    np.testing.assert_array_equal(first.descriptor, kept)
-    assert first.descriptor.flags.owndata
+    first = worker(centre(random_parameters(1)), kind(1, 0))
+    arrays = {name: value for name, value in vars(first).items() if isinstance(value, np.ndarray)}
+    assert arrays.keys() >= {"descriptor", *(["trace_T_B"] if kind is EvaluationChunk else [])}
+    kept = {name: value.copy() for name, value in arrays.items()}
+    worker(centre(random_parameters(2)), kind(2, 1))
+    np.testing.assert_equal(arrays, kept)
+    assert [name for name, value in arrays.items() if not value.flags.owndata] == []
 
 
 def test_running_a_chunk_again_gives_the_same_bits(spec):

@@ -236,10 +236,7 @@ LEAVES = 4
 STEPS = ("add", "mul", "sin", "half", "abs")
 
 
-@pytest.mark.slow
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
-@given(data=st.data())
-def test_random_loops_are_jaxs(data: st.DataObject) -> None:
+def check_random_loop(data: st.DataObject) -> None:
     """Bodies of random operations on carries with random starts and ends; one inside another now and then.
 
     Values stay bounded but are not damped, so that a wrong first trip is seen at the end.
@@ -279,6 +276,20 @@ def test_random_loops_are_jaxs(data: st.DataObject) -> None:
         return lax.fori_loop(0, 4, lambda _, c: run(c), start)
 
     check(function)
+
+
+@pytest.mark.slow
+@settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_random_loops_are_jaxs(data: st.DataObject) -> None:
+    check_random_loop(data)
+
+
+@pytest.mark.long
+@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_so_are_many(data: st.DataObject) -> None:
+    check_random_loop(data)
 
 
 def test_short_loops_become_straight_code(monkeypatch: pytest.MonkeyPatch) -> None:
