@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from es_service.store.codec import (
     Part,
+    as_table,
     decode_part,
     encode_part,
     history_row,
@@ -72,7 +73,7 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
         state = state_sha256(state_sum(in_force if generation == newest else {}))
         values = {name: given.get(name) for name in names}
         rows = [{name: centre.get(name) for name in centre_names} for centre in next(evaluations, ())]
-        centres = table_bytes(meta.evaluation_columns, rows)
+        centres = table_bytes(meta.evaluation_columns, as_table(meta.evaluation_columns, rows))
         connection.execute(insert, history_row(meta.columns, generation, values, centres, state))
     for generation, platform in beginning.platforms:
         text = json.dumps(platform, sort_keys=True)

@@ -12,13 +12,14 @@ import operator
 import re
 import struct
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
-from es_service.loop.history import Column
+from es_service.loop.history import Column, Table
 
 Part = Mapping[str, NDArray[Any]]
 """A part of the search state, which is stored as a whole: name -> array, e.g. {"centre_D": ..., "step": int64[]}."""
@@ -35,6 +36,8 @@ _INTEGER = struct.Struct("<cq")
 _REAL = struct.Struct("<cd")
 _NUMERIC_KINDS = "biufc"
 _SUM_MODULUS = 2**256
+_MARKED = np.dtype([("mark", "S1"), ("bits", "<i8")])
+"""A value of a row as its bytes are, if there is one."""
 
 
 def encode_part(part: Part) -> bytes:
@@ -46,17 +49,23 @@ def encode_part(part: Part) -> bytes:
     Raises:
         StoreError: an array has neither bools nor numbers.
     """
-    header: list[tuple[str, str, list[int]]] = []
+    header: list[tuple[str, str, tuple[int, ...]]] = []
     raw: list[bytes] = []
     for name in sorted(part):
         array = np.asarray(part[name])
         if array.dtype.kind not in _NUMERIC_KINDS:
             raise StoreError(f"state array {name!r} has dtype {array.dtype}; only bools and numbers can be stored")
         little = array.astype(array.dtype.newbyteorder("<"), copy=False)
-        header.append((name, little.dtype.str, list(array.shape)))
+        header.append((name, little.dtype.str, array.shape))
         raw.append(little.tobytes(order="C"))
-    text = json.dumps(header, separators=(",", ":")).encode()
-    return b"".join((_MAGIC, _HEADER_LENGTH.pack(len(text)), text, *raw))
+    return b"".join((_header(tuple(header)), *raw))
+
+
+@lru_cache(maxsize=1024)
+def _header(entries: tuple[tuple[str, str, tuple[int, ...]], ...]) -> bytes:
+    """What comes before the values; kept, because many parts have arrays alike."""
+    text = json.dumps(entries, separators=(",", ":")).encode()
+    return b"".join((_MAGIC, _HEADER_LENGTH.pack(len(text)), text))
 
 
 def decode_part(payload: bytes) -> dict[str, NDArray[Any]]:
@@ -190,10 +199,47 @@ def row_bytes(row: Row) -> bytes:
     return b"".join(parts)
 
 
-def table_bytes(columns: Sequence[Column], rows: Sequence[Mapping[str, int | float | None]]) -> bytes:
-    """Bytes of a few rows with the same columns, such as the centres that one generation evaluated.
+def table_bytes(columns: Sequence[Column], table: Table) -> bytes:
+    """Bytes of rows with the same columns, such as the centres that one generation evaluated: those of `row_bytes` of
+    each, one after another. Values are converted as by `row_values`.
 
-    A run of an older version may have fewer columns than the rows, whose other values are then left out.
+    A run of an older version may have fewer columns than the table, whose other columns are then left out.
+
+    Args:
+        table: its columns; empty if there are no rows.
+
+    Raises:
+        StoreError: the table lacks a column, or one has the wrong type or another length than the others.
+    """
+    if not table or not columns:
+        return b""
+    if missing := {column.name for column in columns} - table.keys():
+        raise StoreError(f"a table has the columns {sorted(table)}; it lacks {sorted(missing)}")
+    rows = len(table[columns[0].name])
+    value_N_C = np.zeros((rows, len(columns)), _MARKED)
+    is_byte_N_C_9 = np.ones((rows, len(columns), _MARKED.itemsize), bool)
+    for at, column in enumerate(columns):
+        value_N, is_missing_N = _column(column, table[column.name], rows)
+        bits_N = value_N.astype("<i8" if column.type == "INTEGER" else "<f8").view("<i8")
+        value_N_C["bits"][:, at] = bits_N
+        value_N_C["mark"][:, at] = np.where(is_missing_N, b"N", b"I" if column.type == "INTEGER" else b"R")
+        is_byte_N_C_9[is_missing_N, at, 1:] = False
+    return value_N_C.view(np.uint8).reshape(is_byte_N_C_9.shape)[is_byte_N_C_9].tobytes()
+
+
+def _column(column: Column, values: NDArray[Any], rows: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """(values, whether each is missing) of a column of a table."""
+    value_N = np.ma.getdata(values)
+    if value_N.shape != (rows,):
+        raise StoreError(f"column {column.name} has the shape {value_N.shape}, and others have {rows} rows")
+    if value_N.dtype.kind not in ("iu" if column.type == "INTEGER" else "iuf"):
+        raise StoreError(f"column {column.name} is {column.type} and cannot hold {value_N.dtype}")
+    is_missing_N = np.ma.getmaskarray(values) | (value_N != value_N)
+    return (value_N if column.type == "INTEGER" else value_N.astype(np.float64) + 0.0), is_missing_N
+
+
+def as_table(columns: Sequence[Column], rows: Sequence[Mapping[str, int | float | None]]) -> dict[str, NDArray[Any]]:
+    """Rows as a table, for `table_bytes`.
 
     Raises:
         StoreError: a row lacks a column, or a value has the wrong type.
@@ -202,7 +248,12 @@ def table_bytes(columns: Sequence[Column], rows: Sequence[Mapping[str, int | flo
     for row in rows:
         if missing := names - row.keys():
             raise StoreError(f"a row has the columns {sorted(row)}; it lacks {sorted(missing)}")
-    return b"".join(row_bytes(tuple(_value(column, row[column.name]) for column in columns)) for row in rows)
+    table: dict[str, NDArray[Any]] = {}
+    for column in columns if rows else ():
+        values = [_value(column, row[column.name]) for row in rows]
+        filled = np.array([0 if value is None else value for value in values], "f8" if column.type == "REAL" else "i8")
+        table[column.name] = np.ma.MaskedArray(filled, [value is None for value in values])
+    return table
 
 
 def table_rows(columns: Sequence[Column], payload: bytes) -> list[Row]:
