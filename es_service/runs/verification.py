@@ -37,10 +37,10 @@ from es_service.store.codec import (
     row_values,
     state_sha256,
     state_sum,
-    table_bytes,
 )
 from es_service.store.kept import KeptRows, rows_in_force
 from es_service.store.lock import require_unlocked
+from es_service.store.tables import table_bytes
 
 
 @dataclass(frozen=True)

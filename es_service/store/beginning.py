@@ -17,17 +17,16 @@ from numpy.typing import NDArray
 
 from es_service.store.codec import (
     Part,
-    as_table,
     decode_part,
     encode_part,
     history_row,
     part_sha256,
     state_sha256,
     state_sum,
-    table_bytes,
     text_sha256,
 )
 from es_service.store.schema import RunMeta, history_insert
+from es_service.store.tables import as_table, table_bytes
 
 SEVERAL = "centre_K_D"
 """Array of a start from several policies, instead of "centre_D"; "mean_K_O" and "std_K_O" are their statistics."""

@@ -9,7 +9,6 @@ import hashlib
 import json
 import math
 import operator
-import re
 import struct
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
-from es_service.loop.history import Column, Table
+from es_service.loop.history import Column
 
 Part = Mapping[str, NDArray[Any]]
 """A part of the search state, which is stored as a whole: name -> array, e.g. {"centre_D": ..., "step": int64[]}."""
@@ -32,12 +31,10 @@ GONE = ""
 """Stands for the SHA-256 of such a row where the rows of a state are listed."""
 _MAGIC = b"ESP1"
 _HEADER_LENGTH = struct.Struct("<I")
-_INTEGER = struct.Struct("<cq")
-_REAL = struct.Struct("<cd")
+INTEGER = struct.Struct("<cq")
+REAL = struct.Struct("<cd")
 _NUMERIC_KINDS = "biufc"
 _SUM_MODULUS = 2**256
-_MARKED = np.dtype([("mark", "S1"), ("bits", "<i8")])
-"""A value of a row as its bytes are, if there is one."""
 
 
 def encode_part(part: Part) -> bytes:
@@ -167,10 +164,11 @@ def row_values(columns: Sequence[Column], generation: int, history: Mapping[str,
         raise StoreError(
             f"history row of generation {generation}: its column generation has the value {given['generation']}"
         )
-    return tuple(_value(column, given[column.name]) for column in columns)
+    return tuple(stored_value(column, given[column.name]) for column in columns)
 
 
-def _value(column: Column, value: Any) -> int | float | None:
+def stored_value(column: Column, value: Any) -> int | float | None:
+    """A value as it is stored; see `row_values`."""
     if value is None or value != value:
         return None
     try:
@@ -191,112 +189,12 @@ def row_bytes(row: Row) -> bytes:
         if value is None:
             parts.append(b"N")
         elif type(value) is int:
-            parts.append(_INTEGER.pack(b"I", value))
+            parts.append(INTEGER.pack(b"I", value))
         elif type(value) is float:
-            parts.append(_REAL.pack(b"R", value))
+            parts.append(REAL.pack(b"R", value))
         else:
             raise ValueError(f"a history row holds {value!r}, which is not a number")
     return b"".join(parts)
-
-
-def table_bytes(columns: Sequence[Column], table: Table) -> bytes:
-    """Bytes of rows with the same columns, such as the centres that one generation evaluated: those of `row_bytes` of
-    each, one after another. Values are converted as by `row_values`.
-
-    A run of an older version may have fewer columns than the table, whose other columns are then left out.
-
-    Args:
-        table: its columns; empty if there are no rows.
-
-    Raises:
-        StoreError: the table lacks a column, or one has the wrong type or another length than the others.
-    """
-    if not table or not columns:
-        return b""
-    if missing := {column.name for column in columns} - table.keys():
-        raise StoreError(f"a table has the columns {sorted(table)}; it lacks {sorted(missing)}")
-    rows = len(table[columns[0].name])
-    value_N_C = np.zeros((rows, len(columns)), _MARKED)
-    is_byte_N_C_9 = np.ones((rows, len(columns), _MARKED.itemsize), bool)
-    for at, column in enumerate(columns):
-        value_N, is_missing_N = _column(column, table[column.name], rows)
-        bits_N = value_N.astype("<i8" if column.type == "INTEGER" else "<f8").view("<i8")
-        value_N_C["bits"][:, at] = bits_N
-        value_N_C["mark"][:, at] = np.where(is_missing_N, b"N", b"I" if column.type == "INTEGER" else b"R")
-        is_byte_N_C_9[is_missing_N, at, 1:] = False
-    return value_N_C.view(np.uint8).reshape(is_byte_N_C_9.shape)[is_byte_N_C_9].tobytes()
-
-
-def _column(column: Column, values: NDArray[Any], rows: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """(values, whether each is missing) of a column of a table."""
-    value_N = np.ma.getdata(values)
-    if value_N.shape != (rows,):
-        raise StoreError(f"column {column.name} has the shape {value_N.shape}, and others have {rows} rows")
-    if value_N.dtype.kind not in ("iu" if column.type == "INTEGER" else "iuf"):
-        raise StoreError(f"column {column.name} is {column.type} and cannot hold {value_N.dtype}")
-    is_missing_N = np.ma.getmaskarray(values) | (value_N != value_N)
-    return (value_N if column.type == "INTEGER" else value_N.astype(np.float64) + 0.0), is_missing_N
-
-
-def as_table(columns: Sequence[Column], rows: Sequence[Mapping[str, int | float | None]]) -> dict[str, NDArray[Any]]:
-    """Rows as a table, for `table_bytes`.
-
-    Raises:
-        StoreError: a row lacks a column, or a value has the wrong type.
-    """
-    names = {column.name for column in columns}
-    for row in rows:
-        if missing := names - row.keys():
-            raise StoreError(f"a row has the columns {sorted(row)}; it lacks {sorted(missing)}")
-    table: dict[str, NDArray[Any]] = {}
-    for column in columns if rows else ():
-        values = [_value(column, row[column.name]) for row in rows]
-        filled = np.array([0 if value is None else value for value in values], "f8" if column.type == "REAL" else "i8")
-        table[column.name] = np.ma.MaskedArray(filled, [value is None for value in values])
-    return table
-
-
-def table_rows(columns: Sequence[Column], payload: bytes) -> list[Row]:
-    """The rows that `table_bytes` encoded, with values in the order of `columns`.
-
-    Raises:
-        ValueError: `payload` does not consist of such rows.
-    """
-    values: list[int | float | None] = []
-    position = 0
-    try:
-        while position < len(payload):
-            mark = payload[position : position + 1]
-            if mark == b"N":
-                values.append(None)
-                position += 1
-            else:
-                kind = {b"I": _INTEGER, b"R": _REAL}[mark]
-                values.append(kind.unpack_from(payload, position)[1])
-                position += kind.size
-    except (KeyError, struct.error) as error:
-        raise ValueError(f"the evaluated centres are unreadable: {error!r}") from error
-    if columns and len(values) % len(columns):
-        raise ValueError(f"the evaluated centres have {len(values)} values, which {len(columns)} columns do not fit")
-    return [tuple(values[i : i + len(columns)]) for i in range(0, len(values), len(columns) or 1)]
-
-
-def leading_values(payload: bytes, count: int, columns: int) -> bytes:
-    """The bytes of the first `count` values of each row that `table_bytes` encoded, of `columns` values each.
-
-    Raises:
-        ValueError: `payload` does not consist of such rows.
-    """
-    value = b"(?:N|[IR].{8})"
-    rows = re.compile(b"(%b{%d})%b{%d}" % (value, count, value, columns - count), re.DOTALL)
-    found, end = [], 0
-    while end < len(payload):
-        row = rows.match(payload, end)
-        if row is None:
-            raise ValueError(f"the evaluated centres are unreadable from byte {end} on")
-        found.append(row[1])
-        end = row.end()
-    return b"".join(found)
 
 
 def column_bytes(columns: Sequence[Column]) -> bytes:

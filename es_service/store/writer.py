@@ -34,7 +34,6 @@ from es_service.store.codec import (
     row_dict,
     state_sha256,
     state_sum,
-    table_bytes,
 )
 from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
@@ -44,6 +43,7 @@ from es_service.store.platforms import newest_before, record, store_list
 from es_service.store.recent import RecentParts
 from es_service.store.repair import open_sound
 from es_service.store.schema import PAGE_BYTES, RunMeta, history_insert, history_select
+from es_service.store.tables import table_bytes
 from es_service.store.upkeep import Upkeep
 
 Values = Mapping[str, int | float | None]

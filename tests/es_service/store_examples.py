@@ -9,12 +9,12 @@ import numpy as np
 
 from es_service.loop.history import Column
 from es_service.store import upkeep as store_upkeep
-from es_service.store.codec import as_table
 from es_service.store.connection import reading
 from es_service.store.digest import digest_of, digest_parts
 from es_service.store.folder import DATABASE
 from es_service.store.reader import read_evaluations, read_history, read_parts
 from es_service.store.schema import Damaged
+from es_service.store.tables import as_table
 from es_service.store.verify import verify
 from es_service.store.writer import RunMeta, RunStore, no_hook
 

@@ -17,6 +17,7 @@ from es_service.loop.parts import (
     elite_to_arrays,
     map_from_parts,
 )
+from es_service.search.maps.batches import insert_each
 from es_service.search.maps.behaviour_map import (
     EMPTY,
     BehaviourMap,
@@ -24,7 +25,6 @@ from es_service.search.maps.behaviour_map import (
     changed,
     empty_map,
     insert,
-    insert_each,
     map_statistics,
     moved,
     orders,

@@ -6,18 +6,16 @@ import pytest
 from es_service.errors import StoreError
 from es_service.loop.history import Column
 from es_service.store.codec import (
-    as_table,
     changed_sum,
     decode_part,
     encode_part,
-    leading_values,
     part_sha256,
     row_bytes,
     row_values,
     state_sha256,
     state_sum,
-    table_bytes,
 )
+from es_service.store.tables import as_table, leading_values, table_bytes
 from tests.es_service.store_examples import COLUMNS, assert_same_state, history_row
 
 ARRAYS = {

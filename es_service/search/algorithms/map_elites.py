@@ -35,7 +35,7 @@ from es_service.search.algorithms.base import Algorithm, CentreEvaluation, Polic
 from es_service.search.algorithms.common import archived_and_mapped
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import settings_of
-from es_service.search.maps.behaviour_map import insert_each
+from es_service.search.maps.batches import insert_each
 
 PARENT_CHOICE = 3
 """Last id of the random stream of Domain.SELECTION that draws the parents."""
@@ -136,5 +136,8 @@ def variation(x: FloatArray, y: FloatArray, keys: Keys, iso_sigma: float, line_s
         keys: of the streams [..., 4]; their coordinates 0 to D - 1 are those of the parameters, coordinate D is that of
             the line.
     """
-    noise, iso, line = normals(keys, x.shape[-1] + 1), np.float32(iso_sigma), np.float32(line_sigma)
-    return np.asarray(x + iso * noise[..., :-1] + line * noise[..., -1:] * (y - x), np.float32)
+    noise = normals(keys, x.shape[-1] + 1)
+    iso, line = np.float32(iso_sigma) * noise[..., :-1], np.float32(line_sigma) * noise[..., -1:]
+    iso += x
+    iso += line * (y - x)
+    return iso

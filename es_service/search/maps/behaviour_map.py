@@ -129,54 +129,6 @@ def insert(
     return _offered(map_, cell, entry)
 
 
-def insert_each(
-    map_: BehaviourMap,
-    descriptor_Q_B: NDArray[np.float64],
-    fitness_Q: NDArray[np.float64],
-    generation: int,
-    centre_Q: NDArray[np.int64],
-    score_Q: NDArray[np.float64],
-    samples: int = 1,
-) -> BehaviourMap:
-    """The map after `insert` of each evaluated centre, one after another.
-
-    Args:
-        descriptor_Q_B: mean descriptor of each, finite.
-        fitness_Q: mean fitness of each, finite.
-        samples: number of each one's evaluation episodes; not used by a map that does not count them.
-    """
-    cell_Q = map_.geometry.cells_of(descriptor_Q_B)
-    fittest = np.lexsort((-fitness_Q, cell_Q))  # stable: of equally fit ones the first comes first
-    fittest = fittest[np.flatnonzero(np.diff(cell_Q[fittest], prepend=EMPTY))]
-    sorted_rows = np.argsort(map_.cell_N)
-    found = np.searchsorted(map_.cell_N, cell_Q[fittest], sorter=sorted_rows)
-    row = np.append(sorted_rows, -1)[found]
-    is_filled = np.append(map_.cell_N, EMPTY)[row] == cell_Q[fittest]
-    is_better = is_filled & (fitness_Q[fittest] > np.append(map_.fitness_N, 0.0)[row])
-    # A cell was filled by the first one in it, which is not the fittest.
-    filled_by = np.unique(cell_Q, return_index=True)[1][~is_filled]
-    filling = fittest[~is_filled][np.argsort(filled_by)]
-    given_Q = {
-        "cell_N": cell_Q,
-        "fitness_N": fitness_Q,
-        "descriptor_N_B": descriptor_Q_B,
-        "generation_N": np.full(cell_Q.shape, generation),
-        "centre_N": centre_Q,
-        "score_N": score_Q,
-        "samples_N": np.full(cell_Q.shape, samples),
-    }
-    if not is_better.any() and not filling.size:
-        return map_
-    columns = {}
-    for name, values in _arrays(map_).items():
-        columns[name] = np.concatenate([values, given_Q[name][filling].astype(values.dtype)])
-        columns[name][row[is_better]] = given_Q[name][fittest[is_better]]
-    if map_.order_N is not None:
-        order = orders(map_)
-        columns["order_N"] = np.append(order, order.max(initial=-1) + 1 + np.arange(filling.size))
-    return replace(map_, **columns)
-
-
 def changed(
     map_: BehaviourMap,
     cell: int,
@@ -205,7 +157,7 @@ def removed(map_: BehaviourMap, cell: int) -> BehaviourMap:
     row = map_.row_of(cell)
     if row is None:
         return map_
-    columns = {name: np.delete(values, row, axis=0) for name, values in _arrays(map_).items()}
+    columns = {name: np.delete(values, row, axis=0) for name, values in columns_of(map_).items()}
     order_N = np.delete(orders(map_), row)
     return replace(map_, **columns, order_N=None if np.array_equal(order_N, np.arange(order_N.size)) else order_N)
 
@@ -225,7 +177,7 @@ def moved(map_: BehaviourMap, cell: int, descriptor_B: NDArray[np.float64]) -> t
         raise KeyError(cell)
     if to == cell:
         return _with(map_, row, {"descriptor_N_B": descriptor_B}), cell, True
-    entry = {name: values[row] for name, values in _arrays(map_).items() if name != "cell_N"}
+    entry = {name: values[row] for name, values in columns_of(map_).items() if name != "cell_N"}
     return _offered(removed(map_, cell), to, entry | {"descriptor_N_B": descriptor_B})
 
 
@@ -269,7 +221,7 @@ def orders(map_: BehaviourMap) -> NDArray[np.int64]:
 def unchanged_entries(map_: BehaviourMap, before: BehaviourMap) -> NDArray[np.bool_]:
     """Whether each entry is the same, bit for bit, as that of its cell in an earlier map, with its order, [N]."""
     was_N, row_N = rows_in(map_, before)
-    now, then = ({**_arrays(one), "order_N": orders(one)} for one in (map_, before))
+    now, then = ({**columns_of(one), "order_N": orders(one)} for one in (map_, before))
     if now.keys() != then.keys():  # one of them counts samples
         return np.zeros(map_.size, bool)
     same_N = was_N.copy()
@@ -323,7 +275,7 @@ def _bytes(values_N: np.ndarray) -> NDArray[np.uint8]:
     return np.frombuffer(values_N.tobytes(), np.uint8).reshape(-1, entry_bytes)
 
 
-def _arrays(map_: BehaviourMap) -> dict[str, np.ndarray]:
+def columns_of(map_: BehaviourMap) -> dict[str, np.ndarray]:
     """The arrays of a map by name, without the order."""
     samples = {} if map_.samples_N is None else {"samples_N": map_.samples_N}
     return {"cell_N": map_.cell_N, **{name: getattr(map_, name) for name in COLUMNS}, **samples}
@@ -337,7 +289,7 @@ def _offered(map_: BehaviourMap, cell: int, entry: dict[str, Any]) -> tuple[Beha
         return (_with(map_, row, entry) if enters else map_), cell, bool(enters)
     columns = {
         name: np.concatenate([values, np.asarray(value, values.dtype)[None]])
-        for name, values in _arrays(map_).items()
+        for name, values in columns_of(map_).items()
         for value in [cell if name == "cell_N" else entry[name]]
     }
     order_N = None if map_.order_N is None else np.append(order := orders(map_), order.max(initial=-1) + 1)
