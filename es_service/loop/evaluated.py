@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from es_service.config.model import RunConfig
 from es_service.loop.checks import valid_members
 from es_service.loop.generation import first_episode, highest, steps_of
-from es_service.loop.history import NO_POLICY, RESETS, Table, episodes_table, norm, with_gaps
+from es_service.loop.history import NO_POLICY, RESETS, Table, doubles, episodes_table, norm, with_gaps
 from es_service.loop.policies import PolicyWork, no_statistics, policy_work
 from es_service.protocol.messages import Centre, EpisodesResult, Moments, TaskSpec
 from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
@@ -230,8 +230,8 @@ def told_of(evaluated: Evaluated, generation: int) -> CentreEvaluations:
         generation,
         evaluated.index_N,
         np.asarray(valid_members(episodes).all(axis=1)),
-        episodes.fitness.astype(np.float64).mean(axis=1),
-        episodes.descriptor.astype(np.float64).mean(axis=1),
+        doubles(episodes.fitness).mean(axis=1),
+        doubles(episodes.descriptor).mean(axis=1),
         evaluated.population_max_N,
         episodes.fitness.shape[1],
     )

@@ -224,14 +224,20 @@ def evaluation_columns(table: Table, episodes: EpisodesResult, row: int, task: T
     }
 
 
+def doubles(values_N_E: FloatArray) -> NDArray[np.float64]:
+    """Values of episodes, [N, E] or [N, E, B], in float64 and with the episodes of a centre side by side in memory.
+
+    NumPy adds along an axis in an order that depends on the strides. With this layout, a mean over the episodes has the
+    bits that the mean of the centre's episodes alone has, whatever the layout in which chunks were put together.
+    """
+    return values_N_E.astype(np.float64, order="C")
+
+
 @np.errstate(invalid="ignore", over="ignore")  # the deviation of infinite values is NaN
 def episodes_table(episodes: EpisodesResult, task: TaskSpec) -> dict[str, NDArray[np.float64]]:
-    """Columns of the evaluated centres about their episodes [N, E]: fitness, return, descriptor, distance to the goal.
-
-    Everything is computed in float64, so that a sum over episodes does not depend on the other centres.
-    """
-    fitness_N_E, returns_N_E = episodes.fitness.astype(np.float64), episodes.returns.astype(np.float64)
-    mean_N_B = episodes.descriptor.astype(np.float64).mean(axis=1)
+    """Columns of the evaluated centres about their episodes [N, E]: fitness, return, descriptor, distance to the goal."""
+    fitness_N_E, returns_N_E = doubles(episodes.fitness), doubles(episodes.returns)
+    mean_N_B = doubles(episodes.descriptor).mean(axis=1)
     columns = {
         "fitness_mean": fitness_N_E.mean(axis=1),
         "fitness_std": fitness_N_E.std(axis=1),
@@ -240,7 +246,7 @@ def episodes_table(episodes: EpisodesResult, task: TaskSpec) -> dict[str, NDArra
         **dict(zip(task.descriptor_names, mean_N_B.T, strict=True)),
     }
     if task.has_goal:
-        end_N_E, least_N_E = np.moveaxis(episodes.goal_distance.astype(np.float64), -1, 0)
+        end_N_E, least_N_E = np.moveaxis(doubles(episodes.goal_distance), -1, 0)
         columns["goal_distance"] = end_N_E.mean(axis=1)
         columns["goal_distance_way"] = least_N_E.mean(axis=1)
         columns["goal_distance_min"] = least_N_E.min(axis=1)
