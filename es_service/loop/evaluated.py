@@ -203,7 +203,12 @@ def _each(change: Callable[..., np.ndarray], *results: EpisodesResult) -> Episod
     names = "fitness", "returns", "descriptor", "steps", "goal_distance"
     columns = (change(*(getattr(one, name) for one in results)) for name in names)
     traces = [one.trace_T_B for one in results if one.trace_T_B is not None]
-    return EpisodesResult(*columns, moments=None, trace_T_B=change(*traces) if len(traces) == len(results) else None)
+    return EpisodesResult(
+        *columns,
+        moments=None,
+        trace_T_B=change(*traces) if len(traces) == len(results) else None,
+        outputs={name: change(*(one.outputs[name] for one in results)) for name in results[0].outputs},
+    )
 
 
 def _joined(parts: Sequence[Evaluated]) -> Evaluated:
@@ -234,6 +239,7 @@ def told_of(evaluated: Evaluated, generation: int) -> CentreEvaluations:
         doubles(episodes.descriptor).mean(axis=1),
         evaluated.population_max_N,
         episodes.fitness.shape[1],
+        episodes,
     )
 
 

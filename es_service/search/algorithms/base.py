@@ -190,6 +190,8 @@ class CentreEvaluations(Sequence[CentreEvaluation]):
     descriptor_N_B: NDArray[np.float64]
     population_max_N: NDArray[np.float64]
     episodes: int = 1
+    results: EpisodesResult | None = None
+    """Results of each episode, [N, E]."""
 
     def __len__(self) -> int:
         return len(self.centre_N)
@@ -209,7 +211,22 @@ class CentreEvaluations(Sequence[CentreEvaluation]):
             self.descriptor_N_B[index],
             float(self.population_max_N[index]),
             self.episodes,
+            None if self.results is None else _one_of(self.results, index),
         )
+
+
+def _one_of(results: EpisodesResult, index: int) -> EpisodesResult:
+    """The results of one centre, [E], from those of all, [N, E]."""
+    return EpisodesResult(
+        fitness=results.fitness[index],
+        returns=results.returns[index],
+        descriptor=results.descriptor[index],
+        steps=results.steps[index],
+        goal_distance=results.goal_distance[index],
+        moments=None,
+        trace_T_B=None if results.trace_T_B is None else results.trace_T_B[index],
+        outputs={name: array[index] for name, array in results.outputs.items()},
+    )
 
 
 def in_columns(evaluations: Sequence[CentreEvaluation]) -> CentreEvaluations:
