@@ -235,7 +235,7 @@ def doubles(values_N_E: FloatArray) -> NDArray[np.float64]:
 
 @np.errstate(invalid="ignore", over="ignore")  # the deviation of infinite values is NaN
 def episodes_table(episodes: EpisodesResult, task: TaskSpec) -> dict[str, NDArray[np.float64]]:
-    """Columns of the evaluated centres about their episodes, [N, E]: fitness, return, descriptor, distance to a goal."""
+    """Columns of the evaluated centres about their episodes, [N, E]: fitness, return, descriptor, distance to goal."""
     fitness_N_E, returns_N_E = doubles(episodes.fitness), doubles(episodes.returns)
     mean_N_B = doubles(episodes.descriptor).mean(axis=1)
     columns = {
