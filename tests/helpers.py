@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -128,6 +128,15 @@ def workers_in_this_process() -> Iterator[None]:
         yield
 
 
+def rows_of(table: Mapping[str, np.ndarray]) -> list[dict]:
+    """The rows of a table; None for no value."""
+    columns = {
+        name: [None if value != value else value for value in np.ma.asarray(values).tolist()]
+        for name, values in table.items()
+    }
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
 class MemoryStore:
     """A run store in memory, for driver tests that are not about the store."""
 
@@ -145,7 +154,7 @@ class MemoryStore:
     def last_history(self) -> dict | None:
         return self.rows[-1] if self.rows else None
 
-    def commit(self, generation, parts, history, evaluations=()) -> None:
+    def commit(self, generation, parts, history, evaluations) -> None:
         self.generation = generation
         self.parts = {name: part for name, part in (self.parts | parts).items() if part is not None}
         self.rows.append(dict(history))

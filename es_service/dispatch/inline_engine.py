@@ -136,6 +136,7 @@ class ChildProcesses:
                 frames.append(frame)
             numbered.append((number, chunk))
         forget_oldest(to.subjects, int)
+        forget_oldest(self._subjects, lambda entry: entry[0].nbytes)
         to.unanswered += 1
         to.channel.send(*frames, framed(("chunks", item_id, attempt, numbered)))
         self._watch(to.channel)
@@ -180,7 +181,6 @@ class ChildProcesses:
             frame = framed(("subject", self._next_subject, subject))
             known = self._subjects[id(subject)] = subject, self._next_subject, frame
             self._next_subject += 1
-            forget_oldest(self._subjects, lambda entry: entry[0].nbytes)
         return known[1:]
 
     def _add(self, number: int, child: _Child, ours: socket.socket) -> None:

@@ -30,14 +30,14 @@ from es_service.loop.evaluated import (
     Evaluations,
     Proposal,
     Update,
-    evaluated_rows,
+    evaluated_table,
     in_ask_order,
     initial_centres,
     policies_asked,
+    told_of,
 )
 from es_service.loop.generation import (
     better,
-    centre_evaluation,
     entered,
     estimate_gradients,
     evaluate_centres,
@@ -53,9 +53,10 @@ from es_service.loop.history import (
     evaluation_columns,
     fault_columns,
     map_columns,
+    norm,
+    or_none,
     population_columns,
     search_columns,
-    step_columns,
 )
 from es_service.loop.interfaces import Search, Stop, Store, Stored
 from es_service.loop.parts import ELITE_PREFIX, elite_from_arrays, elite_part, state_from_parts
@@ -195,19 +196,16 @@ def update(search: Search, evaluator: Evaluator, proposal: Proposal, evaluations
             zip(new_centres, results, evaluations.populations, strict=True),
             zip(proposal.policies, evaluations.policies, strict=True),
             seed=config.seed,
-            generation=generation,
             centres=len(proposal.search.centres),
             fitness_weight=proposal.search.weight.value,
         )
-    told = tuple(centre_evaluation(generation, one.index, one.evaluation, one.population) for one in evaluated)
+    told = told_of(evaluated, generation)
     learned = tell(algorithm, moved, told)
-    nearest, descriptors = config.novelty, [one.descriptor_B for one in told]
-    novelties: Sequence[float | None] = [None] * len(told)
+    nearest, novelty_N = config.novelty, np.full(len(told), np.nan)
     if proposal.asked:
-        novelties = novelty(
-            moved.archive, descriptors, neighbours=nearest.neighbours, distance=nearest.distance, newest=nearest.newest
-        ).tolist()
-    return Update(learned, evaluated, told, novelties)
+        how = {"neighbours": nearest.neighbours, "distance": nearest.distance, "newest": nearest.newest}
+        novelty_N = novelty(moved.archive, told.descriptor_N_B, **how)
+    return Update(learned, evaluated, told, novelty_N)
 
 
 def _step(
@@ -254,48 +252,49 @@ def record(
 ) -> tuple[RunState, HistoryRow]:
     """Commit the generation: the state after it, its row of the history, and those of what it has evaluated."""
     config, generation, learned = search.config, proposal.generation, updated.search
-    evaluated, told = updated.evaluated, updated.told
-    points, results = [one.point for one in evaluated], [one.evaluation for one in evaluated]
+    evaluated, told, results = updated.evaluated, updated.told, updated.evaluated.evaluation
     episodes = sum(one.fitness.size for one in evaluations.populations) * config.task.episodes_per_member
     state = RunState(
         generation=generation,
         search=replace(learned, elites={}),
         observations=merge_moments(before.observations, evaluations.observed),
-        best=better(before.best, points, told),
-        env_steps=before.env_steps + sum(one.env_steps for one in evaluated),
-        episodes=before.episodes + episodes + sum(one.fitness.size for one in results),
+        best=better(before.best, told, evaluated.point),
+        env_steps=before.env_steps + int(evaluated.env_steps_N.sum()),
+        episodes=before.episodes + episodes + results.fitness.size,
         wall_clock_s=clock.total(),
-        elites=entered(learned, told, points, results),
+        elites=entered(learned, told, evaluated.point, results.trace_T_B),
     )
-    at = fittest(told)
-    shown = evaluated[at]  # the history's row is about this one
-    start_cell = proposal.start_cells.get(shown.index)
+    table = evaluated_table(evaluated, search.task, learned.map, generation, proposal.start_cells, updated.novelty_N)
+    at = fittest(told)  # the history's row is about this one
+    shown = int(evaluated.index_N[at])
     row: HistoryRow = {
         "generation": generation,
         "env_steps": state.env_steps,
         "episodes": state.episodes,
         "best_fitness": state.best.fitness,
-        **search_columns(shown.index, shown.fitness_weight, updated.novelties[at], learned.archive.size),
+        **search_columns(
+            shown, float(evaluated.fitness_weight_N[at]), or_none(updated.novelty_N[at]), learned.archive.size
+        ),
         **map_columns(
             learned.map,
             config.map.qd_offset,
             reachable,
             generation=generation,
-            centre=shown.index,
-            start_cell=start_cell,
+            centre=shown,
+            start_cell=proposal.start_cells.get(shown),
         ),
-        **step_columns(shown.before_D, shown.point.parameters_D),
+        "update_norm": or_none(evaluated.update_norm_N[at]),
+        "parameter_norm": norm(evaluated.point(at).parameters_D),
         **population_columns(evaluations.members),
-        **evaluation_columns(shown.evaluation, search.task),
+        **evaluation_columns(table, results, at, search.task),
         **faults,
         "wall_clock_s": state.wall_clock_s,
     }
-    rows = evaluated_rows(evaluated, search.task, learned.map, generation, proposal.start_cells, updated.novelties)
     clock.lap("seconds_driver")
     seconds, laps = clock.finish_generation()
     row |= {"steps_per_second": (state.env_steps - before.env_steps) / seconds, **laps}
     parts = changed_parts(state, before if before.generation >= 0 else None, store.part)
-    store.commit(generation, parts, row, rows)
+    store.commit(generation, parts, row, table)
     clock.lap("seconds_store")
     return state, row
 

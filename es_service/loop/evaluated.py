@@ -2,46 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from es_service.config.model import RunConfig
-from es_service.loop.generation import first_episode, steps_of
-from es_service.loop.history import HistoryRow, Resets, evaluated_row, norm
-from es_service.loop.policies import PolicyWork, each_policy, no_statistics, policy_work
-from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, Moments, TaskSpec
-from es_service.search.algorithms.base import Ask, CentreEvaluation, PolicyAsk, SearchState
-from es_service.search.maps.behaviour_map import BehaviourMap
+from es_service.loop.checks import valid_members
+from es_service.loop.generation import first_episode, highest, steps_of
+from es_service.loop.history import NO_POLICY, RESETS, Table, doubles, episodes_table, norm, with_gaps
+from es_service.loop.policies import PolicyWork, no_statistics, policy_work
+from es_service.protocol.messages import Centre, EpisodesResult, Moments, TaskSpec
+from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
+from es_service.search.maps.behaviour_map import EMPTY, BehaviourMap
 
 
 @dataclass(frozen=True)
 class Evaluated:
-    """A centre or a policy that has been evaluated."""
+    """Centres and policies that have been evaluated, in the order of the asks, as columns. N: each of them."""
 
-    index: int
+    subjects: Sequence[Centre | PolicyWork]
+    """Centres and asks for policies, which together are the N."""
+    index_N: NDArray[np.int64]
     """Index of the centre; policies count on from the centres."""
-    point: Centre
-    """What was evaluated, with its observation statistics."""
     evaluation: EpisodesResult
-    """Results of its evaluation episodes [E]."""
-    resets: Resets
-    """Address of the resets of these episodes."""
-    fitness_weight: float
-    """Weight of fitness in the utilities of its population; for a policy the weight in the state."""
-    population: EpisodesResult | None = None
-    """The population that led to the centre; None for a policy."""
-    before_D: FloatArray | None = None
-    """The centre before its update; None for a policy."""
+    """Results of the evaluation episodes [N, E], with traces [N, T, B]."""
+    reset_N_4: NDArray[np.int64]
+    """Address of the resets of these episodes: the values of `history.RESETS`, of which a centre lacks the last."""
+    fitness_weight_N: NDArray[np.float64]
+    """Weight of fitness in the utilities of the population; for a policy the weight in the state."""
+    population_max_N: NDArray[np.float64]
+    """Highest fitness of a valid member of the population that led to the centre; NaN where there is none."""
+    update_norm_N: NDArray[np.float64]
+    """Euclidean norm of the centre's update; NaN for a policy and for an initial centre."""
+    env_steps_N: NDArray[np.int64]
+    """Environment steps of the evaluation and of the population."""
 
-    @property
-    def update_norm(self) -> float | None:
-        """Euclidean norm of the update; None for a policy."""
-        return None if self.before_D is None else norm(self.point.parameters_D - self.before_D)
-
-    @property
-    def env_steps(self) -> int:
-        """Environment steps of the evaluation and of the population."""
-        return steps_of(self.evaluation) + (0 if self.population is None else steps_of(self.population))
+    def point(self, row: int) -> Centre:
+        """What was evaluated, with its observation statistics, in arrays of its own."""
+        for subject in self.subjects:
+            count = 1 if isinstance(subject, Centre) else len(subject.parameters_N_D)
+            if row < count:
+                return subject if isinstance(subject, Centre) else subject.policy(row)
+            row -= count
+        raise IndexError(row)
 
 
 @dataclass(frozen=True)
@@ -84,12 +90,12 @@ class Update:
     """What has become of the centres, and the state that has learned from it."""
 
     search: SearchState
-    evaluated: Sequence[Evaluated]
+    evaluated: Evaluated
     """New centres and policies, in the order of the asks."""
-    told: tuple[CentreEvaluation, ...]
+    told: CentreEvaluations
     """What the search was told of each."""
-    novelties: Sequence[float | None]
-    """Novelty of each in the archive before the generation; None for initial centres."""
+    novelty_N: NDArray[np.float64]
+    """Novelty of each in the archive before the generation; NaN for initial centres."""
 
 
 def policies_asked(
@@ -122,10 +128,9 @@ def in_ask_order(
     policies: Iterable[tuple[PolicyWork, EpisodesResult]],
     *,
     seed: int,
-    generation: int,
     centres: int,
     fitness_weight: float,
-) -> list[Evaluated]:
+) -> Evaluated:
     """Everything that a generation has evaluated.
 
     Args:
@@ -139,53 +144,129 @@ def in_ask_order(
     for asked in asks:
         if isinstance(asked, Ask):
             number, (point, evaluation, population) = next(of_centres)
-            resets, weight = Resets(seed, ask=number), asked.fitness_weight
-            found.append(Evaluated(asked.centre, point, evaluation, resets, weight, population, asked.centre_D))
+            resets = seed, 0, number, NO_POLICY
+            update_norm = norm(point.parameters_D - asked.centre_D)
+            found.append(
+                _one(asked.centre, point, evaluation, resets, asked.fitness_weight, population, update_norm=update_norm)
+            )
             continue
         number, (work, results) = next(of_policies)
-        given = work.parameters_N_D, work.observation_mean_N_O, work.observation_std_N_O
-        for policy, (parameters_D, mean_O, std_O, evaluation) in enumerate(
-            zip(*given, each_policy(results), strict=True)
-        ):
-            point, resets = Centre(generation, parameters_D, 0.0, mean_O, std_O), Resets(seed, 0, number, policy)
-            found.append(Evaluated(index, point, evaluation, resets, fitness_weight))
-            index += 1
-    return found
+        count = len(work.parameters_N_D)
+        reset_N_4 = np.full((count, len(RESETS)), (seed, 0, number, 0))
+        reset_N_4[:, -1] = np.arange(count)
+        index_N, none_N = np.arange(index, index + count), np.full(count, np.nan)
+        steps_N = results.steps.sum(axis=1, dtype=np.int64)
+        weight_N = np.full(count, float(fitness_weight))
+        found.append(Evaluated((work,), index_N, results, reset_N_4, weight_N, none_N, none_N, steps_N))
+        index += count
+    return _joined(found)
 
 
 def initial_centres(
     points: Iterable[Centre], evaluations: Iterable[EpisodesResult], config: RunConfig, fitness_weight: float
-) -> list[Evaluated]:
+) -> Evaluated:
     """The initial centres, which have no populations; the episodes of each begin with a chunk of its own."""
-    episodes = config.search.evaluation_episodes
-    return [
-        Evaluated(index, point, evaluation, Resets(config.seed, first_episode(index, episodes)), fitness_weight)
-        for index, (point, evaluation) in enumerate(zip(points, evaluations, strict=True))
-    ]
+    episodes, found = config.search.evaluation_episodes, []
+    for index, (point, evaluation) in enumerate(zip(points, evaluations, strict=True)):
+        resets = config.seed, first_episode(index, episodes), 0, NO_POLICY
+        found.append(_one(index, point, evaluation, resets, fitness_weight))
+    return _joined(found)
 
 
-def evaluated_rows(
-    evaluated: Sequence[Evaluated],
+def _one(
+    index: int,
+    point: Centre,
+    evaluation: EpisodesResult,
+    resets: tuple[int, ...],
+    fitness_weight: float,
+    population: EpisodesResult | None = None,
+    *,
+    update_norm: float = math.nan,
+) -> Evaluated:
+    """A centre."""
+    steps = steps_of(evaluation) + (0 if population is None else steps_of(population))
+    population_max = math.nan if population is None else highest(population.fitness)
+    return Evaluated(
+        (point,),
+        np.array([index]),
+        _each(lambda array: array[None], evaluation),
+        np.array([resets]),
+        np.array([float(fitness_weight)]),
+        np.array([population_max]),
+        np.array([update_norm]),
+        np.array([steps]),
+    )
+
+
+def _each(change: Callable[..., np.ndarray], *results: EpisodesResult) -> EpisodesResult:
+    """A function of the arrays of results, array by array."""
+    names = "fitness", "returns", "descriptor", "steps", "goal_distance"
+    columns = (change(*(getattr(one, name) for one in results)) for name in names)
+    traces = [one.trace_T_B for one in results if one.trace_T_B is not None]
+    return EpisodesResult(
+        *columns,
+        moments=None,
+        trace_T_B=change(*traces) if len(traces) == len(results) else None,
+        outputs={name: change(*(one.outputs[name] for one in results)) for name in results[0].outputs},
+    )
+
+
+def _joined(parts: Sequence[Evaluated]) -> Evaluated:
+    """Those of all parts, in order."""
+    if len(parts) == 1:
+        return parts[0]
+    columns = {
+        name: np.concatenate([getattr(one, name) for one in parts])
+        for name in Evaluated.__dataclass_fields__
+        if name not in ("subjects", "evaluation")
+    }
+    return Evaluated(
+        subjects=[subject for one in parts for subject in one.subjects],
+        evaluation=_each(lambda *arrays: np.concatenate(arrays), *(one.evaluation for one in parts)),
+        **columns,
+    )
+
+
+@np.errstate(invalid="ignore", over="ignore")  # an infinite fitness makes the centre invalid
+def told_of(evaluated: Evaluated, generation: int) -> CentreEvaluations:
+    """What a search is told of a generation's centres and policies."""
+    episodes = evaluated.evaluation
+    return CentreEvaluations(
+        generation,
+        evaluated.index_N,
+        np.asarray(valid_members(episodes).all(axis=1)),
+        doubles(episodes.fitness).mean(axis=1),
+        doubles(episodes.descriptor).mean(axis=1),
+        evaluated.population_max_N,
+        episodes.fitness.shape[1],
+        episodes,
+    )
+
+
+def evaluated_table(
+    evaluated: Evaluated,
     task: TaskSpec,
     map_: BehaviourMap | None,
     generation: int,
     start_cells: Mapping[int, int],
-    novelties: Sequence[float | None],
-) -> list[HistoryRow]:
-    """The rows of a generation in the table of evaluated centres."""
-    return [
-        evaluated_row(
-            one.evaluation,
-            task,
-            map_,
-            resets=one.resets,
-            generation=generation,
-            centre=one.index,
-            fitness_weight=one.fitness_weight,
-            start_cell=start_cells.get(one.index),
-            novelty=its_novelty,
-            update_norm=one.update_norm,
-            env_steps=one.env_steps,
-        )
-        for one, its_novelty in zip(evaluated, novelties, strict=True)
-    ]
+    novelty_N: NDArray[np.float64],
+) -> Table:
+    """The rows of a generation in the table of evaluated centres; see `history.evaluated_columns`."""
+    index_N, episodes = evaluated.index_N, evaluated.evaluation
+    cells = {}
+    if map_ is not None:
+        start_N = np.full(index_N.shape, EMPTY)
+        for index, cell in start_cells.items():
+            start_N[index_N == index] = cell
+        cells = {"start_cell": with_gaps(start_N), "cell": with_gaps(map_.cells_with(generation, index_N))}
+    return {
+        "centre": index_N,
+        "fitness_weight": evaluated.fitness_weight_N,
+        **cells,
+        **episodes_table(episodes, task),
+        "novelty": novelty_N,
+        "update_norm": evaluated.update_norm_N,
+        "env_steps": evaluated.env_steps_N,
+        "fitness_first": episodes.fitness[:, 0],
+        **{name: with_gaps(values) for name, values in zip(RESETS, evaluated.reset_N_4.T, strict=True)},
+    }

@@ -16,7 +16,7 @@ import numpy as np
 
 from es_service.config.model import RunConfig
 from es_service.errors import EvaluationError
-from es_service.loop.checks import require_state, valid_members
+from es_service.loop.checks import require_state
 from es_service.loop.interfaces import Search
 from es_service.loop.policies import PolicyWork, policy_episodes
 from es_service.loop.state import Best, RunState, statistics_in_force
@@ -36,9 +36,17 @@ from es_service.protocol.messages import (
     around,
     evaluation_chunks,
 )
-from es_service.search.algorithms.base import Algorithm, CentreEvaluation, CentreState, SearchState, frozen, with_centre
+from es_service.search.algorithms.base import (
+    Algorithm,
+    CentreEvaluation,
+    CentreEvaluations,
+    CentreState,
+    SearchState,
+    frozen,
+    with_centre,
+)
 from es_service.search.algorithms.common import first_state
-from es_service.search.maps.behaviour_map import Elite, empty_map, make_elite
+from es_service.search.maps.behaviour_map import EMPTY, Elite, empty_map, make_elite
 from es_service.search.maps.geometry import make_geometry
 
 Result = TypeVar("Result", EpisodesResult, GradientResult)
@@ -193,28 +201,7 @@ def _evaluate(kind: type[Result], evaluator: Evaluator, asked: Sequence[Sequence
     return [list(islice(found, len(work))) for work in asked]
 
 
-@np.errstate(invalid="ignore", over="ignore")  # an infinite fitness makes the centre invalid
-def centre_evaluation(
-    generation: int, centre: int, evaluation: EpisodesResult, population: EpisodesResult | None = None
-) -> CentreEvaluation:
-    """The evaluation of a centre, from its evaluation episodes and the population that led to it.
-
-    Args:
-        population: its invalid members have the fitness NaN; None for an initial centre.
-    """
-    return CentreEvaluation(
-        generation,
-        centre,
-        bool(valid_members(evaluation).all()),
-        float(np.mean(evaluation.fitness, dtype=np.float64)),
-        evaluation.descriptor.astype(np.float64).mean(axis=0),
-        _highest(population.fitness) if population is not None else math.nan,
-        len(evaluation.fitness),
-        evaluation,
-    )
-
-
-def tell(algorithm: Algorithm, state: SearchState, told: tuple[CentreEvaluation, ...]) -> SearchState:
+def tell(algorithm: Algorithm, state: SearchState, told: Sequence[CentreEvaluation]) -> SearchState:
     """The state after the search is told a generation's evaluations; its arrays are read-only from now on."""
     after = algorithm.tell(state, told)
     require_state(after, "tell", told[0].generation)
@@ -225,39 +212,44 @@ def tell(algorithm: Algorithm, state: SearchState, told: tuple[CentreEvaluation,
         raise EvaluationError(text, field="search.algorithm") from error
 
 
-def fittest(told: Sequence[CentreEvaluation]) -> int:
+def fittest(told: CentreEvaluations) -> int:
     """Index in `told` of the valid centre with the highest fitness, the first of equal ones; 0 if none is valid."""
-    fitness = [one.fitness if one.valid else -math.inf for one in told]
-    return max(range(len(told)), key=fitness.__getitem__)
+    return int(np.where(told.valid_N, told.fitness_N, -math.inf).argmax())
 
 
 def entered(
     state: SearchState,
-    told: Sequence[CentreEvaluation],
-    centres: Sequence[Centre],
-    evaluations: Sequence[EpisodesResult],
+    told: CentreEvaluations,
+    point: Callable[[int], Centre],
+    trace_N_T_B: FloatArray | None,
 ) -> dict[int, Elite]:
     """The policies of elites that the store does not have, by their cells: those of the centres just evaluated that are
     elites now, and those that the search has given.
 
     The map decides this and not `CentreState.cell`, which a search of the user need not set.
+
+    Args:
+        point: function from an index in `told` to what was evaluated.
     """
-    filled = set() if state.map is None or not state.elites else set(state.map.cell_N.tolist())
+    if state.map is None:
+        return {}
+    filled = set(state.map.cell_N.tolist()) if state.elites else set()
     found = {cell: elite for cell, elite in state.elites.items() if cell in filled}
-    for one, centre, evaluation in zip(told, centres, evaluations, strict=True):
-        if state.map is not None and (cell := state.map.cell_of(one.generation, one.centre)) is not None:
-            assert evaluation.trace_T_B is not None, "an evaluation has a trace"
-            found[cell] = make_elite(centre, evaluation.trace_T_B)
+    cell_N = state.map.cells_with(told.generation, told.centre_N)
+    for row in np.flatnonzero(cell_N != EMPTY).tolist():
+        assert trace_N_T_B is not None, "an evaluation has a trace"
+        found[int(cell_N[row])] = make_elite(point(row), trace_N_T_B[row].copy())
     return found
 
 
-def better(best: Best, centres: Sequence[Centre], told: Sequence[CentreEvaluation]) -> Best:
+def better(best: Best, told: CentreEvaluations, point: Callable[[int], Centre]) -> Best:
     """The best centre after more evaluations. An invalid centre, or one of equal fitness, does not replace it."""
-    for centre, one in zip(centres, told, strict=True):
-        if one.valid and one.fitness > best.fitness:
-            mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
-            best = Best(centre.generation, one.fitness, centre.parameters_D, mean_O, std_O)
-    return best
+    at = fittest(told)
+    if not told.valid_N[at] or told.fitness_N[at] <= best.fitness:
+        return best
+    centre = point(at)
+    mean_O, std_O = centre.observation_mean_O, centre.observation_std_O
+    return Best(centre.generation, float(told.fitness_N[at]), centre.parameters_D, mean_O, std_O)
 
 
 def steps_of(result: EpisodesResult) -> int:
@@ -265,7 +257,7 @@ def steps_of(result: EpisodesResult) -> int:
     return int(result.steps.sum(dtype=np.int64))
 
 
-def _highest(fitness: FloatArray) -> float:
+def highest(fitness: FloatArray) -> float:
     """Highest finite value; NaN if there is none."""
     finite = fitness[np.isfinite(fitness)]
     return float(finite.max()) if finite.size else math.nan

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +18,8 @@ HistoryRow = dict[str, int | float | None]
 """Values by name of the column, as the loop writes them."""
 Row = Mapping[str, Any]
 """The same for readers; a missing value may be NaN."""
+Table = Mapping[str, NDArray[Any]]
+"""Rows by column: column name -> its values [N]. No value is NaN, or masked in a column of whole numbers."""
 
 
 @dataclass(frozen=True)
@@ -158,38 +161,15 @@ class Resets:
     policy: int | None = None
 
 
-def evaluated_row(
-    evaluation: EpisodesResult,
-    task: TaskSpec,
-    map_: BehaviourMap | None,
-    *,
-    resets: Resets,
-    generation: int,
-    centre: int,
-    fitness_weight: float,
-    start_cell: int | None,
-    novelty: float | None,
-    update_norm: float | None,
-    env_steps: int,
-) -> HistoryRow:
-    """The row of an evaluated centre; see `evaluated_columns`."""
-    whole = evaluation_columns(evaluation, task)
-    return {
-        "centre": centre,
-        "fitness_weight": fitness_weight,
-        **({} if map_ is None else {"start_cell": start_cell, "cell": map_.cell_of(generation, centre)}),
-        "fitness_mean": whole["centre_fitness_mean"],
-        "fitness_std": whole["centre_fitness_std"],
-        "fitness_max": float(evaluation.fitness.max()),
-        "return_mean": whole["centre_return_mean"],
-        **{name: whole[f"centre_{name}"] for name in task.descriptor_names},
-        **_goal_of_centre(evaluation, task),
-        "novelty": novelty,
-        "update_norm": update_norm,
-        "env_steps": env_steps,
-        "fitness_first": float(evaluation.fitness[0]),
-        **{f"reset_{name}": value for name, value in vars(resets).items()},
-    }
+RESETS = tuple(f"reset_{part.name}" for part in fields(Resets))
+"""Columns with this address."""
+NO_POLICY = -1
+"""Stands for the number of the policy there if a centre was evaluated."""
+
+
+def with_gaps(values_N: NDArray[np.int64]) -> np.ma.MaskedArray:
+    """A column of whole numbers, in which a negative number is no value."""
+    return np.ma.MaskedArray(values_N, values_N < 0)
 
 
 def search_columns(centre: int, fitness_weight: float, centre_novelty: float | None, archive_size: int) -> HistoryRow:
@@ -200,11 +180,6 @@ def search_columns(centre: int, fitness_weight: float, centre_novelty: float | N
         "centre_novelty": centre_novelty,
         "archive_size": archive_size,
     }
-
-
-def step_columns(old_D: FloatArray | None, new_D: FloatArray) -> HistoryRow:
-    """Columns about the update of the centre; `old_D` is None for generation 0, which has no update."""
-    return {"update_norm": None if old_D is None else norm(new_D - old_D), "parameter_norm": norm(new_D)}
 
 
 @np.errstate(invalid="ignore", over="ignore")
@@ -229,32 +204,53 @@ def population_columns(populations: Sequence[EpisodesResult]) -> HistoryRow:
 
 
 @np.errstate(invalid="ignore", over="ignore")  # the deviation of infinite values is NaN
-def evaluation_columns(evaluation: EpisodesResult, task: TaskSpec) -> HistoryRow:
-    """Columns about the new centre's evaluation episodes: fitness, return, descriptor and distance to the goal."""
-    mean_B = evaluation.descriptor.mean(axis=0, dtype=np.float64).tolist()
-    std_B = evaluation.descriptor.std(axis=0, dtype=np.float64).tolist()
-    columns: HistoryRow = {
-        "centre_fitness_mean": float(evaluation.fitness.mean(dtype=np.float64)),
-        "centre_fitness_std": float(evaluation.fitness.std(dtype=np.float64)),
-        "centre_return_mean": float(evaluation.returns.mean(dtype=np.float64)),
-        "centre_return_std": float(evaluation.returns.std(dtype=np.float64)),
-        **{f"centre_{name}": value for name, value in zip(task.descriptor_names, mean_B, strict=True)},
-        **{f"centre_{name}_std": value for name, value in zip(task.descriptor_names, std_B, strict=True)},
-    }
-    goal = _goal_of_centre(evaluation, task)
-    return columns | {name: goal[name] for name in goal if name != "goal_distance_way"}
+def evaluation_columns(table: Table, episodes: EpisodesResult, row: int, task: TaskSpec) -> HistoryRow:
+    """Columns about the episodes of the centre that the history's row is about: fitness, return, descriptor and
+    distance to the goal.
 
-
-def _goal_of_centre(evaluation: EpisodesResult, task: TaskSpec) -> HistoryRow:
-    """Distances of the evaluation episodes to the goal; empty for a task without one."""
-    if not task.has_goal:
-        return {}
-    end_E, least_E = evaluation.goal_distance.T
+    Args:
+        table: columns of all evaluated centres.
+        episodes: their episodes [N, E].
+        row: index of the centre.
+    """
+    same = {"fitness_mean", "fitness_std", "return_mean", *task.descriptor_names}
+    goal = {"goal_distance", "goal_distance_min"} if task.has_goal else set()
+    std_B = episodes.descriptor[row].astype(np.float64).std(axis=0).tolist()
     return {
-        "goal_distance": float(end_E.mean(dtype=np.float64)),
-        "goal_distance_way": float(least_E.mean(dtype=np.float64)),
-        "goal_distance_min": float(least_E.min()),
+        **{f"centre_{name}": float(table[name][row]) for name in same},
+        "centre_return_std": float(episodes.returns[row].astype(np.float64).std()),
+        **{f"centre_{name}_std": value for name, value in zip(task.descriptor_names, std_B, strict=True)},
+        **{name: float(table[name][row]) for name in goal},
     }
+
+
+def doubles(values_N_E: FloatArray) -> NDArray[np.float64]:
+    """Values of episodes, [N, E] or [N, E, B], in float64 and with the episodes of a centre side by side in memory.
+
+    NumPy adds along an axis in an order that depends on the strides. With this layout, a mean over the episodes has the
+    bits that the mean of the centre's episodes alone has, whatever the layout in which chunks were put together.
+    """
+    return values_N_E.astype(np.float64, order="C")
+
+
+@np.errstate(invalid="ignore", over="ignore")  # the deviation of infinite values is NaN
+def episodes_table(episodes: EpisodesResult, task: TaskSpec) -> dict[str, NDArray[np.float64]]:
+    """Columns of the evaluated centres about their episodes, [N, E]: fitness, return, descriptor, distance to goal."""
+    fitness_N_E, returns_N_E = doubles(episodes.fitness), doubles(episodes.returns)
+    mean_N_B = doubles(episodes.descriptor).mean(axis=1)
+    columns = {
+        "fitness_mean": fitness_N_E.mean(axis=1),
+        "fitness_std": fitness_N_E.std(axis=1),
+        "fitness_max": fitness_N_E.max(axis=1),
+        "return_mean": returns_N_E.mean(axis=1),
+        **dict(zip(task.descriptor_names, mean_N_B.T, strict=True)),
+    }
+    if task.has_goal:
+        end_N_E, least_N_E = np.moveaxis(doubles(episodes.goal_distance), -1, 0)
+        columns["goal_distance"] = end_N_E.mean(axis=1)
+        columns["goal_distance_way"] = least_N_E.mean(axis=1)
+        columns["goal_distance_min"] = least_N_E.min(axis=1)
+    return columns
 
 
 def map_columns(
@@ -271,6 +267,11 @@ def map_columns(
         return {}
     cell = map_.cell_of(generation, centre)
     return {"start_cell": start_cell, "cell": cell, **map_statistics(map_, qd_offset, reachable)}
+
+
+def or_none(value: float) -> float | None:
+    """A number, or None for NaN."""
+    return None if math.isnan(value) else float(value)
 
 
 def fault_columns(now: DispatchCounts, *, since: DispatchCounts) -> HistoryRow:

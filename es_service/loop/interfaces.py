@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from es_service.config.model import RunConfig
-from es_service.loop.history import HistoryRow
+from es_service.loop.history import HistoryRow, Table
 from es_service.loop.parts import Arrays, Changes
 from es_service.protocol.messages import FloatArray, Moments, TaskSpec
 from es_service.search.algorithms.base import Algorithm
@@ -29,9 +29,7 @@ class Store(Protocol):
     """What the loop needs from a run store during a run."""
 
     def part(self, name: str) -> Arrays: ...
-    def commit(
-        self, generation: int, parts: Changes, history: HistoryRow, evaluations: Sequence[HistoryRow]
-    ) -> None: ...
+    def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> None: ...
 
 
 @dataclass(frozen=True)

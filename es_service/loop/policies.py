@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from es_service.protocol.messages import EpisodesResult, FloatArray, Policies, PolicyChunk, Work, around
+from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, Policies, PolicyChunk, Work, around
 from es_service.protocol.noise import Domain
 from es_service.protocol.policies import POLICY_SLOTS, chunks_of
 
@@ -25,6 +25,12 @@ class PolicyWork:
     episodes: int
     """Episodes of each policy."""
     work: list[Work]
+
+    def policy(self, number: int) -> Centre:
+        """One of the policies, as a centre without a population, in arrays of its own."""
+        arrays = self.parameters_N_D, self.observation_mean_N_O, self.observation_std_N_O
+        parameters_D, mean_O, std_O = (array[number].copy() for array in arrays)
+        return Centre(self.work[0][1].generation, parameters_D, 0.0, mean_O, std_O)
 
 
 def policy_work(
@@ -85,24 +91,6 @@ def policy_episodes(asked: PolicyWork, results: Sequence[EpisodesResult]) -> Epi
         trace_T_B=np.concatenate(traces) if traces else None,
         outputs={name: by_policy(lambda result, name=name: result.outputs[name]) for name in results[0].outputs},
     )
-
-
-def each_policy(result: EpisodesResult) -> list[EpisodesResult]:
-    """The result of each policy, with the axis [E] and its trace, like that of an evaluated centre."""
-    assert result.trace_T_B is not None, "the policies of a search are traced"
-    return [
-        EpisodesResult(
-            fitness=result.fitness[policy],
-            returns=result.returns[policy],
-            descriptor=result.descriptor[policy],
-            steps=result.steps[policy],
-            goal_distance=result.goal_distance[policy],
-            moments=None,
-            trace_T_B=result.trace_T_B[policy],
-            outputs={name: array[policy] for name, array in result.outputs.items()},
-        )
-        for policy in range(len(result.fitness))
-    ]
 
 
 @np.errstate(invalid="ignore", over="ignore")  # an infinite value makes the policy invalid

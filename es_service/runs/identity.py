@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from es_service.config.model import RunConfig
 from es_service.dispatch.engine import Engine
 from es_service.errors import ConfigError, WayOut
-from es_service.loop.history import HistoryRow
+from es_service.loop.history import HistoryRow, Table
 from es_service.loop.parts import Changes
 from es_service.protocol.machine import CODE, computed_on, is_mixed, platform_info, without_code
 from es_service.protocol.sources import Sources, driver_sources, in_words, other_files, worker_sources
@@ -124,7 +124,7 @@ class Recorder:
         generation: int,
         parts: Changes,
         history: HistoryRow,
-        evaluations: Sequence[HistoryRow],
+        evaluations: Table,
     ) -> None:
         """Record the platform if it has changed, with a notice if the run becomes mixed by that; then commit.
 

@@ -246,7 +246,7 @@ def _moved(answer: ChunkResult, random: np.random.Generator, bounds_B_2: np.ndar
 def _with_past(algorithm: Algorithm, descriptor_N_B: np.ndarray) -> Algorithm:
     """The algorithm, with these entries in the novelty archive after generation 0."""
 
-    def tell(state: SearchState, told: tuple[CentreEvaluation, ...]) -> SearchState:
+    def tell(state: SearchState, told: Sequence[CentreEvaluation]) -> SearchState:
         state = algorithm.tell(state, told)
         if told[0].generation == 0:
             archive = state.archive

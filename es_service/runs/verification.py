@@ -6,7 +6,7 @@ state is not kept: a kept state is only needed as a beginning.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +17,7 @@ from es_service.config.tasks import task_of
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop import driver
-from es_service.loop.history import HistoryRow
+from es_service.loop.history import HistoryRow, Table
 from es_service.loop.parts import Arrays, Changes
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.machine import CODE, platform_info
@@ -37,10 +37,10 @@ from es_service.store.codec import (
     row_values,
     state_sha256,
     state_sum,
-    table_bytes,
 )
 from es_service.store.kept import KeptRows, rows_in_force
 from es_service.store.lock import require_unlocked
+from es_service.store.tables import table_bytes
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class _Comparison:
             return dict(changed)
         return self._run.parts(self.generation, lambda part: part == name)[1][name]
 
-    def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Sequence[HistoryRow]) -> None:
+    def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> None:
         """Compare a generation. Raises _End after the last one, and after one that differs."""
         payloads = {part: encode_change(arrays) for part, arrays in parts.items()}
         sums = {part: part_sha256(part, generation, payload) for part, payload in payloads.items()}

@@ -23,10 +23,10 @@ from es_service.store.codec import (
     part_sha256,
     state_sha256,
     state_sum,
-    table_bytes,
     text_sha256,
 )
 from es_service.store.schema import RunMeta, history_insert
+from es_service.store.tables import as_table, table_bytes
 
 SEVERAL = "centre_K_D"
 """Array of a start from several policies, instead of "centre_D"; "mean_K_O" and "std_K_O" are their statistics."""
@@ -72,7 +72,7 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
         state = state_sha256(state_sum(in_force if generation == newest else {}))
         values = {name: given.get(name) for name in names}
         rows = [{name: centre.get(name) for name in centre_names} for centre in next(evaluations, ())]
-        centres = table_bytes(meta.evaluation_columns, rows)
+        centres = table_bytes(meta.evaluation_columns, as_table(meta.evaluation_columns, rows))
         connection.execute(insert, history_row(meta.columns, generation, values, centres, state))
     for generation, platform in beginning.platforms:
         text = json.dumps(platform, sort_keys=True)

@@ -9,9 +9,9 @@ import hashlib
 import json
 import math
 import operator
-import re
 import struct
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -31,8 +31,8 @@ GONE = ""
 """Stands for the SHA-256 of such a row where the rows of a state are listed."""
 _MAGIC = b"ESP1"
 _HEADER_LENGTH = struct.Struct("<I")
-_INTEGER = struct.Struct("<cq")
-_REAL = struct.Struct("<cd")
+INTEGER = struct.Struct("<cq")
+REAL = struct.Struct("<cd")
 _NUMERIC_KINDS = "biufc"
 _SUM_MODULUS = 2**256
 
@@ -46,17 +46,23 @@ def encode_part(part: Part) -> bytes:
     Raises:
         StoreError: an array has neither bools nor numbers.
     """
-    header: list[tuple[str, str, list[int]]] = []
+    header: list[tuple[str, str, tuple[int, ...]]] = []
     raw: list[bytes] = []
     for name in sorted(part):
         array = np.asarray(part[name])
         if array.dtype.kind not in _NUMERIC_KINDS:
             raise StoreError(f"state array {name!r} has dtype {array.dtype}; only bools and numbers can be stored")
         little = array.astype(array.dtype.newbyteorder("<"), copy=False)
-        header.append((name, little.dtype.str, list(array.shape)))
+        header.append((name, little.dtype.str, array.shape))
         raw.append(little.tobytes(order="C"))
-    text = json.dumps(header, separators=(",", ":")).encode()
-    return b"".join((_MAGIC, _HEADER_LENGTH.pack(len(text)), text, *raw))
+    return b"".join((_header(tuple(header)), *raw))
+
+
+@lru_cache(maxsize=1024)
+def _header(entries: tuple[tuple[str, str, tuple[int, ...]], ...]) -> bytes:
+    """What comes before the values; kept, because many parts have arrays alike."""
+    text = json.dumps(entries, separators=(",", ":")).encode()
+    return b"".join((_MAGIC, _HEADER_LENGTH.pack(len(text)), text))
 
 
 def decode_part(payload: bytes) -> dict[str, NDArray[Any]]:
@@ -158,10 +164,11 @@ def row_values(columns: Sequence[Column], generation: int, history: Mapping[str,
         raise StoreError(
             f"history row of generation {generation}: its column generation has the value {given['generation']}"
         )
-    return tuple(_value(column, given[column.name]) for column in columns)
+    return tuple(stored_value(column, given[column.name]) for column in columns)
 
 
-def _value(column: Column, value: Any) -> int | float | None:
+def stored_value(column: Column, value: Any) -> int | float | None:
+    """A value as it is stored; see `row_values`."""
     if value is None or value != value:
         return None
     try:
@@ -182,70 +189,12 @@ def row_bytes(row: Row) -> bytes:
         if value is None:
             parts.append(b"N")
         elif type(value) is int:
-            parts.append(_INTEGER.pack(b"I", value))
+            parts.append(INTEGER.pack(b"I", value))
         elif type(value) is float:
-            parts.append(_REAL.pack(b"R", value))
+            parts.append(REAL.pack(b"R", value))
         else:
             raise ValueError(f"a history row holds {value!r}, which is not a number")
     return b"".join(parts)
-
-
-def table_bytes(columns: Sequence[Column], rows: Sequence[Mapping[str, int | float | None]]) -> bytes:
-    """Bytes of a few rows with the same columns, such as the centres that one generation evaluated.
-
-    A run of an older version may have fewer columns than the rows, whose other values are then left out.
-
-    Raises:
-        StoreError: a row lacks a column, or a value has the wrong type.
-    """
-    names = {column.name for column in columns}
-    for row in rows:
-        if missing := names - row.keys():
-            raise StoreError(f"a row has the columns {sorted(row)}; it lacks {sorted(missing)}")
-    return b"".join(row_bytes(tuple(_value(column, row[column.name]) for column in columns)) for row in rows)
-
-
-def table_rows(columns: Sequence[Column], payload: bytes) -> list[Row]:
-    """The rows that `table_bytes` encoded, with values in the order of `columns`.
-
-    Raises:
-        ValueError: `payload` does not consist of such rows.
-    """
-    values: list[int | float | None] = []
-    position = 0
-    try:
-        while position < len(payload):
-            mark = payload[position : position + 1]
-            if mark == b"N":
-                values.append(None)
-                position += 1
-            else:
-                kind = {b"I": _INTEGER, b"R": _REAL}[mark]
-                values.append(kind.unpack_from(payload, position)[1])
-                position += kind.size
-    except (KeyError, struct.error) as error:
-        raise ValueError(f"the evaluated centres are unreadable: {error!r}") from error
-    if columns and len(values) % len(columns):
-        raise ValueError(f"the evaluated centres have {len(values)} values, which {len(columns)} columns do not fit")
-    return [tuple(values[i : i + len(columns)]) for i in range(0, len(values), len(columns) or 1)]
-
-
-def leading_values(payload: bytes, count: int, columns: int) -> bytes:
-    """The bytes of the first `count` values of each row that `table_bytes` encoded, of `columns` values each.
-
-    Raises:
-        ValueError: `payload` does not consist of such rows.
-    """
-    value = b"(?:N|[IR].{8})"
-    rows = re.compile(b"(%b{%d})%b{%d}" % (value, count, value, columns - count), re.DOTALL)
-    found, end = [], 0
-    while end < len(payload):
-        row = rows.match(payload, end)
-        if row is None:
-            raise ValueError(f"the evaluated centres are unreadable from byte {end} on")
-        found.append(row[1])
-        end = row.end()
-    return b"".join(found)
 
 
 def column_bytes(columns: Sequence[Column]) -> bytes:

@@ -22,11 +22,12 @@ from es_service.errors import StoreError, WayOut
 from es_service.loop.parts import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.protocol.machine import is_mixed
 from es_service.search.state_parts import PIECE
-from es_service.store.codec import NO_PAYLOAD, column_bytes, decode_part, leading_values, row_bytes
+from es_service.store.codec import NO_PAYLOAD, column_bytes, decode_part, row_bytes
 from es_service.store.connection import reading
 from es_service.store.folder import DATABASE
 from es_service.store.reader import kept_states, platforms, state_payload
 from es_service.store.schema import RunMeta, history_select
+from es_service.store.tables import leading_values
 from es_service.store.verify import verify
 
 Connection = sqlite3.Connection

@@ -18,12 +18,13 @@ from es_service.loop.history import Column
 from es_service.store import certifications
 from es_service.store.beginning import load_start
 from es_service.store.certifications import CertifiedRow
-from es_service.store.codec import Row, column_bytes, decode_part, part_sha256, row_dict, table_rows
+from es_service.store.codec import Row, column_bytes, decode_part, part_sha256, row_dict
 from es_service.store.columns import Columns, Table
 from es_service.store.connection import reading
 from es_service.store.kept import KeptRows, kept_rows, newest_state, rows_in_force, whole_states
 from es_service.store.platforms import sound_platforms
 from es_service.store.schema import Damaged, RunMeta, history_select
+from es_service.store.tables import table_rows
 from es_service.store.verify import row_is_sound
 
 GENERATION = Column("generation", "INTEGER", True, "generation that evaluated the centre")
@@ -38,7 +39,7 @@ class HistoryRow(NamedTuple):
     row: Row
     """Values in the order of the run's columns."""
     evaluations: bytes
-    """The evaluated centres, encoded by `codec.table_bytes`."""
+    """The evaluated centres, encoded by `tables.table_bytes`."""
     state: str
     """`codec.state_sha256` of the state after the generation."""
 

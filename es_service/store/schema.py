@@ -37,7 +37,7 @@ _CERTIFICATION = (
     "payload BLOB NOT NULL, sha256 TEXT NOT NULL, PRIMARY KEY (number, rank)) WITHOUT ROWID"
 )
 _OWN_HISTORY_COLUMNS = {"evaluations": "BLOB", "state_sha256": "TEXT", "sha256": "TEXT"}
-"""Columns of the table history besides those of the run: the evaluated centres (`codec.table_bytes`), the SHA-256 of
+"""Columns of the table history besides those of the run: the evaluated centres (`tables.table_bytes`), the SHA-256 of
 the state, and that of the row."""
 
 

@@ -16,13 +16,14 @@ from typing import Any
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
-from es_service.store.codec import Row, column_bytes, decode_part, part_sha256, row_dict, table_rows
+from es_service.store.codec import Row, column_bytes, decode_part, part_sha256, row_dict
 from es_service.store.columns import Columns, Table
 from es_service.store.connection import connected_to, reading
 from es_service.store.folder import COPY
 from es_service.store.kept import kept_rows, newest_state, rows_in_force, whole_states
 from es_service.store.reader import GENERATION, platforms, state_payload
 from es_service.store.schema import Damaged, RunMeta, history_select
+from es_service.store.tables import table_rows
 from es_service.store.verify import row_is_sound
 
 Arrays = dict[str, NDArray[Any]]

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
+from es_service.loop.history import Table
 from es_service.store.beginning import Beginning, load_start
 from es_service.store.certifications import encoded, next_number
 from es_service.store.codec import (
@@ -33,20 +34,22 @@ from es_service.store.codec import (
     row_dict,
     state_sha256,
     state_sum,
-    table_bytes,
 )
 from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
 from es_service.store.kept import earlier_states, outdated_rows, rows_in_force
 from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.platforms import newest_before, record, store_list
+from es_service.store.recent import RecentParts
 from es_service.store.repair import open_sound
 from es_service.store.schema import PAGE_BYTES, RunMeta, history_insert, history_select
+from es_service.store.tables import table_bytes
 from es_service.store.upkeep import Upkeep
 
 Values = Mapping[str, int | float | None]
 """One history row: column name -> value; NaN or None stands for no value."""
 _LOG = logger(__name__)
+NO_ROWS: Table = {}
 NOTHING = Beginning()
 """Beginning of an ordinary run."""
 
@@ -76,6 +79,7 @@ class RunStore:
         self.lock = lock
         self._hook = hook
         self._closed = self._recorded = False
+        self._recent = RecentParts()
         self._connection, verdict = open_sound(folder, self.notices)
         self.meta = verdict.meta
         self.generation = verdict.good
@@ -153,15 +157,24 @@ class RunStore:
             StoreError: a part has been damaged since the run was opened.
         """
         names = sorted(rows_in_force(self._kept, self.generation)) if self.generation is not None else []
-        return {name: self.part(name) for name in names if without is None or not name.startswith(without)}
+        return {name: self._part(name) for name in names if without is None or not name.startswith(without)}
 
     def part(self, name: str) -> dict[str, NDArray[Any]]:
-        """One part of the newest generation's state: name -> array.
+        """One part of the newest generation's state: name -> read-only array. Parts read lately are kept in memory.
 
         Raises:
             KeyError: there is no such part.
             StoreError: the part has been damaged since the run was opened.
         """
+        at = max(self._kept[name])
+        if (kept := self._recent.get(name, at)) is not None:
+            return kept
+        arrays = self._part(name)
+        self._recent.add(name, at, arrays)
+        return arrays
+
+    def _part(self, name: str) -> dict[str, NDArray[Any]]:
+        """As `part`, from the database."""
         at, sha256 = max(self._kept[name].items())
         if sha256 == GONE:
             raise KeyError(name)
@@ -178,7 +191,7 @@ class RunStore:
             return decode_part(row[0])
 
     def commit(
-        self, generation: int, parts: Mapping[str, Part | None], history: Values, evaluations: Sequence[Values] = ()
+        self, generation: int, parts: Mapping[str, Part | None], history: Values, evaluations: Table = NO_ROWS
     ) -> None:
         """Store a generation in one transaction. If this raises, the store is unchanged and can still be used.
 
@@ -186,7 +199,7 @@ class RunStore:
             generation: the generation after `self.generation`, or 0 if that is None.
             parts: parts of the state that have changed, None for those that are removed; the others keep their values.
             history: value of each column of the run; `generation` may be left out; NaN or None stands for no value.
-            evaluations: likewise for each centre that the generation evaluated, in the order of the asks.
+            evaluations: likewise for the centres that the generation evaluated, in the order of the asks: a table.
 
         Raises:
             StoreError: the generation is not the next one, the history does not fit the columns, or the disk is full.
@@ -206,11 +219,10 @@ class RunStore:
         self._hook("before_begin")
         with self._transaction(f"storing generation {generation}") as execute:
             # Delete first, so that the new rows use the pages of the old ones.
-            for part, at in outdated:
-                execute("DELETE FROM state WHERE part = ? AND generation = ?", (part, at))
-            for part, payload in payloads.items():
-                row = (part, generation, sums[part], payload)
-                execute("INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)", row)
+            self._connection.executemany("DELETE FROM state WHERE part = ? AND generation = ?", outdated)
+            rows = ((part, generation, sums[part], payload) for part, payload in payloads.items())
+            insert = "INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)"
+            self._connection.executemany(insert, rows)
             self._hook("mid_transaction")
             execute(self._insert_history, history_values)
             if self._recorded:

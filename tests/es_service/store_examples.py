@@ -14,6 +14,7 @@ from es_service.store.digest import digest_of, digest_parts
 from es_service.store.folder import DATABASE
 from es_service.store.reader import read_evaluations, read_history, read_parts
 from es_service.store.schema import Damaged
+from es_service.store.tables import as_table
 from es_service.store.verify import verify
 from es_service.store.writer import RunMeta, RunStore, no_hook
 
@@ -104,6 +105,10 @@ def evaluated(generation):
     ]
 
 
+def evaluated_table(generation):
+    return as_table(EVALUATION_COLUMNS, evaluated(generation))
+
+
 def create(folder, *, seed=0, generations=0, hook=no_hook, run_meta=None):
     store = RunStore.create(Path(folder), CONFIG_YAML, run_meta or meta(), hook=hook)
     advance(store, generations - 1, seed=seed)
@@ -114,7 +119,7 @@ def advance(store, last, *, seed=0):
     """Commit generations up to and including `last`."""
     first = 0 if store.generation is None else store.generation + 1
     for generation in range(first, last + 1):
-        store.commit(generation, parts_of(generation, seed), history_row(generation), evaluated(generation))
+        store.commit(generation, parts_of(generation, seed), history_row(generation), evaluated_table(generation))
 
 
 def finished(folder, generations, seed=0):

@@ -10,9 +10,10 @@ from es_service.api import open_run
 from es_service.errors import StoreError
 from es_service.loop.parts import cell_part, elite_part
 from es_service.store import schema as store_schema
-from es_service.store.codec import encode_part, table_bytes
+from es_service.store.codec import encode_part
 from es_service.store.digest import arrays_sha256, checked_parts, digest_at, digest_of, digest_parts
 from es_service.store.reader import read_generation
+from es_service.store.tables import as_table, table_bytes
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import (
     COLUMNS,
@@ -21,6 +22,7 @@ from tests.es_service.store_examples import (
     create,
     digest,
     evaluated,
+    evaluated_table,
     finished,
     flip_bit,
     history_row,
@@ -84,7 +86,7 @@ def test_layout_does_not_count(folder, tmp_path, monkeypatch):
                 part: arrays and dict(reversed(arrays.items()))
                 for part, arrays in reversed(parts_of(generation).items())
             }
-            store.commit(generation, parts, history_row(generation), evaluated(generation))
+            store.commit(generation, parts, history_row(generation), evaluated_table(generation))
     assert digest(tmp_path / "other") == expected
     with contextlib.closing(sqlite3.connect(tmp_path / "other" / "run.db")) as connection:
         connection.execute("VACUUM")
@@ -94,7 +96,7 @@ def test_layout_does_not_count(folder, tmp_path, monkeypatch):
 def test_when_a_part_was_last_written_does_not_count(folder, tmp_path):
     with create(tmp_path / "all", generations=GENERATIONS - 1) as store:
         store.commit(
-            GENERATIONS - 1, state_at(GENERATIONS - 1), history_row(GENERATIONS - 1), evaluated(GENERATIONS - 1)
+            GENERATIONS - 1, state_at(GENERATIONS - 1), history_row(GENERATIONS - 1), evaluated_table(GENERATIONS - 1)
         )
     assert digest(tmp_path / "all") == digest(folder)
 
@@ -152,7 +154,8 @@ def test_every_evaluated_centre_counts(folder, change_of):
         name = {"value": "fitness_mean", "nothing": "fitness_first"}[change_of]
         rows[1][name] = float(np.nextafter(rows[1][name], np.inf))
     rows = rows[:-1] if change_of == "row" else rows[::-1] if change_of == "order" else rows
-    change(folder, "UPDATE history SET evaluations = ? WHERE generation = 0", table_bytes(EVALUATION_COLUMNS, rows))
+    payload = table_bytes(EVALUATION_COLUMNS, as_table(EVALUATION_COLUMNS, rows))
+    change(folder, "UPDATE history SET evaluations = ? WHERE generation = 0", payload)
     assert changed_names(before, digest_parts(folder)) == ({"evaluations"} if change_of != "nothing" else set())
 
 
@@ -163,7 +166,7 @@ def test_columns_that_do_not_count_leave_the_digest_of_a_run_without_them(folder
 
 
 def test_evaluated_centres_that_cannot_be_taken_apart_are_an_error(folder):
-    payload = table_bytes(EVALUATION_COLUMNS, evaluated(0))
+    payload = table_bytes(EVALUATION_COLUMNS, evaluated_table(0))
     change(folder, "UPDATE history SET evaluations = ? WHERE generation = 0", payload[:-1])
     with pytest.raises(StoreError, match="the evaluated centres are unreadable from byte"):
         digest_parts(folder)

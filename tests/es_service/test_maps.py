@@ -17,7 +17,9 @@ from es_service.loop.parts import (
     elite_to_arrays,
     map_from_parts,
 )
+from es_service.search.maps.batches import insert_each
 from es_service.search.maps.behaviour_map import (
+    EMPTY,
     BehaviourMap,
     Elite,
     changed,
@@ -28,6 +30,7 @@ from es_service.search.maps.behaviour_map import (
     orders,
     removed,
     resampled,
+    unchanged_entries,
     with_score,
 )
 from tests.es_service.map_examples import PLANE
@@ -120,6 +123,38 @@ def test_any_offers_give_the_twin_s_map_and_never_a_worse_one(offers):
     columns = map_statistics(map_, -2.0, None)
     assert columns["coverage"] == twin.coverage(other.elites, 12)
     assert columns["qd_score"] == twin.qd_score(other.elites, -2.0)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(-1, 8).map(float), st.integers(-2, 10).map(lambda x: x / 4), st.integers(0, 4)),
+        min_size=1,
+        max_size=60,
+    ),
+    st.integers(1, 20),
+    st.booleans(),
+    st.booleans(),
+)
+def test_a_batch_enters_as_its_offers_one_after_another(offers, batch, counts_samples, with_gaps):
+    place_N_2, fitness_N = np.array([offer[:2] for offer in offers]), np.array([float(offer[2]) for offer in offers])
+    score_N, centre_N = np.where(fitness_N == 2.0, np.nan, -fitness_N), np.arange(len(offers)) + 3
+    at_once = one_by_one = empty_map(PLANE, counts_samples=counts_samples)
+    for generation, first in enumerate(range(0, len(offers), batch)):
+        part = slice(first, first + batch)
+        columns = fitness_N[part], generation, centre_N[part], score_N[part], 7
+        at_once = insert_each(at_once, place_N_2[part], *columns)
+        for row in range(len(offers))[part]:
+            values = float(fitness_N[row]), generation, int(centre_N[row]), float(score_N[row]), 7
+            one_by_one, _, _ = insert(one_by_one, place_N_2[row], *values)
+        if with_gaps:
+            at_once, one_by_one = (removed(map_, int(map_.cell_N[0])) for map_ in (at_once, one_by_one))
+        np.testing.assert_array_equal(at_once.cell_N, one_by_one.cell_N)
+        np.testing.assert_array_equal(orders(at_once), orders(one_by_one))
+        assert unchanged_entries(at_once, one_by_one).all()
+        for earlier in range(generation + 1):
+            entries = zip(at_once.generation_N, at_once.centre_N, at_once.cell_N, strict=True)
+            cells = {centre: cell for made, centre, cell in entries if made == earlier}
+            assert at_once.cells_with(earlier, centre_N).tolist() == [cells.get(one, EMPTY) for one in centre_N]
 
 
 # Entries that change, move and leave

@@ -15,6 +15,17 @@ COORDINATES = np.arange(4482, dtype=np.uint32)
 words = st.integers(0, 2**32 - 1)
 
 
+def test_several_streams_at_once_have_the_variates_of_each():
+    keys = stream_keys(3, Domain.VARIATION, 5, np.arange(21).reshape(7, 3))
+    for count in (0, 1, 4483, 40_000):
+        coordinate, some = np.arange(count, dtype=np.uint32), keys[: 2 if count > 5000 else 7]
+        several = normals(some, count)
+        assert several.shape == (*some.shape[:-1], count)
+        for at in np.ndindex(some.shape[:-1]):
+            expected = normal_integers(np, keys[at], coordinate).astype(np.float32) / np.float32(NORMAL_STD)
+            np.testing.assert_array_equal(several[at].view(np.uint32), expected.view(np.uint32))
+
+
 def test_published_vectors():
     for (seed, domain, generation, ids), expected in TEST_VECTORS:
         key = stream_keys(seed, domain, generation, *ids)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from es_service import api
-from es_service.loop import evaluated
+from es_service.loop import driver
 from es_service.report.write import write_report
 from es_service.runs.replay import record
 
@@ -63,13 +63,13 @@ def test_a_fork_in_which_fitness_means_something_else_has_no_stored_episode_of_t
 
 
 def test_a_replay_that_is_not_the_stored_episode_is_an_error_in_the_page(tmp_path, monkeypatch):
-    row_of = evaluated.evaluated_row
+    table_of = driver.evaluated_table
 
     def wrong(*arguments, **named):
-        row = row_of(*arguments, **named)
-        return row | {"fitness_first": row["fitness_first"] + 1.0}
+        table = table_of(*arguments, **named)
+        return table | {"fitness_first": table["fitness_first"] + 1.0}
 
-    monkeypatch.setattr(evaluated, "evaluated_row", wrong)
+    monkeypatch.setattr(driver, "evaluated_table", wrong)
     page = page_of(api.run(CONFIG, tmp_path / "run").run)
     assert 'class="problem episode"' in page
     assert "This is not the stored episode, whose fitness is" in page

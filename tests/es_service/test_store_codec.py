@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 
@@ -7,14 +9,13 @@ from es_service.store.codec import (
     changed_sum,
     decode_part,
     encode_part,
-    leading_values,
     part_sha256,
     row_bytes,
     row_values,
     state_sha256,
     state_sum,
-    table_bytes,
 )
+from es_service.store.tables import as_table, leading_values, table_bytes
 from tests.es_service.store_examples import COLUMNS, assert_same_state, history_row
 
 ARRAYS = {
@@ -93,6 +94,42 @@ def test_history_rows_that_do_not_fit_are_refused_by_name():
         row_values(COLUMNS, 3, {**row, "env_steps": 2**63})
 
 
+def as_stored(columns, row):
+    """The values of a row, one by one."""
+    kinds = {"INTEGER": int, "REAL": float}
+    values = ((kinds[column.type], row[column.name]) for column in columns)
+    return tuple(None if value is None or value != value else kind(value) + kind(0) for kind, value in values)
+
+
+def test_a_table_has_the_bytes_of_its_rows():
+    columns = [Column("i", "INTEGER", True, ""), Column("x", "REAL", True, ""), Column("y", "REAL", True, "")]
+    numbers, floats = np.array([3, -1, 2**62]), np.array([np.nan, -0.0, np.inf])
+    small = np.array([0.1, np.nan, -0.0], np.float32)
+    table = {"i": np.ma.MaskedArray(numbers, [False, True, False]), "x": floats, "y": small, "z": floats}
+    rows = [
+        {"i": 3, "x": math.nan, "y": float(small[0])},
+        {"i": None, "x": 0.0, "y": None},
+        {"i": 2**62, "x": math.inf, "y": 0.0},
+    ]
+    expected = b"".join(row_bytes(as_stored(columns, row)) for row in rows)
+    assert table_bytes(columns, table) == table_bytes(columns, as_table(columns, rows)) == expected
+    assert table_bytes(columns, {}) == table_bytes(columns, as_table(columns, [])) == b""
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"x": np.zeros(2)}, r"has the columns \['x'\]; it lacks \['i'\]"),
+        ({"i": np.zeros(2, int), "x": np.zeros(3)}, r"column x has the shape \(3,\), and others have 2 rows"),
+        ({"i": np.zeros(2), "x": np.zeros(2)}, "column i is INTEGER and cannot hold float64"),
+        ({"i": np.zeros(2, int), "x": np.array(["a", "b"])}, "column x is REAL and cannot hold <U1"),
+    ],
+)
+def test_a_table_that_cannot_be_stored_is_refused(table, message):
+    with pytest.raises(StoreError, match=message):
+        table_bytes([Column("i", "INTEGER", True, ""), Column("x", "REAL", True, "")], table)
+
+
 def test_the_leading_values_of_rows_are_those_of_the_rows_without_the_rest():
     """Also where bytes of numbers look like the marks of values, or like the ends of lines."""
     columns = [
@@ -105,9 +142,10 @@ def test_the_leading_values_of_rows_are_those_of_the_rows_without_the_rest():
         {column.name: values[index] for column, index in zip(columns, random.integers(5, size=5), strict=True)}
         for _ in range(300)
     ]
-    payload = table_bytes(columns, rows)
+    payload = table_bytes(columns, as_table(columns, rows))
+    assert payload == b"".join(row_bytes(as_stored(columns, row)) for row in rows)
     for count in range(1, 5):
-        assert leading_values(payload, count, 5) == table_bytes(columns[:count], rows)
+        assert leading_values(payload, count, 5) == table_bytes(columns[:count], as_table(columns, rows))
     with pytest.raises(ValueError, match="unreadable from byte"):
         leading_values(payload + b"N", 2, 5)
 

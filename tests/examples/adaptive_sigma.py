@@ -3,6 +3,7 @@
 es-service run my_config.yaml --set search.algorithm=adaptive_sigma:adaptive_sigma    # where this file lies
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +25,7 @@ def adaptive_sigma(config: RunConfig) -> Algorithm:
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
         return tuple(replace(asked, sigma=float(state.own["sigma"])) for asked in shared.ask(state, generation))
 
-    def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
+    def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         state = shared.tell(state, evaluations)
         sigma, record = float(state.own["sigma"]), float(state.own["record"])
         highest = max((one.fitness for one in evaluations if one.valid), default=-np.inf)

@@ -3,6 +3,7 @@
 es-service run my_config.yaml --set search.algorithm=reevaluated_elites:reevaluated_elites --set map.enabled=true
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -51,7 +52,7 @@ def reevaluated_elites(config: RunConfig) -> Algorithm:
         policies = [PolicyAsk(*(np.stack([getattr(one, name) for one in elites]) for name in names))] if elites else []
         return (*shared.ask(state, generation), *policies)
 
-    def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
+    def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         count, before, map_, left = len(state.centres), state.map, state.map, dict(state.own["left"].entries)
         samples = [one for one in evaluations if one.centre >= count]
         for cell, one in zip(drawn(state, evaluations[0].generation), samples, strict=bool(samples)):

@@ -11,7 +11,7 @@ from es_service.protocol.messages import EvaluationChunk, PolicyShape
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
-from tests.helpers import DirectEvaluator, MemoryStore
+from tests.helpers import DirectEvaluator, MemoryStore, rows_of
 from tests.twins.behaviour_map import cell_number
 from workers.environments import SHIPPED
 from workers.policy import initial_parameters
@@ -80,10 +80,10 @@ class Remembering(MemoryStore):
         super().__init__()
         self.after, self.evaluated = [], []
 
-    def commit(self, generation, parts, history, evaluations=()):
+    def commit(self, generation, parts, history, evaluations):
         super().commit(generation, parts, history, evaluations)
         self.after.append(dict(self.parts))
-        self.evaluated.append([dict(row) for row in evaluations])
+        self.evaluated.append(rows_of(evaluations))
 
 
 def first_centres(config):

@@ -31,7 +31,7 @@ from tests.es_service.store_examples import (
     CONFIG_YAML,
     assert_same_state,
     create,
-    evaluated,
+    evaluated_table,
     history_row,
     meta,
     verify_run,
@@ -211,7 +211,7 @@ def reference(state: RunState):
 
 def commit(store, state, before):
     parts = changed_parts(state, before, store.part)
-    store.commit(state.generation, parts, history_row(state.generation), evaluated(state.generation))
+    store.commit(state.generation, parts, history_row(state.generation), evaluated_table(state.generation))
 
 
 def loaded(folder, generation):

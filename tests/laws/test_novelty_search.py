@@ -137,7 +137,7 @@ def test_a_state_put_together_again_is_the_same_and_only_the_moved_centre_is_wri
     config = config_of("nsra_es")
 
     class Recording(MemoryStore):
-        def commit(self, generation, parts, history, evaluations=()):
+        def commit(self, generation, parts, history, evaluations):
             super().commit(generation, parts, history, evaluations)
             centres = {name for name in parts if name.startswith("centre_")}
             wanted = range(5) if generation == 0 else [history["centre"]]

@@ -8,7 +8,7 @@ import pytest
 from es_service.loop.generation import fittest
 from es_service.loop.parts import elite_part, map_from_parts
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk
-from es_service.search.algorithms.base import NO_CELL, CentreEvaluation
+from es_service.search.algorithms.base import NO_CELL, CentreEvaluation, in_columns
 from es_service.search.algorithms.common import archived, first_state, mapped, novelty_of_centres
 from es_service.search.algorithms.me_es import CELL_CHOICE, block_mode
 from es_service.search.algorithms.nsra_es import adapted_weight
@@ -255,7 +255,8 @@ def test_counts_of_a_generation_are_sums_over_its_populations():
 
 def test_the_fittest_valid_centre_is_shown_and_of_equal_ones_the_first():
     def shown(*fitness):
-        return fittest([CentreEvaluation(1, 0, f is not None, 99.0 if f is None else f, np.zeros(1)) for f in fitness])
+        told = [CentreEvaluation(1, 0, f is not None, 99.0 if f is None else f, np.zeros(1)) for f in fitness]
+        return fittest(in_columns(told))
 
     assert shown(1.0, 3.0, 2.0) == 1
     assert shown(-2.0, -1.0, -1.0) == 1

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -176,6 +176,68 @@ class CentreEvaluation:
     """Results of each episode, [E]."""
 
 
+@dataclass(frozen=True, eq=False)
+class CentreEvaluations(Sequence[CentreEvaluation]):
+    """The evaluations of a generation's centres and policies, in the order of the asks: a sequence, and its columns.
+
+    Axis N: the evaluations.
+    """
+
+    generation: int
+    centre_N: NDArray[np.int64]
+    valid_N: NDArray[np.bool_]
+    fitness_N: NDArray[np.float64]
+    descriptor_N_B: NDArray[np.float64]
+    population_max_N: NDArray[np.float64]
+    episodes: int = 1
+    results: EpisodesResult | None = None
+    """Results of each episode, [N, E]."""
+
+    def __len__(self) -> int:
+        return len(self.centre_N)
+
+    @overload
+    def __getitem__(self, index: int) -> CentreEvaluation: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[CentreEvaluation, ...]: ...
+    def __getitem__(self, index: int | slice) -> CentreEvaluation | tuple[CentreEvaluation, ...]:
+        if isinstance(index, slice):
+            return tuple(self[row] for row in range(*index.indices(len(self))))
+        return CentreEvaluation(
+            self.generation,
+            int(self.centre_N[index]),
+            bool(self.valid_N[index]),
+            float(self.fitness_N[index]),
+            self.descriptor_N_B[index],
+            float(self.population_max_N[index]),
+            self.episodes,
+            None if self.results is None else _one_of(self.results, index),
+        )
+
+
+def _one_of(results: EpisodesResult, index: int) -> EpisodesResult:
+    """The results of one centre, [E], from those of all, [N, E]."""
+    return EpisodesResult(
+        fitness=results.fitness[index],
+        returns=results.returns[index],
+        descriptor=results.descriptor[index],
+        steps=results.steps[index],
+        goal_distance=results.goal_distance[index],
+        moments=None,
+        trace_T_B=None if results.trace_T_B is None else results.trace_T_B[index],
+        outputs={name: array[index] for name, array in results.outputs.items()},
+    )
+
+
+def in_columns(evaluations: Sequence[CentreEvaluation]) -> CentreEvaluations:
+    """The evaluations of a generation, of which there is at least one, as columns."""
+    if isinstance(evaluations, CentreEvaluations):
+        return evaluations
+    names = "centre", "valid", "fitness", "descriptor_B", "population_max"
+    centre_N, *columns = (np.array([getattr(one, name) for one in evaluations]) for name in names)
+    return CentreEvaluations(evaluations[0].generation, centre_N, *columns, episodes=evaluations[0].episodes)
+
+
 def _without_populations(*arguments: object) -> Any:
     raise TypeError("a search that asks for populations needs the functions `weights` and `step`")
 
@@ -186,7 +248,7 @@ class Algorithm:
 
     ask: Callable[[SearchState, int], tuple[Ask | PolicyAsk, ...]]
     """(state, generation) -> populations and policies to evaluate in that generation, side by side."""
-    tell: Callable[[SearchState, tuple[CentreEvaluation, ...]], SearchState]
+    tell: Callable[[SearchState, Sequence[CentreEvaluation]], SearchState]
     """(state, evaluations of a generation's centres and policies in the order of the asks) -> state updated with them.
     The first call has all initial centres."""
     weights: Callable[[SearchState, Ask, EpisodesResult], NDArray[np.float32]] = _without_populations

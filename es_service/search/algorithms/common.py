@@ -40,7 +40,7 @@ from es_service.search.steps import STEPS, fresh_state
 CENTRE_CHOICE = 0
 """Last id of the random streams of Domain.SELECTION that choose the centre to update."""
 
-AdaptWeight = Callable[[FitnessWeight, tuple[CentreEvaluation, ...]], FitnessWeight]
+AdaptWeight = Callable[[FitnessWeight, Sequence[CentreEvaluation]], FitnessWeight]
 
 
 def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight | None = None) -> Algorithm:
@@ -67,7 +67,7 @@ def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight 
     def step(state: SearchState, asked: Ask, gradient_D: FloatArray) -> SearchState:
         return moved(state, asked, gradient_D, search)
 
-    def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
+    def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         weight = state.weight
         if adapt is not None and evaluations[0].generation > 0:
             weight = adapt(weight, evaluations)
@@ -171,7 +171,7 @@ def moved(state: SearchState, asked: Ask, gradient_D: FloatArray, search: Popula
     return with_centre(state, asked.centre, replace(centre, centre_D=centre_D, step=step))
 
 
-def archived_and_mapped(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
+def archived_and_mapped(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
     """The state with the evaluated centres in the novelty archive and in the behaviour map, one after another."""
     for evaluation in evaluations:
         state = mapped(archived(state, evaluation), evaluation)

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import importlib.util
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -110,7 +111,7 @@ def jedi(config: RunConfig) -> Algorithm:
         ]
         return tuple(population(state, one, search, objective, generation) for one, objective in enumerate(objectives))
 
-    def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
+    def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         state, generation, own = shared.tell(state, evaluations), evaluations[0].generation, dict(state.own)
         valid = [one.descriptor_B for one in evaluations if one.valid]
         if valid:

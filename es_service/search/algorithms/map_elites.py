@@ -17,6 +17,7 @@ deviation 1 of observations, since nothing gathers statistics. The novelty archi
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -30,16 +31,18 @@ from es_service.config.presets import same
 from es_service.config.search import SearchConfig
 from es_service.protocol.messages import FloatArray
 from es_service.protocol.noise import Domain, Keys, normals, stream_keys, uniforms
-from es_service.search.algorithms.base import Algorithm, CentreEvaluation, PolicyAsk, SearchState
+from es_service.search.algorithms.base import Algorithm, CentreEvaluation, PolicyAsk, SearchState, in_columns
 from es_service.search.algorithms.common import archived_and_mapped
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import settings_of
-from es_service.search.maps.behaviour_map import insert
+from es_service.search.maps.batches import insert_each
 
 PARENT_CHOICE = 3
 """Last id of the random stream of Domain.SELECTION that draws the parents."""
-LARGE = 1 << 14
-"""Number of a policy's parameters from which several threads make a batch sooner than one does."""
+LARGE = 1 << 19
+"""Number of a batch's parameters from which several threads make it sooner than one does."""
+TOGETHER = 8
+"""Policies that are made together. Those of a small network stay in the cache of a core."""
 
 
 class MapElitesSettings(SearchConfig):
@@ -84,27 +87,32 @@ def map_elites(config: RunConfig) -> Algorithm:
     def ask(state: SearchState, generation: int) -> tuple[PolicyAsk, ...]:
         known = {cell: elite.centre_D for cell, elite in state.elites.items()}
         known = known or {index: centre.centre_D for index, centre in enumerate(state.centres)}
-        drawn_N_2 = parent_cells(config, state, generation).tolist()
+        drawn_N_2 = parent_cells(config, state, generation)
+        key_N_4 = stream_keys(config.seed, Domain.VARIATION, generation, np.arange(search.batch))
+        policy_N_D = np.empty((search.batch, state.centres[0].centre_D.size), np.float32)
 
-        def varied(number: int) -> FloatArray:
-            x_D, y_D = (known[drawn] for drawn in drawn_N_2[number])
-            key = stream_keys(config.seed, Domain.VARIATION, generation, number)
-            return variation(x_D, y_D, key, search.iso_sigma, search.line_sigma)
+        def vary(first: int) -> None:
+            part = slice(first, first + TOGETHER)
+            x_N_D, y_N_D = (np.stack([known[one] for one in drawn]) for drawn in drawn_N_2[part].T.tolist())
+            policy_N_D[part] = variation(x_N_D, y_N_D, key_N_4[part], search.iso_sigma, search.line_sigma)
 
-        numbers = range(search.batch)
-        if state.centres[0].centre_D.size < LARGE:
-            return (PolicyAsk(np.stack([varied(number) for number in numbers])),)
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:  # the workers wait meanwhile
-            return (PolicyAsk(np.stack(list(pool.map(varied, numbers)))),)
+        firsts = range(0, search.batch, TOGETHER)
+        if policy_N_D.size < LARGE:
+            list(map(vary, firsts))
+        else:
+            with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:  # the workers wait meanwhile
+                list(pool.map(vary, firsts))
+        return (PolicyAsk(policy_N_D),)
 
-    def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
+    def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         if evaluations[0].generation == 0:
             return archived_and_mapped(state, evaluations)
-        map_ = state.map
-        for one in evaluations:
-            if map_ is not None and one.valid:
-                origin = one.generation, one.centre
-                map_, _, _ = insert(map_, one.descriptor_B, one.fitness, *origin, one.population_max, one.episodes)
+        told, map_ = in_columns(evaluations), state.map
+        valid, generation = told.valid_N, told.generation
+        if map_ is None or not valid.any():
+            return state
+        columns = told.centre_N[valid], told.population_max_N[valid]
+        map_ = insert_each(map_, told.descriptor_N_B[valid], told.fitness_N[valid], generation, *columns, told.episodes)
         return replace(state, map=map_)
 
     return Algorithm(ask, tell, parents=parents)
@@ -121,11 +129,15 @@ def parent_cells(config: RunConfig, state: SearchState, generation: int) -> NDAr
     return among[(drawn_N_2.astype(np.float64) * among.size).astype(np.int64)]
 
 
-def variation(x_D: FloatArray, y_D: FloatArray, key: Keys, iso_sigma: float, line_sigma: float) -> FloatArray:
-    """The iso+line variation of x, whose line goes through y, with noise of one stream.
+def variation(x: FloatArray, y: FloatArray, keys: Keys, iso_sigma: float, line_sigma: float) -> FloatArray:
+    """The iso+line variation of each x [..., D], whose line goes through its y, with noise of a stream for each.
 
     Args:
-        key: of the stream; its coordinates 0 to D - 1 are those of the parameters, coordinate D is that of the line.
+        keys: of the streams [..., 4]; their coordinates 0 to D - 1 are those of the parameters, coordinate D is that of
+            the line.
     """
-    noise = normals(key, x_D.size + 1)
-    return x_D + np.float32(iso_sigma) * noise[:-1] + np.float32(line_sigma) * noise[-1] * (y_D - x_D)
+    noise = normals(keys, x.shape[-1] + 1)
+    iso, line = np.float32(iso_sigma) * noise[..., :-1], np.float32(line_sigma) * noise[..., -1:]
+    iso += x
+    iso += line * (y - x)
+    return iso

@@ -16,6 +16,7 @@ fitness.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -114,7 +115,7 @@ def memes(config: RunConfig) -> Algorithm:
             for emitter in range(len(state.centres))
         )
 
-    def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
+    def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         state = shared.tell(state, evaluations)
         entered_M = np.array([centre.cell != NO_CELL for centre in state.centres])
         counts = {STAGNANT: np.where(entered_M, 0, state.own[STAGNANT] + 1)}

@@ -9,6 +9,7 @@ centre after them always does, as in the released code.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -55,7 +56,7 @@ def nsra_es(config: RunConfig) -> Algorithm:
 
 
 def adapted_weight(
-    search: NsraSettings, weight: FitnessWeight, evaluations: tuple[CentreEvaluation, ...]
+    search: NsraSettings, weight: FitnessWeight, evaluations: Sequence[CentreEvaluation]
 ) -> FitnessWeight:
     """The weight of fitness after the centres evaluated in one more generation, in the order of the asks.
 

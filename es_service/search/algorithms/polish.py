@@ -18,6 +18,7 @@ are those of this run.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -69,7 +70,7 @@ def polish(config: RunConfig) -> Algorithm:
         left = np.flatnonzero(state.own[LEFT][: len(state.centres)])
         return tuple(population(state, int(index), search, search.objective, generation) for index in left)
 
-    def tell(state: SearchState, evaluations: tuple[CentreEvaluation, ...]) -> SearchState:
+    def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         own, generation = state.own, evaluations[0].generation
         in_round = (generation - 1) % search.round_generations + 1
         remain = search.candidates if generation == 0 else -(-len(evaluations) // 2)

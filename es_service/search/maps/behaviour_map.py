@@ -23,6 +23,8 @@ from es_service.search.maps.geometry import Geometry
 
 COLUMNS = {"fitness_N": "f8", "descriptor_N_B": "f8", "generation_N": "i8", "centre_N": "i8", "score_N": "f8"}
 """Type of each array that every map has besides the numbers of its cells."""
+EMPTY = -1
+"""Stands for no cell in an array of cells."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +64,17 @@ class BehaviourMap:
 
     def cell_of(self, generation: int, centre: int) -> int | None:
         """The cell whose elite is the centre that was evaluated in a generation; None if there is none."""
-        found = np.flatnonzero((self.generation_N == generation) & (self.centre_N == centre))
-        return int(self.cell_N[found[0]]) if found.size else None
+        cell = int(self.cells_with(generation, np.array([centre]))[0])
+        return None if cell == EMPTY else cell
+
+    def cells_with(self, generation: int, centre_Q: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The cell whose elite is each of the centres that were evaluated in a generation, [Q]; EMPTY where none is."""
+        rows = np.flatnonzero(self.generation_N == generation)
+        rows = rows[np.argsort(self.centre_N[rows], kind="stable")]
+        found_Q = np.searchsorted(self.centre_N[rows], centre_Q)
+        is_there_Q = np.append(self.centre_N[rows], 0)[found_Q] == centre_Q
+        is_there_Q &= found_Q < rows.size
+        return np.where(is_there_Q, np.append(self.cell_N[rows], EMPTY)[found_Q], EMPTY)
 
 
 @dataclass(frozen=True)
@@ -146,7 +157,7 @@ def removed(map_: BehaviourMap, cell: int) -> BehaviourMap:
     row = map_.row_of(cell)
     if row is None:
         return map_
-    columns = {name: np.delete(values, row, axis=0) for name, values in _arrays(map_).items()}
+    columns = {name: np.delete(values, row, axis=0) for name, values in columns_of(map_).items()}
     order_N = np.delete(orders(map_), row)
     return replace(map_, **columns, order_N=None if np.array_equal(order_N, np.arange(order_N.size)) else order_N)
 
@@ -166,7 +177,7 @@ def moved(map_: BehaviourMap, cell: int, descriptor_B: NDArray[np.float64]) -> t
         raise KeyError(cell)
     if to == cell:
         return _with(map_, row, {"descriptor_N_B": descriptor_B}), cell, True
-    entry = {name: values[row] for name, values in _arrays(map_).items() if name != "cell_N"}
+    entry = {name: values[row] for name, values in columns_of(map_).items() if name != "cell_N"}
     return _offered(removed(map_, cell), to, entry | {"descriptor_N_B": descriptor_B})
 
 
@@ -210,7 +221,7 @@ def orders(map_: BehaviourMap) -> NDArray[np.int64]:
 def unchanged_entries(map_: BehaviourMap, before: BehaviourMap) -> NDArray[np.bool_]:
     """Whether each entry is the same, bit for bit, as that of its cell in an earlier map, with its order, [N]."""
     was_N, row_N = rows_in(map_, before)
-    now, then = ({**_arrays(one), "order_N": orders(one)} for one in (map_, before))
+    now, then = ({**columns_of(one), "order_N": orders(one)} for one in (map_, before))
     if now.keys() != then.keys():  # one of them counts samples
         return np.zeros(map_.size, bool)
     same_N = was_N.copy()
@@ -264,7 +275,7 @@ def _bytes(values_N: np.ndarray) -> NDArray[np.uint8]:
     return np.frombuffer(values_N.tobytes(), np.uint8).reshape(-1, entry_bytes)
 
 
-def _arrays(map_: BehaviourMap) -> dict[str, np.ndarray]:
+def columns_of(map_: BehaviourMap) -> dict[str, np.ndarray]:
     """The arrays of a map by name, without the order."""
     samples = {} if map_.samples_N is None else {"samples_N": map_.samples_N}
     return {"cell_N": map_.cell_N, **{name: getattr(map_, name) for name in COLUMNS}, **samples}
@@ -278,7 +289,7 @@ def _offered(map_: BehaviourMap, cell: int, entry: dict[str, Any]) -> tuple[Beha
         return (_with(map_, row, entry) if enters else map_), cell, bool(enters)
     columns = {
         name: np.concatenate([values, np.asarray(value, values.dtype)[None]])
-        for name, values in _arrays(map_).items()
+        for name, values in columns_of(map_).items()
         for value in [cell if name == "cell_N" else entry[name]]
     }
     order_N = None if map_.order_N is None else np.append(order := orders(map_), order.max(initial=-1) + 1)

@@ -1,0 +1,61 @@
+"""Parts of the state that are kept decoded: what is read is what is stored, whatever was read before."""
+
+import sqlite3
+
+import numpy as np
+import pytest
+
+from es_service.store.recent import RecentParts
+from tests.es_service.store_examples import assert_same_state, create, history_row, parts_of
+
+
+def arrays(kilobytes, value=0.0):
+    return {"a": np.full(kilobytes * 128, value), "b": np.zeros(0, np.float32)}
+
+
+def test_parts_not_asked_for_the_longest_are_forgotten_when_there_are_too_many_bytes():
+    recent = RecentParts(most_bytes=3 * 1024)
+    for name in "xyz":
+        recent.add(name, 1, arrays(1))
+    assert recent.get("x", 1) is not None
+    recent.add("w", 1, arrays(1))
+    assert [name for name in "wxyz" if recent.get(name, 1) is not None] == ["w", "x", "z"]
+    recent.add("large", 1, arrays(4))
+    assert not any(recent.get(name, 1) for name in ["w", "x", "z", "large"])
+    recent.add("small", 1, arrays(3))
+    assert recent.get("small", 1) is not None
+
+
+def test_a_part_is_kept_as_its_newest_generation_has_it():
+    recent = RecentParts()
+    recent.add("x", 1, arrays(1, 1.0))
+    recent.add("x", 2, arrays(1, 2.0))
+    assert recent.get("x", 1) is None
+    assert (recent.get("x", 2) or {})["a"][0] == 2.0
+
+
+def test_a_store_returns_the_newest_part_though_it_keeps_parts(tmp_path):
+    with create(tmp_path / "run") as store:
+        for generation in range(6):
+            store.commit(generation, parts_of(generation), history_row(generation))
+            for name, expected in parts_of(generation).items():
+                for _ in range(2):
+                    if expected is None:
+                        with pytest.raises(KeyError):
+                            store.part(name)
+                    else:
+                        assert_same_state({name: store.part(name)}, {name: expected})
+        part = store.part("centre_0")
+        array = next(iter(part.values()))
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
+        part.clear()
+        assert store.part("centre_0")
+
+
+def test_a_part_that_was_read_needs_no_other_reading(tmp_path):
+    with create(tmp_path / "run", generations=3) as store:
+        before = store.part("centre_0")
+        with sqlite3.connect(tmp_path / "run" / "run.db") as connection:
+            connection.execute("UPDATE state SET payload = x'00' WHERE part = 'centre_0'")
+        assert_same_state({"p": store.part("centre_0")}, {"p": before})
