@@ -30,7 +30,7 @@ POINT = SHIPPED["point_maze"]
 EVIL = """</script></style><img src=x onerror="alert(1)">'&<!--"""
 OPTION = """</script><b>'&<!--"""
 """An option cannot have the letters = and . in its name."""
-VOID = {"meta", "input"}
+VOID = {"meta", "input", "link"}
 
 
 class Elements(HTMLParser):

@@ -138,6 +138,11 @@ class Page:
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self.send("Input.dispatchMouseEvent", type=kind, x=across, y=down, button="left", clickCount=1)
 
+    def key(self, name: str) -> None:
+        """Press a key that is no letter, such as ArrowLeft or Enter."""
+        for kind in ("keyDown", "keyUp"):
+            self.send("Input.dispatchKeyEvent", type=kind, key=name, code=name)
+
     def slide(self, selector: str, value: float) -> None:
         """Set a slider, as a user would with the keyboard."""
         self.value(
