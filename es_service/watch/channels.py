@@ -17,10 +17,10 @@ from es_service.logs import logger
 from es_service.report.markup import Markup, tag
 
 _LOG = logger(__name__)
-SHARE = 0.02
-"""Share of one core that drawing and sending a page may take while it is open."""
-LEAST_S, MOST_S = 1.0, 30.0
-"""Seconds between two pictures."""
+SHARE = 0.03
+"""Share of one core that drawing and sending may take while pages are open, all of them together."""
+LEAST_S, MOST_S = 1.0, 60.0
+"""Seconds between two pictures of a page."""
 ALIVE_S = 10.0
 """An idle connection gets a comment so often, by which a lost one is noticed."""
 LINGER_S = 20.0
@@ -40,12 +40,26 @@ class Picture(NamedTuple):
     """Whether there is more to read at once."""
 
 
+class Allowance:
+    """How long a page waits for its next picture, so that all of them together leave the processor to the runs."""
+
+    def __init__(self) -> None:
+        self._charged_s, self._free_s = time.process_time(), 0.0
+
+    def pause_s(self, *, first: bool) -> float:
+        """Seconds to wait; what this process has used since the last call is paid for, unless it drew a page first."""
+        now_s, used_s = time.monotonic(), time.process_time()
+        cost_s, self._charged_s = used_s - self._charged_s, used_s
+        self._free_s = min(max(self._free_s, now_s) + (0.0 if first else cost_s / SHARE), now_s + MOST_S)
+        return 0.0 if first else max(self._free_s - now_s, 0.0)
+
+
 class Channel:
     """A page that is drawn again and again while somebody looks at it."""
 
-    def __init__(self, draw: Callable[[], Picture | None], on_end: Callable[[], object]) -> None:
+    def __init__(self, draw: Callable[[], Picture | None], on_end: Callable[[], object], allowance: Allowance) -> None:
         """`draw`: called in a thread; None if nothing has changed. `on_end`: called when nobody looks any more."""
-        self._draw, self._on_end = draw, on_end
+        self._draw, self._on_end, self._allowance = draw, on_end, allowance
         self._texts: dict[str, str] = {}
         self._title = ""
         self._version = 0
@@ -90,12 +104,10 @@ class Channel:
                 if not self._viewers:
                     await asyncio.sleep(0.1)
                     continue
-                began_s, used_s = time.monotonic(), time.process_time()
+                first = self._version == 0
                 more = await self._show()
-                await asyncio.sleep(0.0 if more else LEAST_S)
-                if not more:  # what was sent meanwhile counts, too
-                    pause_s = min((time.process_time() - used_s) / SHARE, MOST_S) - (time.monotonic() - began_s)
-                    await asyncio.sleep(max(0.0, pause_s))
+                await asyncio.sleep(0.0 if more else LEAST_S)  # what is sent meanwhile counts, too
+                await asyncio.sleep(self._allowance.pause_s(first=first or more))
         finally:
             self._on_end()
 

@@ -29,7 +29,7 @@ from es_service.report.page import Evaluate, asset, cell_details
 from es_service.report.replays import replay_section
 from es_service.runs.view import open_run
 from es_service.watch import pages
-from es_service.watch.channels import Channel, Picture
+from es_service.watch.channels import Allowance, Channel, Picture
 from es_service.watch.guard import LOCAL, Guard
 from es_service.watch.metrics import metrics
 from es_service.watch.runs import Found, Reading, Runs, require_inside
@@ -57,6 +57,7 @@ class Site:
         """`evaluate`: what evaluates a policy of a run's folder, as text. `trusted`: see `replay_section`."""
         self._runs, self._evaluate, self._trusted = Runs(roots), evaluate, trusted
         self._channels: dict[str, Channel] = {}
+        self._allowance = Allowance()
         self._readings: dict[str, Reading] = {}
         self._replays: dict[tuple[Any, ...], dict[str, Any]] = {}
 
@@ -96,25 +97,34 @@ class Site:
         return Response(asset(name, package), media_type=kind)
 
     async def _events(self, request: Request) -> Response:
-        name = f"{request.path_params['page']}?{request.url.query}"
+        name = request.path_params["page"]
+        if name == "compare":
+            name += f"?{request.url.query}"
         if name not in self._channels:
-            draw = await self._drawer(request)
+            draw, reading = await self._drawer(request)
             if name not in self._channels:  # it may have been made meanwhile
-                self._channels[name] = Channel(draw, lambda: self._channels.pop(name, None))
+                self._channels[name] = Channel(draw, lambda: self._ended(name), self._allowance)
+                if reading is not None:
+                    self._readings[name] = reading
         return StreamingResponse(self._channels[name].stream(), media_type="text/event-stream")
 
-    async def _drawer(self, request: Request) -> Callable[[], Picture | None]:
+    def _ended(self, name: str) -> None:
+        del self._channels[name]
+        self._readings.pop(name, None)
+
+    async def _drawer(self, request: Request) -> tuple[Callable[[], Picture | None], Reading | None]:
+        """What draws a page, and for the page of one run what reads it."""
         match request.path_params["page"].split("/"):
             case ["list"]:
-                return pages.draw_list(self._runs)
+                return pages.draw_list(self._runs), None
             case ["run", key]:
                 found = await self._found(key)
-                self._readings[key] = Reading(found)
-                return pages.draw_run(self._runs, found, self._readings[key])
+                reading = Reading(found)
+                return pages.draw_run(self._runs, found, reading), reading
             case ["compare"]:
                 keys = list(dict.fromkeys(request.query_params.getlist("run")))[:MOST_COMPARED]
                 compared = [(found, Reading(found)) for found in [await self._found(key) for key in keys]]
-                return pages.draw_comparison(compared, request.query_params.getlist("group_by"))
+                return pages.draw_comparison(compared, request.query_params.getlist("group_by")), None
         raise HTTPException(404)
 
     async def _found(self, key: str) -> Found:
@@ -159,7 +169,7 @@ class Site:
     def _data(self, found: Found) -> RunData:
         """The run as an open page shows it, else as it is."""
         require_inside(found)
-        reading = self._readings.get(found.key) or Reading(found)
+        reading = self._readings.get(f"run/{found.key}") or Reading(found)
         if reading.data is None:
             reading.update()
         assert reading.data is not None

@@ -347,7 +347,7 @@ def test_one_picture_is_drawn_for_all_viewers_and_only_what_changed_is_sent(monk
         return found
 
     async def watched():
-        channel = channels.Channel(draw, lambda: ended.append(1))
+        channel = channels.Channel(draw, lambda: ended.append(1), channels.Allowance())
         found = await asyncio.gather(*(viewer(channel) for _ in range(20)))
         monkeypatch.setattr(channels, "LINGER_S", 0.0)
         await channel._task

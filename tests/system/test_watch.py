@@ -77,7 +77,7 @@ def opened(page, address, name, **window):
     """Open the page of a run and wait for its first picture."""
     key = links(address)[name]
     page.open(f"{address}run/{key}", **window)
-    page.until("document.body.dataset.pictures > 0")
+    page.until("document.body?.dataset.pictures > 0")
     return key
 
 
@@ -86,12 +86,12 @@ def test_a_run_that_goes_on_is_killed_and_is_resumed_is_seen(page, tmp_path):
     (tmp_path / "runs").mkdir()
     with watching(tmp_path / "runs") as address:
         page.open(address)
-        page.until("document.body.dataset.pictures > 0")
+        page.until("document.body?.dataset.pictures > 0")
         assert "There is no run yet" in page.text("main")
         with start(folder, config=GOES_ON) as process:
             page.until("/^1 runs, of which 1 are running/.test(document.querySelector('.verdict').textContent)")
             page.click("a[href^='/run/']")
-            page.until("document.body.dataset.base !== '' && !!document.querySelector('#map .way')")
+            page.until("!!document.querySelector('#map .way')")
             generation, cells = page.value(GENERATIONS), page.value(CELLS)
             assert "running on" in page.text("#what")
             page.until(f"{GENERATIONS} > {generation + 5} && {CELLS} > {cells}")
@@ -300,7 +300,7 @@ def test_the_pages_fit_their_window(page, tmp_path, width, dark):
         assert len(found) == len(keys)
         for path in ("", f"run/{found[0]}", f"compare?run={found[0]}&run={found[1]}"):
             page.open(address + path, width, dark=dark)
-            page.until("document.body.dataset.pictures > 0")
+            page.until("document.body?.dataset.pictures > 0")
             assert page.value("document.documentElement.scrollWidth") <= width
 
 
