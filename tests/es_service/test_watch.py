@@ -4,19 +4,22 @@ import asyncio
 import json
 import re
 import shutil
+import socket
 from dataclasses import replace
-from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from es_service import api
+from es_service.cli.main import app as program
 from es_service.errors import StoreError
 from es_service.report.data import read_run
 from es_service.report.page import run_sections
 from es_service.report.write import python_call
 from es_service.watch import channels
+from es_service.watch.pages import draw_run
 from es_service.watch.runs import Reading, Runs
 from es_service.watch.server import Site
 from tests.es_service.test_report_page import Elements
@@ -201,22 +204,25 @@ def test_a_cell_has_its_path_and_its_command(tmp_path):
 
 def test_what_was_seen_stays_when_a_run_is_moved_or_deleted(tmp_path):
     folder, runs = write_run(tmp_path / "a"), Runs([tmp_path])
-    from es_service.watch.pages import draw_run
-
     one = runs.find()[0]
     draw = draw_run(runs, one, Reading(one))
-    before = draw()
-    assert draw() is None
+
+    def drawn():
+        picture = draw()
+        assert picture is not None
+        assert draw() is None  # nothing is new
+        return picture.sections
+
+    before = drawn()
     folder.rename(tmp_path / "b")
-    gone = draw()
-    assert "does not exist" in gone.sections["live"]
-    assert f'<a href="/run/{key_of(tmp_path, f"{tmp_path.name}/b")}">' in gone.sections["live"]
-    assert gone.sections["curves"] == before.sections["curves"]
-    assert draw() is None
+    gone = drawn()
+    assert "does not exist" in gone["live"]
+    assert f'<a href="/run/{key_of(tmp_path, f"{tmp_path.name}/b")}">' in gone["live"]
+    assert gone["curves"] == before["curves"]
     (tmp_path / "b").rename(folder)
-    assert "live" not in draw().sections
+    assert "live" not in drawn()
     shutil.rmtree(folder)
-    assert "It is now" not in draw().sections["live"]
+    assert "It is now" not in drawn()["live"]
 
 
 def test_runs_are_compared_and_those_of_other_tasks_are_refused(tmp_path):
@@ -361,21 +367,10 @@ def test_one_picture_is_drawn_for_all_viewers_and_only_what_changed_is_sent(monk
 
 
 def test_the_command_refuses_files_and_ports_in_use(tmp_path):
-    from typer.testing import CliRunner
-
-    from es_service.cli.main import app
-
     file = tmp_path / "file"
     file.write_text("")
-    result = CliRunner().invoke(app, ["watch", str(file)])
+    result = CliRunner().invoke(program, ["watch", str(file)])
     assert "is a file" in str(result.exception)
-    import socket
-
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        result = CliRunner().invoke(app, ["watch", str(tmp_path), "--port", str(taken.getsockname()[1])])
+        result = CliRunner().invoke(program, ["watch", str(tmp_path), "--port", str(taken.getsockname()[1])])
     assert "choose another --port" in str(result.exception)
-
-
-def test_nothing_but_the_command_loads_the_server():
-    text = Path(api.__file__).with_name("cli").joinpath("main.py").read_text()
-    assert "es_service.watch" not in text

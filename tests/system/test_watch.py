@@ -48,6 +48,8 @@ def page():
 def watching(*folders, options=()):
     """The address that `es-service watch` prints, while it runs."""
     with running(PROGRAM, "watch", *folders, "--port", 0, *options) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
         address = process.stdout.readline().strip()
         assert address.startswith("http://"), process.communicate()
         yield address
