@@ -157,7 +157,7 @@ class Rows:
     def read(self, connection: sqlite3.Connection, problems: list[str], most: int = -1) -> bool:
         """Read the rows after those that are read, at most so many (-1: all); return whether they are all."""
         columns, at = column_bytes(self.meta.columns), [one.name for one in self.meta.columns].index("generation")
-        count = 0
+        count, first = 0, self.next
         with _noted(problems, "the end of the history cannot be read"):
             query = history_select(self.meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation"
             for *values, centres, state, sha256 in connection.execute(f"{query} LIMIT ?", (self.next, most)):
@@ -172,7 +172,8 @@ class Rows:
                 self.last, self.sha256, self.next = row, sha256, row[at] + 1
                 for centre in evaluated:
                     self.evaluations.add((row[at], *centre))
-        whole, lost = count != most, list(self._lost)
+        whole = count != most or self.next == first  # so many damaged rows in a row are the end
+        lost = list(self._lost)
         if whole:
             with _noted(problems, "the number of generations cannot be read"):
                 newest = newest_state(connection)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 
 from es_service.errors import ServiceError
 from es_service.runs.recent import FAULTS_OF, read_recent
-from es_service.watch.runs import Summary
+from es_service.watch.runs import FORGED, Summary
 
 GAUGES = {
     "generation": ("generation", "Newest committed generation."),
@@ -33,11 +33,15 @@ def metrics(summaries: Iterable[Summary]) -> str:
     values: dict[str, list[str]] = {name: [] for name in (*GAUGES, *OTHERS)}
     for one in summaries:
         labels = {"run": one.found.name}
-        if one.standing is not None:
-            constants = one.standing.run.constants
-            labels |= {"task": constants["task.environment"], "search": constants["search.algorithm"]}
+        try:
+            found = _values(one)
+            if one.standing is not None:
+                constants = one.standing.run.constants
+                labels |= {"task": constants["task.environment"], "search": constants["search.algorithm"]}
+        except FORGED:
+            found = {"readable": 0.0}
         shown = ",".join(f'{name}="{_escaped(str(text))}"' for name, text in labels.items())
-        for name, value in _values(one).items():
+        for name, value in found.items():
             if math.isfinite(value):
                 values[name].append(f"{PREFIX}{name}{{{shown}}} {value!r}\n")
     about = {name: text for name, (_, text) in GAUGES.items()} | OTHERS

@@ -17,7 +17,7 @@ from es_service.report.page import REPLAY, run_sections, run_title, section
 from es_service.report.progress import short
 from es_service.runs.standing import state
 from es_service.watch.channels import Picture
-from es_service.watch.runs import Found, Reading, Runs, Summary
+from es_service.watch.runs import FORGED, Found, Reading, Runs, Summary
 
 SECTION_OF = {"charts": "curves", "map": "map", "cloud": "centres"}
 """Data of the page's script -> the section that they belong to."""
@@ -71,7 +71,7 @@ def draw_list(runs: Runs) -> Callable[[], Picture]:
         found = runs.summaries()
         running = sum(one.standing is not None and one.standing.driver is not None for one in found)
         said = f"{len(found):,} runs, of which {running:,} are running." if found else "There is no run yet."
-        rows = [tag("tr", *_cells(one)) for one in found]
+        rows = [tag("tr", *_row(one)) for one in found]
         heads = tag("thead", tag("tr", *(tag("th", head, scope="col") for head in HEADS)))
         listed = tag("div", tag("table", heads, tag("tbody", *rows), class_="runs"), class_="scroll") if rows else None
         choice = tag("button", "Compare the ticked runs", type="submit") if len(found) > 1 else None
@@ -79,6 +79,14 @@ def draw_list(runs: Runs) -> Callable[[], Picture]:
         return Picture("Runs", {"runs": tag("section", form, id="runs")}, {})
 
     return draw
+
+
+def _row(one: Summary) -> list[Markup]:
+    """The cells of a row; a run with forged data hides no other."""
+    try:
+        return _cells(one)
+    except FORGED as error:
+        return _cells(Summary(one.found, None, None, f"its data are not those of a run: {error!r}"))
 
 
 def _cells(one: Summary) -> list[Markup]:

@@ -32,6 +32,10 @@ DEEPEST = 8
 FILES = (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm", f"{DATABASE}-journal", COPY, CONFIG, LOCK)
 
 
+FORGED = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+"""What data raise that a run of ours cannot have, although their hashes are right."""
+
+
 class Found(NamedTuple):
     """A run below a given folder."""
 
@@ -142,6 +146,8 @@ def _summary(found: Found) -> Summary:
         certified = newest_certified(certified_policies(found.folder))
     except ServiceError as error:
         return Summary(found, None, None, " ".join(error.sentence.split()))
+    except FORGED as error:
+        return Summary(found, None, None, f"its data are not those of a run: {error!r}")
     return Summary(found, standing, certified, "")
 
 

@@ -57,7 +57,7 @@ class Site:
         """`evaluate`: what evaluates a policy of a run's folder, as text. `trusted`: see `replay_section`."""
         self._runs, self._evaluate, self._trusted = Runs(roots), evaluate, trusted
         self._channels: dict[str, Channel] = {}
-        self._allowance = Allowance()
+        self._allowance, self._recording = Allowance(), asyncio.Lock()
         self._readings: dict[str, Reading] = {}
         self._replays: dict[tuple[Any, ...], dict[str, Any]] = {}
 
@@ -151,7 +151,10 @@ class Site:
 
     async def _replay(self, request: Request) -> Response:
         found, which = await self._found(request.path_params["key"]), request.path_params["which"]
-        return JSONResponse(await _answer(_RECORDING, lambda: self._recorded(found, which)))
+        async with self._recording:
+            if await request.is_disconnected():  # the viewer has chosen another cell meanwhile
+                return Response(status_code=409)
+            return JSONResponse(await _answer(_RECORDING, lambda: self._recorded(found, which)))
 
     def _recorded(self, found: Found, which: str) -> dict[str, Any]:
         """The section of a replay, of "best" or of the elite of a cell, and what its script needs."""

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import socket
+import sqlite3
 from dataclasses import replace
 from urllib.parse import quote
 
@@ -18,6 +19,7 @@ from es_service.errors import StoreError
 from es_service.report.data import read_run
 from es_service.report.page import run_sections
 from es_service.report.write import python_call
+from es_service.store.codec import text_sha256
 from es_service.watch import channels
 from es_service.watch.pages import draw_run
 from es_service.watch.runs import Reading, Runs
@@ -374,3 +376,34 @@ def test_the_command_refuses_files_and_ports_in_use(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         result = CliRunner().invoke(program, ["watch", str(tmp_path), "--port", str(taken.getsockname()[1])])
     assert "choose another --port" in str(result.exception)
+
+
+def test_many_damaged_rows_in_a_row_end_the_reading(tmp_path, monkeypatch):
+    monkeypatch.setattr("es_service.watch.runs.MOST_ROWS", 3)
+    folder = write_run(tmp_path / "a", generations=20)
+    with sqlite3.connect(folder / "run.db") as connection:
+        connection.execute("UPDATE history SET sha256 = '' WHERE generation BETWEEN 5 AND 9")
+    reading = Reading(Runs([tmp_path]).find()[0])
+    for _ in range(30):
+        reading.update()
+    assert reading.whole
+    assert reading.data is not None
+    assert reading.data.history["generation"].tolist() == [0, 1, 2, 3, 4]
+    assert "generations 5 to 20" in reading.data.problems[0]
+
+
+def test_a_run_with_forged_data_hides_no_other(tmp_path):
+    for name in ("a", "b"):
+        write_run(tmp_path / name)
+    with sqlite3.connect(tmp_path / "a/run.db") as connection:
+        [text] = connection.execute("SELECT value FROM meta WHERE key = 'run'").fetchone()
+        text = json.dumps(json.loads(text) | {"constants": {"task.environment": 3}})
+        row = (text, text_sha256("run", text))
+        connection.execute("UPDATE meta SET value = ?, sha256 = ? WHERE key = 'run'", row)
+    app = site(tmp_path).app(None)
+    html = sections(app, "/events/list")["sections"]["runs"]["html"]
+    assert "its data are not those of a run" in html
+    assert "20 of 20" in html
+    assert f'run="{tmp_path.name}/b",task="point_maze"' in get(app, "/metrics")[2]
+    key = key_of(tmp_path, f"{tmp_path.name}/a")
+    assert "cannot be drawn" in sections(app, f"/events/run/{key}")["sections"]["live"]["html"]

@@ -65,12 +65,14 @@
     script.onerror = reject;
     document.head.append(script);
   });
-  let asked = 0;
+  let asked = 0, asking = new AbortController();
   const replay = async (which, what) => {
     const mine = ++asked, status = (text) => { if (mine === asked) byId("recording").textContent = text; };
+    asking.abort(); // the server need not record what nobody waits for
+    asking = new AbortController();
     status(`recording the episode of ${what} …`);
     try {
-      const answer = await fetch(`${base}/replay/${which}`, { method: "POST" });
+      const answer = await fetch(`${base}/replay/${which}`, { method: "POST", signal: asking.signal });
       if (!answer.ok) return status(await failed(answer));
       const { html, data } = await answer.json();
       if (data.replay?.solid) await library("three.bundle.js");
