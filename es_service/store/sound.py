@@ -57,10 +57,10 @@ def read_sound(folder: Path, kept: Kept = lambda part, arrays: arrays) -> SoundR
         StoreError: neither the database nor its copy has a sound description of the run.
     """
     problems: list[str] = []
-    with any_sound(folder, problems) as (connection, meta):
+    with _any_sound(folder, problems) as (connection, meta):
         rows = Rows(meta)
         rows.read(connection, problems)
-        return sound_run(connection, rows, kept, problems)
+        return _sound_run(connection, rows, kept, problems)
 
 
 class Followed:
@@ -74,13 +74,13 @@ class Followed:
 
     def read(self, most: int) -> tuple[SoundRun, bool]:
         """The run as far as it is read now, with at most so many new rows, so that the transaction is short; and
-        whether these are all. The columns must not be used after the next call. Raises StoreError as `read_sound`."""
+        whether these are all. Raises StoreError as `read_sound`."""
         problems: list[str] = []
-        with any_sound(self.folder, problems) as (connection, meta):
+        with _any_sound(self.folder, problems) as (connection, meta):
             if self._rows is None or not self._rows.are_of(connection, meta):
                 self._rows, self._known = Rows(meta), {}
             whole = self._rows.read(connection, problems, most)
-            found = sound_run(connection, self._rows, self._kept, problems, self._wanted, self._known)
+            found = _sound_run(connection, self._rows, self._kept, problems, self._wanted, self._known)
             history, evaluations = (  # copies, since nothing can be added to a table whose columns are in use
                 {name: values.copy() for name, values in columns.items()}
                 for columns in (found.history, found.evaluations)
@@ -88,7 +88,7 @@ class Followed:
             return replace(found, history=history, evaluations=evaluations), whole
 
 
-def sound_run(
+def _sound_run(
     connection: sqlite3.Connection,
     rows: Rows,
     kept: Kept,
@@ -110,7 +110,7 @@ def sound_run(
 
 
 @contextlib.contextmanager
-def any_sound(folder: Path, problems: list[str]) -> Iterator[tuple[sqlite3.Connection, RunMeta]]:
+def _any_sound(folder: Path, problems: list[str]) -> Iterator[tuple[sqlite3.Connection, RunMeta]]:
     """Connection to the run, or to its copy if the database cannot be opened."""
     with contextlib.ExitStack() as stack:
         try:

@@ -39,7 +39,6 @@ HEADS = (
     "search",
     "seed",
 )
-COVERAGE = "coverage"
 
 
 def shell(title: str, events: str, base: str = "") -> str:
@@ -101,7 +100,8 @@ def _cells(one: Summary) -> list[Markup]:
         of = {key: f" of {short(limit)}" for key, limit in limits.items()}
         best = number(row["best_fitness"]) if row else ""
         certified = "" if one.certified is None else number(one.certified.row()["return_mean"])
-        coverage = f"{100 * row[COVERAGE]:.1f} %" if COVERAGE in row else ""
+        share = row.get("coverage")
+        coverage = "" if share is None else f"{100 * share:.1f} %"
         values = [
             box, link, state(standing),
             f"{row['generation']:,}{of.get('generations', '')}" if row else "",
@@ -129,7 +129,8 @@ def draw_run(runs: Runs, found: Found, reading: Reading) -> Callable[[], Picture
             other = None if reading.data is None else runs.moved(reading.data.meta.run_id, found)
             before, told = told, f"{error.sentence} {other}"
             where = () if other is None else (" It is now ", tag("a", other.name, href=f"/run/{other.key}"), ".")
-            shown = {"live": _notice(error.sentence, *where), **last.sections}
+            others = {one: html for one, html in last.sections.items() if one != "live"}
+            shown = {"live": _notice(error.sentence, *where), **others}
             return None if told == before else last._replace(sections=shown, more=False)
         assert reading.data is not None
         last, told = _run_picture(reading.data, whole=reading.whole), ""
