@@ -15,11 +15,11 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from es_service.config.tasks import TASKS
 from es_service.runs.view import open_run
 from tests.run_examples import write_run
 from tests.system.browser import browser
@@ -251,8 +251,8 @@ def test_a_body_is_replayed_in_three_dimensions(page, tmp_path):
 
 @pytest.mark.long
 def test_a_task_of_a_user_is_only_replayed_if_it_is_trusted(page, tmp_path):
-    task = TASKS["tests.examples.ant_slalom:AntSlalom"]
-    write_run(tmp_path / "a", {"map.enabled": False, "search.algorithm": "es"}, task=task)
+    task = replace(SHIPPED["point_maze"], name="no_such_package:Task")
+    write_run(tmp_path / "a", task=task)
     with watching(tmp_path) as address:
         opened(page, address, f"{tmp_path.name}/a")
         page.click("#replay-best")
