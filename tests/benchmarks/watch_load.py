@@ -44,8 +44,7 @@ def main() -> None:
 def measure(folder: Path, pages: int, seconds: float, rounds: int) -> None:
     program = str(Path(sys.executable).with_name("es-service"))
     words = [program, "run", "point_maze_me_es", "--out", str(folder), *(f"--set={one}" for one in SETTINGS)]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    driver = subprocess.Popen(words, **quiet)
+    driver = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     server = subprocess.Popen([program, "watch", str(folder), "--port", "0"], stdout=subprocess.PIPE, text=True)
     try:
         assert server.stdout is not None
