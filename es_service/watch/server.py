@@ -224,7 +224,7 @@ def serve(
     try:
         listener = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:
-        what = f"cannot listen on {host}, port {port}: {error.strerror or error}; choose another --port, or 0 for any"
+        what = f"cannot listen on {host}, port {port}: {error.strerror or error}; choose another port, or 0 for any"
         raise ConfigError(what, field="port", value=port) from error
     config = uvicorn.Config(
         Site(roots, evaluate, trusted=trusted).app(token),
