@@ -24,14 +24,14 @@ from es_service.errors import StartError, WayOut
 from es_service.logs import in_run
 from es_service.loop.interfaces import Stop as Stop
 from es_service.report.progress import in_notebook, show_in_notebook
-from es_service.runs import targets
+from es_service.runs import targets, view
 from es_service.runs.certified import target_reached
 from es_service.runs.checked_config import accepted, changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.lineage import fork_config, forked, started
 from es_service.runs.resume_checks import columns, require_resumable
 from es_service.runs.session import OnGeneration, OnNotice, Outcome, require_cores, work
-from es_service.runs.view import open_run
+from es_service.runs.view import Run, open_run
 from es_service.store.beginning import Beginning
 from es_service.store.create import remove_run_folder
 from es_service.store.folder import CONFIG, explained, holds_run, write_config
@@ -40,6 +40,15 @@ from es_service.store.writer import RunStore, no_hook
 
 RUNS_FOLDER = Path("runs")
 """Default parent folder of runs, relative to the current folder."""
+
+
+def _draw_for_notebook(run: Run) -> str:
+    from es_service.report.notebook import run_html  # takes time that other programs need not spend
+
+    return run_html(run)
+
+
+view.draw_for_notebook = _draw_for_notebook
 
 
 def _warn(notice: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,11 @@ PROGRAM = "es-service"
 def command(*words: object) -> str:
     """A command of this program, quoted so that it can be copied into a shell: a folder's name may contain spaces."""
     return shlex.join([*_program(), *map(str, words)])
+
+
+def evaluation_of(folder: Path) -> Callable[[str], str]:
+    """Function from the name of a policy of a run, "best" or a cell, to the command that evaluates it."""
+    return lambda name: command("evaluate", folder, *(["--best"] if name == "best" else ["--cell", name]))
 
 
 def assignments(values: Mapping[str, Any]) -> list[str]:

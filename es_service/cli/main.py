@@ -1,5 +1,5 @@
-"""The command line: `es-service run | resume | fork | polish | sweep | status | digest | config | list | evaluate |
-export | report | verify | submit | jobs | logs | stop | bench | doctor`.
+"""The command line: `es-service run | resume | fork | polish | sweep | status | watch | digest | config | list |
+evaluate | export | report | verify | submit | jobs | logs | stop | bench | doctor`.
 
 Exit codes: 0 done, 1 failed, 2 bad usage or config, 3 cannot be checked now (`verify` of a running run), 130 or 143
 interrupted by SIGINT or SIGTERM.
@@ -47,6 +47,7 @@ from es_service.cli.session import session, told_to_user
 from es_service.cli.show import config_, digest_, list_, status
 from es_service.cli.sweep import SeedsOption, run_seeds, sweep
 from es_service.cli.verify import verify
+from es_service.cli.watch import watch
 from es_service.config.changes import again_with
 from es_service.config.keys import parse_overrides
 from es_service.config.parallel import parallel_sentence
@@ -157,6 +158,7 @@ app.command()(polish)
 app.command()(sweep)
 app.command()(export)
 app.command()(report)
+app.command()(watch)
 app.command()(verify)
 app.add_typer(job_commands)
 app.add_typer(bench, name="bench")

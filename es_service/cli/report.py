@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from es_service import api
-from es_service.cli.commands import command
+from es_service.cli.commands import evaluation_of
 from es_service.cli.options import RunArgument, place_of, print_note
 from es_service.cli.several import RunsArgument, is_single, of_each, readable
 from es_service.errors import ConfigError
@@ -63,16 +63,13 @@ def report(
         raise ConfigError("--replay none cannot be combined with other replays; leave it out")
     cells = [place_of(text, "--replay") for text in wanted if text not in ("best", "none")]
 
-    def evaluate(name: str) -> str:
-        return command("evaluate", folder, *(["--best"] if name == "best" else ["--cell", name]))
-
     for file in write_report(
         folder,
         out,
         best="best" in wanted,
         cells=cells,
         trusted=replay is not None,
-        evaluate=evaluate,
+        evaluate=evaluation_of(folder),
         figures=figures,
     ):
         print(file)

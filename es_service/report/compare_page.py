@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from es_service.report.compare import Group, Quartiles, Summary
 from es_service.report.curves import draw, values_text
 from es_service.report.data import RunData
 from es_service.report.facts import number
-from es_service.report.markup import Markup, table, tag
+from es_service.report.markup import Markup, joined, table, tag
 from es_service.report.page import axis_choice, document, section
 from es_service.report.series import X_AXES
 from es_service.runs.standing import state
@@ -26,7 +27,15 @@ HEADS = {**compare.LABELS, "env_steps": "million steps", "wall_clock_s": "second
 
 
 def comparison_page(runs: Sequence[RunData], keys: Sequence[str] = (), threshold: float | None = None) -> str:
-    """HTML of the comparison of runs; see `compare.grouped` for the keys.
+    """HTML of the comparison of runs; arguments and errors as of `comparison_sections`."""
+    title, sections, scripts = comparison_sections(runs, keys, threshold)
+    return document(title, list(sections.values()), scripts)
+
+
+def comparison_sections(
+    runs: Sequence[RunData], keys: Sequence[str] = (), threshold: float | None = None
+) -> tuple[str, dict[str, Markup], dict[str, Any]]:
+    """Title, sections by id and data of the script of a page that compares runs; see `compare.grouped` for the keys.
 
     Args:
         threshold: fitness from which a run counts as solved; None: the target fitness of all runs, if there is one.
@@ -54,9 +63,10 @@ def comparison_page(runs: Sequence[RunData], keys: Sequence[str] = (), threshold
         figures.append(figure)
         points.append({"axes": axes, "texts": texts})
     task = runs[0].constants["task.environment"]
-    sections = [
-        tag("section", tag("p", _sentence(groups, threshold), class_="verdict"), *_problems(runs), id="what"),
-        section(
+    said = tag("p", _sentence(groups, threshold), class_="verdict")
+    sections = {
+        "what": tag("section", said, *_problems(runs), id="what"),
+        "curves": section(
             "Curves",
             tag("p", "Median over the seeds of a group; a shaded region is its interval, explained below the final "
                 f"values. A curve ends where the first of its runs ends. {_seeds(groups)}.", class_="note"),
@@ -64,11 +74,11 @@ def comparison_page(runs: Sequence[RunData], keys: Sequence[str] = (), threshold
             tag("div", *figures, class_="charts"),
             id_="curves",
         ),
-        section("Final values", _final(groups, threshold), id_="final"),
-        *_maps(groups),
-        section("Runs", _runs(groups), id_="runs"),
-    ]  # fmt: skip
-    return document(f"{len(runs)} runs on {task}", sections, {"charts": points})
+        "final": section("Final values", _final(groups, threshold), id_="final"),
+        "maps": joined(_maps(groups)),
+        "runs": section("Runs", _runs(groups), id_="runs"),
+    }  # fmt: skip
+    return f"{len(runs)} runs on {task}", sections, {"charts": points}
 
 
 def _sentence(groups: Sequence[Group], threshold: float | None) -> str:

@@ -6,7 +6,7 @@ Axes: G generations, N evaluated centres, T points of a path, B descriptor dimen
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +26,13 @@ from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.certified import Certified, certified_policies, newest_certified
 from es_service.runs.standing import Standing, standing_at
-from es_service.runs.view import Run
+from es_service.runs.view import Run, is_light
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.store.columns import as_floats
 from es_service.store.digest import checked_parts, digest_of
 from es_service.store.lock import lock_holder
 from es_service.store.schema import RunMeta
-from es_service.store.sound import Arrays, SoundRun, read_sound
+from es_service.store.sound import Arrays, Followed, SoundRun, read_sound
 
 Columns = Mapping[str, NDArray[np.float64]]
 """Column name -> its values; NaN stands for no value."""
@@ -113,17 +113,18 @@ def read_run(folder: Path, *, paths: bool = True, digest: bool = True) -> RunDat
         StoreError: `folder` is not a run folder, or nothing of the run can be read.
     """
 
-    def kept(part: str, arrays: Arrays) -> Arrays | None:
-        if part.startswith(ELITE_PREFIX):
-            return {TRACE: arrays[TRACE]} if paths else None
-        if part == BEST:
-            return {name: arrays[name] for name in ("generation", "fitness")}
-        return arrays if part == GEOMETRY_PART or part.startswith(CELL_PREFIX) else None
-
     driver = lock_holder(folder)  # read before the history, so that the last row is not missed
-    found = read_sound(folder, kept)
+    found = read_sound(folder, _kept if paths else _kept_without_paths)
+    data = run_data(folder, found, driver)
+    if not digest or driver is not None or found.newest is None:
+        return data
+    problems = list(data.problems)
+    return replace(data, digest=_digest(folder, problems), problems=tuple(problems))
+
+
+def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) -> RunData:
+    """The data of a run that was read before; `driver`: what `lock_holder` said before that."""
     problems = list(found.problems)
-    row = found.newest
     run = Run(folder)
     run.__dict__["meta"] = found.meta  # it is cached there, and `run.db` itself may be damaged
     best = found.parts.get(BEST)
@@ -137,11 +138,28 @@ def read_run(folder: Path, *, paths: bool = True, digest: bool = True) -> RunDat
         paths=_paths(found),
         best=None if best is None else (int(best["generation"]), float(best["fitness"])),
         certified=_certified(folder, problems),
-        standing=standing_at(run, driver, row),
+        standing=standing_at(run, driver, found.newest),
         platforms=found.platforms,
-        digest=_digest(folder, problems) if digest and driver is None and row is not None else "",
+        digest="",
         problems=tuple(problems),
     )
+
+
+def _kept(part: str, arrays: Arrays) -> Arrays | None:
+    if part.startswith(ELITE_PREFIX):
+        return {TRACE: arrays[TRACE]}
+    if part == BEST:
+        return {name: arrays[name] for name in ("generation", "fitness")}
+    return arrays if part == GEOMETRY_PART or part.startswith(CELL_PREFIX) else None
+
+
+def _kept_without_paths(part: str, arrays: Arrays) -> Arrays | None:
+    return None if part.startswith(ELITE_PREFIX) else _kept(part, arrays)
+
+
+def followed(folder: Path) -> Followed:
+    """A run that is read again and again for `run_data`, without paths: no elite is read."""
+    return Followed(folder, _kept, lambda part: part == BEST or is_light(part))
 
 
 def _floats(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[np.float64]]:

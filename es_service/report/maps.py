@@ -41,9 +41,7 @@ class MapView(NamedTuple):
     explanation: str
     """How to read the figure; one or two sentences."""
     cells: dict[str, Any]
-    """`rows`: number of a cell -> [name, text]; `paths`: all paths in base64; `points`: their length; `lines`: number
-    of curves of a path, each with x and y; `overlay`: whether they are drawn above the map; `detours`: number of a cell
-    -> [number of a point, way from there to the next point as SVG] where no straight line is drawn."""
+    """`rows`: number of a cell -> [name, text]; `overlay`: whether paths are drawn above the map."""
     path_figure: Markup | None
     """Empty figure for the path of a chosen cell where it cannot be drawn above the map."""
 
@@ -52,8 +50,8 @@ def map_view(data: RunData) -> MapView:
     """The behaviour map of a run, which must have one."""
     assert data.map is not None
     figure, explanation, frame = draw_map(data)
-    cells, path_figure = _paths(data, frame)
-    return MapView(figure, explanation, cells, path_figure)
+    cells = {"rows": _rows(data), "overlay": frame is not None}
+    return MapView(figure, explanation, cells, _path_figure(data) if frame is None else None)
 
 
 def draw_map(
@@ -123,7 +121,7 @@ def _overlay() -> Markup:
 def _svg(content: list[Markup], width: float, height: float, class_: str = "map cells") -> Markup:
     outline = tag("g", class_="outline")  # of the chosen cell, above its neighbours
     return tag("svg", *content, outline, viewBox=f"0 0 {width:.0f} {height:.0f}", class_=class_, role="img",
-               aria_label="Behaviour map")  # fmt: skip
+               tabindex=0, aria_label="Behaviour map; arrow keys choose a cell")  # fmt: skip
 
 
 def _rectangles(map_: BehaviourMap, frame: Frame, level_N: NDArray[np.int64]) -> list[Markup]:
@@ -232,25 +230,37 @@ def _pairs(data: RunData, level_N: NDArray[np.int64]) -> Markup:
     return tag("div", *figures, class_="pairs")
 
 
-def _paths(data: RunData, frame: Frame | None) -> tuple[dict[str, Any], Markup | None]:
-    """`MapView.cells` and `MapView.path_figure`."""
-    map_ = data.map
+def _rows(data: RunData) -> dict[str, list[str]]:
+    """Number of a cell -> its name and its values in words."""
+    map_, rows = data.map, {}
     assert map_ is not None
-    rows = {}
     for row, cell in enumerate(map_.cell_N.tolist()):
         place = ", ".join(
             f"{name} {number(float(x))}" for name, x in zip(data.names, map_.descriptor_N_B[row], strict=True)
         )
         text = f"fitness {number(float(map_.fitness_N[row]))}; {place}; found in generation {map_.generation_N[row]:,}"
         rows[str(cell)] = [data.cell_name(cell), text]
+    return rows
+
+
+def path_lines(data: RunData) -> dict[str, Any]:
+    """The paths of `data.paths` for the page's script.
+
+    Returns:
+        `order`: numbers of the cells; `paths`: their paths in base64; `points`: the length of each; `lines`: number of
+        curves of a path, each with x and y; `detours`: number of a cell -> [number of a point, way from there to the
+        next point as SVG] where no straight line is drawn.
+    """
+    map_ = data.map
+    assert map_ is not None
     known = [cell for cell in map_.cell_N.tolist() if cell in data.paths]
-    found: dict[str, Any] = {"rows": rows, "order": known, "overlay": frame is not None, "points": 0, "lines": 1}
-    found["detours"] = {}
+    found: dict[str, Any] = {"order": known, "points": 0, "lines": 1, "detours": {}, "paths": ""}
     if not known:
-        return found | {"paths": ""}, None
+        return found
     path_N_T_B = np.stack([data.paths[cell] for cell in known]).astype(np.float64)
     points = path_N_T_B.shape[1]
-    if frame is not None:
+    if len(map_.geometry.bounds) == 2:
+        frame = floor.plan_frame(map_.geometry.bounds)
         inside_N_T_B = np.clip(path_N_T_B, *np.array(map_.geometry.bounds).T)  # an episode may leave the map meanwhile
         lines = np.stack([frame.across(inside_N_T_B[..., 0]), frame.down(inside_N_T_B[..., 1])], axis=-1)
         found["detours"] = {
@@ -258,15 +268,22 @@ def _paths(data: RunData, frame: Frame | None) -> tuple[dict[str, Any], Markup |
             for cell, inside_T_B in zip(known, inside_N_T_B, strict=True)
             if (around := detours(inside_T_B, data.task, map_.geometry.bounds))
         }
-        return found | {"points": points, "paths": packed(TENTHS * lines, "int16")}, None
-    shown = min(len(data.names), PAIRED_DIMENSIONS)
-    time = Frame(
-        (0.0, float(data.constants["task.episode_steps"])), (0.0, 1.0), 40, 8, floor.WIDTH - 50, PATH_HEIGHT - 48
-    )
+        return found | {"points": points, "paths": packed(TENTHS * lines, "int16")}
+    time, shown = _path_frame(data), min(len(data.names), PAIRED_DIMENSIONS)
     low_B, high_B = np.array(data.bounds).T
     share = np.clip((path_N_T_B - low_B) / (high_B - low_B), -0.02, 1.02)[..., :shown]
     x = np.broadcast_to(time.across(np.linspace(*time.x, points))[:, None], share.shape)
     lines = np.stack([x, time.down(share)], axis=-1).transpose(0, 2, 1, 3)
+    return found | {"points": points, "lines": shown, "paths": packed(TENTHS * lines, "int16")}
+
+
+def _path_frame(data: RunData) -> Frame:
+    steps = float(data.constants["task.episode_steps"])
+    return Frame((0.0, steps), (0.0, 1.0), 40, 8, floor.WIDTH - 50, PATH_HEIGHT - 48)
+
+
+def _path_figure(data: RunData) -> Markup:
+    shown = min(len(data.names), PAIRED_DIMENSIONS)
     legend = [tag("span", tag("i", class_=f"dot s{b}"), data.names[b], class_="key") for b in range(shown)]
     box = tag("rect", x=40, y=8, width=floor.WIDTH - 50, height=PATH_HEIGHT - 48, class_="ground")
     labels = joined(
@@ -278,8 +295,7 @@ def _paths(data: RunData, frame: Frame | None) -> tuple[dict[str, Any], Markup |
     )
     chart = tag("svg", box, labels, _overlay(), viewBox=f"0 0 {floor.WIDTH} {PATH_HEIGHT}", class_="map")
     caption = tag("figcaption", "Descriptor in the course of the chosen elite's episode, between the map's bounds")
-    figure = tag("figure", caption, chart, tag("div", *legend, class_="legend"))
-    return found | {"points": points, "lines": shown, "paths": packed(TENTHS * lines, "int16")}, figure
+    return tag("figure", caption, chart, tag("div", *legend, class_="legend"))
 
 
 def _way(frame: Frame, place_N_2: NDArray[np.float64]) -> str:

@@ -23,14 +23,14 @@ class Markup(str):
     __slots__ = ()
 
 
-def tag(name: str, *children: object, **attributes: object) -> Markup:
+def tag(name: str, /, *children: object, **attributes: object) -> Markup:
     """An element. A child or attribute that is None or False is left out; `class_` stands for class, `_` for `-`."""
     shown = "".join(
         f' {key.rstrip("_").replace("_", "-")}="{html.escape(str(value))}"'
         for key, value in attributes.items()
         if value is not None and value is not False
     )
-    return Markup(f"<{name}{shown}>{joined(children)}</{name}>")
+    return Markup(f"<{name}{shown}>" if name == "input" else f"<{name}{shown}>{joined(children)}</{name}>")
 
 
 def joined(children: Iterable[object]) -> Markup:

@@ -15,6 +15,8 @@ from es_service.report.settings import changed_settings
 
 Evaluate = Callable[[str], str]
 """Function from the name of a policy ("best", or a cell such as "3,17") to the text that evaluates it."""
+REPLAY = "replay"
+"""Id of the section of replays."""
 MOST_FAULTS = 20
 """Generations with faults that are listed one by one."""
 
@@ -32,17 +34,41 @@ def run_page(data: RunData, evaluate: Evaluate, replays: Mapping[str, Any] | Non
         evaluate: what evaluates a policy, as text to copy.
         replays: what `replays.replay_section` returns; None for no replay.
     """
-    sections = [_head(data)]
-    scripts: dict[str, Any] = {}
-    if data.history["generation"].size:
-        sections += [_curves(data, scripts), _map(data, evaluate, scripts), _cloud(data, scripts)]
-        if replays is not None:
-            sections.append(replays["section"])
-            scripts |= replays["scripts"]
-        sections += [_time(data), _faults(data)]
+    sections, scripts = run_sections(data, evaluate)
+    if replays is not None and data.history["generation"].size:
+        sections[REPLAY] = replays["section"]
+        scripts |= replays["scripts"]
     libraries = list(replays["libraries"]) if replays is not None else []
-    return document(f"{data.name}: {data.constants['search.algorithm']} on {data.constants['task.environment']}",
-                    sections, scripts, libraries)  # fmt: skip
+    return document(run_title(data), [one for one in sections.values() if one], scripts, libraries)
+
+
+def run_title(data: RunData) -> str:
+    """Name of a run, its search and its task."""
+    return f"{data.name}: {data.constants['search.algorithm']} on {data.constants['task.environment']}"
+
+
+def run_sections(data: RunData, evaluate: Evaluate | None) -> tuple[dict[str, Markup], dict[str, Any]]:
+    """The sections of a run's page by their ids, in order (that of replays is empty), and the data of its script.
+
+    Args:
+        evaluate: see `run_page`; None: the page asks `cell_details` for what it shows of a chosen cell.
+    """
+    sections, scripts = {"what": _head(data)}, {}
+    if data.history["generation"].size:
+        sections |= {
+            "curves": _curves(data, scripts),
+            "map": _map(data, evaluate, scripts),
+            "centres": _cloud(data, scripts),
+            REPLAY: Markup(),
+            "time": _time(data),
+            "faults": _faults(data),
+        }
+    return sections, scripts
+
+
+def cell_details(data: RunData, cell: int, evaluate: Evaluate) -> dict[str, Any]:
+    """What the page shows of a chosen cell: its path, which `data.paths` must have, and the call that evaluates it."""
+    return maps.path_lines(data) | {"evaluate": evaluate(data.cell_name(cell))}
 
 
 def document(title: str, sections: list[Markup], scripts: Mapping[str, Any], libraries: list[str] | None = None) -> str:
@@ -62,9 +88,9 @@ def document(title: str, sections: list[Markup], scripts: Mapping[str, Any], lib
     return f"<!DOCTYPE html>\n{tag('html', head, body, lang='en')}\n"
 
 
-def asset(name: str) -> str:
-    """Text of a file of `assets`."""
-    return (resources.files("es_service.report") / "assets" / name).read_text(encoding="utf-8")
+def asset(name: str, package: str = "es_service.report") -> str:
+    """Text of a file of a package's `assets`."""
+    return (resources.files(package) / "assets" / name).read_text(encoding="utf-8")
 
 
 def section(title: str, *content: object, id_: str) -> Markup:
@@ -120,7 +146,7 @@ def _curves(data: RunData, scripts: dict[str, Any]) -> Markup:
     )
 
 
-def _map(data: RunData, evaluate: Evaluate, scripts: dict[str, Any]) -> Markup:
+def _map(data: RunData, evaluate: Evaluate | None, scripts: dict[str, Any]) -> Markup:
     if data.map is None:
         enabled = data.constants.get("map.enabled")
         text = "The map cannot be read." if enabled else "This run has no behaviour map (map.enabled is false)."
@@ -129,12 +155,15 @@ def _map(data: RunData, evaluate: Evaluate, scripts: dict[str, Any]) -> Markup:
         return section("Behaviour map", tag("p", "No cell is filled yet."), id_="map")
     view = maps.map_view(data)
     names = {cell: row[0] for cell, row in view.cells["rows"].items()}
-    scripts["map"] = view.cells | {"evaluate": {cell: evaluate(name) for cell, name in names.items()}}
+    scripts["map"] = view.cells
+    if evaluate is not None:
+        scripts["map"] |= maps.path_lines(data) | {"evaluate": {cell: evaluate(one) for cell, one in names.items()}}
+    detours = data.task.walls if evaluate is None else scripts["map"]["detours"]
     fittest = str(int(data.map.cell_N[data.map.fitness_N.argmax()]))
     scripts["map"]["first"] = fittest
     return section(
         "Behaviour map",
-        tag("p", f"{view.explanation} {MAP_NOTE}{f' {DETOUR_NOTE}' if view.cells['detours'] else ''}", class_="note"),
+        tag("p", f"{view.explanation} {MAP_NOTE}{f' {DETOUR_NOTE}' if detours else ''}", class_="note"),
         tag(
             "div",
             tag("div", view.figure, maps.colour_bar(value_range(data.map.fitness_N), cells=maps.has_area(data.map))),

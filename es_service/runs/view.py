@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+draw_for_notebook: Callable[[Run], str] | None = None
+"""Set by `api`."""
+
+
 @dataclass(frozen=True)
 class Run:
     """A run folder, opened for reading. Every access reads the committed data, also while a driver is writing."""
@@ -181,6 +185,10 @@ class Run:
     def generation(self) -> int | None:
         """Newest committed generation; None before the first."""
         return reader.read_generation(self.folder)
+
+    def _repr_html_(self) -> str | None:
+        """What a notebook shows: summary, curves and map; `report/notebook.py` draws it, which is above this room."""
+        return None if draw_for_notebook is None else draw_for_notebook(self)
 
     def digest(self) -> str:
         """SHA-256 of everything deterministic in the run, after a check of all stored data.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,14 +59,55 @@ def read_sound(folder: Path, kept: Kept = lambda part, arrays: arrays) -> SoundR
     """
     problems: list[str] = []
     with _any_sound(folder, problems) as (connection, meta):
-        history, newest, evaluations = _history(connection, meta, problems)
-        found: list[tuple[int, dict[str, Any]]] = []
-        with _noted(problems, "the platforms cannot be read"):
-            found = platforms(connection)
-        generation, parts = None, {}
-        with _noted(problems, "the state cannot be read"):
-            generation, parts = _state(connection, kept, problems)
-    return SoundRun(meta, history, newest, evaluations, found, generation, parts, tuple(problems))
+        rows = Rows(meta)
+        rows.read(connection, problems)
+        return _sound_run(connection, rows, kept, problems)
+
+
+class Followed:
+    """A run that is read again and again; each time, what was read before is not read anew."""
+
+    def __init__(self, folder: Path, kept: Kept, wanted: Callable[[str], bool]) -> None:
+        """`kept`: as in `read_sound`; `wanted`: whether to read a part of this name at all."""
+        self.folder, self._kept, self._wanted = folder, kept, wanted
+        self._rows: Rows | None = None
+        self._known: dict[str, tuple[int, str, Arrays | None]] = {}
+
+    def read(self, most: int) -> tuple[SoundRun, bool]:
+        """The run as far as it is read now, with at most so many new rows, so that the transaction is short; and
+        whether these are all. Raises StoreError as `read_sound`."""
+        problems: list[str] = []
+        with _any_sound(self.folder, problems) as (connection, meta):
+            if self._rows is None or not self._rows.are_of(connection, meta):
+                self._rows, self._known = Rows(meta), {}
+            whole = self._rows.read(connection, problems, most)
+            found = _sound_run(connection, self._rows, self._kept, problems, self._wanted, self._known)
+            history, evaluations = (  # copies, since nothing can be added to a table whose columns are in use
+                {name: values.copy() for name, values in columns.items()}
+                for columns in (found.history, found.evaluations)
+            )
+            return replace(found, history=history, evaluations=evaluations), whole
+
+
+def _sound_run(
+    connection: sqlite3.Connection,
+    rows: Rows,
+    kept: Kept,
+    problems: list[str],
+    wanted: Callable[[str], bool] = lambda part: True,
+    known: dict[str, tuple[int, str, Arrays | None]] | None = None,
+) -> SoundRun:
+    """The run of a connection whose rows are read already; see `_state` for `wanted` and `known`."""
+    found: list[tuple[int, dict[str, Any]]] = []
+    with _noted(problems, "the platforms cannot be read"):
+        found = platforms(connection)
+    generation, parts = None, {}
+    with _noted(problems, "the state cannot be read"):
+        generation, parts = _state(connection, kept, problems, wanted, {} if known is None else known)
+    return SoundRun(
+        rows.meta, rows.history.columns(), rows.newest, rows.evaluations.columns(), found, generation, parts,
+        tuple(problems),
+    )  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -96,41 +137,76 @@ def _noted(problems: list[str], what: str) -> Iterator[None]:
         problems.append(f"{what}: {error}")
 
 
-def _history(
-    connection: sqlite3.Connection, meta: RunMeta, problems: list[str]
-) -> tuple[Columns, dict[str, int | float] | None, Columns]:
-    """The sound history rows, the last of them, and the centres that were evaluated; a damaged row is left out."""
-    columns, at = column_bytes(meta.columns), [column.name for column in meta.columns].index("generation")
-    history, evaluations = Table(meta.columns), Table((GENERATION, *meta.evaluation_columns))
-    last: Row | None = None
-    expected = 0
-    lost: list[range] = []
-    with _noted(problems, "the end of the history cannot be read"):
-        query = history_select(meta.columns) + " ORDER BY history.generation"
-        for *values, centres, state, sha256 in connection.execute(query):
-            row = tuple(values)
-            # A damaged page can also show rows again.
-            if not row_is_sound(columns, row, centres, state, sha256) or row[at] < expected:
-                continue
-            evaluated = table_rows(meta.evaluation_columns, centres)
-            history.add(row)
-            if row[at] > expected:
-                lost.append(range(expected, row[at]))
-            last, expected = row, row[at] + 1
-            for centre in evaluated:
-                evaluations.add((row[at], *centre))
-    with _noted(problems, "the number of generations cannot be read"):
-        newest = newest_state(connection)
-        if newest is not None and newest >= expected:
-            lost.append(range(expected, newest + 1))
-    if lost:
-        problems.append(f"the history rows of generations {_spans(lost)} are damaged or missing")
-    named = None if last is None else row_dict(meta.columns, last)
-    return history.columns(), named, evaluations.columns()
+class Rows:
+    """The sound history rows of a run, and the centres that were evaluated; a damaged row is left out."""
+
+    def __init__(self, meta: RunMeta) -> None:
+        self.meta = meta
+        self.history, self.evaluations = Table(meta.columns), Table((GENERATION, *meta.evaluation_columns))
+        self.sha256: object = None
+        """That of the last sound row."""
+        self.last: Row | None = None
+        self.next = 0
+        """Generation of the next row to be read."""
+        self._lost: list[range] = []
+
+    @property
+    def newest(self) -> dict[str, int | float] | None:
+        """The last of the rows, as values by column name."""
+        return None if self.last is None else row_dict(self.meta.columns, self.last)
+
+    def read(self, connection: sqlite3.Connection, problems: list[str], most: int = -1) -> bool:
+        """Read the rows after those that are read, at most so many (-1: all); return whether they are all."""
+        columns, at = column_bytes(self.meta.columns), [one.name for one in self.meta.columns].index("generation")
+        count, first = 0, self.next
+        with _noted(problems, "the end of the history cannot be read"):
+            query = history_select(self.meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation"
+            for *values, centres, state, sha256 in connection.execute(f"{query} LIMIT ?", (self.next, most)):
+                row, count = tuple(values), count + 1
+                # A damaged page can also show rows again.
+                if not row_is_sound(columns, row, centres, state, sha256) or row[at] < self.next:
+                    continue
+                evaluated = table_rows(self.meta.evaluation_columns, centres)
+                self.history.add(row)
+                if row[at] > self.next:
+                    self._lost.append(range(self.next, row[at]))
+                self.last, self.sha256, self.next = row, sha256, row[at] + 1
+                for centre in evaluated:
+                    self.evaluations.add((row[at], *centre))
+        whole = count != most or self.next == first  # so many damaged rows in a row are the end
+        lost = list(self._lost)
+        if whole:
+            with _noted(problems, "the number of generations cannot be read"):
+                newest = newest_state(connection)
+                if newest is not None and newest >= self.next:
+                    lost.append(range(self.next, newest + 1))
+        if lost:
+            problems.append(f"the history rows of generations {_spans(lost)} are damaged or missing")
+        return whole
+
+    def are_of(self, connection: sqlite3.Connection, meta: RunMeta) -> bool:
+        """Whether the last row is still that of the run, which may have fallen back, or be another one."""
+        if meta != self.meta or self.next == 0:
+            return meta == self.meta
+        with _noted([], ""):
+            query = "SELECT sha256 FROM history WHERE generation = ?"
+            return connection.execute(query, (self.next - 1,)).fetchone() == (self.sha256,)
+        return False
 
 
-def _state(connection: sqlite3.Connection, kept: Kept, problems: list[str]) -> tuple[int | None, dict[str, Arrays]]:
-    """The newest generation whose whole state is stored, and its parts; the newest parts there are if none is."""
+def _state(
+    connection: sqlite3.Connection,
+    kept: Kept,
+    problems: list[str],
+    wanted: Callable[[str], bool],
+    known: dict[str, tuple[int, str, Arrays | None]],
+) -> tuple[int | None, dict[str, Arrays]]:
+    """The newest generation whose whole state is stored, and its parts; the newest parts there are if none is.
+
+    Args:
+        wanted: whether to read a part of this name at all.
+        known: the parts of an earlier call, which are not read again, and are replaced by those of this one.
+    """
     stored = kept_rows(connection)
     found = (newest_state(connection), connection.execute("SELECT max(generation) FROM history").fetchone()[0])
     if (newest := max((at for at in found if at is not None), default=None)) is None:
@@ -144,15 +220,22 @@ def _state(connection: sqlite3.Connection, kept: Kept, problems: list[str]) -> t
         )
     parts: dict[str, Arrays] = {}
     damaged = []
+    before = dict(known)
+    known.clear()
     for part, (at, sha256) in sorted(rows_in_force(stored, generation).items()):
-        try:
-            payload = state_payload(connection, part, at)
-            if part_sha256(part, at, payload) != sha256:
-                raise ValueError(part)
-            arrays = kept(part, decode_part(payload))
-        except (sqlite3.Error, Damaged, ValueError):
-            damaged.append(part)
+        if not wanted(part):
             continue
+        at_before, sha256_before, arrays = before.get(part, (None, None, None))
+        if (at, sha256) != (at_before, sha256_before):
+            try:
+                payload = state_payload(connection, part, at)
+                if part_sha256(part, at, payload) != sha256:
+                    raise ValueError(part)
+                arrays = kept(part, decode_part(payload))
+            except (sqlite3.Error, Damaged, ValueError):
+                damaged.append(part)
+                continue
+        known[part] = at, sha256, arrays
         if arrays is not None:
             parts[part] = arrays
     if damaged:

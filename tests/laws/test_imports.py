@@ -16,7 +16,21 @@ from es_service.search.algorithms import OURS
 from workers.rollouts import BACKENDS
 
 ROOT = Path(__file__).parents[2]
-LAYERS = ("cli", "api", "report", "runs", "dispatch", "store", "loop", "search", "config", "protocol", "errors", "logs")
+LAYERS = (
+    "cli",
+    "api",
+    "watch",
+    "report",
+    "runs",
+    "dispatch",
+    "store",
+    "loop",
+    "search",
+    "config",
+    "protocol",
+    "errors",
+    "logs",
+)
 """From the user's side down."""
 LOWEST = ("protocol", "errors", "logs")
 """Layers that import nothing of the project."""

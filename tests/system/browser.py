@@ -84,13 +84,13 @@ class Page:
                 self.requests.append(message["params"]["request"]["url"])
         return message
 
-    def open(self, file: Path, width: int = 1280, *, dark: bool = False) -> None:
-        """Open a file and wait until its scripts have run."""
+    def open(self, page: Path | str, width: int = 1280, *, dark: bool = False) -> None:
+        """Open a file, or an address of this machine, and wait until its scripts have run."""
         height = 900 if width > 600 else 800
         self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.send("Emulation.setEmulatedMedia", features=[scheme])
-        address = file.absolute().as_uri()
+        address = page if isinstance(page, str) else page.absolute().as_uri()
         self.send("Page.navigate", url=address)
         self.until(f"document.readyState === 'complete' && location.href === {json.dumps(address)}")
         self.requests = [one for one in self.requests if one != address and not one.startswith("data:")]
@@ -138,6 +138,11 @@ class Page:
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self.send("Input.dispatchMouseEvent", type=kind, x=across, y=down, button="left", clickCount=1)
 
+    def key(self, name: str) -> None:
+        """Press a key that is no letter, such as ArrowLeft or Enter."""
+        for kind in ("keyDown", "keyUp"):
+            self.send("Input.dispatchKeyEvent", type=kind, key=name, code=name)
+
     def slide(self, selector: str, value: float) -> None:
         """Set a slider, as a user would with the keyboard."""
         self.value(
@@ -163,7 +168,7 @@ def browser() -> Iterator[Page]:
         # The protocol's pipes are the file descriptors 3 and 4 of the browser; bash moves them there.
         options = (
             "--remote-debugging-pipe --no-sandbox --headless --disable-gpu-sandbox --enable-unsafe-swiftshader "
-            f'--hide-scrollbars --host-resolver-rules="MAP * ~NOTFOUND" --user-data-dir={profile}'
+            f'--hide-scrollbars --host-resolver-rules="MAP * ~NOTFOUND, EXCLUDE 127.0.0.1" --user-data-dir={profile}'
         )
         script = f"exec 3<&{to_read} 4>&{from_write}; exec {needed()} {options}"
         process = subprocess.Popen(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import es_service
 from es_service import Stop
 from es_service.errors import StartError
 from tests.examples import optuna_pruning
+from tests.system.processes import ROOT
 from tests.system.session import SMALL
 
 pytestmark = pytest.mark.usefixtures("workers_here")
@@ -113,6 +115,27 @@ def test_a_notebook_shows_the_progress_unless_it_is_told_each_generation_or_not_
         assert "no generation was run" in shown("resume('b');")[-1][1]["data"]["text/html"]
         for told in ("progress=False", "on_generation=print"):
             assert shown(f"resume('b', {told});") == []
+    finally:
+        client.stop_channels()
+        manager.shutdown_kernel(now=True)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:jupyter_client")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_the_example_of_a_notebook_shows_what_it_has_stored(tmp_path, monkeypatch):
+    """Each of its cells runs, and shows the same kinds of things as when the notebook was stored."""
+    monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
+    cells = json.loads((ROOT / "tests/examples/notebook.ipynb").read_text())["cells"]
+    manager, client = start_new_kernel(cwd=str(tmp_path))
+    try:
+        for number, cell in enumerate(one for one in cells if one["cell_type"] == "code"):
+            found: list[dict] = []
+            code = "".join(cell["source"])
+            answer = client.execute_interactive(code, timeout=300, output_hook=found.append)["content"]
+            assert answer["status"] == "ok", answer
+            shown = [one["content"] for one in found if one["msg_type"] in ("stream", "display_data", "execute_result")]
+            assert [set(one["data"]) for one in shown] == [set(one["data"]) for one in cell["outputs"]], code
+            assert cell["execution_count"] == number + 1
     finally:
         client.stop_channels()
         manager.shutdown_kernel(now=True)

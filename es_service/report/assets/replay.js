@@ -1,9 +1,12 @@
 // Replays: the recorded poses, drawn with three.js where the page has WebGL, else the path from above.
 "use strict";
-window.addEventListener("DOMContentLoaded", () => {
+let endReplay = () => {};
+window.report.start.replay = () => {
+  endReplay(); // of the replay that this one replaces
   const { read, bytes, byId } = window.report;
   const data = read("replay");
-  if (!data) return;
+  if (!data || !byId("episode")) return;
+  const ended = new AbortController(), { signal } = ended;
   const episodes = data.episodes.map((one) => ({
     ...one,
     way: new Int16Array(bytes(one.way)),
@@ -141,6 +144,7 @@ window.addEventListener("DOMContentLoaded", () => {
         canvas.dataset.triangles = renderer.info.render.triangles;
       },
       listen(draw) { orbit.addEventListener("change", draw); },
+      end() { orbit.dispose(); renderer.dispose(); renderer.forceContextLoss(); }, // a page has few contexts
     };
   };
 
@@ -194,8 +198,10 @@ window.addEventListener("DOMContentLoaded", () => {
   scrub.addEventListener("input", () => { step = Number(scrub.value); exact = step; show(); });
   byId("episode").addEventListener("change", () => { stop(); load(); });
   byId("follow")?.addEventListener("change", () => { if (view.aim) { view.aim(); show(); } });
-  window.addEventListener("resize", show);
-  dark.addEventListener("change", show);
+  window.addEventListener("resize", show, { signal });
+  dark.addEventListener("change", show, { signal });
   load();
   view.listen?.(() => view.draw());
-});
+  endReplay = () => { stop(); ended.abort(); view.end?.(); };
+};
+window.addEventListener("DOMContentLoaded", window.report.start.replay);

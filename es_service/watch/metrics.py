@@ -1,0 +1,75 @@
+"""The newest numbers of all runs as text for Prometheus."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+from es_service.errors import ServiceError
+from es_service.runs.recent import FAULTS_OF, read_recent
+from es_service.watch.runs import FORGED, Summary
+
+GAUGES = {
+    "generation": ("generation", "Newest committed generation."),
+    "env_steps": ("env_steps", "Environment steps until then."),
+    "steps_per_second": ("steps_per_second", "Environment steps a second of the newest generation."),
+    "best_fitness": ("best_fitness", "Highest mean fitness of an evaluated centre: selected, not certified."),
+    "coverage": ("coverage", "Filled cells as a share of all cells."),
+    "workers": ("workers", "Workers of the newest generation."),
+}
+"""Metric -> history column, meaning."""
+OTHERS = {
+    "running": "Whether a driver is writing.",
+    "readable": "Whether the run can be read.",
+    "certified_fitness": "Mean return of the policy that the newest certification has put first.",
+    "lost_workers": f"Workers lost in the newest {FAULTS_OF} generations.",
+    "retries": f"Chunks sent again in the newest {FAULTS_OF} generations.",
+}
+PREFIX = "es_service_"
+
+
+def metrics(summaries: Iterable[Summary]) -> str:
+    """A gauge for each number of each run, labelled with the run, its task and its search."""
+    values: dict[str, list[str]] = {name: [] for name in (*GAUGES, *OTHERS)}
+    for one in summaries:
+        labels = {"run": one.found.name}
+        try:
+            found = _values(one)
+            if one.standing is not None:
+                constants = one.standing.run.constants
+                labels |= {"task": constants["task.environment"], "search": constants["search.algorithm"]}
+        except FORGED:
+            found = {"readable": 0.0}
+        shown = ",".join(f'{name}="{_escaped(str(text))}"' for name, text in labels.items())
+        for name, value in found.items():
+            if math.isfinite(value):
+                values[name].append(f"{PREFIX}{name}{{{shown}}} {value!r}\n")
+    about = {name: text for name, (_, text) in GAUGES.items()} | OTHERS
+    return "".join(
+        f"# HELP {PREFIX}{name} {about[name]}\n# TYPE {PREFIX}{name} gauge\n{''.join(lines)}"
+        for name, lines in values.items()
+        if lines
+    )
+
+
+def _values(one: Summary) -> Mapping[str, float]:
+    found: dict[str, float] = {"readable": float(one.standing is not None)}
+    if one.standing is None:
+        return found
+    row = one.standing.row
+    found["running"] = float(one.standing.driver is not None)
+    if one.certified is not None:
+        found["certified_fitness"] = float(one.certified.row()["return_mean"])
+    if row is not None:
+        found |= {name: float(row[column]) for name, (column, _) in GAUGES.items() if column in row}
+        try:
+            recent = read_recent(one.standing.run, int(row["generation"]))
+        except ServiceError:  # it was deleted meanwhile
+            return found
+        if recent.problem is None:
+            found |= {"lost_workers": float(recent.lost_workers), "retries": float(recent.retries)}
+    return found
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")

@@ -1,0 +1,191 @@
+"""What the live pages show: the list of runs, one run, several compared. The sections are those of the reports."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from es_service.errors import ServiceError
+from es_service.report.compare_page import comparison_sections
+from es_service.report.data import RunData
+from es_service.report.facts import number
+from es_service.report.maps import empty_pattern
+from es_service.report.markup import Markup, tag
+from es_service.report.page import REPLAY, run_sections, run_title, section
+from es_service.report.progress import short
+from es_service.runs.standing import state
+from es_service.watch.channels import Picture
+from es_service.watch.runs import FORGED, Found, Reading, Runs, Summary
+
+SECTION_OF = {"charts": "curves", "map": "map", "cloud": "centres"}
+"""Data of the page's script -> the section that they belong to."""
+NO_DIGEST = "not computed for a live page; es-service digest and report compute it"
+NO_REPLAY = (
+    "Click a cell of the map, or choose one with the arrow keys and press Enter, to see its elite's episode here."
+)
+HEADS = (
+    "",
+    "run",
+    "state",
+    "generation",
+    "steps",
+    "steps/s",
+    "best",
+    "certified",
+    "coverage",
+    "task",
+    "search",
+    "seed",
+)
+
+
+def shell(title: str, events: str, base: str = "") -> str:
+    """HTML of a live page, whose sections arrive as events.
+
+    Args:
+        events: address of the events.
+        base: address of the run, below which its cells and replays are; empty for other pages.
+    """
+    head = tag(
+        "head",
+        Markup('<meta charset="utf-8">'),
+        Markup('<meta name="viewport" content="width=device-width, initial-scale=1">'),
+        tag("title", title),
+        *(Markup(f'<link rel="stylesheet" href="/assets/{name}">') for name in ("page.css", "live.css")),
+    )
+    status = tag("span", "connecting", id="connection", role="status")
+    home = tag("a", "All runs", href="/") if events != "/events/list" else None
+    header = tag("header", tag("nav", home, status), tag("h1", title))
+    scripts = [tag("script", src=f"/assets/{name}") for name in ("page.js", "replay.js", "live.js")]
+    body = tag("body", empty_pattern(), header, tag("main"), *scripts, data_events=events, data_base=base)
+    return f"<!DOCTYPE html>\n{tag('html', head, body, lang='en')}\n"
+
+
+def draw_list(runs: Runs) -> Callable[[], Picture]:
+    """What draws the list of all runs."""
+
+    def draw() -> Picture:
+        found = runs.summaries()
+        running = sum(one.standing is not None and one.standing.driver is not None for one in found)
+        said = f"{len(found):,} runs, of which {running:,} are running." if found else "There is no run yet."
+        rows = [tag("tr", *_row(one)) for one in found]
+        heads = tag("thead", tag("tr", *(tag("th", head, scope="col") for head in HEADS)))
+        listed = tag("div", tag("table", heads, tag("tbody", *rows), class_="runs"), class_="scroll") if rows else None
+        choice = tag("button", "Compare the ticked runs", type="submit") if len(found) > 1 else None
+        form = tag("form", tag("p", said, class_="verdict"), listed, choice, action="/compare", method="get")
+        return Picture("Runs", {"runs": tag("section", form, id="runs")}, {})
+
+    return draw
+
+
+def _row(one: Summary) -> list[Markup]:
+    """The cells of a row; a run with forged data hides no other."""
+    try:
+        return _cells(one)
+    except FORGED as error:
+        return _cells(Summary(one.found, None, None, f"its data are not those of a run: {error!r}"))
+
+
+def _cells(one: Summary) -> list[Markup]:
+    """The cells of a row, each with the name of its column for narrow windows."""
+    found, standing = one.found, one.standing
+    box = tag("input", type="checkbox", name="run", value=found.key, aria_label=f"compare {found.name}")
+    link = tag("a", found.name, href=f"/run/{found.key}")
+    if standing is None:
+        values = [None, link, tag("span", one.problem, class_="problem"), *[None] * (len(HEADS) - 3)]
+    else:
+        constants, row, limits = standing.run.constants, standing.row or {}, standing.limits
+        of = {key: f" of {short(limit)}" for key, limit in limits.items()}
+        best = number(row["best_fitness"]) if row else ""
+        certified = "" if one.certified is None else number(one.certified.row()["return_mean"])
+        share = row.get("coverage")
+        coverage = "" if share is None else f"{100 * share:.1f} %"
+        values = [
+            box, link, state(standing),
+            f"{row['generation']:,}{of.get('generations', '')}" if row else "",
+            f"{short(row['env_steps'])}{of.get('env_steps', '')}" if row else "",
+            _short(row.get("steps_per_second")), best, certified, coverage,
+            constants["task.environment"], constants["search.algorithm"], constants["seed"],
+        ]  # fmt: skip
+    return [tag("td", value, data_head=head) for head, value in zip(HEADS, values, strict=True)]
+
+
+def _short(value: float | None) -> str:
+    return "" if value is None or not math.isfinite(value) else short(value)
+
+
+def draw_run(runs: Runs, found: Found, reading: Reading) -> Callable[[], Picture | None]:
+    """What draws one run; what was seen of it remains if it is moved or deleted."""
+    last, told = Picture(found.name, {}, {}), ""
+
+    def draw() -> Picture | None:
+        nonlocal last, told
+        try:
+            if not reading.update() and not told:
+                return None
+        except ServiceError as error:
+            other = None if reading.data is None else runs.moved(reading.data.meta.run_id, found)
+            before, told = told, f"{error.sentence} {other}"
+            where = () if other is None else (" It is now ", tag("a", other.name, href=f"/run/{other.key}"), ".")
+            others = {one: html for one, html in last.sections.items() if one != "live"}
+            shown = {"live": _notice(error.sentence, *where), **others}
+            return None if told == before else last._replace(sections=shown, more=False)
+        assert reading.data is not None
+        last, told = _run_picture(reading.data, whole=reading.whole), ""
+        return last
+
+    return draw
+
+
+def _run_picture(data: RunData, *, whole: bool) -> Picture:
+    sections, scripts = run_sections(replace(data, digest=NO_DIGEST), None)
+    if not whole:
+        newest = data.last("generation")
+        said = f"Generations up to {newest:,.0f} are shown, since the others are still being read."
+        sections = {"live": _notice(said)} | sections
+    shown = {("replays" if one == REPLAY else one): html for one, html in sections.items()}
+    if "replays" in shown:
+        best = tag("button", "Replay the best centre", type="button", id="replay-best")
+        note = tag("p", NO_REPLAY, class_="note") if "map" in scripts else None
+        controls = tag("div", best, tag("span", id="recording", role="status"), class_="controls")
+        shown["replays"] = section("Replay", note, controls, tag("div", id="shown"), id_="replays")
+    return Picture(run_title(data), shown, {SECTION_OF[name]: {name: one} for name, one in scripts.items()}, not whole)
+
+
+def draw_comparison(readings: Sequence[tuple[Found, Reading]], keys: Sequence[str]) -> Callable[[], Picture | None]:
+    """What draws the comparison of runs; arguments as of `comparison_sections`."""
+    drawn: Any = None
+
+    def draw() -> Picture | None:
+        nonlocal drawn
+        notices, changed = [], []
+        for _, reading in readings:
+            try:
+                changed.append(reading.update())
+            except ServiceError as error:
+                notices.append(error.sentence)
+        used = [reading for _, reading in readings if reading.data is not None and _begun(reading.data)]
+        notices += [f"{found.name} has no finished generation yet." for found, one in readings if one not in used]
+        if not any(changed) and notices == drawn:
+            return None
+        drawn = notices
+        try:
+            title, sections, scripts = comparison_sections([one.data for one in used if one.data], keys)
+        except ServiceError as error:
+            title, sections, scripts = "Comparison", {}, {}
+            notices = [*notices, error.sentence]
+        shown = {"live": _notice(*notices)} if notices else {}
+        of = {SECTION_OF[name]: {name: one} for name, one in scripts.items()}
+        return Picture(title, shown | sections, of, not all(one.whole for one in used))
+
+    return draw
+
+
+def _begun(data: RunData) -> bool:
+    return bool(data.history["generation"].size)
+
+
+def _notice(*said: object) -> Markup:
+    return tag("section", tag("p", *said, class_="problem", role="alert"), id="live")

@@ -1,0 +1,173 @@
+"""The runs below some folders, read again and again: which there are, and what is new in one of them.
+
+A run is named by a key, which is looked up among the runs that were found, so that no request can name a file. Links
+are followed for the folders that were given, and for nothing below them: neither a folder nor a file of a run may be a
+link that leads out of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from es_service.errors import ServiceError, StoreError
+from es_service.report.data import RunData, followed, run_data
+from es_service.runs.certified import Certified, certified_policies, newest_certified
+from es_service.runs.standing import Standing, look
+from es_service.runs.view import open_run
+from es_service.store.folder import CONFIG, COPY, DATABASE, LOCK, holds_run
+from es_service.store.lock import lock_holder
+
+MOST_ROWS = 20_000
+"""Generations that are read at once: half a second of a core, so that a long run has its first picture soon and its
+log can be emptied meanwhile."""
+AGAIN_S = 30.0
+"""A run is read again after so many seconds, even if its files look the same: a network file system may be late."""
+DEEPEST = 8
+"""Levels of folders below a given one in which runs are found."""
+FILES = (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm", f"{DATABASE}-journal", COPY, CONFIG, LOCK)
+
+
+FORGED = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+"""What data raise that a run of ours cannot have, although their hashes are right."""
+
+
+class Found(NamedTuple):
+    """A run below a given folder."""
+
+    key: str
+    name: str
+    """Its folder as users name it: the given folder, and the way from there."""
+    folder: Path
+    root: Path
+
+
+class Summary(NamedTuple):
+    """What a list shows of a run."""
+
+    found: Found
+    standing: Standing | None
+    certified: Certified | None
+    problem: str
+    """Why it cannot be read; empty if it can."""
+
+
+class Runs:
+    """All runs below some folders."""
+
+    def __init__(self, roots: Sequence[Path]) -> None:
+        self._roots = [root.absolute() for root in roots]
+        self._known: dict[str, Found] = {}
+        self._summaries: dict[str, tuple[Any, Summary]] = {}
+
+    def find(self) -> list[Found]:
+        """The runs that there are now, in the order of their names."""
+        found = {one.key: one for root in self._roots for one in _below(root)}
+        self._known |= found
+        self._summaries = {key: one for key, one in self._summaries.items() if key in found}
+        return list(found.values())
+
+    def get(self, key: str) -> Found | None:
+        """A run that is there, or was there before; None if there is none of this key."""
+        return self._known.get(key) or {one.key: one for one in self.find()}.get(key)
+
+    def summaries(self) -> list[Summary]:
+        """All runs; those whose files have not changed are not read again."""
+        return [self._summary(one) for one in self.find()]
+
+    def _summary(self, found: Found) -> Summary:
+        seen = seen_of(found.folder)
+        before = self._summaries.get(found.key)
+        if before is None or before[0] != seen:
+            self._summaries[found.key] = before = seen, _summary(found)
+        return before[1]
+
+    def moved(self, run_id: str, but: Found) -> Found | None:
+        """A run of this id in another folder."""
+        for one in self.summaries():
+            if one.found.key != but.key and one.standing is not None and one.standing.run.run_id == run_id:
+                return one.found
+        return None
+
+
+class Reading:
+    """A run that is read again and again; each time, only what is new."""
+
+    def __init__(self, found: Found) -> None:
+        self._found, self._followed = found, followed(found.folder)
+        self._seen: Any = None
+        self.data: RunData | None = None
+        """The run as it was read last; None before that."""
+        self.whole = False
+        """Whether all of its generations are read."""
+
+    def update(self) -> bool:
+        """Read what is new; return whether there was something. Raises StoreError if the run cannot be read."""
+        seen = seen_of(self._found.folder), time.monotonic() // AGAIN_S
+        if self.whole and seen == self._seen:
+            return False
+        require_inside(self._found)
+        driver = lock_holder(self._found.folder)  # read before the history, so that the last row is not missed
+        self.whole, self._seen = False, None
+        found, self.whole = self._followed.read(MOST_ROWS)
+        self.data, self._seen = run_data(self._found.folder, found, driver), seen
+        return True
+
+
+def seen_of(folder: Path) -> Mapping[str, Any]:
+    """What shows without opening a run whether it has changed: its files, and who writes."""
+    found: dict[str, Any] = {}
+    for name in (DATABASE, f"{DATABASE}-wal", COPY, CONFIG):
+        try:
+            stat = os.stat(folder / name)
+        except OSError:
+            continue
+        found[name] = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
+    return found | {LOCK: lock_holder(folder)}
+
+
+def require_inside(found: Found) -> None:
+    """Raise StoreError if the folder of a run, or one of its files, is a link out of the folder that was given."""
+    root = found.root.resolve()
+    for name in ("", *FILES):
+        if not (found.folder / name).resolve().is_relative_to(root):
+            what = f"{found.folder / name} is a link that leads out of {found.root}; it is not followed"
+            raise StoreError(what, run=found.folder)
+
+
+def _summary(found: Found) -> Summary:
+    try:
+        require_inside(found)
+        standing = look(open_run(found.folder))
+        certified = newest_certified(certified_policies(found.folder))
+    except ServiceError as error:
+        return Summary(found, None, None, " ".join(error.sentence.split()))
+    except FORGED as error:
+        return Summary(found, None, None, f"its data are not those of a run: {error!r}")
+    return Summary(found, standing, certified, "")
+
+
+def _below(root: Path) -> Iterator[Found]:
+    for folder in _run_folders(root, DEEPEST):
+        key = hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]
+        name = root.name if folder == root else str(Path(root.name) / folder.relative_to(root))
+        # A name may be no UTF-8; then it is shown with question marks.
+        yield Found(key, os.fsencode(name).decode(errors="replace"), folder, root)
+
+
+def _run_folders(folder: Path, deeper: int) -> Iterator[Path]:
+    """Run folders in and below a folder, in the order of their names; hidden ones are runs in creation, or not runs."""
+    try:
+        if holds_run(folder):
+            yield folder
+            return
+        inside = [one.name for one in os.scandir(folder) if one.is_dir(follow_symlinks=False) and one.name[:1] != "."]
+    except (OSError, ServiceError):
+        return  # it was deleted meanwhile, or is not ours to read
+    if deeper:
+        for name in sorted(inside):
+            yield from _run_folders(folder / name, deeper - 1)

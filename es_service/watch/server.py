@@ -1,0 +1,237 @@
+"""The server of the live page: its addresses, and what answers each of them.
+
+Reading and drawing are done in threads, a replay by a child process of one more; one replay at a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import socket
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from es_service.errors import ConfigError, ServiceError
+from es_service.loop.parts import elite_part
+from es_service.report.data import TRACE, RunData
+from es_service.report.page import Evaluate, asset, cell_details
+from es_service.report.replays import replay_section
+from es_service.runs.view import open_run
+from es_service.watch import pages
+from es_service.watch.channels import Allowance, Channel, Picture
+from es_service.watch.guard import LOCAL, Guard
+from es_service.watch.metrics import metrics
+from es_service.watch.runs import Found, Reading, Runs, require_inside
+
+ASSETS = {
+    "page.css": ("es_service.report", "text/css"),
+    "page.js": ("es_service.report", "text/javascript"),
+    "replay.js": ("es_service.report", "text/javascript"),
+    "three.bundle.js": ("es_service.report", "text/javascript"),
+    "live.css": ("es_service.watch", "text/css"),
+    "live.js": ("es_service.watch", "text/javascript"),
+}
+MOST_COMPARED = 50
+MOST_REPLAYS = 16
+"""Replays that are kept for the next viewer."""
+_READING = ThreadPoolExecutor(4, "reading")
+_RECORDING = ThreadPoolExecutor(1, "recording")
+T = TypeVar("T")
+
+
+class Site:
+    """The live page of the runs below some folders."""
+
+    def __init__(self, roots: Sequence[Path], evaluate: Callable[[Path], Evaluate], *, trusted: bool) -> None:
+        """`evaluate`: what evaluates a policy of a run's folder, as text. `trusted`: see `replay_section`."""
+        self._runs, self._evaluate, self._trusted = Runs(roots), evaluate, trusted
+        self._channels: dict[str, Channel] = {}
+        self._allowance, self._recording = Allowance(), asyncio.Lock()
+        self._readings: dict[str, Reading] = {}
+        self._replays: dict[tuple[Any, ...], dict[str, Any]] = {}
+
+    def app(self, token: str | None) -> Starlette:
+        """The ASGI application."""
+        routes = [
+            Route("/", self._list),
+            Route("/run/{key}", self._run),
+            Route("/run/{key}/cell/{cell:int}", self._cell),
+            Route("/run/{key}/replay/{which}", self._replay, methods=["POST"]),
+            Route("/compare", self._compare),
+            Route("/events/{page:path}", self._events),
+            Route("/metrics", self._metrics),
+            Route("/assets/{name}", self._asset),
+        ]
+        return Starlette(routes=routes, middleware=[Middleware(Guard, token=token)])
+
+    async def _list(self, request: Request) -> Response:
+        return HTMLResponse(pages.shell("Runs", "/events/list"))
+
+    async def _run(self, request: Request) -> Response:
+        found = await self._found(request.path_params["key"])
+        return HTMLResponse(pages.shell(found.name, f"/events/run/{found.key}", f"/run/{found.key}"))
+
+    async def _compare(self, request: Request) -> Response:
+        return HTMLResponse(pages.shell("Comparison", f"/events/compare?{request.url.query}"))
+
+    async def _metrics(self, request: Request) -> Response:
+        text = await _in(_READING, lambda: metrics(self._runs.summaries()))
+        return PlainTextResponse(text, media_type="text/plain; version=0.0.4")
+
+    async def _asset(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        if name not in ASSETS:
+            raise HTTPException(404)
+        package, kind = ASSETS[name]
+        return Response(asset(name, package), media_type=kind)
+
+    async def _events(self, request: Request) -> Response:
+        name = request.path_params["page"]
+        if name == "compare":
+            name += f"?{request.url.query}"
+        if name not in self._channels:
+            draw, reading = await self._drawer(request)
+            if name not in self._channels:  # it may have been made meanwhile
+                self._channels[name] = Channel(draw, lambda: self._ended(name), self._allowance)
+                if reading is not None:
+                    self._readings[name] = reading
+        return StreamingResponse(self._channels[name].stream(), media_type="text/event-stream")
+
+    def _ended(self, name: str) -> None:
+        del self._channels[name]
+        self._readings.pop(name, None)
+
+    async def _drawer(self, request: Request) -> tuple[Callable[[], Picture | None], Reading | None]:
+        """What draws a page, and for the page of one run what reads it."""
+        match request.path_params["page"].split("/"):
+            case ["list"]:
+                return pages.draw_list(self._runs), None
+            case ["run", key]:
+                found = await self._found(key)
+                reading = Reading(found)
+                return pages.draw_run(self._runs, found, reading), reading
+            case ["compare"]:
+                keys = list(dict.fromkeys(request.query_params.getlist("run")))[:MOST_COMPARED]
+                compared = [(found, Reading(found)) for found in [await self._found(key) for key in keys]]
+                return pages.draw_comparison(compared, request.query_params.getlist("group_by")), None
+        raise HTTPException(404)
+
+    async def _found(self, key: str) -> Found:
+        found = await _in(_READING, lambda: self._runs.get(key))
+        if found is None:
+            raise HTTPException(404, "there is no such run below the folders that are watched")
+        return found
+
+    async def _cell(self, request: Request) -> Response:
+        """The path of an elite, and the call that evaluates it."""
+        found, cell = await self._found(request.path_params["key"]), request.path_params["cell"]
+        return JSONResponse(await _answer(_READING, lambda: self._details(found, cell)))
+
+    def _details(self, found: Found, cell: int) -> dict[str, Any]:
+        data = self._data(found)
+        if data.map is None or cell not in data.map.cell_N:
+            raise HTTPException(404, "this cell is empty")
+        try:
+            part = elite_part(cell)
+            paths = {cell: open_run(found.folder).parts(wanted=lambda name: name == part)[1][part][TRACE]}
+        except (ServiceError, KeyError):  # it is damaged, which the page says
+            paths = {}
+        return cell_details(replace(data, paths=paths), cell, self._evaluate(found.folder))
+
+    async def _replay(self, request: Request) -> Response:
+        found, which = await self._found(request.path_params["key"]), request.path_params["which"]
+        async with self._recording:
+            if await request.is_disconnected():  # the viewer has chosen another cell meanwhile
+                return Response(status_code=409)
+            return JSONResponse(await _answer(_RECORDING, lambda: self._recorded(found, which)))
+
+    def _recorded(self, found: Found, which: str) -> dict[str, Any]:
+        """The section of a replay, of "best" or of the elite of a cell, and what its script needs."""
+        data = self._data(found)
+        cells = [] if which == "best" else [_place(data, which)]
+        generation = data.best if which == "best" else _generation(data, int(which))
+        name = (found.key, data.meta.run_id, which, generation)
+        if name not in self._replays:
+            section = replay_section(data, best=which == "best", cells=cells, trusted=self._trusted)
+            while len(self._replays) >= MOST_REPLAYS:
+                del self._replays[next(iter(self._replays))]
+            self._replays[name] = {"html": section["section"], "data": section["scripts"]}
+        return self._replays[name]
+
+    def _data(self, found: Found) -> RunData:
+        """The run as an open page shows it, else as it is."""
+        require_inside(found)
+        reading = self._readings.get(f"run/{found.key}") or Reading(found)
+        if reading.data is None:
+            reading.update()
+        assert reading.data is not None
+        return reading.data
+
+
+def _place(data: RunData, cell: str) -> tuple[int, ...]:
+    if data.map is None or not cell.isdecimal() or int(cell) not in data.map.cell_N:
+        raise HTTPException(404, "this cell is empty")
+    return tuple(map(int, data.map.geometry.index_of(int(cell))))
+
+
+def _generation(data: RunData, cell: int) -> int:
+    assert data.map is not None
+    return int(data.map.generation_N[data.map.row_of(cell)])
+
+
+async def _in(threads: ThreadPoolExecutor, work: Callable[[], T]) -> T:
+    return await asyncio.get_running_loop().run_in_executor(threads, work)
+
+
+async def _answer(threads: ThreadPoolExecutor, work: Callable[[], T]) -> T:
+    try:
+        return await _in(threads, work)
+    except ServiceError as error:
+        raise HTTPException(409, error.sentence) from error
+
+
+def serve(
+    roots: Sequence[Path],
+    evaluate: Callable[[Path], Evaluate],
+    on_start: Callable[[str], None],
+    *,
+    host: str,
+    port: int,
+    trusted: bool,
+) -> None:
+    """Serve the live page until a signal arrives.
+
+    Args:
+        on_start: called with the address of the page, which contains the token if one is needed.
+        host: address to listen on; viewers need a token unless it is that of the loopback interface.
+        port: 0 for a free one.
+
+    Raises:
+        ConfigError: it cannot listen there.
+    """
+    token = None if host in LOCAL else secrets.token_urlsafe(32)
+    try:
+        listener = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        what = f"cannot listen on {host}, port {port}: {error.strerror or error}; choose another port, or 0 for any"
+        raise ConfigError(what, field="port", value=port) from error
+    config = uvicorn.Config(
+        Site(roots, evaluate, trusted=trusted).app(token),
+        log_config=None, log_level="critical", access_log=False, server_header=False, proxy_headers=False,
+        lifespan="off", ws="none", timeout_graceful_shutdown=1,
+    )  # fmt: skip
+    shown = f"[{host}]" if ":" in host else socket.gethostname() if host in ("0.0.0.0", "::") else host
+    address = f"http://{shown}:{listener.getsockname()[1]}/"
+    on_start(address if token is None else f"{address}?token={token}")
+    uvicorn.Server(config).run(sockets=[listener])
