@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from es_service.protocol.messages import SIGNS, TRACE_POINTS, PolicyShape, TaskSpec, WorkerSpec
+from es_service.protocol.messages import SIGNS, TRACE_POINTS, PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, evaluation_reset_keys, normal_integers, normals, uniforms
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from tests.twins import point_maze
 from workers.compilable import Compilable
-from workers.policy import act, normalise, split_layers
+from workers.policies.policy import act, normalise, split_layers
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 
 REGISTERING = """
@@ -40,9 +40,15 @@ class NumPy(RolloutBackend):
     compile_s = (1, 1)
     chunk_pairs = (1, 2)
 
-    def why_not(self, task: TaskSpec, policy: PolicyShape) -> str:
-        """It knows one task."""
-        return "" if task.name == "point_maze" else "it knows no other task than point_maze"
+    def why_not(self, task: TaskSpec, policy: PolicySpec) -> str:
+        """It knows one task and one output."""
+        if task.name != "point_maze":
+            return "it knows no other task than point_maze"
+        return (
+            ""
+            if policy.output == "tanh" and not policy.memory
+            else "it knows policies with tanh as output, without memory"
+        )
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """Loops over the episodes of a chunk."""
@@ -110,7 +116,7 @@ def episode(
     places, rewards, seen, done = [(x, y)], [], [], False
     while len(rewards) < spec.episode_steps and not done:
         seen.append(np.array([x, y], np.float32))
-        action_A = act(np, layers, normalise(np, seen[-1], mean_O, std_O, spec.observation_clip))
+        action_A, _ = act(np, spec.policy, layers, None, normalise(np, seen[-1], mean_O, std_O, spec.observation_clip))
         if action_key is not None:
             noise_A = normal_integers(np, action_key, np.arange(2, dtype=np.uint32) + np.uint32(2 * len(rewards)))
             action_A = action_A + np.float32(spec.action_noise / NORMAL_STD) * noise_A.astype(np.float32)
