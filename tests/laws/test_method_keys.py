@@ -60,6 +60,9 @@ OTHER = {
     "task.episodes_per_member": 2,
     "task.options.start": "corner",
     "policy.hidden": [6],
+    "policy.activation": "relu",
+    "policy.output": "linear",
+    "policy.bias": False,
     "policy.init": "small_columns",
     "policy.observation_normalization": False,
     "policy.observation_clip": 0.3,
@@ -127,6 +130,7 @@ NOT_MEASURED = {
     "search.init_from": "names a folder, of which the functions of a search know nothing",
     "search.candidate_choice": "chooses among the elites of that folder, which `test_polish.py` checks",
     "search.max_invalid_fraction": "stops a run, which `test_es.py` and `test_policies.py` check",
+    "policy.memory": "needs XLA; `test_policy_kinds.py` has it",
     "compute.rollout": "the other one is XLA",
     "compute.rollout_block_pairs": "only XLA uses it",
 }
