@@ -163,7 +163,12 @@ BEHAVIOUR_MAP, PARTS = "es_service/search/maps/behaviour_map.py", "es_service/lo
 GENERATION, TREE = "es_service/loop/generation.py", "es_service/protocol/gradient_tree.py"
 SCHEDULER, CHANGES = "es_service/dispatch/scheduler.py", "es_service/dispatch/scheduler_changes.py"
 ENGINE = "es_service/dispatch/engine.py"
-EPISODE, WORKER, RESULTS, POLICY = "workers/episode.py", "workers/worker.py", "workers/results.py", "workers/policy.py"
+EPISODE, WORKER, RESULTS, POLICY = (
+    "workers/episode.py",
+    "workers/worker.py",
+    "workers/results.py",
+    "workers/policies/policy.py",
+)
 XLA, SIMD = "workers/rollout.py", "workers/simd/episodes/rollout.py"
 COMPILED, HIDDEN = "workers/simd/episodes/compiled.py", "workers/simd/episodes/hidden.py"
 NETWORK = "workers/simd/episodes/network.py"

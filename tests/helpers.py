@@ -17,7 +17,7 @@ import pytest
 from es_service.dispatch.events import Limits
 from es_service.errors import Interrupted
 from es_service.protocol.evaluator import DispatchCounts
-from es_service.protocol.messages import Centre, Chunk, ChunkResult, PolicyShape, Work, WorkerSpec
+from es_service.protocol.messages import Centre, Chunk, ChunkResult, PolicySpec, Work, WorkerSpec
 from workers.recording import record
 from workers.worker import make_worker
 
@@ -28,7 +28,7 @@ SPEC = WorkerSpec(
     episode_steps=200,
     fitness="sum",
     episodes_per_member=1,
-    policy=PolicyShape((2, 8, 8, 2)),
+    policy=PolicySpec((2, 8, 8, 2)),
     observation_clip=5.0,
     action_noise=0.01,
     common_random_numbers=True,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from es_service.config.loading import load_config
-from es_service.config.model import policy_shape
+from es_service.config.model import policy_spec
 from es_service.loop.changes import changed_parts
 from es_service.loop.history import evaluated_columns, history_columns
 from es_service.loop.state import Best, RunState
@@ -46,7 +46,7 @@ def write_run(
     """
     source = {"task.environment": task.name, "search.algorithm": "me_es", "budget.generations": generations or 1}
     config = load_config({}, source | (settings or {}), tasks={task.name: task}, algorithms=OURS, rollouts=BACKENDS)
-    enabled, shape = config.map.enabled, policy_shape(config, task)
+    enabled, shape = config.map.enabled, policy_spec(config, task)
     meta = RunMeta(
         run_id=f"run-{config.seed}",
         created="2025-01-01T00:00:00+00:00",

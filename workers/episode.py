@@ -17,7 +17,8 @@ from es_service.protocol.messages import TRACE_POINTS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
 from workers.environments import Environment
 from workers.outputs import OUTPUTS
-from workers.policy import normalise
+from workers.policies.outputs import action, drawn_action
+from workers.policies.policy import initial_memory, normalise
 from workers.rollouts.backend import Episodes
 
 
@@ -26,6 +27,8 @@ class Carry(NamedTuple):
 
     state: Any
     alive: Any
+    memory_H: Any
+    """Memory of the policy; None for one without."""
     episode: Episodes
 
 
@@ -37,7 +40,8 @@ class EpisodeSteps(NamedTuple):
     look: Callable[[Carry, Any, Any], Any]
     """Function (carry, mean_O, std_O) -> normalised observation [O]."""
     move: Callable[[Carry, Any, Any, Any], Carry]
-    """Function (carry, mean_O, action [A], stream key of the action noise) -> carry; only training uses the key."""
+    """Function (carry, mean_O, outputs of the policy's last layer, stream key of the action noise) -> carry; only
+    training uses the key. The memory stays."""
 
 
 def episode_steps(
@@ -50,7 +54,7 @@ def episode_steps(
     """
     action_unit = np.float32(spec.action_noise / NORMAL_STD)
     action_size = spec.policy.widths[-1]
-    noisy = training and spec.action_noise > 0.0
+    noisy = spec.action_noise > 0.0
     named = {} if training else {name: OUTPUTS[name] for name in spec.outputs}
     points = min(TRACE_POINTS, spec.episode_steps + 1)
     last_steps_T = (np.arange(points) * spec.episode_steps // (points - 1)).astype(np.int32)
@@ -75,24 +79,29 @@ def episode_steps(
             trace_T_B=trace_T_B,
             outputs={name: output.begin(environment, state) for name, output in named.items()},
         )
-        return Carry(state, jnp.array(True), nothing)
+        return Carry(state, jnp.array(True), initial_memory(jnp, spec.policy), nothing)
 
     def look(carry: Carry, mean_O: Any, std_O: Any) -> Any:
         return normalise(jnp, observe(carry.state), mean_O, std_O, spec.observation_clip)
 
-    def action_noise(key: Any, step: Any) -> Any:
+    def training_action(outputs: Any, key: Any, step: Any) -> Any:
         coordinates_A = step.astype(jnp.uint32) * np.uint32(action_size) + jnp.arange(action_size, dtype=jnp.uint32)
-        return action_unit * normal_integers(jnp, key, coordinates_A).astype(jnp.float32)
+        action_A = drawn_action(jnp, spec.policy.output, outputs, key, coordinates_A)
+        if not noisy:
+            return action_A
+        return action_A + action_unit * normal_integers(jnp, key, coordinates_A).astype(jnp.float32)
 
     def traced(trace_T_B: Any, steps: Any, descriptor_B: Any) -> Any:
         """Trace whose points at this step and later are set to this descriptor; later steps overwrite them."""
         reached_T = steps + 1 <= last_steps_T
         return jnp.where(reached_T[:, None], descriptor_B, trace_T_B)
 
-    def move(carry: Carry, mean_O: Any, action_A: Any, action_key: Any) -> Carry:
+    def move(carry: Carry, mean_O: Any, outputs: Any, action_key: Any) -> Carry:
         alive, before = carry.alive, carry.episode
-        if noisy:
-            action_A = action_A + action_noise(action_key, before.steps)  # a living episode has done as many steps
+        if training:
+            action_A = training_action(outputs, action_key, before.steps)  # a living episode has done as many steps
+        else:
+            action_A = action(jnp, spec.policy.output, outputs)
         state, reward, done = environment.step(carry.state, action_A)
         distance = jnp.asarray(environment.goal_distance(state), jnp.float32)
         descriptor_B = jnp.asarray(environment.descriptor(state), jnp.float32)
@@ -110,6 +119,6 @@ def episode_steps(
             outputs={name: one.after(environment, state, reward, before.outputs[name]) for name, one in named.items()},
         )
         masked = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)
-        return Carry(state, alive & ~done, masked)
+        return Carry(state, alive & ~done, carry.memory_H, masked)
 
     return EpisodeSteps(begin, look, move)

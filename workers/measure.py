@@ -15,12 +15,12 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
+from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, stream_keys
 from es_service.protocol.rollouts import why_not
 from workers.describe import described
 from workers.environments import SHIPPED
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 from workers.rollouts import BACKENDS
 from workers.rollouts.backend import RolloutBackend
 
@@ -56,7 +56,7 @@ def measure(
         the rollout cannot compute the task or cannot run on this machine.
     """
     size = SHIPPED[task] if task in SHIPPED else described(task)
-    shape, backend = PolicyShape((size.observation_size, *hidden, size.action_size)), BACKENDS[rollout]
+    shape, backend = PolicySpec((size.observation_size, *hidden, size.action_size)), BACKENDS[rollout]
     if problem := why_not(backend, size, shape, here=True):
         return {"problem": problem}
     if policy:
@@ -77,7 +77,7 @@ def measure(
 
 
 def _with_policy(
-    backend: RolloutBackend, shape: PolicyShape, task: TaskSpec, options: Mapping[str, str], batch: int
+    backend: RolloutBackend, shape: PolicySpec, task: TaskSpec, options: Mapping[str, str], batch: int
 ) -> Callable[[int], int]:
     """Function that runs training episodes with a policy and returns the number of steps."""
     pairs = batch // 2

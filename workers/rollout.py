@@ -21,7 +21,7 @@ from es_service.protocol.policies import POLICY_SLOTS
 from workers.compilable import Compilable, jitted
 from workers.environments import Environment
 from workers.episode import Carry, episode_steps
-from workers.policy import act, split_layers
+from workers.policies.policy import act, split_layers
 
 
 def make_training_rollout(environment: Environment, spec: WorkerSpec) -> Compilable:
@@ -161,7 +161,7 @@ def _make_episodes(
     """
     steps = episode_steps(environment, spec, training=training)
     by_lane, of_statistics = 0 if training or own_weights else None, 0 if own_weights else None
-    policies = jax.vmap(lambda layers, x_O: act(jnp, layers, x_O), in_axes=(by_lane, 0))
+    policies = jax.vmap(lambda *given: act(jnp, spec.policy, *given), in_axes=(by_lane, 0, 0))
     looks = jax.vmap(steps.look, in_axes=(0, of_statistics, of_statistics))
     moves = jax.vmap(steps.move, in_axes=(0, of_statistics, 0, 0))
 
@@ -179,8 +179,9 @@ def _make_episodes(
 
         def body(at: tuple[Any, Carry, Carry | None]) -> tuple[Any, Carry, Carry | None]:
             step, carry, seen_T = at
-            action_L_A = policies(layers, looks(carry, mean_O, std_O))
-            return step + 1, moves(carry, mean_O, action_L_A, keys_L), keep(seen_T, step, carry)
+            outputs_L, memory_L_H = policies(layers, carry.memory_H, looks(carry, mean_O, std_O))
+            moved = moves(carry, mean_O, outputs_L, keys_L)._replace(memory_H=memory_L_H)
+            return step + 1, moved, keep(seen_T, step, carry)
 
         def unfinished(at: tuple[Any, Carry, Carry | None]):
             step, carry, _ = at

@@ -30,7 +30,7 @@ from es_service.protocol.noise import TEST_VECTORS, normal_integers, stream_keys
 from es_service.runs.signals import stop_on_signals
 from es_service.search.observation_statistics import no_observations, normalisation
 from es_service.store.folder import is_network_filesystem
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 from workers.simd.backend.target import NoVectorsError, host_target
 from workers.simd.episodes.kernel import compile_kernel
 

@@ -24,6 +24,7 @@ from es_service.config.problems import nearest, one_of, unfit
 from es_service.config.search import SearchConfig
 from es_service.config.yaml_text import in_line, parse_value, show
 from es_service.errors import Problem
+from es_service.protocol.policy_spec import PolicySpec
 
 SECTIONS = {
     name: field.annotation
@@ -60,6 +61,15 @@ RENAMED = {
 """Name of a key before version 0.13 -> its present name. What was an option of a search is a key of `search`."""
 BUDGET = [name for name in FIELDS if name.startswith("budget.")]
 """Keys of which at least one must be set."""
+
+
+def policy_of(values: Mapping[str, Any], observation_size: int, action_size: int) -> PolicySpec:
+    """The policy that values of a config make, by dotted key; keys that are missing have their defaults."""
+    names = ("hidden", "activation", "output", "bias", "memory")
+    hidden, activation, output, bias, memory = (
+        values.get(f"policy.{name}", FIELDS[f"policy.{name}"].default) for name in names
+    )
+    return PolicySpec((observation_size, *hidden, action_size), activation, output, bias, memory or 0)
 
 
 def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, Any], set[str], list[Problem]]:

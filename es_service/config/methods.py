@@ -19,6 +19,7 @@ from es_service.config.problems import not_allowed, one_of, unfit
 from es_service.config.search import SearchConfig
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
+from es_service.protocol.policy_spec import NOISY_OUTPUTS
 
 
 class HasSettings(Protocol):
@@ -97,6 +98,8 @@ def filled_in(values: Mapping[str, Any], settings: type[SearchConfig]) -> dict[s
     normalised = "policy.observation_normalization"
     if values.get(normalised, filled.get(normalised)) is False:
         filled["policy.observation_clip"] = None  # the bound is in standard deviations, which are then unknown
+    if values.get("policy.output", "tanh") not in NOISY_OUTPUTS:
+        filled["policy.action_noise"] = 0.0
     return filled
 
 

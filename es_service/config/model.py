@@ -28,7 +28,8 @@ from es_service.config.fields import (
 )
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.yaml_text import dump_yaml
-from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
+from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
+from es_service.protocol.policy_spec import Activation, Output
 from es_service.protocol.sources import worker_sources
 
 
@@ -53,9 +54,20 @@ class TaskConfig(Section):
 
 
 class PolicyConfig(Section):
-    """The controller: a tanh multilayer perceptron with outputs in [-1, 1]. Constants of the run."""
+    """The controller: a multilayer perceptron, perhaps with a memory. Constants of the run."""
 
-    hidden: Widths = Field((64, 64), description="Widths of the hidden layers; [] is a linear policy under a tanh.")
+    hidden: Widths = Field((64, 64), description="Widths of the hidden layers; [] is a linear policy under its output.")
+    activation: Activation = Field("tanh", description="Function after each hidden layer.")
+    memory: Count | None = Field(
+        None, description="Units of a gated recurrent cell (GRU) between the hidden layers and the last; null: none."
+    )
+    output: Output = Field(
+        "tanh",
+        description="What makes an action of the last layer: tanh; linear, the numbers themselves; argmax, 1 for the "
+        "greatest and 0 for the others; categorical, the same drawn by softmax probabilities; gaussian, tanh of a "
+        "normal variate with a mean and a spread of the last layer. Evaluations take the most probable action.",
+    )
+    bias: Switch = Field(True, description="Whether layers have biases.")
     init: Literal["unit_columns", "small_columns"] = Field(
         description="Initial weights: Gaussian columns scaled to a norm, biases 0. unit_columns: norm 1.0 in hidden "
         "layers, 0.01 in the output layer. small_columns: 0.01 in every layer. Set by the preset."
@@ -71,7 +83,8 @@ class PolicyConfig(Section):
     )
     action_noise: NotNegative = Field(
         0.01,
-        description="Standard deviation of the Gaussian noise added to actions in training episodes, in action units.",
+        description="Standard deviation of the Gaussian noise added to actions in training episodes, in action units. "
+        "Only outputs tanh and linear have it; for others it is 0.",
     )
 
 
@@ -182,9 +195,10 @@ def flat(sections: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return values
 
 
-def policy_shape(config: RunConfig, task: TaskSpec) -> PolicyShape:
-    """Shape of the policy network, from the task's observation to its action."""
-    return PolicyShape((task.observation_size, *config.policy.hidden, task.action_size))
+def policy_spec(config: RunConfig, task: TaskSpec) -> PolicySpec:
+    """The policy of a run, from the task's observation to its action."""
+    policy, widths = config.policy, (task.observation_size, *config.policy.hidden, task.action_size)
+    return PolicySpec(widths, policy.activation, policy.output, policy.bias, policy.memory or 0)
 
 
 def worker_spec(config: RunConfig, task: TaskSpec, outputs: tuple[str, ...] = ()) -> WorkerSpec:
@@ -198,7 +212,7 @@ def worker_spec(config: RunConfig, task: TaskSpec, outputs: tuple[str, ...] = ()
         seed=config.seed,
         environment=settings.environment,
         environment_options=dict(settings.options),
-        policy=policy_shape(config, task),
+        policy=policy_spec(config, task),
         episode_steps=settings.episode_steps,
         fitness=settings.fitness,
         episodes_per_member=settings.episodes_per_member,

@@ -13,16 +13,17 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from es_service.config.fields import RESOURCES
-from es_service.config.keys import FIELDS
+from es_service.config.keys import FIELDS, policy_of
 from es_service.config.map_rules import default_cells, default_kind, default_qd_offset
 from es_service.config.methods import default_centres
-from es_service.config.model import RunConfig, policy_shape
+from es_service.config.model import RunConfig, policy_spec
 from es_service.config.options import options_of
 from es_service.config.problems import not_allowed, one_of, unfit, wrong_value
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
-from es_service.protocol.messages import PolicyShape, TaskSpec, with_options
+from es_service.protocol.messages import TaskSpec, with_options
+from es_service.protocol.policy_spec import DISCRETE_OUTPUTS, NOISY_OUTPUTS, PolicySpec
 from es_service.protocol.rollouts import CHUNK_PAIRS, Rollouts, choose, why_not
 
 LEFT_OPEN: dict[str, str | None] = {
@@ -125,7 +126,7 @@ def resolve(
         for_ray = _value(values, "compute.address") is not None or has_actor_cores or _on_gpu(values)
         values["compute.engine"] = "ray" if for_ray else "inline"
     if "compute.rollout" in left_open and task is not None:
-        shape, gpu, here = _policy_shape(values, task), _on_gpu(values), _is_here(values)
+        shape, gpu, here = _policy_spec(values, task), _on_gpu(values), _is_here(values)
         values["compute.rollout"] = choose(rollouts, task, shape, gpu=gpu, here=here)
     has_pairs = settings is None or issubclass(settings, PopulationConfig)
     pairs = values.get("search.pairs") if has_pairs else WITHOUT_PAIRS
@@ -134,7 +135,7 @@ def resolve(
         values["compute.chunk_pairs"] = default_chunk_pairs(pairs, rollout.chunk_pairs if rollout else CHUNK_PAIRS)
     chunk_pairs = values.get("compute.chunk_pairs")
     if chunk_pairs is not None and task is not None:
-        parameters = _policy_shape(values, task).parameters
+        parameters = _policy_spec(values, task).parameters
         if "compute.rollout_block_pairs" in left_open:
             values["compute.rollout_block_pairs"] = default_rollout_block_pairs(chunk_pairs, parameters)
         if "compute.gradient_block_pairs" in left_open and pairs is not None:
@@ -154,18 +155,25 @@ def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
 
 
 def policy_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
-    """The problem of a network that is too large for the run store."""
-    shape = _policy_shape(values, task)
-    if shape.parameters <= MOST_PARAMETERS:
-        return []
-    hidden = list(shape.widths[1:-1])
+    """Problems of a network that is too large for the run store, and of an output that does not fit."""
+    spec, problems = _policy_spec(values, task), []
+    noise = values.get("policy.action_noise", 0.0)
+    if noise and spec.output not in NOISY_OUTPUTS:
+        why = f" for policy.output = {spec.output}, which has numbers only for {one_of(NOISY_OUTPUTS)}"
+        problems.append(not_allowed("policy.action_noise", noise, "0", why=why))
+    if spec.output in DISCRETE_OUTPUTS and task.action_size < 2:
+        why = f" for {task.name}, whose action is one number: {spec.output} chooses among several"
+        problems.append(not_allowed("policy.output", spec.output, "tanh, linear or gaussian", why=why))
+    if spec.parameters <= MOST_PARAMETERS:
+        return problems
+    hidden = list(spec.widths[1:-1])
     what = f"{show(hidden)} makes more than {MOST_PARAMETERS:,} parameters for {task.name}"
     problem = f"{what}, which is the most that the run store can keep; the layers must be narrower"
-    return [unfit("policy.hidden", hidden, problem, allowed="narrower")]
+    return [*problems, unfit("policy.hidden", hidden, problem, allowed="narrower")]
 
 
-def _policy_shape(values: Mapping[str, Any], task: TaskSpec) -> PolicyShape:
-    return PolicyShape((task.observation_size, *_value(values, "policy.hidden"), task.action_size))
+def _policy_spec(values: Mapping[str, Any], task: TaskSpec) -> PolicySpec:
+    return policy_of(values, task.observation_size, task.action_size)
 
 
 def shape_problems(values: Mapping[str, Any]) -> list[Problem]:
@@ -250,7 +258,7 @@ def rollout_problems(values: Mapping[str, Any], task: TaskSpec | None, rollouts:
         return [wrong_value("compute.rollout", name, f"auto or {one_of(rollouts)}", [*rollouts])]
     if _on_gpu(values) and not rollout.runs_on_gpus:
         why = f"{name} runs only on CPUs, but {RESOURCES}gpu is {show(_value(values, f'{RESOURCES}gpu'))}"
-    elif task is not None and (reason := rollout.why_not(task, _policy_shape(values, task))):
+    elif task is not None and (reason := rollout.why_not(task, _policy_spec(values, task))):
         why = f"{name} cannot run {task.name}: {reason}"
     else:
         return []
@@ -264,7 +272,7 @@ def config_warnings(config: RunConfig, task: TaskSpec, rollouts: Rollouts) -> li
     Args:
         rollouts: as for `resolve`.
     """
-    shape, here, names = policy_shape(config, task), config.compute.address is None, [*rollouts]
+    shape, here, names = policy_spec(config, task), config.compute.address is None, [*rollouts]
     faster = names[names.index(chosen := config.compute.rollout) + 1 :]
     warnings = [
         f"compute.rollout: {chosen} is used because {name} cannot run {task.name}: {why}"

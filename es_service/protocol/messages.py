@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.options import Option, OptionValue
 from es_service.protocol.policies import Policies, PolicyChunk
+from es_service.protocol.policy_spec import PolicySpec
 
 FloatArray = NDArray[np.float32]
 Bounds = tuple[tuple[float, float], ...]
@@ -77,31 +78,13 @@ def with_options(task: TaskSpec, options: Mapping[str, OptionValue]) -> TaskSpec
 
 
 @dataclass(frozen=True)
-class PolicyShape:
-    """Shape of a policy network. Its parameters are one flat vector [D]: per layer weights [in, out], then biases."""
-
-    widths: tuple[int, ...]
-    """Widths of the layers, from the observation to the action."""
-
-    @property
-    def layers(self) -> tuple[tuple[int, int], ...]:
-        """(inputs, outputs) of each layer."""
-        return tuple(zip(self.widths[:-1], self.widths[1:], strict=True))
-
-    @property
-    def parameters(self) -> int:
-        """Number of parameters, D."""
-        return sum(inputs * outputs + outputs for inputs, outputs in self.layers)
-
-
-@dataclass(frozen=True)
 class WorkerSpec:
     """Constants of the run that a worker needs; sent to it once, when it starts."""
 
     seed: int
     environment: str
     environment_options: dict[str, OptionValue]
-    policy: PolicyShape
+    policy: PolicySpec
     episode_steps: int
     fitness: Literal["sum", "final"]
     episodes_per_member: int

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
-from es_service.protocol.messages import PolicyShape, TaskSpec
+from es_service.protocol.messages import PolicySpec, TaskSpec
 
 CHUNK_PAIRS = (16, 64)
 """Fewest pairs of a chunk, so that the cost of messages does not exceed the gain from distributing a small population,
@@ -32,7 +32,7 @@ class Rollout(Protocol):
     chunk_pairs: tuple[int, int] = CHUNK_PAIRS
     """Limits within which `compute.chunk_pairs: auto` chooses the largest divisor of the pairs."""
 
-    def why_not(self, task: TaskSpec, policy: PolicyShape) -> str:
+    def why_not(self, task: TaskSpec, policy: PolicySpec) -> str:
         """Reason why it cannot compute episodes of a task with a policy; empty if it can.
 
         Unless a rollout says otherwise, the reason is what the description of the task has found.
@@ -48,7 +48,7 @@ Rollouts = Mapping[str, Rollout]
 """Rollouts by name, from the slowest to the fastest."""
 
 
-def choose(rollouts: Rollouts, task: TaskSpec, policy: PolicyShape, *, gpu: bool, here: bool) -> str:
+def choose(rollouts: Rollouts, task: TaskSpec, policy: PolicySpec, *, gpu: bool, here: bool) -> str:
     """Name of the rollout that `compute.rollout: auto` means: the fastest that can run; the slowest if none can, whose
     reason is then reported.
 
@@ -61,6 +61,6 @@ def choose(rollouts: Rollouts, task: TaskSpec, policy: PolicyShape, *, gpu: bool
     return able[-1] if able else next(iter(rollouts))
 
 
-def why_not(rollout: Rollout, task: TaskSpec, policy: PolicyShape, *, here: bool) -> str:
+def why_not(rollout: Rollout, task: TaskSpec, policy: PolicySpec, *, here: bool) -> str:
     """Reason why a rollout cannot compute episodes of a new run; empty if it can. Arguments are as for `choose`."""
     return rollout.why_not(task, policy) or (rollout.why_not_here() if here else "")

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from es_service.config.compute import implied_by
 from es_service.config.loading import Source
-from es_service.config.model import RunConfig, policy_shape
+from es_service.config.model import RunConfig, policy_spec
 from es_service.config.parallel import ANY_NUMBER
 from es_service.config.tasks import task_of
 from es_service.dispatch.engine import Engine
@@ -59,7 +59,7 @@ class PolicyEvaluator:
         self.config = config
         self.task = task
         """The task, with `descriptor_names` and `descriptor_bounds`."""
-        self.parameters = policy_shape(config, self.task).parameters
+        self.parameters = policy_spec(config, self.task).parameters
         """Number of parameters of a policy, D."""
         self._engine = engine
         self._closed = ""
@@ -172,7 +172,7 @@ def evaluator(
 
 def policies_of(config: RunConfig, task: TaskSpec, parameters: ArrayLike) -> FloatArray:
     """The argument `parameters` as policies, float32 [N, D]. Raises ConfigError if it is wrong."""
-    size = policy_shape(config, task).parameters
+    size = policy_spec(config, task).parameters
     allowed = f"an array of numbers of shape (policies, {size}), with at least one policy"
     policies_N_D = _floats("parameters", parameters, allowed)
     if policies_N_D.ndim != 2 or not len(policies_N_D) or policies_N_D.shape[1] != size:

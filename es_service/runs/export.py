@@ -74,16 +74,21 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
     """All policies of a run after one generation, with their observation statistics: the best centre, the newest
     centre (none if the generation evaluated only policies, as those of map_elites do) and every elite of the map.
 
-    Names: `widths` of the layers, `observation_clip` (NaN: none); for the best and the newest centre `best_parameters`
+    Names: `widths` of the layers, `activation`, `output`, `bias` and `memory` (0: none) as in the config,
+    `observation_clip` (NaN: none); for the best and the newest centre `best_parameters`
     [D], `best_mean` [O], `best_std` [O], `centre_parameters`, ...; for N elites `cell` [N, dimensions of the map],
     `fitness` [N], `descriptor` [N, B], `generation` [N], `samples` [N] (where they are counted), `parameters` [N, D],
     `mean` [N, O], `std` [N, O], `trace` [N, T, B]. A layer's weights [inputs, outputs] come before its biases, layer
-    after layer.
+    after layer; those of a memory are of its gates and its candidate (`workers/policies/recurrent.py`).
     """
     moment = run.at()
-    clip = run.constants["policy.observation_clip"]
+    clip, spec = run.constants["policy.observation_clip"], run.policy_spec
     found: dict[str, Any] = {
-        "widths": np.array(run.policy_shape.widths),
+        "widths": np.array(spec.widths),
+        "activation": np.array(spec.activation),
+        "output": np.array(spec.output),
+        "bias": np.array(spec.bias),
+        "memory": np.array(spec.memory),
         "observation_clip": np.array(math.nan if clip is None else clip),
     }
     stored: list[Literal["best", "centre"]] = ["best"] if moment.newest_centre is None else ["best", "centre"]
@@ -159,8 +164,8 @@ def ribs_archive(run: Run) -> Any:
 
 def _map_arrays(run: Run, map_: BehaviourMap, elites: dict[int, Elite]) -> dict[str, np.ndarray]:
     fields = {"parameters": "centre_D", "mean": "observation_mean_O", "std": "observation_std_O", "trace": "trace_T_B"}
-    sizes = {"parameters": (run.policy_shape.parameters,), "trace": (0, len(map_.geometry.bounds))}
-    none = run.policy_shape.widths[:1]
+    sizes = {"parameters": (run.policy_spec.parameters,), "trace": (0, len(map_.geometry.bounds))}
+    none = run.policy_spec.widths[:1]
     return {
         "cell": map_places(map_),
         "fitness": map_.fitness_N,

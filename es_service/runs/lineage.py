@@ -10,7 +10,7 @@ import numpy as np
 
 from es_service.config.changes import START_KEYS, does_not_fit, start_afresh
 from es_service.config.keys import Overrides, parse_overrides
-from es_service.config.model import RunConfig, policy_shape
+from es_service.config.model import RunConfig, policy_spec
 from es_service.config.parts import TargetObjective
 from es_service.config.search import CandidatesConfig
 from es_service.config.start import start_of
@@ -86,8 +86,8 @@ def fork_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> Ru
     if not unfit and list(names) != origin.descriptor_names:  # a task of the user that was edited
         what = f"the descriptor of {config.task.environment}"
         unfit = [_unfit(what, origin.descriptor_names, list(names), "task.environment")]
-    if not unfit and origin.policy_shape != (shape := policy_shape(config, task_of(config))):
-        old, new = list(origin.policy_shape.widths), list(shape.widths)
+    if not unfit and origin.policy_spec != (spec := policy_spec(config, task_of(config))):
+        old, new = list(origin.policy_spec.widths), list(spec.widths)
         unfit = [_unfit("the network's layers", old, new, "policy.hidden")]
     if unfit:
         raise _refused(origin, "its state does not fit these changes", unfit)
@@ -186,11 +186,14 @@ def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> t
             no newest centre.
     """
     folder, which = start_of(init_from)
-    origin, shape = open_run(folder), policy_shape(config, task_of(config))
-    if origin.policy_shape != shape:
+    origin, spec = open_run(folder), policy_spec(config, task_of(config))
+    if origin.policy_spec != spec:
+        mine, theirs = ({**vars(one), "widths": list(one.widths)} for one in (spec, origin.policy_spec))
+        name = next(name for name in mine if mine[name] != theirs[name])
+        word, key = ("layers", "hidden") if name == "widths" else (name, name)
         raise ConfigError(
-            f"search.init_from: the policy of {origin.folder} has layers {list(origin.policy_shape.widths)}, "
-            f"this run's policy has {list(shape.widths)}; use the same task and policy.hidden",
+            f"search.init_from: the policy of {origin.folder} has {word} {theirs[name]}, "
+            f"this run's policy has {mine[name]}; use the same task and policy.{key}",
             field="search.init_from",
             value=init_from,
             run=origin.folder,
@@ -208,7 +211,7 @@ def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> t
         kept = moment.best if isinstance(which, str) else origin.elite(which)
         centre_D, own = kept.centre_D, (kept.observation_mean_O, kept.observation_std_O)
     if not origin.constants[NORMALISED]:
-        moments = no_observations(shape.widths[0])  # they were gathered, but its policy did not use them
+        moments = no_observations(spec.widths[0])  # they were gathered, but its policy did not use them
     elif own is not None:
         # The statistics that the policy runs with, weighted by the run's number of observations.
         mean_O, std_O = (values.astype(np.float64) for values in own)
@@ -247,7 +250,7 @@ def _several(
         SEVERAL: np.stack([one.parameters_D for one in chosen]),
         "mean_K_O": np.stack([one.observation_mean_O for one in chosen]),
         "std_K_O": np.stack([one.observation_std_O for one in chosen]),
-        **moments_to_arrays(no_observations(origin.policy_shape.widths[0])),
+        **moments_to_arrays(no_observations(origin.policy_spec.widths[0])),
     }
     return _lineage(origin, moment.generation), Beginning(start=start)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from operator import index
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.config.keys import policy_of
 from es_service.errors import NotInRunError
 from es_service.loop.parts import (
     BEST,
@@ -26,13 +27,14 @@ from es_service.loop.parts import (
     moments_from_arrays,
 )
 from es_service.loop.state import Best, statistics_in_force
-from es_service.protocol.messages import FloatArray, PolicyShape
+from es_service.protocol.messages import FloatArray, PolicySpec
 from es_service.search.algorithms.base import CentreState
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.maps.geometry import Grid
 from es_service.store import reader
 from es_service.store.schema import RunMeta
-from workers.policy import act, normalise, split_layers
+from workers.policies.outputs import action
+from workers.policies.policy import act, initial_memory, normalise, split_layers
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,27 +42,54 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Policy:
-    """A trained controller that needs only NumPy: observation [O] or [..., O] -> action [..., A] in [-1, 1].
+    """A trained controller that needs only NumPy: observation [O] or [..., O] -> action [..., A].
 
-    It includes the observation statistics that it runs with.
+    It includes the observation statistics that it runs with. A policy with a memory is called through `start`.
     """
 
-    shape: PolicyShape
+    spec: PolicySpec
     parameters_D: FloatArray
     observation_mean_O: FloatArray
     observation_std_O: FloatArray
     observation_clip: float | None
 
     def __call__(self, observation: Any) -> FloatArray:
-        """Action for a raw (not normalised) observation, without action noise. Raises ValueError for a wrong size."""
+        """Action for a raw (not normalised) observation, as in evaluations: without noise, and the most probable one.
+
+        Raises ValueError for a wrong size, or if the policy has a memory.
+        """
+        if self.spec.memory:
+            raise ValueError(
+                "this policy has a memory of what it saw in an episode; call act = policy.start() at the start of each "
+                "episode, and then act(observation)"
+            )
+        return self.act(observation)[0]
+
+    def start(self) -> Callable[[Any], FloatArray]:
+        """Function from the observations of one episode, one after another, to actions; of several episodes at once if
+        they have leading axes. Each call of it continues the memory, if the policy has one."""
+        memory_H = None
+
+        def step(observation: Any) -> FloatArray:
+            nonlocal memory_H
+            found, memory_H = self.act(observation, memory_H)
+            return found
+
+        return step
+
+    def act(self, observation: Any, memory: FloatArray | None = None) -> tuple[FloatArray, FloatArray | None]:
+        """(action, memory after the step); the memory before it is None at the start of an episode. A policy without a
+        memory has None always."""
         observation = np.asarray(observation, np.float32)
-        size = self.shape.widths[0]
+        size = self.spec.widths[0]
         if observation.shape[-1:] != (size,):
             raise ValueError(
                 f"this policy takes observations of shape [..., {size}]; got shape {list(observation.shape)}"
             )
         x = normalise(np, observation, self.observation_mean_O, self.observation_std_O, self.observation_clip)
-        return act(np, split_layers(self.shape, self.parameters_D), x)
+        before = initial_memory(np, self.spec, *x.shape[:-1]) if memory is None else memory
+        outputs, after = act(np, self.spec, split_layers(self.spec, self.parameters_D), before, x)
+        return action(np, self.spec.output, outputs), after
 
 
 @dataclass(frozen=True)
@@ -187,13 +216,12 @@ class Moment:
 
 def make_policy(meta: RunMeta, parameters_D: FloatArray, mean_O: FloatArray, std_O: FloatArray) -> Policy:
     """A policy with the network and the observation clip of a run."""
-    return Policy(policy_shape(meta), parameters_D, mean_O, std_O, meta.constants["policy.observation_clip"])
+    return Policy(policy_spec(meta), parameters_D, mean_O, std_O, meta.constants["policy.observation_clip"])
 
 
-def policy_shape(meta: RunMeta) -> PolicyShape:
-    """Layer widths of a run's policies."""
-    widths = (meta.task["observation_size"], *meta.constants["policy.hidden"], meta.task["action_size"])
-    return PolicyShape(widths)
+def policy_spec(meta: RunMeta) -> PolicySpec:
+    """What a run's policies are."""
+    return policy_of(meta.constants, meta.task["observation_size"], meta.task["action_size"])
 
 
 def descriptor_names(meta: RunMeta) -> list[str]:

@@ -50,7 +50,7 @@ from es_service.store.beginning import Beginning
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
 from workers.cores import parts
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 
 MEASURE_S = 1.0
 """Time for the measurement of each kind of chunk."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from es_service.config.changes import again_with
 from es_service.config.compute import implied_by
-from es_service.config.model import RunConfig, policy_shape, worker_spec
+from es_service.config.model import RunConfig, policy_spec, worker_spec
 from es_service.config.parallel import chunks_at_once, parallel_sentence
 from es_service.config.tasks import task_of
 from es_service.dispatch.cores import cores
@@ -35,7 +35,7 @@ from es_service.store.beginning import SEVERAL
 from es_service.store.codec import Part
 from es_service.store.writer import RunStore
 from workers.actor import WorkerActor
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 
 _LOG = logger(__name__)
 LIMIT_NAMES = {
@@ -264,7 +264,7 @@ def initial_statistics(start: Part | None) -> list[tuple[FloatArray, FloatArray]
 
 def initial_policy(config: RunConfig, centre: int) -> FloatArray:
     """Random parameters [D] with which a centre of a run begins, by `policy.init` and the seed."""
-    return initial_parameters(policy_shape(config, task_of(config)), config.policy.init, config.seed, centre)
+    return initial_parameters(policy_spec(config, task_of(config)), config.policy.init, config.seed, centre)
 
 
 def worker_count(config: RunConfig, most: int | None = None) -> int:

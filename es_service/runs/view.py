@@ -15,9 +15,9 @@ from es_service.config.compute import COMPUTE_CONSTANTS
 from es_service.config.yaml_text import read_yaml_file
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop.parts import BEST, BLOCK_PREFIX, CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART, elite_part
-from es_service.protocol.messages import PolicyShape
+from es_service.protocol.messages import PolicySpec
 from es_service.runs.certified import certified_policies, newest_certified
-from es_service.runs.moment import Moment, Policy, descriptor_names, make_policy, policy_shape
+from es_service.runs.moment import Moment, Policy, descriptor_names, make_policy, policy_spec
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.store import reader
 from es_service.store.columns import Columns
@@ -198,9 +198,9 @@ class Run:
         return digest_of(checked_parts(self.folder)[0])
 
     @property
-    def policy_shape(self) -> PolicyShape:
-        """Layer widths of this run's policies."""
-        return policy_shape(self.meta)
+    def policy_spec(self) -> PolicySpec:
+        """What this run's policies are: their layers, memory and output."""
+        return policy_spec(self.meta)
 
     def policy(self, which: Literal["best", "centre", "certified"] | int | Sequence[int] = "best") -> Policy:
         """A policy of the run, with its observation statistics.

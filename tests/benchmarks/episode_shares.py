@@ -29,7 +29,7 @@ from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, Domain, stream_keys
 from tests.benchmarks.simd_physics import peak
 from workers.environments import make_environment
 from workers.episode import episode_steps
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 from workers.simd.backend.emit import graph_function
 from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.target import compile_object, host_target, load_object
@@ -90,9 +90,9 @@ def measure(task: str) -> dict[str, float]:
     steps = episode_steps(environment, spec, training=True, inputs_O=inputs_O)
     network = plan(spec.policy, inputs_O, width)
     key, inputs = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32), jax.ShapeDtypeStruct((len(inputs_O),), jnp.float32)
-    action = jax.ShapeDtypeStruct((spec.policy.widths[-1],), jnp.float32)
+    action = jax.ShapeDtypeStruct((spec.policy.outputs,), jnp.float32)
     carry = jax.eval_shape(steps.begin, key)
-    words, actions = sum(map(words_of, jax.tree.leaves(carry))), spec.policy.widths[-1]
+    words, actions = sum(map(words_of, jax.tree.leaves(carry))), spec.policy.outputs
 
     graph, _, outputs = trace_jaxpr(jax.make_jaxpr(steps.look)(carry, inputs, inputs))
     sources = [("carry", words), ("constants", len(inputs_O)), ("constants", len(inputs_O))]

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from es_service import api
-from es_service.config.model import policy_shape
+from es_service.config.model import policy_spec
 from es_service.config.tasks import task_of
 from es_service.loop import driver
 from es_service.loop.history import history_columns
@@ -93,7 +93,7 @@ def prepared(environment: str, hidden: list[int], algorithm: str, generations: i
             "budget": {"generations": generations},
         }
     )
-    task, shape = task_of(config), policy_shape(config, task_of(config))
+    task, shape = task_of(config), policy_spec(config, task_of(config))
     initial = [np.zeros(shape.parameters, np.float32)], no_observations(task.observation_size)
     search = driver.Search(config, ALGORITHMS[algorithm](config), lambda: initial, task)
     size = shape.parameters, task.observation_size, task.descriptor_bounds, config.compute.chunk_pairs
@@ -108,7 +108,7 @@ def fill(place: Path, *case: Any) -> None:
         driver.run(search, invented, memory, None, _stop)
     parts = memory.parts
     if config.map.enabled:
-        parts = filled(parts, policy_shape(config, search.task).parameters, search.task.observation_size)
+        parts = filled(parts, policy_spec(config, search.task).parameters, search.task.observation_size)
     columns = history_columns(search.task, config.map.enabled)
     meta = RunMeta("benchmark", "", config.model_dump(mode="json"), config.constants(), asdict(search.task), columns)
     beginning = Beginning(history=[memory.rows[0]], parts=parts, newest=0)

@@ -36,7 +36,7 @@ from tests.benchmarks.peers_environments import NAMED, THEIRS, asked, build, pyt
 from tests.benchmarks.rollouts_per_second import ANT_STEPS, config_of, measure
 from tests.helpers import centre
 from workers.environments.ant import STEP_S, SUBSTEPS
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 
 ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).parent / "results" / "peers.csv"

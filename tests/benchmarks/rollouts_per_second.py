@@ -40,7 +40,7 @@ from es_service.loop.policies import no_statistics, policy_episodes, policy_work
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.messages import EpisodesResult, TrainingChunk, around
 from tests.helpers import centre
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 
 ROUNDS = 5
 PAIRS = {"point_maze": 4096}

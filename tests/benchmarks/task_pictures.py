@@ -16,11 +16,11 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from es_service.protocol.messages import PolicyShape
+from es_service.protocol.messages import PolicySpec
 from es_service.protocol.noise import Domain, stream_keys
 from workers.environments import SHIPPED, ant_maze, ant_trap, make_environment
 from workers.environments.walls import WALL_RADIUS
-from workers.policy import act, split_layers
+from workers.policies.policy import act, split_layers
 
 RESULTS = Path(__file__).parent / "results"
 POLICIES, STEPS = 8, 600
@@ -29,7 +29,7 @@ POLICIES, STEPS = 8, 600
 def ways(name: str) -> np.ndarray:
     """Torso positions of one episode of each of some random policies, [policies, steps + 1, 2]; NaN after the end."""
     task, environment = SHIPPED[name], make_environment(name, {})
-    shape = PolicyShape((task.observation_size, 32, task.action_size))
+    shape = PolicySpec((task.observation_size, 32, task.action_size))
     parameters = np.random.default_rng(0).normal(size=(POLICIES, shape.parameters)).astype(np.float32) * 0.6
 
     def episode(parameters_D, key):
@@ -37,7 +37,7 @@ def ways(name: str) -> np.ndarray:
 
         def step(carry, _):
             state, alive = carry
-            state, _, done = environment.step(state, act(jnp, layers, environment.observe(state)))
+            state, _, done = environment.step(state, act(jnp, shape, layers, None, environment.observe(state))[0])
             return (state, alive & ~done), jnp.where(alive, state.q[:2], jnp.nan)
 
         state = environment.reset(key)

@@ -23,7 +23,7 @@ from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.machine import VERSION
 
 VERSIONS = {"ray": "2.60.0", "python": "3.11.2", "es-service": "0.8.0", "jax": "0.10.2", "cpu": "A 1/1 avx2"}
-CODE = {"workers/worker.py": "a", "workers/policy.py": "b"}
+CODE = {"workers/worker.py": "a", "workers/policies/policy.py": "b"}
 HERE = NodeFacts("this host", VERSIONS, CODE)
 SOUND = ClusterFacts(
     HERE,
@@ -80,11 +80,15 @@ def test_nothing_is_in_order_if_no_node_answers():
             ("other versions: jax 0.9.0 (here 0.10.2), ray 2.59.0 (here 2.60.0); ", "constraints.txt"),
         ),
         (
-            with_second(sources=CODE | {"workers/policy.py": "c"}),
+            with_second(sources=CODE | {"workers/policies/policy.py": "c"}),
             "FAIL",
-            ("other code than here in workers/policy.py;",),
+            ("other code than here in workers/policies/policy.py;",),
         ),
-        (with_second(sources={"workers/worker.py": "a"}), "FAIL", ("other code than here in workers/policy.py;",)),
+        (
+            with_second(sources={"workers/worker.py": "a"}),
+            "FAIL",
+            ("other code than here in workers/policies/policy.py;",),
+        ),
         (
             with_second(sources={}, problem="ModuleNotFoundError: No module named 'es_service'"),
             "FAIL",
@@ -120,7 +124,7 @@ def test_each_problem_is_one_line_that_names_the_node_and_what_to_do(facts, leve
 
 
 def test_nodes_with_the_same_problem_are_named_together():
-    wrong = {**CODE, "workers/policy.py": "c"}
+    wrong = {**CODE, "workers/policies/policy.py": "c"}
     facts = replace(SOUND, nodes=tuple(replace(node, sources=wrong) for node in SOUND.nodes))
     (found,) = bad(facts)
     assert found.where == "one 10.0.0.1, two 10.0.0.2"

@@ -69,6 +69,7 @@ def problems(source=MINIMAL, *overrides: str) -> list[str]:
         ("policy.hidden=64", "64 ... must be a list of whole numbers, each at least 1, such as [64, 64]"),
         ("policy.hidden=[64, 0]", "[64, 0] is not allowed"),
         ("policy.observation_normalization=1", "1 ... must be true or false"),
+        ("policy.activation=rely", "rely ... must be tanh or relu; did you mean relu?"),
         ("policy.observation_clip=0", "0 ... must be a number above 0 or null"),
         ("compute.engine=rey", "rey ... must be auto or ray or inline; did you mean ray?"),
         ("compute.rollout=sind", "sind ... must be auto or xla or simd; did you mean simd?"),
@@ -302,3 +303,20 @@ def test_a_map_that_does_not_fit_the_algorithm_or_its_kind_is_refused():
         )
     (line,) = (line.strip() for line in str(caught.value).splitlines()[1:])
     assert line.startswith("map.enabled: false is not allowed for me_es, whose blocks start from elites of the map")
+
+
+def test_outputs_that_are_no_numbers_have_no_action_noise():
+    assert load(MINIMAL, "policy.output=categorical").policy.action_noise == 0.0
+    assert load(MINIMAL, "policy.output=linear").policy.action_noise == 0.01
+    (line,) = problems(MINIMAL, "policy.output=gaussian", "policy.action_noise=0.1")
+    assert line.startswith("policy.action_noise: 0.1 is not allowed for policy.output = gaussian, which")
+    assert line.endswith("must be 0")
+
+
+def test_a_memory_has_its_rollout_and_the_reason_for_it():
+    assert load(MINIMAL, "policy.memory=4").compute.rollout == "xla"
+    (line,) = problems(MINIMAL, "policy.memory=4", "compute.rollout=simd")
+    assert line == (
+        "compute.rollout: simd cannot run point_maze: its code of a policy has no memory (policy.memory); must be auto "
+        "or xla"
+    )

@@ -15,7 +15,7 @@ import pytest
 from es_service.dispatch.events import Limits, StartWorker, Submit
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError
-from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk, around
+from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk, around
 from tests.helpers import SPEC, DirectEvaluator, centre, random_parameters, spec, stop
 
 FIRST = centre(random_parameters(0))
@@ -66,7 +66,7 @@ def test_killed_children_change_no_result_and_leave_nothing_behind():
 @pytest.mark.timeout(60)
 def test_a_child_stopped_in_mid_message_blocks_nobody():
     """Its socket holds a fraction of a 5 MB centre. The deadline passes, it is replaced, the result is right."""
-    wide = spec(policy=PolicyShape((2, 1120, 1120, 2)), episode_steps=2)
+    wide = spec(policy=PolicySpec((2, 1120, 1120, 2)), episode_steps=2)
     one, other = (centre(random_parameters(seed, wide.policy.parameters, 0.03)) for seed in (0, 1))
     assert one.parameters_D.nbytes > 5_000_000
     chunks = [EvaluationChunk(1, chunk_id) for chunk_id in range(3)]

@@ -1,16 +1,16 @@
 """Small runs in memory, of ES unless another search is named."""
 
 from es_service.api import load_config
-from es_service.config.model import policy_shape, worker_spec
+from es_service.config.model import policy_spec, worker_spec
 from es_service.loop import driver
-from es_service.protocol.messages import EpisodesResult, PolicyShape
+from es_service.protocol.messages import EpisodesResult, PolicySpec
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
 from workers.environments import SHIPPED
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 
-SHAPE = PolicyShape((2, 8, 8, 2))
+SHAPE = PolicySpec((2, 8, 8, 2))
 
 
 class Tampering(DirectEvaluator):
@@ -38,7 +38,7 @@ def small_config(policy=None, **changes):
 
 def run_in_memory(config, evaluator=None):
     evaluator = evaluator or DirectEvaluator(worker_spec(config, SHIPPED["point_maze"]))
-    first = initial_parameters(policy_shape(config, SHIPPED["point_maze"]), config.policy.init, config.seed)
+    first = initial_parameters(policy_spec(config, SHIPPED["point_maze"]), config.policy.init, config.seed)
     search = driver.Search(
         config,
         ALGORITHMS[config.search.algorithm](config),

@@ -7,16 +7,16 @@ import numpy as np
 from es_service.api import load_config
 from es_service.config.model import worker_spec
 from es_service.loop import driver
-from es_service.protocol.messages import EvaluationChunk, PolicyShape
+from es_service.protocol.messages import EvaluationChunk, PolicySpec
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore, rows_of
 from tests.twins.behaviour_map import cell_number
 from workers.environments import SHIPPED
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 
-SHAPE = PolicyShape((2, 8, 8, 2))
+SHAPE = PolicySpec((2, 8, 8, 2))
 CELLS, BLOCK = (20, 15), 3
 PRESETS = {
     "literature": {"first_block": "explore", "sampling": "top", "squared": False},

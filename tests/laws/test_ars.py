@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from es_service.config.model import policy_shape, worker_spec
+from es_service.config.model import policy_spec, worker_spec
 from es_service.config.parts import PlainStep, TopPairs
 from es_service.protocol.messages import TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys
@@ -15,7 +15,7 @@ from es_service.search.steps import STEPS
 from tests.laws.es_runs import Tampering, run_in_memory, small_config
 from tests.twins import ars as twin
 from workers.environments import SHIPPED
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 
 LINEAR = {"hidden": [], "action_noise": 0.0}
 
@@ -53,7 +53,7 @@ def test_twenty_generations_equal_the_twin(policy, search, tampered):
     state, store, evaluator, _ = run_in_memory(
         config, Tampering(worker_spec(config, task), spoil) if tampered else None
     )
-    shape, search = policy_shape(config, task), config.search
+    shape, search = policy_spec(config, task), config.search
     first = initial_parameters(shape, config.policy.init, 0)
     other = twin.ARS(first, search.step.learning_rate, search.step.l2, search.shaping.count or search.pairs)
     for generation in range(1, 21):

@@ -16,7 +16,7 @@ from es_service.protocol.messages import (
     EpisodesResult,
     GradientChunk,
     GradientResult,
-    PolicyShape,
+    PolicySpec,
     TrainingChunk,
 )
 from es_service.protocol.noise import Domain, normals, stream_keys
@@ -26,7 +26,7 @@ from tests.helpers import DirectEvaluator, MemoryStore
 from tests.laws.es_runs import SHAPE, Tampering, run_in_memory, small_config
 from tests.twins import es as twin
 from workers.environments import SHIPPED
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 from workers.simd.backend import target
 from workers.simd.episodes import compiled
 from workers.simd.episodes import rollout as simd_rollout
@@ -277,7 +277,7 @@ def test_the_driver_holds_no_population_times_parameters_array():
     """2,048 pairs of 4,482 parameters would be 37 MB; the driver gets by with a few vectors of parameters."""
     mapping = {"task": {"environment": "point_maze"}, "search": {"algorithm": "es", "pairs": 2048}}
     config = load_config(mapping | {"budget": {"generations": 3}})
-    shape = PolicyShape((2, 64, 64, 2))
+    shape = PolicySpec((2, 64, 64, 2))
     first = initial_parameters(shape, "unit_columns", 0)
     search = driver.Search(
         config, ALGORITHMS["es"](config), lambda: ([first], no_observations(2)), SHIPPED["point_maze"]

@@ -27,7 +27,7 @@ from tests.laws.me_es_runs import (
 from tests.twins import me_es as twin
 from tests.twins.behaviour_map import GridMap, coverage, qd_score
 from workers.environments import SHIPPED
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 
 
 @pytest.mark.parametrize("mode", ["explore", "exploit", "explore_exploit"])

@@ -9,7 +9,7 @@ import pytest
 
 from es_service.config.loading import load_config
 from es_service.config.methods import has_effect as is_declared
-from es_service.config.model import policy_shape, worker_spec
+from es_service.config.model import policy_spec, worker_spec
 from es_service.config.tasks import TASKS
 from es_service.loop import driver
 from es_service.loop.history import history_columns
@@ -19,7 +19,7 @@ from es_service.store.digest import arrays_sha256
 from tests.helpers import DirectEvaluator
 from tests.laws.me_es_runs import Remembering
 from workers.environments import SHIPPED
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 from workers.rollouts import BACKENDS
 
 TASK = SHIPPED["point_maze"]
@@ -60,6 +60,9 @@ OTHER = {
     "task.episodes_per_member": 2,
     "task.options.start": "corner",
     "policy.hidden": [6],
+    "policy.activation": "relu",
+    "policy.output": "linear",
+    "policy.bias": False,
     "policy.init": "small_columns",
     "policy.observation_normalization": False,
     "policy.observation_clip": 0.3,
@@ -127,6 +130,7 @@ NOT_MEASURED = {
     "search.init_from": "names a folder, of which the functions of a search know nothing",
     "search.candidate_choice": "chooses among the elites of that folder, which `test_polish.py` checks",
     "search.max_invalid_fraction": "stops a run, which `test_es.py` and `test_policies.py` check",
+    "policy.memory": "needs XLA; `test_policy_kinds.py` has it",
     "compute.rollout": "the other one is XLA",
     "compute.rollout_block_pairs": "only XLA uses it",
 }
@@ -177,7 +181,7 @@ def evaluator(config):
 
 def digest(config):
     """SHA-256 of all that the digest of a run is made of, after each of its generations."""
-    shape, store = policy_shape(config, TASK), Remembering()
+    shape, store = policy_spec(config, TASK), Remembering()
     first = [initial_parameters(shape, config.policy.init, config.seed, i) for i in range(config.search.centres)]
     algorithm = ALGORITHMS[config.search.algorithm](config)
     search = driver.Search(config, algorithm, lambda: (first, no_observations(2)), TASK)

@@ -9,7 +9,7 @@ from es_service.config.parts import Ranks, Returns
 from es_service.loop import driver
 from es_service.loop.checks import invalidate
 from es_service.loop.parts import state_from_parts
-from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicySpec, TrainingChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation, FitnessWeight
@@ -26,9 +26,9 @@ from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
 from tests.twins import novelty_search as twin
 from workers.environments import SHIPPED
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 
-SHAPE = PolicyShape((2, 8, 8, 2))
+SHAPE = PolicySpec((2, 8, 8, 2))
 RULE = {"fitness_weight_start": 0.6, "fitness_weight_step": 0.15, "fitness_weight_patience": 2}
 STARTS = {"es": 1.0, "ns_es": 0.0, "nsr_es": 0.5, "nsra_es": 0.6}
 

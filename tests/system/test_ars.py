@@ -49,7 +49,7 @@ def test_xla_computes_a_linear_policy_too(tmp_path, undisturbed):
 
 def test_a_linear_policy_is_read_evaluated_exported_and_started_from(tmp_path, undisturbed):
     best = undisturbed.policy("best")
-    assert best.shape.widths == (2, 2)
+    assert best.spec.widths == (2, 2)
     weights, biases, seen = best.parameters_D[:4].reshape(2, 2), best.parameters_D[4:], np.array([0.3, -0.8])
     normalised = np.clip((seen - best.observation_mean_O) / best.observation_std_O, -5, 5)
     np.testing.assert_allclose(best(seen), np.tanh(normalised @ weights + biases), rtol=1e-5)

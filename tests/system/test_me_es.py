@@ -43,7 +43,7 @@ def test_a_fork_with_another_task_begins_with_an_empty_map(tmp_path, mapped):
         forked = api.fork(mapped.folder, changes, out=tmp_path / "empty").run
     assert forked.constants["map.qd_offset"] == pytest.approx(-2.3431 * 30)
     assert len(forked.map) == 0
-    assert arrays(forked)["parameters"].shape == (0, forked.policy_shape.parameters)
+    assert arrays(forked)["parameters"].shape == (0, forked.policy_spec.parameters)
     assert command("export", forked.folder, "--to", "csv").returncode == 0
     for wrong in (("evaluate", forked.folder, "--all"), ("export", forked.folder, "--to", "ribs")):
         result = command(*wrong)

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from es_service.protocol.messages import SIGNS, TRACE_POINTS, PolicyShape, TaskSpec, WorkerSpec
+from es_service.protocol.messages import SIGNS, TRACE_POINTS, PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, evaluation_reset_keys, normal_integers, normals, uniforms
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from tests.twins import point_maze
 from workers.compilable import Compilable
-from workers.policy import act, normalise, split_layers
+from workers.policies.outputs import action, drawn_action
+from workers.policies.policy import act, normalise, split_layers
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 
 REGISTERING = """
@@ -40,9 +41,11 @@ class NumPy(RolloutBackend):
     compile_s = (1, 1)
     chunk_pairs = (1, 2)
 
-    def why_not(self, task: TaskSpec, policy: PolicyShape) -> str:
-        """It knows one task."""
-        return "" if task.name == "point_maze" else "it knows no other task than point_maze"
+    def why_not(self, task: TaskSpec, policy: PolicySpec) -> str:
+        """It knows one task, and no memory."""
+        if task.name != "point_maze":
+            return "it knows no other task than point_maze"
+        return "a policy of it has no memory" if policy.memory else ""
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """Loops over the episodes of a chunk."""
@@ -110,10 +113,13 @@ def episode(
     places, rewards, seen, done = [(x, y)], [], [], False
     while len(rewards) < spec.episode_steps and not done:
         seen.append(np.array([x, y], np.float32))
-        action_A = act(np, layers, normalise(np, seen[-1], mean_O, std_O, spec.observation_clip))
+        outputs, _ = act(np, spec.policy, layers, None, normalise(np, seen[-1], mean_O, std_O, spec.observation_clip))
+        action_A = action(np, spec.policy.output, outputs)
         if action_key is not None:
-            noise_A = normal_integers(np, action_key, np.arange(2, dtype=np.uint32) + np.uint32(2 * len(rewards)))
-            action_A = action_A + np.float32(spec.action_noise / NORMAL_STD) * noise_A.astype(np.float32)
+            coordinates_A = np.arange(2, dtype=np.uint32) + np.uint32(2 * len(rewards))
+            noise_A = normal_integers(np, action_key, coordinates_A).astype(np.float32)
+            drawn_A = drawn_action(np, spec.policy.output, outputs, action_key, coordinates_A)
+            action_A = drawn_A + np.float32(spec.action_noise / NORMAL_STD) * noise_A
         x, y, reward, done = point_maze.step(x, y, (float(action_A[0]), float(action_A[1])))
         places.append((x, y))
         rewards.append(reward)

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from es_service.protocol.messages import SIGNS, PolicyShape
+from es_service.protocol.messages import SIGNS, PolicySpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normals, stream_keys
 from tests.helpers import SPEC
 from tests.workers.steps import (
@@ -30,7 +30,7 @@ from workers import rollout as xla
 from workers.environments import SHIPPED, make_environment
 from workers.environments.ant import STEP_S, AntState, contact_forces, load_system, observe
 from workers.environments.brax_parts import pipeline
-from workers.policy import act, initial_parameters, split_layers
+from workers.policies.policy import act, initial_parameters, split_layers
 from workers.simd.episodes import rollout as simd
 from workers.worker import episode_keys
 
@@ -83,7 +83,7 @@ def test_a_control_step_is_ten_of_brax_s():
 @pytest.mark.parametrize("make_training_rollout", [xla.make_training_rollout, simd.make_training_rollout])
 def test_a_compiled_episode_is_brax_s_after_one_step(make_training_rollout):
     """The whole rollout, policy and all, beside Brax's own reset and ten of its substeps, far from any wall."""
-    shape = PolicyShape((29, 16, 8))
+    shape = PolicySpec((29, 16, 8))
     spec = replace(SPEC, environment="ant_maze", policy=shape, episode_steps=2, action_noise=0.0, observation_clip=None)
     environment = make_environment("ant_maze", {})
     keys_P_S_E = episode_keys(spec, 1, np.arange(8))[0]
@@ -100,7 +100,10 @@ def test_a_compiled_episode_is_brax_s_after_one_step(make_training_rollout):
         first_P_O = np.asarray(jax.vmap(environment.observe)(states))
         parameters_P_D = centre_D + np.float32(sign * sigma) * noise_P_D
         action_P_A = np.stack(
-            [act(np, split_layers(spec.policy, d), o) for d, o in zip(parameters_P_D, first_P_O, strict=True)]
+            [
+                act(np, spec.policy, split_layers(spec.policy, d), None, o)[0]
+                for d, o in zip(parameters_P_D, first_P_O, strict=True)
+            ]
         )
         assert np.abs(action_P_A).max() > 0.05
         full = brax_start()(states.q, states.qd)

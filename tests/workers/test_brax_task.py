@@ -9,7 +9,7 @@ import pytest
 
 from es_service.config.tasks import TASKS
 from es_service.errors import ConfigError
-from es_service.protocol.messages import PolicyShape, with_options
+from es_service.protocol.messages import PolicySpec, with_options
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.options import Option
 from tests.helpers import centre, chunk_runner, random_parameters, spec
@@ -196,7 +196,7 @@ def test_the_driver_asks_a_process_and_gets_the_same_answer():
 
 def test_a_worker_runs_the_example():
     task = user_task.describe(EXAMPLE)
-    shape = PolicyShape((task.observation_size, 8, task.action_size))
+    shape = PolicySpec((task.observation_size, 8, task.action_size))
     worker_spec = spec(
         environment=EXAMPLE, environment_options={"walls": "first"}, policy=shape, episode_steps=20,
         chunk_pairs=2, rollout_block_pairs=2, gradient_block_pairs=2,

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicySpec, TrainingChunk
 from tests.helpers import DirectEvaluator, centre, chunk_runner, random_parameters
 from tests.workers.simd.rollouts import task_spec
 from tests.workers.steps import environment_of, resets_of
 from tests.workers.test_policies import bits, evaluate
 from workers import environments
 from workers.environments import SHIPPED, Environment
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 
 
 def counting(success) -> Environment:
@@ -76,7 +76,7 @@ def test_an_output_changes_no_bit_of_the_other_results_of_a_small_task(spec):
     ],
 )
 def test_an_output_changes_no_bit_of_the_other_results_of_an_ant(task, rollout):
-    shape = PolicyShape((SHIPPED[task].observation_size, 8, SHIPPED[task].action_size))
+    shape = PolicySpec((SHIPPED[task].observation_size, 8, SHIPPED[task].action_size))
     worker_spec = replace(task_spec(task), policy=shape, episode_steps=50, rollout=rollout)
     parameters_D = initial_parameters(shape, "unit_columns", 3)
     size = SHIPPED[task].observation_size

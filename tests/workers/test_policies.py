@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from es_service.loop.policies import no_statistics, policy_episodes, policy_work
-from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicyShape, WorkerSpec
+from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicySpec, WorkerSpec
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.policies import POLICY_SLOTS
 from tests.helpers import PARAMETERS, SPEC, DirectEvaluator, centre, random_parameters, spec
 from tests.workers.simd.rollouts import targets, task_spec
 from workers.environments import make_environment
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 from workers.simd.backend.words import aligned
 from workers.simd.episodes import rollout
 from workers.simd.episodes.compiled import compile_episodes
@@ -53,7 +53,7 @@ def evaluator(request):
 
 @pytest.mark.parametrize("hidden", [(64, 64), (48, 33), (96,), (5, 144), (1,), (), (80, 112), (256, 128)])
 def test_a_lane_with_weights_of_its_own_has_the_bits_of_a_centre_at_every_width(hidden: tuple[int, ...]):
-    shape, lanes = PolicyShape((2, *hidden, 2)), 19
+    shape, lanes = PolicySpec((2, *hidden, 2)), 19
     worker_spec = dataclasses.replace(SPEC, policy=shape, episode_steps=20)
     policies = np.stack([3 * initial_parameters(shape, "unit_columns", seed) for seed in range(5)])
     owner_L, keys_L = np.arange(lanes) % 5, stream_keys(1, Domain.EVALUATION_RESET, 2, np.arange(lanes))

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from es_service.protocol.messages import PolicyShape
-from workers.policy import initial_parameters
+from es_service.protocol.messages import PolicySpec
+from workers.policies.policy import initial_parameters
 
 
 def test_initial_columns_have_their_norms_and_layers_differ():
-    shape = PolicyShape((8, 8, 8, 8))  # equal shapes on purpose: one key for all layers would make them equal
+    shape = PolicySpec((8, 8, 8, 8))  # equal shapes on purpose: one key for all layers would make them equal
     for init, norms in (("unit_columns", (1.0, 1.0, 0.01)), ("small_columns", (0.01, 0.01, 0.01))):
         flat = initial_parameters(shape, init, seed=0)
         layers = [flat[start : start + 64].reshape(8, 8) for start in (0, 72, 144)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from es_service.loop.policies import policy_episodes, policy_work
-from es_service.protocol.messages import EvaluationChunk, PolicyShape
+from es_service.protocol.messages import EvaluationChunk, PolicySpec
 from es_service.protocol.recordings import RecordRequest
 from tests import helpers
 from tests.workers.test_episode_ends import counting_environment
@@ -18,7 +18,7 @@ from workers.viewer import shapes
 
 def spec_of(name, rollout, steps):
     task = SHIPPED[name]
-    shape = PolicyShape((task.observation_size, 8, task.action_size))
+    shape = PolicySpec((task.observation_size, 8, task.action_size))
     return helpers.spec(environment=name, policy=shape, episode_steps=steps, rollout=rollout)
 
 

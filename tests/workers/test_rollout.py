@@ -12,7 +12,7 @@ from es_service.protocol.messages import (
     EvaluationChunk,
     GradientChunk,
     GradientResult,
-    PolicyShape,
+    PolicySpec,
     TrainingChunk,
 )
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, normals, stream_keys
@@ -26,7 +26,7 @@ from workers.environments import Environment, make_environment
 from workers.rollout import make_training_rollout
 from workers.worker import episode_keys
 
-SHAPE = PolicyShape((2, 8, 8, 2))
+SHAPE = PolicySpec((2, 8, 8, 2))
 MEAN, STD = np.float32([0.1, -0.4]), np.float32([0.3, 0.6])
 
 

@@ -32,9 +32,9 @@ It may also have:
 All methods are pure functions of one state that JAX can trace; they are batched and compiled by the service.
 `es_service.protocol.noise.uniforms(key, counters)` makes random numbers of the key of `reset`, which is no key of JAX;
 `jax.random.wrap_key_data(key[:2])` makes one of it, which the functions of `jax.random` accept. In training, actions
-may exceed [-1, 1] by up to 7.95 times `policy.action_noise`, which is added after the last tanh; a task that needs
-bounded actions must clip them. Observations are summed in float32, so their mean must be less than a thousand standard
-deviations from 0.
+may exceed [-1, 1] by up to 7.95 times `policy.action_noise`, which is added after the output, and the output `linear`
+has no bounds; a task that needs bounded actions must clip them. Observations are summed in float32, so their mean must
+be less than a thousand standard deviations from 0.
 """
 
 from __future__ import annotations

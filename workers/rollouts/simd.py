@@ -7,6 +7,7 @@ from functools import cache
 
 from es_service.protocol.messages import TaskSpec, WorkerSpec
 from es_service.protocol.options import OptionValue
+from es_service.protocol.policy_spec import PolicySpec
 from es_service.protocol.recordings import Recordings, RecordRequest
 from workers import environments
 from workers.rollouts.backend import ChunkFunctions, RolloutBackend
@@ -19,6 +20,12 @@ class Simd(RolloutBackend):
     runs_in_threads = True
     takes_chunks_together = True
     compile_s = (10, 4)
+
+    def why_not(self, task: TaskSpec, policy: PolicySpec) -> str:
+        """A memory of the policy, or what the description of the task has found."""
+        if policy.memory:
+            return "its code of a policy has no memory (policy.memory)"
+        return super().why_not(task, policy)
 
     def why_not_here(self) -> str:
         """What the processor lacks."""

@@ -8,12 +8,12 @@ import jax
 import numpy as np
 
 import workers.rollout
-from es_service.protocol.messages import PolicyShape, WorkerSpec
+from es_service.protocol.messages import PolicySpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, stream_keys
 from tests.helpers import spec
 from workers.environments import SHIPPED, make_environment
 from workers.episode import Episodes
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 from workers.simd.backend.target import WIDTHS, NoVectorsError, host_target
 from workers.simd.episodes import rollout
 
@@ -37,7 +37,7 @@ def isas() -> list[str]:
 def task_spec(task: str, **changes: Any) -> WorkerSpec:
     size = SHIPPED[task]
     hidden = (64, 64) if task == "point_maze" else (256, 256)
-    shape = PolicyShape((size.observation_size, *hidden, size.action_size))
+    shape = PolicySpec((size.observation_size, *hidden, size.action_size))
     return spec(environment=task, policy=shape, episode_steps=size.episode_steps, **changes)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
 from es_service.protocol.noise import Domain, stream_keys
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from tests.workers.simd.rollouts import targets
@@ -28,7 +28,7 @@ KINDS = [{"training": True}, {"training": False}, {"training": False, "own_weigh
 @pytest.mark.parametrize("kind", KINDS, ids=["training", "evaluation", "policies"])
 @pytest.mark.parametrize("hidden", [(), (16,), (33, 48), (144,)], ids=str)
 def test_policies_of_all_shapes_have_the_bits_of_their_twin(hidden, kind, target, tmp_path: Path) -> None:
-    shape = spec(policy=PolicyShape((2, *hidden, 2)))
+    shape = spec(policy=PolicySpec((2, *hidden, 2)))
     checked = []
     compile_episodes(
         make_environment("point_maze", {}),

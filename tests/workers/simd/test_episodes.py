@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import workers.rollout
-from es_service.protocol.messages import PolicyShape, WorkerSpec
+from es_service.protocol.messages import PolicySpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, TEST_VECTORS, Domain, normal_integers, stream_keys
 from tests.helpers import random_parameters, spec
 from tests.workers.simd.rollouts import arguments, both, by_xla, targets, task_spec
@@ -92,7 +92,7 @@ def test_bits_are_the_same_at_every_width(task: str, training: bool, pairs: int,
     """AVX-512 and AVX2 give one digest; and an episode does not see who is beside it, or that a lane is empty."""
     environment = make_environment(task, {})
     worker_spec = dataclasses.replace(task_spec(task), episode_steps=20)
-    shape = PolicyShape((worker_spec.policy.widths[0], *hidden, worker_spec.policy.widths[-1]))
+    shape = PolicySpec((worker_spec.policy.widths[0], *hidden, worker_spec.policy.widths[-1]))
     worker_spec = dataclasses.replace(worker_spec, policy=shape)
     centre_D, unit, mean_O, std_O, keys, resets, actions = arguments(worker_spec, 3.0)
     found = []
@@ -180,7 +180,7 @@ def test_a_reset_that_cannot_be_compiled_is_jaxs():
         return jnp.sort(environment.reset(key))  # sorting is not compiled
 
     sorting = dataclasses.replace(environment, reset=reset)
-    worker_spec = spec(policy=PolicyShape((2, 8, 2)))
+    worker_spec = spec(policy=PolicySpec((2, 8, 2)))
     given = arguments(worker_spec)
     ours = rollout.make_training_rollout(sorting, worker_spec)(*given)
     theirs = workers.rollout.make_training_rollout(sorting, worker_spec)(*given)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from es_service.protocol.messages import PolicyShape
+from es_service.protocol.messages import PolicySpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normals, stream_keys
 from tests.helpers import random_parameters
 from tests.workers.simd.rollouts import targets
@@ -60,7 +60,7 @@ def run(
     return action.view(np.float32).T.copy(), hidden.reshape(-1)
 
 
-def actions_of(shape: PolicyShape, parameters_D: np.ndarray, x: np.ndarray) -> np.ndarray:
+def actions_of(shape: PolicySpec, parameters_D: np.ndarray, x: np.ndarray) -> np.ndarray:
     """The twin, in float64."""
     values, start = x.astype(float), 0
     for inputs, outputs in shape.layers:
@@ -82,7 +82,7 @@ def test_actions_are_those_of_members_with_their_own_weights(
     (target,) = [one for one in targets() if one.isa == isa] or [None]
     if target is None:
         pytest.skip(f"no {isa}")
-    shape = PolicyShape(widths)
+    shape = PolicySpec(widths)
     centre_D = random_parameters(4, shape.parameters, 0.5)
     inputs_O = np.arange(0, widths[0], seen)
     x = np.zeros((target.width, widths[0]), np.float32)
@@ -103,7 +103,7 @@ def test_actions_are_those_of_members_with_their_own_weights(
 def test_weights_made_once_per_episode_give_the_bits_of_those_made_in_each_step(
     target: Target, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    shape = PolicyShape((5, 64, 17, 3))
+    shape = PolicySpec((5, 64, 17, 3))
     network = plan(shape, np.arange(5), target.width)
     centre_D, x = random_parameters(4, shape.parameters, 0.5), random_parameters(5, 5 * target.width, 1.0)
     keys = stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(target.width // 2))
@@ -120,7 +120,7 @@ def test_weights_made_once_per_episode_give_the_bits_of_those_made_in_each_step(
 @pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)
 def test_the_dead_cost_nothing(noisy: bool, target: Target, tmp_path: Path):
     """Hidden layers of eight neighbours all dead are not computed, and the others' actions are what they were."""
-    shape = PolicyShape((3, 64, 64, 2))
+    shape = PolicySpec((3, 64, 64, 2))
     network, group = plan(shape, np.arange(3), target.width), min(8, target.width)
     centre_D, x = random_parameters(4, shape.parameters, 0.5), np.ones((target.width, 3), np.float32)
     keys = stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(target.width // 2)) if noisy else None
@@ -140,7 +140,7 @@ def test_the_dead_cost_nothing(noisy: bool, target: Target, tmp_path: Path):
 @pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)
 @pytest.mark.parametrize("widths", [(2, 1), (2, 3, 1)])
 def test_a_sum_starts_with_its_bias(target, widths, tmp_path):
-    shape, wide = PolicyShape(widths), widths[1]
+    shape, wide = PolicySpec(widths), widths[1]
     centre_D = np.zeros(shape.parameters, np.float32)
     centre_D[: 3 * wide] = np.repeat(np.float32([1e8, -1e8, 1.0]), wide)  # weights of two inputs, then biases
     centre_D[3 * wide :] = 1.0 if len(widths) == 3 else 0.0

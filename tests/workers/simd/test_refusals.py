@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import workers.simd.episodes.program
-from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
 from es_service.protocol.noise import Domain, normal_integers, stream_keys
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import SHIPPED, describe_environment, make_environment
@@ -82,7 +82,7 @@ def test_what_the_compiler_refuses_after_tracing_is_refused_beforehand(
     task = describe_environment(f"{__name__}:Heat")
     why = rollout.why_not(task)
     assert why == f"loops carry and read {found} values; simd supports at most {limit:,}"
-    worker = chunk_runner(spec(environment=task.name, policy=PolicyShape((1, 8, 1)), episode_steps=5, rollout="simd"))
+    worker = chunk_runner(spec(environment=task.name, policy=PolicySpec((1, 8, 1)), episode_steps=5, rollout="simd"))
     point = centre(random_parameters(size=25), observation_size=1)
     for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
         with pytest.raises(UnsupportedError, match=why):

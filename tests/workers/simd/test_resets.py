@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from es_service.protocol.messages import EvaluationChunk, PolicyShape, TrainingChunk
+from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from workers.environments import describe_environment
 from workers.simd.episodes import rollout
@@ -61,7 +61,7 @@ class Watched(Drift):
 def test_a_reset_that_the_compiler_chokes_on_is_jaxs(task: type) -> None:
     name = f"{__name__}:{task.__name__}"
     assert rollout.why_not(describe_environment(name)) == ""
-    worker_spec = spec(environment=name, policy=PolicyShape((2, 8, 2)), episode_steps=10)
+    worker_spec = spec(environment=name, policy=PolicySpec((2, 8, 2)), episode_steps=10)
     simd, xla = (
         chunk_runner(spec(**vars(worker_spec) | {"rollout": rollout_name})) for rollout_name in ("simd", "xla")
     )

@@ -17,11 +17,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from es_service.protocol.messages import PolicyShape
+from es_service.protocol.messages import PolicySpec
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from tests.helpers import spec
 from workers.environments import SHIPPED, describe_environment, make_environment
-from workers.policy import initial_parameters
+from workers.policies.policy import initial_parameters
 from workers.simd.backend.emit import emit
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import host_target
@@ -93,7 +93,7 @@ def test_training_evaluation_and_omitted_zero_inputs_agree_on_every_bit(task: st
     environment = make_environment(task, {})
     worker_spec = spec(
         environment=task,
-        policy=PolicyShape((size.observation_size, 16, size.action_size)),
+        policy=PolicySpec((size.observation_size, 16, size.action_size)),
         episode_steps=STEPS,
         fitness=fitness,
         action_noise=0.0,

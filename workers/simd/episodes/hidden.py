@@ -1,7 +1,7 @@
-"""Code of the hidden layers of a policy, for a block of members: tanh(weights x), one member per lane.
+"""Code of the hidden layers of a policy, for a block of members: f(weights x), one member per lane.
 
-A vector holds several outputs of one member. Every output is one sum in the order of the inputs, starting with the
-bias, whatever the width and wherever the weights are from:
+f is `Layer.activation`. A vector holds several outputs of one member. Every output is one sum in the order of the
+inputs, starting with the bias (0 without biases), whatever the width and wherever the weights are from:
 
 shared: from the centre, for all members.
 perturbed: the weights of + are (centre + unit) + 2 unit j, and those of - are 2 centre minus that weight, its mirror
@@ -15,9 +15,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from es_service.protocol.policy_spec import Activation
 from workers.simd.backend.emit import inline
 from workers.simd.backend.function_builder import FunctionBuilder, Values
 from workers.simd.episodes.layout import Layer, Network, sums_at_once
+from workers.simd.frontend.primitives.choices import extreme_of
 from workers.simd.graph import elementary
 from workers.simd.graph.folding import FoldingGraph
 
@@ -31,7 +33,7 @@ class View(NamedTuple):
 
 
 def shared(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
-    """Write out = tanh(centre x), for several members at a time."""
+    """Write out = f(centre x), for several members at a time."""
     floats = builder.llvm_types["f"]
     members = min(builder.width, sums_at_once(builder.width) // layer.tile)
     assert builder.width % members == 0
@@ -51,7 +53,7 @@ def shared(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
                 found += [builder.fma(seen, vector, one) for vector, one in zip(vectors, mine, strict=True)]
             return found
 
-        sums = builder.loop(layer.inputs, add, [(floats, one) for one in centre(layer.inputs) * members])
+        sums = builder.loop(layer.inputs, add, first_sums(builder, layer.bias, centre(layer.inputs) * members))
         for member in range(members):
             _put(builder, layer, out, first, member, number, sums[member * layer.tile : (member + 1) * layer.tile])
         return []
@@ -60,7 +62,7 @@ def shared(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
 
 
 def perturbed(builder: FunctionBuilder, network: Network, layer: Layer, x: View, out: View) -> None:
-    """Write out = tanh((centre +- unit k) x), for several pairs at a time.
+    """Write out = f((centre +- unit k) x), for several pairs at a time.
 
     The weights of - come from an addition, because the multipliers are the bottleneck.
     """
@@ -103,7 +105,7 @@ def perturbed(builder: FunctionBuilder, network: Network, layer: Layer, x: View,
             for pair, of_signs in enumerate(member_weights(layer.inputs, v)):
                 for sign, weight in enumerate(of_signs):
                     biases[(2 * pair + sign) * layer.tile + v] = weight
-        sums = builder.loop(layer.inputs, add, [(floats, one) for one in biases])
+        sums = builder.loop(layer.inputs, add, first_sums(builder, layer.bias, biases))
         for member in range(2 * pairs):
             _put(builder, layer, out, first, member, number, sums[member * layer.tile : (member + 1) * layer.tile])
         return []
@@ -137,7 +139,7 @@ def _weights_of_plus(builder: FunctionBuilder, centre: str, places: Sequence[str
 
 
 def own(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
-    """Write out = tanh(weights x) with the parameters of each member, whose addresses are in `%weights`.
+    """Write out = f(weights x) with the parameters of each member, whose addresses are in `%weights`.
 
     A weight is used once per call, so memory is the bottleneck. A tile is therefore as wide as the registers allow,
     which reads the weights in the order in which they are stored.
@@ -173,8 +175,8 @@ def own(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
                 found += [builder.fma(seen, vector, one) for vector, one in zip(vectors, mine, strict=True)]
             return found
 
-        biases = [(floats, vector) for vectors in weights(layer.inputs) for vector in vectors]
-        sums = builder.loop(layer.inputs, add, biases)
+        biases = [vector for vectors in weights(layer.inputs) for vector in vectors]
+        sums = builder.loop(layer.inputs, add, first_sums(builder, layer.bias, biases))
         for member in range(members):
             _put(builder, wide, out, first, member, number, sums[member * wide.tile : (member + 1) * wide.tile])
         return []
@@ -216,9 +218,9 @@ def _seen(builder: FunctionBuilder, x: View, first: str, member: int, row: str) 
 def _put(
     builder: FunctionBuilder, layer: Layer, out: View, first: str, member: int, tile: str, sums: Sequence[str]
 ) -> None:
-    """Store tanh of a member's sums in `out`."""
+    """Store f of a member's sums in `out`."""
     vectors = layer.tiles * layer.tile
-    for v, value in enumerate(tanh(builder, sums)):
+    for v, value in enumerate(activated(builder, layer.activation, sums)):
         place = builder.index((first, vectors), (tile, layer.tile), (member * vectors + v, 1))
         builder.store(builder.llvm_types["f"], value, out.pointer, place)
 
@@ -230,9 +232,23 @@ def _any_alive(builder: FunctionBuilder, first: str, members: int) -> str:
     )
 
 
-def tanh(builder: FunctionBuilder, values: Sequence[str]) -> Values:
-    """Vectors of tanh of each vector."""
+def first_sums(builder: FunctionBuilder, bias: bool, biases: Sequence[str]) -> list[tuple[str, str]]:
+    """(type, value) of the vectors with which sums begin: the biases, or 0."""
+    return [(builder.llvm_types["f"], one if bias else "zeroinitializer") for one in biases]
+
+
+def activated(builder: FunctionBuilder, activation: Activation, values: Sequence[str]) -> Values:
+    """Vectors of the activation of each vector."""
     graph = FoldingGraph()
     nodes = [graph.input("f", k) for k in range(len(values))]
-    outputs = [elementary.tanh(graph, node) for node in nodes]
+    outputs = [activated_node(graph, activation, node) for node in nodes]
     return inline(builder, graph, outputs, dict(zip(nodes, values, strict=True)))
+
+
+def activated_node(graph: FoldingGraph, activation: Activation, node: int) -> int:
+    """Node of the activation of a node: tanh, or the greater of it and 0, or NaN."""
+    return (
+        elementary.tanh(graph, node)
+        if activation == "tanh"
+        else extreme_of(graph, "max", "float32")(node, graph.f(0.0))
+    )

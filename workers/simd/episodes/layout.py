@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.messages import PolicyShape
+from es_service.protocol.policy_spec import Activation, Output, PolicySpec
 from workers.simd.backend.words import ALIGNMENT, aligned
 
 KEPT_BYTES = 1 << 18
@@ -26,6 +26,9 @@ class Layer(NamedTuple):
     """Vectors of outputs in a tile, which are summed at the same time."""
     first: int
     """Number of the layer's first vector of weights."""
+    activation: Activation
+    """Function of its sums."""
+    bias: bool
 
 
 class Network(NamedTuple):
@@ -47,6 +50,9 @@ class Network(NamedTuple):
     """Places in the flat vector of parameters: of the vectors, then of the single weights."""
     width: int
     """Lanes of a vector."""
+    output: Output
+    """What the last layer's sums become; all but `tanh` are made of them elsewhere."""
+    bias: bool
 
     @property
     def hidden_vectors(self) -> int:
@@ -114,11 +120,11 @@ def sums_at_once(width: int) -> int:
     return 16 if width == 16 else 8
 
 
-def plan(shape: PolicyShape, inputs_O: NDArray[np.intp], width: int) -> Network:
+def plan(spec: PolicySpec, inputs_O: NDArray[np.intp], width: int) -> Network:
     """Lay out a policy's weights.
 
     Args:
-        shape: widths of the policy's layers.
+        spec: the policy, without a memory. Without biases, their places are those of other weights, and never used.
         inputs_O: inputs of the first layer that are computed; others are always zero.
         width: lanes of a vector.
     """
@@ -126,16 +132,19 @@ def plan(shape: PolicyShape, inputs_O: NDArray[np.intp], width: int) -> Network:
     # With noise, four pairs are computed at a time. They share what is made of the centre, so few vectors of many pairs
     # cost less than many vectors of few. Tiles are powers of 2, so that the members that fit divide the width.
     most = sums_at_once(width) // 8
-    rows, (*hidden, (inputs, outputs)) = inputs_O.tolist(), shape.layers
+    rows, (*hidden, (inputs, outputs)) = inputs_O.tolist(), spec.layers
     for given, wanted in hidden:
         vectors = -(-wanted // width)
         tile = max(size for size in (1, 2) if size <= most and vectors % size == 0)
-        layers.append(Layer(len(rows), wanted, vectors // tile, tile, len(places)))
+        layers.append(Layer(len(rows), wanted, vectors // tile, tile, len(places), spec.activation, spec.bias))
         for first in range(0, vectors, tile):
-            for row in [*rows, given]:
+            for row in [*rows, given if spec.bias else 0]:
                 places += [coordinate + row * wanted + (first + v) * width for v in range(tile)]
-        coordinate += (given + 1) * wanted
+        coordinate += (given + spec.bias) * wanted
         rows = list(range(wanted))
     vectors = len(places)
-    places += [coordinate + row * outputs + output for row in [*rows, inputs] for output in range(outputs)]
-    return Network(tuple(layers), len(rows), outputs, vectors, np.array(places, np.uint32), width)
+    places += [
+        coordinate + row * outputs + output for row in [*rows, inputs if spec.bias else 0] for output in range(outputs)
+    ]
+    kept = np.array(places, np.uint32)
+    return Network(tuple(layers), len(rows), outputs, vectors, kept, width, spec.output, spec.bias)

@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import Literal
 
 from workers.simd.backend.function_builder import FunctionBuilder, Values
-from workers.simd.episodes.hidden import View, noise_of_weights, own, perturbed, shared, tanh, units
+from workers.simd.episodes.hidden import View, activated, first_sums, noise_of_weights, own, perturbed, shared, units
 from workers.simd.episodes.layout import Network
 
 Weights = Literal["shared", "perturbed", "own"]
@@ -87,7 +87,7 @@ def singles_function(network: Network) -> FunctionBuilder:
 
 
 def _last(builder: FunctionBuilder, network: Network, x: str, outputs: range, weights: Weights) -> None:
-    """Write action = tanh(weights x) for some outputs; the lanes of a vector are members."""
+    """Write action = f(weights x) for some outputs, with f = tanh or none; the lanes of a vector are members."""
     floats, count = builder.llvm_types["f"], network.outputs
     singles = "" if weights == "own" else builder.at("%centre", network.vectors * builder.width, "float")
 
@@ -114,8 +114,9 @@ def _last(builder: FunctionBuilder, network: Network, x: str, outputs: range, we
         seen = builder.load(floats, x, row)
         return [builder.fma(seen, weight, one) for weight, one in zip(of_row(row), sums, strict=True)]
 
-    sums = builder.loop(network.inputs, add, [(floats, one) for one in of_row(network.inputs)])
-    for output, value in zip(outputs, tanh(builder, sums), strict=True):
+    sums = builder.loop(network.inputs, add, first_sums(builder, network.bias, of_row(network.inputs)))
+    sums = activated(builder, "tanh", sums) if network.output == "tanh" else sums
+    for output, value in zip(outputs, sums, strict=True):
         builder.store(floats, value, "%action", output)
 
 

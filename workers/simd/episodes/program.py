@@ -69,11 +69,11 @@ def write_episodes(
     steps = episode_steps(environment, spec, training=training, inputs_O=inputs_O)
     network = plan(spec.policy, inputs_O, width)
     key, inputs = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32), jax.ShapeDtypeStruct((len(inputs_O),), jnp.float32)
-    action = jax.ShapeDtypeStruct((spec.policy.widths[-1],), jnp.float32)
+    outputs = jax.ShapeDtypeStruct((spec.policy.outputs,), jnp.float32)
     carry = jax.eval_shape(steps.begin, key)
     look, move = (
         jax.make_jaxpr(steps.look)(carry, inputs, inputs),
-        jax.make_jaxpr(steps.move)(carry, inputs, action, key),
+        jax.make_jaxpr(steps.move)(carry, inputs, outputs, key),
     )
     leaves = jax.tree.leaves(carry)
     if [(aval.shape, aval.dtype) for aval in move.out_avals] != [(aval.shape, aval.dtype) for aval in leaves]:

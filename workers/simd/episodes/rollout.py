@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from es_service.protocol.messages import PolicyShape, TaskSpec, WorkerSpec
+from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
 from workers.compilable import Compilable
 from workers.environments import Environment, make_environment
@@ -42,7 +42,7 @@ def why_not(task: TaskSpec) -> str:
         seed=0,
         environment=task.name,
         environment_options=options,
-        policy=PolicyShape((task.observation_size, task.action_size)),
+        policy=PolicySpec((task.observation_size, task.action_size)),
         episode_steps=task.episode_steps,
         fitness="sum",
         episodes_per_member=1,

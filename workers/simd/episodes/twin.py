@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from es_service.protocol.messages import PolicyShape
 from es_service.protocol.noise import normal_integers
-from workers.simd.graph import elementary
+from es_service.protocol.policy_spec import Activation, PolicySpec
+from workers.simd.episodes.hidden import activated_node
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.operations import compute
 from workers.simd.graph.twin import evaluate
@@ -23,21 +23,27 @@ WeightsOf = Callable[[NDArray[np.intp], bool], Floats]
 """Function (places in the flat vector of parameters [K], whether they are in the last layer) -> weights [K, L]."""
 
 
-def policy(shape: PolicyShape, inputs_O: NDArray[np.intp], x_I_L: Floats, weights_of: WeightsOf) -> Floats:
-    """Actions [A, L] of each lane.
+def policy(spec: PolicySpec, inputs_O: NDArray[np.intp], x_I_L: Floats, weights_of: WeightsOf) -> Floats:
+    """Outputs of the last layer, [A, L], of each lane.
 
     Args:
         inputs_O: inputs of the first layer that are computed; others are always zero.
         x_I_L: those inputs.
     """
     seen, rows, start = x_I_L, inputs_O, 0
-    for number, (inputs, outputs) in enumerate(shape.layers, 1):
-        last = number == len(shape.layers)
-        sums = weights_of(start + inputs * outputs + np.arange(outputs), last)
+    for number, (inputs, outputs) in enumerate(spec.layers, 1):
+        last = number == len(spec.layers)
+        if spec.bias:
+            sums = weights_of(start + inputs * outputs + np.arange(outputs), last)
+        else:
+            sums = np.zeros((outputs, x_I_L.shape[1]), np.float32)
         for row, x_L in zip(rows, seen, strict=True):
             weights = weights_of(start + row * outputs + np.arange(outputs), last)
             sums = compute("fma", [np.broadcast_to(x_L, sums.shape), weights, sums])
-        seen, rows, start = _tanh(sums), np.arange(outputs), start + (inputs + 1) * outputs
+        if last and spec.output != "tanh":
+            return sums
+        seen, rows = _activated("tanh" if last else spec.activation, sums), np.arange(outputs)
+        start += (inputs + spec.bias) * outputs
     return seen
 
 
@@ -73,7 +79,7 @@ def perturbed(centre_D: Floats, unit: np.float32, noise_keys_P: Any) -> WeightsO
     return weights_of
 
 
-def _tanh(x: Floats) -> Floats:
+def _activated(activation: Activation, x: Floats) -> Floats:
     graph = FoldingGraph()
-    outputs = [elementary.tanh(graph, graph.input("f", 0))]
+    outputs = [activated_node(graph, activation, graph.input("f", 0))]
     return evaluate(graph, outputs, np.ascontiguousarray(x).view(np.uint32).reshape(1, -1))[0].reshape(x.shape)
