@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from es_service import api
-from es_service.config.model import policy_shape
+from es_service.config.model import policy_spec
 from es_service.config.tasks import task_of
 from es_service.loop import driver
 from es_service.loop.history import evaluated_columns, history_columns
@@ -81,7 +81,7 @@ def measure(batch: int, generations: int, place: Path) -> dict[str, Any]:
     )
     task = task_of(config)
     rng = np.random.default_rng(1)
-    numbers = policy_shape(config, task).parameters
+    numbers = policy_spec(config, task).parameters
     centres = [rng.normal(size=numbers).astype(np.float32) for _ in range(config.search.centres)]
     initial = centres, no_observations(task.observation_size)
     search = driver.Search(config, ALGORITHMS["map_elites"](config), lambda: initial, task)

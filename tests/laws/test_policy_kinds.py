@@ -1,0 +1,55 @@
+"""Every kind of policy with what is done with a run: it is resumed, verified, replayed, exported and called."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+from es_service import api
+from es_service.runs.export import export
+from es_service.runs.replay import record
+from es_service.runs.verification import verify
+from es_service.store.digest import digest_parts
+
+pytestmark = pytest.mark.usefixtures("workers_here")
+KINDS = {
+    "relu, linear outputs, no biases": {"activation": "relu", "output": "linear", "bias": False},
+    "one action": {"output": "argmax"},
+    "one action at random": {"output": "categorical"},
+    "any action at random": {"output": "gaussian"},
+    "a memory": {"memory": 4},
+}
+
+
+def config_of(kind, **more):
+    return {
+        "task": {"environment": "point_maze", "episode_steps": 25},
+        "policy": {"hidden": [6], **KINDS[kind]},
+        "search": {"algorithm": "nsr_es", "centres": 2, "pairs": 16, "sigma": 0.2, "evaluation_episodes": 3},
+        "map": {"cells": [6, 6]},
+        "budget": {"generations": 3},
+        "compute": {"engine": "inline", "workers": 1},
+    } | more
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_with_each_kind_of_policy_is_resumed_verified_replayed_exported_and_called(kind, tmp_path):
+    run = api.run(config_of(kind), tmp_path / "run").run
+    part = api.run(config_of(kind, budget={"generations": 1}), tmp_path / "part").run
+    shutil.copytree(part.folder, tmp_path / "killed")
+    resumed = api.resume(tmp_path / "killed", ["budget.generations=3"]).run
+    assert digest_parts(resumed.folder) == digest_parts(run.folder)
+    assert all(not one.differences for one in verify(run, 2, 1))
+    place = tuple(int(n) for n in run.map[["cell_x", "cell_y"]].iloc[-1])
+    replays, _ = record(run, best=True, cells=[place])
+    assert all(one.is_the_stored for one in replays)
+    export(run, "npz", tmp_path / "out")
+    policy, observations = run.policy("best"), np.array([[0.1, -0.8], [0.3, 0.2]], np.float32)
+    act = policy.start()
+    first, second = (act(one) for one in observations)
+    if KINDS[kind].get("memory"):
+        assert not np.array_equal(policy.start()(observations[1]), second), "it remembers the first observation"
+    else:
+        assert np.array_equal(policy(observations), np.stack([first, second]))
