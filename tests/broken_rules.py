@@ -260,12 +260,17 @@ CASES = [
     *cases(
         "action noise",
         OF_ROLLOUT,
-        ("in evaluations", EPISODE, "noisy = training and spec.action_noise > 0.0", "noisy = spec.action_noise > 0.0"),
+        (
+            "in evaluations",
+            EPISODE,
+            "action_A = action(jnp, spec.policy.output, outputs)",
+            "action_A = training_action(outputs, action_key, before.steps)",
+        ),
         (
             "the same in every step",
             EPISODE,
-            "action_noise(action_key, before.steps)",
-            "action_noise(action_key, jnp.int32(0))",
+            "action_A = training_action(outputs, action_key, before.steps)",
+            "action_A = training_action(outputs, action_key, jnp.int32(0))",
         ),
         ("of another scale", EPISODE, "np.float32(spec.action_noise / NORMAL_STD)", "np.float32(spec.action_noise)"),
         (
@@ -314,7 +319,7 @@ CASES = [
         "steps after done",
         f"{OF_ROLLOUT} tests/workers/test_episode_ends.py",
         ("count", EPISODE, "jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)", "after"),
-        ("revive an episode", EPISODE, "Carry(state, alive & ~done, masked)", "Carry(state, ~done, masked)"),
+        ("revive an episode", EPISODE, "alive & ~done, carry", "~done, carry"),
         ("one too many, xla", XLA, "(step < spec.episode_steps)", "(step <= spec.episode_steps)"),
         ("one too many, simd", COMPILED, "go(self.spec.episode_steps)", "go(self.spec.episode_steps + 1)"),
     ),
@@ -433,22 +438,22 @@ CASES = [
         (
             "is that of the whole batch",
             MAP_ELITES,
-            "Domain.VARIATION, generation, number)",
-            "Domain.VARIATION, generation)",
+            "Domain.VARIATION, generation, np.arange(search.batch)",
+            "Domain.VARIATION, generation, np.zeros(search.batch, np.int64)",
         ),
         (
             "is that of every generation",
             MAP_ELITES,
-            "Domain.VARIATION, generation, number)",
-            "Domain.VARIATION, 0, number)",
+            "Domain.VARIATION, generation, np.arange(search.batch)",
+            "Domain.VARIATION, 0, np.arange(search.batch)",
         ),
         (
             "is that of a pair",
             MAP_ELITES,
-            "Domain.VARIATION, generation, number)",
-            "Domain.PARAMETER_NOISE, generation, number)",
+            "Domain.VARIATION, generation, np.arange(search.batch)",
+            "Domain.PARAMETER_NOISE, generation, np.arange(search.batch)",
         ),
-        ("has a line for each parameter", MAP_ELITES, "noise[-1] * (y_D - x_D)", "noise[1:] * (y_D - x_D)"),
+        ("has a line for each parameter", MAP_ELITES, "noise[..., -1:]", "noise[..., 1:]"),
     ),
     *cases(
         "an elite's fitness",
@@ -471,9 +476,9 @@ CASES = [
         ("is read from its score", PARTS, 'column("fitness", np.float64)', 'column("score", np.float64)'),
         (
             "is that of its best episode",
-            GENERATION,
-            "np.mean(evaluation.fitness, dtype=np.float64)",
-            "np.max(evaluation.fitness)",
+            "es_service/loop/evaluated.py",
+            "doubles(episodes.fitness).mean(axis=1)",
+            "doubles(episodes.fitness).max(axis=1)",
         ),
         (
             "is its score",

@@ -150,7 +150,7 @@ def test_no_path_of_an_elite_crosses_a_wall_and_dashed_ways_are_near_those_of_th
 def test_the_page_and_the_plot_draw_these_ways(folder):
     data, run = read_run(folder), api.open_run(folder)
     assert data.map is not None
-    frame, cells = plan_frame(data.bounds), maps.map_view(data).cells
+    frame, cells = plan_frame(data.bounds), maps.path_lines(data)
     cell = next(cell for cell, ways in cells["detours"].items() if len(ways) == 1 and ways[0][1])
     path_T_2 = data.paths[int(cell)].astype(float)
     [(at, places)] = detours(path_T_2, POINT, data.bounds).items()

@@ -99,7 +99,7 @@ def test_a_centre_is_sent_once_while_it_is_among_the_newest_and_again_when_it_wa
         ([64], 65),
         ([1], 65),
         ([0], 66),  # the oldest of 65 was forgotten
-        (range(100), 66 + 99),  # of so many in turn, each is forgotten before its turn
+        (range(100), 66 + 36),  # those that are still there at the start of a message are not sent again
     ):
         transport.send(0, "key", 1, work_of(*numbers))
         assert worker.item() == [(number, position) for position, number in enumerate(numbers)]
@@ -119,9 +119,9 @@ def test_of_large_centres_a_worker_keeps_as_many_as_fit_and_always_one(transport
         ([0, 1], 2, 2),
         ([2, 1], 3, 2),  # 0 made room
         ([0], 4, 2),  # and 1 for it
-        ([3, 3, 2], 6, 1),  # too large to be kept with another
-        ([3], 7, 1),
-        ([3, 3], 7, 1),  # the newest stays, however large
+        ([3, 3, 2], 5, 1),  # too large to be kept with another
+        ([3], 5, 1),
+        ([3, 3], 5, 1),  # the newest stays, however large
     ):
         work = [(points[number], TrainingChunk(3, position)) for position, number in enumerate(numbers)]
         transport.send(0, "key", 1, work)

@@ -119,7 +119,7 @@ def test_a_comparison_shows_groups_maps_and_runs(runs):
     page = comparison_page(runs, threshold=-80.0)
     found = Elements(page)
     assert found.open == []
-    assert page.count('aria-label="Behaviour map"') == 2
+    assert page.count('aria-label="Behaviour map;') == 2
     assert "reach -80.00" in page
     for run in runs:
         assert str(run.folder) in page

@@ -157,7 +157,7 @@ def test_an_invalid_centre_enters_neither_archive_nor_map_and_the_search_goes_on
     assert store.rows[1]["start_cell"] is None  # no elite anywhere: from where it is
     for generation in (5, 7):
         row, before = store.rows[generation], store.rows[generation - 1]
-        assert np.isnan(row["centre_novelty"])
+        assert row["centre_novelty"] is None
         assert row["cell"] is None
         assert store.after[generation]["centre_0"]["cell"] == NO_CELL
         for name in (*names[:-1], "best_fitness"):

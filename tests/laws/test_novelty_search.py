@@ -313,7 +313,7 @@ def test_an_invalid_centre_never_enters_the_archive():
     config = config_of("nsra_es")
     state, store, _ = run_in_memory(config, Spoiling(worker_spec(config, SHIPPED["point_maze"])))
     assert [row["archive_size"] for row in store.rows[:6]] == [0, 1, 2, 2, 3, 4]
-    assert np.isnan(store.rows[3]["centre_novelty"])
+    assert store.rows[3]["centre_novelty"] is None
     assert 3 not in state.search.archive.generation_N
     assert all(row["invalid_members"] == 2 for row in store.rows[1:])
     assert all(np.isfinite(centre.centre_D).all() for centre in state.search.centres)
