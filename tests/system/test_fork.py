@@ -115,7 +115,9 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
     )  # fmt: skip
     for module in (checked_config, tasks):
         monkeypatch.setattr(module, "TASKS", {"point_maze": told})
-    monkeypatch.setattr(api, "work", lambda *arguments: None)  # as workers know of no such option
+    monkeypatch.setattr(
+        api, "work", lambda *_: api.Outcome(api.open_run(tmp_path / "run"), "")
+    )  # as workers know of no such option
     api.run(SMALL, tmp_path / "run")
     assert (
         lineage.fork_config(tmp_path / "run", ["task.options.descriptor=place"]).task.options["descriptor"] == "place"
