@@ -16,7 +16,7 @@ import numpy as np
 from es_service.protocol.messages import TRACE_POINTS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
 from workers.environments import Environment
-from workers.outputs import OUTPUTS
+from workers.outputs import Step, named_outputs
 from workers.policies.outputs import action, drawn_action
 from workers.policies.policy import initial_memory, normalise
 from workers.rollouts.backend import Episodes
@@ -49,13 +49,16 @@ def episode_steps(
 ) -> EpisodeSteps:
     """Step functions of training episodes (action noise, sums of observations) or of evaluation episodes (traces).
 
+    Both have the outputs that the spec names. Of those of `OF_STEPS` a carry has the value after the newest step; what
+    runs the episode keeps the values of all.
+
     Args:
         inputs_O: indices of the environment's observations that are computed, for the policy and for the sums.
     """
     action_unit = np.float32(spec.action_noise / NORMAL_STD)
     action_size = spec.policy.widths[-1]
     noisy = spec.action_noise > 0.0
-    named = {} if training else {name: OUTPUTS[name] for name in spec.outputs}
+    named = named_outputs(spec.outputs)
     points = min(TRACE_POINTS, spec.episode_steps + 1)
     last_steps_T = (np.arange(points) * spec.episode_steps // (points - 1)).astype(np.int32)
 
@@ -65,7 +68,7 @@ def episode_steps(
     def begin(reset_key: Any) -> Carry:
         state = environment.reset(reset_key)
         start_B = jnp.asarray(environment.descriptor(state), jnp.float32)
-        zero = jnp.float32(0.0)
+        zero, zeros_A = jnp.float32(0.0), jnp.zeros(action_size, jnp.float32)
         sums_O = jnp.zeros(observe(state).shape if training else (0,), jnp.float32)
         trace_T_B = jnp.broadcast_to(start_B, (0 if training else points, *start_B.shape))
         nothing = Episodes(
@@ -77,7 +80,8 @@ def episode_steps(
             shifted_sum_O=sums_O,
             shifted_square_sum_O=sums_O,
             trace_T_B=trace_T_B,
-            outputs={name: output.begin(environment, state) for name, output in named.items()},
+            outputs={name: one.begin(environment, state, zeros_A) for name, one in named.items()},
+            of_steps={},
         )
         return Carry(state, jnp.array(True), initial_memory(jnp, spec.policy), nothing)
 
@@ -103,6 +107,7 @@ def episode_steps(
         else:
             action_A = action(jnp, spec.policy.output, outputs)
         state, reward, done = environment.step(carry.state, action_A)
+        step = Step(carry.state, action_A, state, reward, done)
         distance = jnp.asarray(environment.goal_distance(state), jnp.float32)
         descriptor_B = jnp.asarray(environment.descriptor(state), jnp.float32)
         returns = before.returns + reward
@@ -116,7 +121,8 @@ def episode_steps(
             shifted_sum_O=before.shifted_sum_O + shifted_O,
             shifted_square_sum_O=before.shifted_square_sum_O + shifted_O * shifted_O,
             trace_T_B=before.trace_T_B if training else traced(before.trace_T_B, before.steps, descriptor_B),
-            outputs={name: one.after(environment, state, reward, before.outputs[name]) for name, one in named.items()},
+            outputs={name: one.after(environment, step, before.outputs[name]) for name, one in named.items()},
+            of_steps={},
         )
         masked = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)
         return Carry(state, alive & ~done, carry.memory_H, masked)

@@ -15,7 +15,7 @@ def training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
     """Results of a training chunk's members from their episodes [P, S, E].
 
     They are means over the episodes, except the least goal distance, which is the minimum, and the steps, which are the
-    sum.
+    sum. Outputs of steps are those of all episodes.
     """
     host = episodes.map(np.asarray)
 
@@ -30,6 +30,8 @@ def training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
         steps=host.steps.sum(axis=2, dtype=np.int32),
         goal_distance=np.stack([mean(distance_P_S_E[..., 0]), distance_P_S_E[..., 1].min(axis=2)], axis=-1),
         moments=_moments(host, shift_O),
+        outputs={name: mean(array.astype(np.float32)) for name, array in host.outputs.items()},
+        of_steps=_valid_steps(host),
     )
 
 
@@ -56,7 +58,17 @@ def _episodes_result(episodes: Episodes) -> EpisodesResult:
         goal_distance=host.goal_distance,
         moments=None,
         outputs=host.outputs,
+        of_steps=_valid_steps(host),
     )
+
+
+def _valid_steps(host: Episodes) -> dict[str, Any]:
+    """Outputs of the valid steps of all episodes, [K, ...]: all steps of the first episode, then of the second, ..."""
+
+    def valid(array: Any) -> Any:
+        return array[np.arange(array.shape[host.steps.ndim]) < host.steps[..., None]]
+
+    return {name: valid(array) for name, array in host.of_steps.items()}
 
 
 def _moments(host: Episodes, shift_O: Any) -> Moments:

@@ -17,6 +17,7 @@ from jax import lax
 
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, SIGNS, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, normal_integers
+from es_service.protocol.outputs import OF_STEPS
 from es_service.protocol.policies import POLICY_SLOTS
 from workers.compilable import Compilable, jitted
 from workers.environments import Environment
@@ -177,20 +178,28 @@ def _make_episodes(
         def keep(seen_T: Carry | None, step: Any, carry: Carry) -> Carry | None:
             return jax.tree.map(lambda kept, now: kept.at[step].set(now[slot]), seen_T, carry) if watched else None
 
-        def body(at: tuple[Any, Carry, Carry | None]) -> tuple[Any, Carry, Carry | None]:
-            step, carry, seen_T = at
+        def body(at: tuple[Any, Carry, Any, Carry | None]) -> tuple[Any, Carry, Any, Carry | None]:
+            step, carry, of_steps_T_L, seen_T = at
             outputs_L, memory_L_H = policies(layers, carry.memory_H, looks(carry, mean_O, std_O))
             moved = moves(carry, mean_O, outputs_L, keys_L)._replace(memory_H=memory_L_H)
-            return step + 1, moved, keep(seen_T, step, carry)
+            of_steps_T_L = {name: kept.at[step].set(moved.episode.outputs[name]) for name, kept in of_steps_T_L.items()}
+            return step + 1, moved, of_steps_T_L, keep(seen_T, step, carry)
 
-        def unfinished(at: tuple[Any, Carry, Carry | None]):
-            step, carry, _ = at
+        def unfinished(at: tuple[Any, Carry, Any, Carry | None]):
+            step, carry, *_ = at
             return (step < spec.episode_steps) & carry.alive.any()
+
+        def room(steps: int, x: Any) -> Any:
+            return jnp.zeros((steps, *x.shape), x.dtype)
 
         start, seen_T = jax.vmap(steps.begin)(reset_keys_L), None
         if watched:
-            seen_T = jax.tree.map(lambda x: jnp.zeros((spec.episode_steps + 1, *x.shape[1:]), x.dtype), start)
-        step, end, seen_T = lax.while_loop(unfinished, body, (jnp.int32(0), start, seen_T))
-        return keep(seen_T, step, end) if watched else end.episode
+            seen_T = jax.tree.map(lambda x: room(spec.episode_steps + 1, x[0]), start)
+        of_steps_T_L = {
+            name: room(spec.episode_steps, x) for name, x in start.episode.outputs.items() if name in OF_STEPS
+        }
+        step, end, of_steps_T_L, seen_T = lax.while_loop(unfinished, body, (jnp.int32(0), start, of_steps_T_L, seen_T))
+        of_steps_L_T = {name: jnp.swapaxes(kept, 0, 1) for name, kept in of_steps_T_L.items()}
+        return keep(seen_T, step, end) if watched else end.episode.with_steps(of_steps_L_T)
 
     return episodes

@@ -205,7 +205,7 @@ def worker_spec(config: RunConfig, task: TaskSpec, outputs: tuple[str, ...] = ()
     """The message that every worker of the run receives once, when it starts.
 
     Args:
-        outputs: see `WorkerSpec.outputs`.
+        outputs: see `WorkerSpec.outputs`; those that the search reads are added.
     """
     settings, policy, compute, search = config.task, config.policy, config.compute, config.search
     return WorkerSpec(
@@ -223,6 +223,6 @@ def worker_spec(config: RunConfig, task: TaskSpec, outputs: tuple[str, ...] = ()
         rollout_block_pairs=compute.rollout_block_pairs,
         gradient_block_pairs=compute.gradient_block_pairs,
         rollout=compute.rollout,
-        outputs=outputs,
+        outputs=tuple(sorted({*outputs, *search.outputs()})),
         sources=worker_sources(settings.environment),
     )

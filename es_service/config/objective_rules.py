@@ -32,6 +32,9 @@ def objective_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Proble
                 f"{', '.join(names)}; give descriptor one number for each"
             )
             problems.append(unfit(key, middle, what))
+        if kind == "final" and not task.final_fitness:
+            what = f"final says little about an episode of {task.name}; choose return or another objective"
+            problems.append(unfit(key, kind, what, suggestion="return"))
         if kind == "goal_distance" and not task.has_goal:
             what = f"goal_distance is not known in {task.name}, which has no goal; choose another objective"
             problems.append(unfit(key, kind, what))

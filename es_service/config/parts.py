@@ -6,7 +6,8 @@ A kind is a class here, whose other fields are its keys, and a function in `sear
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Iterable
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -87,31 +88,45 @@ class TopPairs(Section):
     )
 
 
-class FitnessObjective(Section):
+class ObjectivePart(Section):
+    """What members are ranked by."""
+
+    reads: ClassVar[tuple[str, ...]] = ()
+    """Outputs of episodes that it reads beside those of every result: names of `protocol.outputs.AT_THE_END`."""
+
+
+class FitnessObjective(ObjectivePart):
     """Fitness, which `task.fitness` defines."""
 
     kind: Literal["fitness"] = "fitness"
 
 
-class ReturnObjective(Section):
+class ReturnObjective(ObjectivePart):
     """The sum of the rewards, whatever `task.fitness` is."""
 
     kind: Literal["return"] = "return"
 
 
-class GoalObjective(Section):
+class FinalObjective(ObjectivePart):
+    """The reward of the last valid step, whatever `task.fitness` is, in a task that allows `task.fitness: final`."""
+
+    kind: Literal["final"] = "final"
+    reads = ("last_reward",)
+
+
+class GoalObjective(ObjectivePart):
     """How near to the goal an episode ends, in a task that has one."""
 
     kind: Literal["goal_distance"] = "goal_distance"
 
 
-class NoveltyObjective(Section):
+class NoveltyObjective(ObjectivePart):
     """Novelty in the novelty archive."""
 
     kind: Literal["novelty"] = "novelty"
 
 
-class MixtureObjective(Section):
+class MixtureObjective(ObjectivePart):
     """Fitness and novelty, each shaped by itself."""
 
     kind: Literal["mixture"] = "mixture"
@@ -122,7 +137,7 @@ class MixtureObjective(Section):
     )
 
 
-class TargetObjective(Section):
+class TargetObjective(ObjectivePart):
     """Fitness among the members that end in a ball of descriptors; all others rank below these, by their distance."""
 
     kind: Literal["target"] = "target"
@@ -134,7 +149,7 @@ class TargetObjective(Section):
     radius: Positive = Field(1.0, description="Of kind target: greatest distance from the middle inside of the set.")
 
 
-class NearnessObjective(Section):
+class NearnessObjective(ObjectivePart):
     """Nearness to a descriptor and fitness, each scaled to the range that it has in the population."""
 
     kind: Literal["nearness"] = "nearness"
@@ -147,6 +162,7 @@ Shaping = Ranks | Signs | Returns | TopPairs
 Objective = (
     FitnessObjective
     | ReturnObjective
+    | FinalObjective
     | GoalObjective
     | NoveltyObjective
     | MixtureObjective
@@ -158,5 +174,10 @@ Objectives = Annotated[
     Field(min_length=1),
     BeforeValidator(as_tuple),
     "a list of objectives, such as [{kind: novelty}, {kind: fitness}, {kind: mixture, weight: 0.5}, {kind: target, "
-    "descriptor: [35, -25], radius: 5}], also of kind return, goal_distance or nearness",
+    "descriptor: [35, -25], radius: 5}], also of kind return, final, goal_distance or nearness",
 ]
+
+
+def outputs_of(objectives: Iterable[Objective]) -> tuple[str, ...]:
+    """Outputs of episodes that any of the objectives reads."""
+    return tuple(sorted({name for one in objectives for name in one.reads}))

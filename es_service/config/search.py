@@ -11,7 +11,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from es_service.config.fields import Count, Fraction, NotNegative, Positive, Section, Share, Switch, Text
-from es_service.config.parts import AdamStep, FitnessObjective, Objective, Ranks, Shaping, Step
+from es_service.config.parts import AdamStep, FitnessObjective, Objective, Ranks, Shaping, Step, outputs_of
 from es_service.config.presets import PresetRow
 
 
@@ -80,6 +80,13 @@ class SearchConfig(Section):
 
     def spread_keys(self) -> tuple[str, ...]:
         """Keys that change the number of populations, or of policies."""
+        return ()
+
+    def outputs(self) -> tuple[str, ...]:
+        """Outputs of episodes that it reads beside those of every result: names of `protocol.outputs.AT_THE_END`.
+
+        They are then in the `outputs` of each `EpisodesResult`, of populations and of evaluations.
+        """
         return ()
 
 
@@ -154,9 +161,10 @@ class CandidatesConfig(PopulationConfig):
         FitnessObjective(),
         discriminator="kind",
         description="What members are ranked by, and candidates. fitness: what task.fitness says. return: the sum of "
-        "the rewards. goal_distance: how near to the goal an episode ends. novelty, mixture: novelty, alone or beside "
-        "fitness. target: fitness among those that end in a set of descriptors, before all others, which rank by their "
-        "distance from it. nearness: nearness to a descriptor beside fitness.",
+        "the rewards. final: the reward of the last step. goal_distance: how near to the goal an episode ends. "
+        "novelty, mixture: novelty, alone or beside fitness. target: fitness among those that end in a set of "
+        "descriptors, before all others, which rank by their distance from it. nearness: nearness to a descriptor "
+        "beside fitness.",
     )
 
     only_centres = "search.screened"
@@ -169,3 +177,7 @@ class CandidatesConfig(PopulationConfig):
     def spread_keys(self) -> tuple[str, ...]:
         """The key that makes more populations."""
         return ("search.candidates",)
+
+    def outputs(self) -> tuple[str, ...]:
+        """What the objective reads."""
+        return outputs_of([self.objective])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from es_service.loop.checks import valid_members
 from es_service.loop.generation import first_episode, highest, steps_of
 from es_service.loop.history import NO_POLICY, RESETS, Table, doubles, episodes_table, norm, with_gaps
 from es_service.loop.policies import PolicyWork, no_statistics, policy_work
+from es_service.protocol.episodes import each, joined
 from es_service.protocol.messages import Centre, EpisodesResult, Moments, TaskSpec
 from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
 from es_service.search.maps.behaviour_map import EMPTY, BehaviourMap
@@ -189,25 +190,12 @@ def _one(
     return Evaluated(
         (point,),
         np.array([index]),
-        _each(lambda array: array[None], evaluation),
+        replace(each(lambda array: array[None], evaluation), of_steps=evaluation.of_steps),
         np.array([resets]),
         np.array([float(fitness_weight)]),
         np.array([population_max]),
         np.array([update_norm]),
         np.array([steps]),
-    )
-
-
-def _each(change: Callable[..., np.ndarray], *results: EpisodesResult) -> EpisodesResult:
-    """A function of the arrays of results, array by array."""
-    names = "fitness", "returns", "descriptor", "steps", "goal_distance"
-    columns = (change(*(getattr(one, name) for one in results)) for name in names)
-    traces = [one.trace_T_B for one in results if one.trace_T_B is not None]
-    return EpisodesResult(
-        *columns,
-        moments=None,
-        trace_T_B=change(*traces) if len(traces) == len(results) else None,
-        outputs={name: change(*(one.outputs[name] for one in results)) for name in results[0].outputs},
     )
 
 
@@ -222,7 +210,7 @@ def _joined(parts: Sequence[Evaluated]) -> Evaluated:
     }
     return Evaluated(
         subjects=[subject for one in parts for subject in one.subjects],
-        evaluation=_each(lambda *arrays: np.concatenate(arrays), *(one.evaluation for one in parts)),
+        evaluation=joined([one.evaluation for one in parts]),
         **columns,
     )
 

@@ -20,6 +20,7 @@ from es_service.loop.checks import require_state
 from es_service.loop.interfaces import Search
 from es_service.loop.policies import PolicyWork, policy_episodes
 from es_service.loop.state import Best, RunState, statistics_in_force
+from es_service.protocol.episodes import joined
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.gradient_tree import tree_sum
 from es_service.protocol.messages import (
@@ -107,7 +108,7 @@ def evaluate_populations(
     trained, of_policies = found[: len(asked)], found[len(asked) :]
     moments = [result.moments for results in trained for result in results if result.moments is not None]
     return (
-        [_concatenate(results, count) for results, count in zip(trained, pairs, strict=True)],
+        [joined(results, count) for results, count in zip(trained, pairs, strict=True)],
         moments,
         [policy_episodes(one, results) for one, results in zip(policies, of_policies, strict=True)],
     )
@@ -134,7 +135,8 @@ def evaluate_centres(
         if resets == "by_chunk":
             start += first_episode(index, episodes) // EVALUATION_EPISODES_PER_CHUNK
         asked.append(around(centre, evaluation_chunks(centre.generation, episodes, first=start, ask=ask)))
-    return [_concatenate(results, episodes) for results in _evaluate(EpisodesResult, evaluator, asked)]
+    found = _evaluate(EpisodesResult, evaluator, asked)
+    return [replace(joined(results, episodes), trace_T_B=results[0].trace_T_B) for results in found]
 
 
 def first_episode(centre: int, episodes: int) -> int:
@@ -261,21 +263,3 @@ def highest(fitness: FloatArray) -> float:
     """Highest finite value; NaN if there is none."""
     finite = fitness[np.isfinite(fitness)]
     return float(finite.max()) if finite.size else math.nan
-
-
-def _concatenate(results: Sequence[EpisodesResult], count: int) -> EpisodesResult:
-    """Join results along the first axis and keep the first `count`; the result has no observation moments."""
-
-    def join(of: Callable[[EpisodesResult], np.ndarray]) -> np.ndarray:
-        return np.concatenate([of(result) for result in results])[:count]
-
-    return EpisodesResult(
-        fitness=join(lambda result: result.fitness),
-        returns=join(lambda result: result.returns),
-        descriptor=join(lambda result: result.descriptor),
-        steps=join(lambda result: result.steps),
-        goal_distance=join(lambda result: result.goal_distance),
-        moments=None,
-        trace_T_B=results[0].trace_T_B,
-        outputs={name: join(lambda result, name=name: result.outputs[name]) for name in results[0].outputs},
-    )

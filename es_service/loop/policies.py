@@ -5,11 +5,12 @@ Axes: N policies, E episodes, D policy parameters, O observation, T points of a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from es_service.protocol.episodes import each, joined
 from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, Policies, PolicyChunk, Work, around
 from es_service.protocol.noise import Domain
 from es_service.protocol.policies import POLICY_SLOTS, chunks_of
@@ -73,24 +74,25 @@ def policy_episodes(asked: PolicyWork, results: Sequence[EpisodesResult]) -> Epi
     policies, episodes = len(asked.parameters_N_D), asked.episodes
     whole = policies // POLICY_SLOTS * POLICY_SLOTS
 
-    def by_policy(of: Callable[[EpisodesResult], np.ndarray]) -> np.ndarray:
-        flat = np.concatenate([of(result) for result in results])
+    def by_policy(flat: np.ndarray) -> np.ndarray:
         full, last = flat[: whole * episodes], flat[whole * episodes :]
         full = full.reshape(-1, episodes, POLICY_SLOTS, *flat.shape[1:]).swapaxes(1, 2)
         last = last.reshape(episodes, policies - whole, *flat.shape[1:]).swapaxes(0, 1)
         return np.concatenate([full.reshape(whole, *full.shape[2:]), last])
 
     traces = [result.trace_T_B for result in results if result.trace_T_B is not None]
-    return EpisodesResult(
-        fitness=by_policy(lambda result: result.fitness),
-        returns=by_policy(lambda result: result.returns),
-        descriptor=by_policy(lambda result: result.descriptor),
-        steps=by_policy(lambda result: result.steps),
-        goal_distance=by_policy(lambda result: result.goal_distance),
-        moments=None,
-        trace_T_B=np.concatenate(traces) if traces else None,
-        outputs={name: by_policy(lambda result, name=name: result.outputs[name]) for name in results[0].outputs},
-    )
+    flat = joined([replace(result, trace_T_B=None) for result in results])
+    found = replace(each(by_policy, flat), trace_T_B=np.concatenate(traces) if traces else None)
+    if not flat.of_steps:
+        return found
+    row_K = _rows(by_policy(np.cumsum(flat.steps) - flat.steps), found.steps)
+    return replace(found, of_steps={name: array[row_K] for name, array in flat.of_steps.items()})
+
+
+def _rows(first_N_E: np.ndarray, count_N_E: np.ndarray) -> np.ndarray:
+    """Indices from each `first` on, `count` of them, one range after another."""
+    first, count = first_N_E.reshape(-1), count_N_E.reshape(-1).astype(np.int64)
+    return np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
 
 
 @np.errstate(invalid="ignore", over="ignore")  # an infinite value makes the policy invalid

@@ -101,7 +101,7 @@ class WorkerSpec:
     rollout: str
     """What computes episodes and gradients: a name in `workers.rollouts.BACKENDS`."""
     outputs: tuple[str, ...] = ()
-    """Outputs of evaluation and policy episodes besides those of every result; names of `workers.outputs.OUTPUTS`."""
+    """Outputs of episodes besides those of every result; names of `protocol.outputs`."""
     sources: dict[str, str] = field(default_factory=dict)
     """`sources.worker_sources` of the driver, which a worker must have as well; empty if this is not checked."""
 
@@ -281,8 +281,16 @@ class EpisodesResult:
     """Descriptor along the first episode of an evaluation chunk, at equal time intervals from the reset to the last
     possible step; None for training. For policies [..., T, B]: of each slot with a first episode, or None."""
     outputs: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """Outputs that `WorkerSpec.outputs` names, by name, with the leading axes of the other arrays; none in training.
-    success: bool, whether the episode succeeded as the task declares it; last_reward: reward of the last valid step."""
+    """Outputs that `WorkerSpec.outputs` names, by name, with the leading axes of the other arrays.
+
+    success: bool, whether the episode succeeded as the task declares it; last_reward: reward of the last valid step;
+    last_observation [..., O]: observation after it. A member has the mean of its episodes, float32."""
+    of_steps: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Outputs of each step that it names, [K, ...]: the valid steps of all episodes, one episode after another in the
+    order of the other arrays, with as many rows as `steps` says of each.
+
+    observation [K, O]: what the policy sees, neither normalised nor clipped; action [K, A]: what the task gets, with
+    its noise; reward, done: those of the step, float32 and bool; step_descriptor [K, B]: descriptor after it."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Evaluation as a service: episodes of policies from an optimiser of the caller's own.
 
 The policies run on the workers of a run, with the same engines and the same handling of faults. Axes: N policies,
-E episodes, D policy parameters, O observation, B descriptor dimensions.
+E episodes, D policy parameters, O observation, A action, B descriptor dimensions, K steps of all episodes.
 """
 
 from __future__ import annotations
@@ -26,12 +26,51 @@ from es_service.logs import logger
 from es_service.loop.checks import valid_members
 from es_service.loop.policies import no_statistics, policy_episodes, policy_work
 from es_service.protocol.messages import EpisodesResult, FloatArray, TaskSpec
+from es_service.protocol.outputs import TRANSITIONS
 from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.session import initial_policy, make_engine
 
 _LOG = logger(__name__)
 LARGEST = 2**63 - 1
 """Largest seed and generation."""
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """The valid steps of all episodes: those of policy 0 in episode 0, of policy 0 in episode 1, and so on.
+
+    The observation after a step is the one of the next row, and that after an episode's last step is in
+    `last_observation`.
+    """
+
+    observation: FloatArray
+    """[K, O]: what the policy saw, neither normalised nor clipped."""
+    action: FloatArray
+    """[K, A]: what it did."""
+    reward: FloatArray
+    """[K]"""
+    done: NDArray[np.bool_]
+    """[K]: whether the task ended the episode with the step. An episode that reaches `task.episode_steps` without that
+    has no such step."""
+    descriptor: FloatArray
+    """[K, B]: descriptor after the step."""
+    last_observation: FloatArray
+    """[N, E, O]: observation after the last step of an episode."""
+    steps: NDArray[np.int32]
+    """[N, E]: number of steps of an episode."""
+
+    def rows(self, policy: int, episode: int = 0) -> slice:
+        """The rows of an episode."""
+        before = self.steps[:policy].sum(dtype=np.int64) + self.steps[policy, :episode].sum(dtype=np.int64)
+        return slice(int(before), int(before + self.steps[policy, episode]))
+
+    def next_observation(self) -> FloatArray:
+        """[K, O]: the observation after each step, as a new array."""
+        following = np.roll(self.observation, -1, axis=0)
+        following[np.cumsum(self.steps.reshape(-1), dtype=np.int64) - 1] = self.last_observation.reshape(
+            -1, self.observation.shape[1]
+        )
+        return following
 
 
 @dataclass(frozen=True)
@@ -50,6 +89,8 @@ class PolicyEvaluations:
     """[N, E]: whether fitness and descriptor are finite."""
     success: NDArray[np.bool_] | None
     """[N, E]: whether an episode succeeded, as the task declares it; None if the task declares nothing."""
+    transitions: Transitions | None = None
+    """All steps, if the evaluator was made with `transitions=True`."""
 
 
 class PolicyEvaluator:
@@ -113,8 +154,15 @@ class PolicyEvaluator:
             self.close(f"this evaluator was closed by an error during a call ({type(error).__name__}: {error})")
             raise
         result = policy_episodes(asked, [answer for answer in answers if isinstance(answer, EpisodesResult)])
-        valid, success = valid_members(result), result.outputs.get("success")
-        return PolicyEvaluations(result.fitness, result.returns, result.descriptor, result.steps, valid, success)
+        return PolicyEvaluations(
+            result.fitness,
+            result.returns,
+            result.descriptor,
+            result.steps,
+            valid_members(result),
+            result.outputs.get("success"),
+            transitions_of(result) if result.of_steps else None,
+        )
 
     def close(self, why: str = "this evaluator is closed") -> None:
         """End the workers. Later calls raise an EvaluationError that begins with `why`."""
@@ -148,6 +196,7 @@ def evaluator(
     workers: int | Literal["auto"] | None = None,
     engine: Literal["inline", "ray"] | None = None,
     address: str | None = None,
+    transitions: bool = False,
 ) -> Evaluating:
     """Start the workers of a config and evaluate policies with them; at the end of the block, the workers end.
 
@@ -163,11 +212,27 @@ def evaluator(
         workers, engine, address: as `--workers`, `--engine` and `--address` of the command line: number of workers
             ("auto": one for each core of the machine or the cluster), "inline" or "ray", and the Ray cluster to join;
             None: as configured.
+        transitions: whether results have all steps of the episodes. They travel from the workers and stay in memory:
+            4 (O + A + B + 1) + 1 bytes for each step: 497 of AntTrap, 33 of PointMaze.
 
     Raises:
         ConfigError: the config is wrong. EvaluationError: the workers cannot be started.
     """
-    return Evaluating(_started(config, workers, engine, address))
+    return Evaluating(_started(config, workers, engine, address, transitions))
+
+
+def transitions_of(result: EpisodesResult) -> Transitions:
+    """The transitions of episodes [N, E]."""
+    steps = result.of_steps
+    return Transitions(
+        observation=steps["observation"],
+        action=steps["action"],
+        reward=steps["reward"],
+        done=steps["done"],
+        descriptor=steps["step_descriptor"],
+        last_observation=result.outputs["last_observation"],
+        steps=result.steps,
+    )
 
 
 def policies_of(config: RunConfig, task: TaskSpec, parameters: ArrayLike) -> FloatArray:
@@ -210,12 +275,12 @@ def statistics_of(
 
 @contextmanager
 def _started(
-    config: RunConfig | Source, workers: int | str | None, engine: str | None, address: str | None
+    config: RunConfig | Source, workers: int | str | None, engine: str | None, address: str | None, transitions: bool
 ) -> Iterator[PolicyEvaluator]:
     """See `evaluator`."""
     config = evaluating_config(config, workers, engine, address)
     task = task_of(config)  # before the workers start, since it may raise
-    outputs = ("success",) if task.success else ()
+    outputs = (*("success",) * bool(task.success), *TRANSITIONS * transitions)
     started = make_engine(config, on_wait=_tell_wait, on_refusal=_LOG.warning, at_once=ANY_NUMBER, outputs=outputs)
     made = PolicyEvaluator(config, task, started)
     try:

@@ -13,6 +13,7 @@ import numpy as np
 
 from es_service.loop.generation import steps_of
 from es_service.loop.policies import policy_episodes, policy_work
+from es_service.protocol.episodes import one_of
 from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.messages import EpisodesResult, FloatArray, Work
 from es_service.protocol.noise import Domain
@@ -110,7 +111,7 @@ def new_episodes(
     work: list[Work] = [one for each in asked for one in each.work]
     answers = iter([answer for answer in engine.evaluate(work) if isinstance(answer, EpisodesResult)])
     found = [policy_episodes(each, [next(answers) for _ in each.work]) for each in asked]
-    return [_first(result) for result in found]
+    return [one_of(result, 0) for result in found]
 
 
 def kept(result: EpisodesResult) -> Episodes:
@@ -122,17 +123,4 @@ def kept(result: EpisodesResult) -> Episodes:
         result.outputs.get("success"),
         result.steps.astype(np.int64),
         result.descriptor.astype(np.float64),
-    )
-
-
-def _first(result: EpisodesResult) -> EpisodesResult:
-    """Results of the first policy, [E]."""
-    return EpisodesResult(
-        fitness=result.fitness[0],
-        returns=result.returns[0],
-        descriptor=result.descriptor[0],
-        steps=result.steps[0],
-        goal_distance=result.goal_distance[0],
-        moments=None,
-        outputs={name: array[0] for name, array in result.outputs.items()},
     )

@@ -86,6 +86,7 @@ def values(objective: Objective, results: EpisodesResult) -> NDArray:
         return nearness_values(objective, results.fitness, results.descriptor)
     of: dict[str, Callable[[], NDArray]] = {
         "return": lambda: results.returns,
+        "final": lambda: results.outputs["last_reward"],
         "goal_distance": lambda: -results.goal_distance[..., 0],
     }
     found = of.get(objective.kind, lambda: results.fitness)()

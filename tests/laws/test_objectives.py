@@ -14,7 +14,7 @@ from es_service.config.parts import (
     TargetObjective,
 )
 from es_service.loop.generation import halves
-from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult
+from es_service.protocol.messages import EpisodesResult, GradientChunk, GradientResult, TrainingChunk
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.common import first_state, scheduled
 from es_service.search.novelty import empty_archive, extended
@@ -81,6 +81,23 @@ def test_each_kind_ranks_by_what_it_names():
     for objective in (FitnessObjective(), ReturnObjective(), GoalObjective()):
         invalid = results_of([1, NAN, 3], returns=[3, 2, 1], distance=[[5, 0], [4, 9], [6, 0]])
         assert np.isnan(values(objective, invalid)).tolist() == [False, True, False]
+
+
+def test_final_is_the_fitness_that_final_rewards_are():
+    """A run whose objective is `final` takes the first step of one whose fitness is `final`."""
+
+    def first_steps(fitness, objective):
+        config = small_config(algorithm="me_es", objectives=[{"kind": objective}])
+        task = config.task.model_copy(update={"fitness": fitness})
+        budget = config.budget.model_copy(update={"generations": 1})
+        state, store, evaluator, _ = run_in_memory(config.model_copy(update={"task": task, "budget": budget}))
+        populations = [one for _, chunk, one in evaluator.recorded if isinstance(chunk, TrainingChunk)]
+        return [one.centre_D.tobytes() for one in state.search.centres], populations, store
+
+    (final, _, _), (by_fitness, populations, _) = first_steps("sum", "final"), first_steps("final", "fitness")
+    assert final == by_fitness
+    assert final != first_steps("sum", "fitness")[0]
+    assert not populations[0].outputs
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.3, 1.0])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 from pathlib import Path
 
 import pytest
@@ -43,7 +42,7 @@ def test_one_worker_and_two_of_which_one_is_killed(tmp_path, environment):
 
     def strike(row):
         if row["generation"] == 2:
-            threading.Timer(0.02, os.kill, (children()[-1], signal.SIGKILL)).start()
+            os.kill(children()[-1], signal.SIGKILL)
 
     outcome = run(tmp_path / "two", environment, 2, strike, notices.append)
     assert len(notices) == 1

@@ -61,6 +61,13 @@ def reference():
         return [bits(evaluate(POLICIES, episodes=3, seed=7, generation=generation)) for generation in (0, 1)]
 
 
+def all_steps(**where) -> list[bytes]:
+    """Bits of results with their transitions."""
+    with es_service.evaluator(CONFIG, transitions=True, **where) as evaluate:
+        result = evaluate(POLICIES, episodes=3, seed=7)
+    return bits(result) + [array.tobytes() for array in vars(result.transitions).values()]
+
+
 def twice(evaluate) -> list[list[bytes]]:
     return [bits(evaluate(POLICIES, episodes=3, seed=7, generation=generation)) for generation in (0, 1)]
 
@@ -79,6 +86,12 @@ def test_bits_are_the_same_with_any_workers_and_engine(reference, where):
     with es_service.evaluator(CONFIG, **where) as evaluate:
         assert twice(evaluate) == reference
     assert children() == before
+
+
+def test_transitions_are_the_same_with_any_workers_and_change_no_other_bit(reference):
+    found = all_steps(workers=1)
+    assert found == all_steps(workers=3)
+    assert found[: len(FIELDS)] == reference[0]
 
 
 def test_bits_are_the_same_with_threads_and_from_a_run_config(reference):

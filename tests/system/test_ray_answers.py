@@ -108,6 +108,9 @@ def test_an_evaluator_has_the_same_bits_as_inline():
         expected = test_evaluator.twice(evaluate)
     with es_service.evaluator(test_evaluator.CONFIG, engine="ray", workers=2) as evaluate:
         assert test_evaluator.twice(evaluate) == expected
+    with workers_in_this_process():
+        expected = test_evaluator.all_steps()
+    assert test_evaluator.all_steps(engine="ray", workers=2) == expected
 
 
 def test_workers_that_raise_while_starting_stop_the_run_with_their_error():

@@ -12,6 +12,7 @@ import numpy as np
 
 from es_service.protocol.messages import SIGNS, TRACE_POINTS, PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, evaluation_reset_keys, normal_integers, normals, uniforms
+from es_service.protocol.outputs import OF_STEPS
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from tests.twins import point_maze
 from workers.compilable import Compilable
@@ -110,7 +111,7 @@ def episode(
     """(results, places [T + 1, B] from the reset on, rewards) of an episode; with an action key, one of training."""
     layers, start = split_layers(spec.policy, parameters_D), uniforms(reset_key, np.arange(2, dtype=np.uint32))
     x, y = -0.1 + 0.2 * float(start[0]), -1.0 + 0.3 * float(start[1])
-    places, rewards, seen, done = [(x, y)], [], [], False
+    places, rewards, seen, actions, done = [(x, y)], [], [], [], False
     while len(rewards) < spec.episode_steps and not done:
         seen.append(np.array([x, y], np.float32))
         outputs, _ = act(np, spec.policy, layers, None, normalise(np, seen[-1], mean_O, std_O, spec.observation_clip))
@@ -122,13 +123,28 @@ def episode(
             action_A = drawn_A + np.float32(spec.action_noise / NORMAL_STD) * noise_A
         x, y, reward, done = point_maze.step(x, y, (float(action_A[0]), float(action_A[1])))
         places.append((x, y))
+        actions.append(action_A)
         rewards.append(reward)
     places_T_B, returns, shifted_T_O = np.array(places, np.float32), np.float32(sum(rewards)), np.array(seen) - mean_O
     points = min(TRACE_POINTS, spec.episode_steps + 1)
     at_T = np.minimum(np.arange(points) * spec.episode_steps // (points - 1), len(rewards))
     none = mean_O[:0]
     sums = (none, none) if action_key is None else (shifted_T_O.sum(axis=0), np.square(shifted_T_O).sum(axis=0))
-    named = {"success": np.bool_(done), "last_reward": np.float32(rewards[-1])}
+
+    def padded(steps: Any) -> Any:
+        array = np.array(steps, np.float32)
+        return np.concatenate([array, np.full((spec.episode_steps - len(array), *array.shape[1:]), 7.0, np.float32)])
+
+    named = {
+        "success": np.bool_(done),
+        "last_reward": np.float32(rewards[-1]),
+        "last_observation": places_T_B[-1],
+        "observation": padded(seen),
+        "action": padded(actions),
+        "reward": padded(rewards),
+        "done": np.array([*[False] * (len(rewards) - 1), done, *[False] * (spec.episode_steps - len(rewards))]),
+        "step_descriptor": padded(places[1:]),
+    }
     found = Episodes(
         fitness=np.float32(rewards[-1]) if spec.fitness == "final" else returns,
         returns=returns,
@@ -138,14 +154,16 @@ def episode(
         shifted_sum_O=sums[0],
         shifted_square_sum_O=sums[1],
         trace_T_B=places_T_B[at_T if action_key is None else at_T[:0]],
-        outputs={name: named[name] for name in spec.outputs if action_key is None},
+        outputs={name: named[name] for name in spec.outputs if name not in OF_STEPS},
+        of_steps={name: named[name] for name in spec.outputs if name in OF_STEPS},
     )
     return found, places_T_B, rewards
 
 
 def stacked(episodes: Sequence[Episodes]) -> Episodes:
     """Episodes along a new first axis."""
-    outputs = {name: np.stack([one.outputs[name] for one in episodes]) for name in episodes[0].outputs}
-    return Episodes._make(
-        [*(np.stack(arrays) for arrays in zip(*(one[:-1] for one in episodes), strict=True)), outputs]
+    arrays = (np.stack(arrays) for arrays in zip(*(one[:-2] for one in episodes), strict=True))
+    named = (
+        {name: np.stack([one[field][name] for one in episodes]) for name in episodes[0][field]} for field in (-2, -1)
     )
+    return Episodes._make([*arrays, *named])

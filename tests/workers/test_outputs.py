@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicySpec, TrainingChunk
+from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicySpec, TrainingChunk, WorkerSpec
+from es_service.protocol.noise import evaluation_reset_keys
+from es_service.protocol.outputs import TRANSITIONS
+from es_service.runs.evaluator import Transitions, transitions_of
 from tests.helpers import DirectEvaluator, centre, chunk_runner, random_parameters
 from tests.workers.simd.rollouts import task_spec
 from tests.workers.steps import environment_of, resets_of
 from tests.workers.test_policies import bits, evaluate
 from workers import environments
 from workers.environments import SHIPPED, Environment
+from workers.outputs import OUTPUTS
 from workers.policies.policy import initial_parameters
+from workers.worker import episode_keys
 
 
 def counting(success) -> Environment:
@@ -54,15 +60,89 @@ def test_success_is_that_of_the_last_valid_state(spec, monkeypatch, success, wan
     np.testing.assert_array_equal(of_policies.outputs["success"], wanted(of_policies.steps))
 
 
-def test_training_episodes_have_no_such_outputs(spec):
-    result = chunk_runner(spec(episode_steps=8, outputs=("success",)))(centre(random_parameters()), TrainingChunk(1, 0))
+def test_a_member_has_the_mean_of_its_episodes(spec, monkeypatch):
+    monkeypatch.setattr(environments, "make_environment", lambda name, options: counting(lambda state, _: state[1] > 4))
+    given = spec(episode_steps=8, outputs=("success",), episodes_per_member=3, common_random_numbers=False)
+    result = chunk_runner(given)(centre(random_parameters()), TrainingChunk(1, 0))
     assert isinstance(result, EpisodesResult)
-    assert not result.outputs
+    resets_P_S_E, _ = episode_keys(given, 1, np.arange(given.chunk_pairs))
+    is_long_P_S_E = 1 + resets_P_S_E[..., 0] % 9 > 4
+    assert result.outputs["success"].dtype == np.float32
+    np.testing.assert_allclose(result.outputs["success"], is_long_P_S_E.mean(axis=-1), atol=1e-6)
+    assert len(np.unique(result.outputs["success"])) > 2
 
 
-def test_an_output_changes_no_bit_of_the_other_results_of_a_small_task(spec):
-    without, with_success = (evaluate(DirectEvaluator(spec(outputs=names))) for names in ((), ("success",)))
-    assert bits(without) == bits(with_success)
+def evaluated(worker_spec: WorkerSpec) -> tuple[EpisodesResult, Transitions]:
+    result = evaluate(DirectEvaluator(worker_spec))
+    return result, transitions_of(result)
+
+
+def test_transitions_are_the_steps_of_the_task(spec):
+    """Each episode again by the task's own functions, from its reset with the actions that it had."""
+    short = spec(episode_steps=30, outputs=TRANSITIONS)
+    result, found = evaluated(short)
+    task = environment_of("point_maze")
+    step, observe = jax.jit(jax.vmap(task.step)), jax.jit(jax.vmap(task.observe))
+    assert len(found.reward) == result.steps.sum()
+    policy, episode = (index.reshape(-1) for index in np.indices(result.steps.shape))
+    states = jax.vmap(task.reset)(evaluation_reset_keys(5, 9, episode, 0, policy))
+    first = np.array([found.rows(*one).start for one in zip(policy, episode, strict=True)])
+    for number in range(30):
+        goes_on = result.steps.reshape(-1) > number
+        at = first[goes_on] + number
+        np.testing.assert_allclose(found.observation[at], np.asarray(observe(states))[goes_on], atol=1e-6)
+        actions = np.zeros((len(first), 2), np.float32)
+        actions[goes_on] = found.action[at]
+        states, rewards, done = step(states, actions)
+        np.testing.assert_allclose(found.reward[at], np.asarray(rewards)[goes_on], atol=1e-5)
+        np.testing.assert_array_equal(found.done[at], np.asarray(done)[goes_on])
+        np.testing.assert_allclose(found.descriptor[at], np.asarray(states)[goes_on], atol=1e-6)
+    last = first + result.steps.reshape(-1) - 1
+    np.testing.assert_array_equal(found.descriptor[last], result.descriptor.reshape(-1, 2))
+    np.testing.assert_array_equal(found.last_observation.reshape(-1, 2), result.descriptor.reshape(-1, 2))
+    following = found.next_observation()
+    inner = np.setdiff1d(np.arange(len(found.reward)), last)
+    np.testing.assert_array_equal(following[inner], found.observation[inner + 1])
+    np.testing.assert_array_equal(following[last], found.descriptor[last])
+
+
+def test_transitions_end_with_the_step_that_is_done(spec, monkeypatch):
+    monkeypatch.setattr(environments, "make_environment", lambda name, options: counting(lambda state, before: before))
+    result, found = evaluated(spec(episode_steps=6, outputs=TRANSITIONS))
+    assert set(result.steps.reshape(-1)) == {1, 2, 3, 4, 5, 6}
+    for policy, episode in np.ndindex(result.steps.shape):
+        rows, steps = found.rows(policy, episode), result.steps[policy, episode]
+        lifetime = found.observation[rows][0, 0]
+        np.testing.assert_array_equal(found.observation[rows, 1], np.arange(steps))
+        np.testing.assert_array_equal(found.descriptor[rows, 1], np.arange(1, steps + 1))
+        np.testing.assert_array_equal(found.done[rows], np.arange(1, steps + 1) >= lifetime)
+        assert found.last_observation[policy, episode].tolist() == [lifetime, steps]
+
+
+def test_actions_of_training_steps_have_their_noise(spec):
+    quiet, noisy = (
+        chunk_runner(spec(episode_steps=5, outputs=TRANSITIONS, action_noise=noise))(
+            centre(random_parameters()), TrainingChunk(1, 0)
+        )
+        for noise in (0.0, 0.1)
+    )
+    assert isinstance(quiet, EpisodesResult)
+    assert isinstance(noisy, EpisodesResult)
+    assert len(noisy.of_steps["action"]) == noisy.steps.sum()
+    first = np.cumsum(noisy.steps.reshape(-1)) - noisy.steps.reshape(-1)
+    noise = (noisy.of_steps["action"] - quiet.of_steps["action"])[first]
+    assert 0.05 < noise.std() < 0.2
+
+
+@pytest.mark.parametrize("names", [("success",), ("last_reward", *TRANSITIONS)])
+def test_an_output_changes_no_bit_of_the_other_results_of_a_small_task(spec, names):
+    without, with_it = (evaluate(DirectEvaluator(spec(outputs=named))) for named in ((), names))
+    assert bits(without) == bits(with_it)
+
+
+def test_an_output_that_does_not_exist_is_named(spec):
+    with pytest.raises(ValueError, match=r"no output of episodes has the name 'succes'; choose among success, "):
+        chunk_runner(spec(outputs=("succes",)))(centre(random_parameters()), EvaluationChunk(1, 0))
 
 
 @pytest.mark.slow
@@ -86,7 +166,7 @@ def test_an_output_changes_no_bit_of_the_other_results_of_an_ant(task, rollout):
         observation_std_O=np.ones(size, np.float32),
     )
     found = [
-        chunk_runner(replace(worker_spec, outputs=names))(ant, EvaluationChunk(1, 0)) for names in ((), ("success",))
+        chunk_runner(replace(worker_spec, outputs=names))(ant, EvaluationChunk(1, 0)) for names in ((), tuple(OUTPUTS))
     ]
     without, with_success = (result for result in found if isinstance(result, EpisodesResult))
     for name in ("fitness", "returns", "descriptor", "steps", "trace_T_B"):

@@ -38,12 +38,22 @@ class Episodes(NamedTuple):
     """Descriptor along an evaluation episode; empty in training. Point k is the descriptor after k / (points - 1) of
     the episode's maximal number of steps, or at its end if it ended before."""
     outputs: dict[str, Any]
-    """Outputs of an evaluation episode that the run names, by name; empty in training."""
+    """Outputs that the run names, by name (`protocol.outputs.AT_THE_END`)."""
+    of_steps: dict[str, Any]
+    """Outputs of each step that the run names, by name, [..., T, ...] (`protocol.outputs.OF_STEPS`). Rows from `steps`
+    on may be anything."""
 
     def map(self, function: Callable[[Any], Any]) -> Episodes:
         """The episodes with a function of each array in its place."""
-        outputs = {name: function(array) for name, array in self.outputs.items()}
-        return Episodes._make([*map(function, self[:-1]), outputs])
+        named = ({name: function(array) for name, array in of.items()} for of in self[-2:])
+        return Episodes._make([*map(function, self[:-2]), *named])
+
+    def with_steps(self, of_steps: Mapping[str, Any]) -> Episodes:
+        """The episodes with these values of all steps, in place of those after the newest."""
+        return self._replace(
+            outputs={name: array for name, array in self.outputs.items() if name not in of_steps},
+            of_steps=dict(of_steps),
+        )
 
 
 class ChunkFunctions(NamedTuple):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.config.parts import Objective
+from es_service.protocol.episodes import one_of
 from es_service.protocol.messages import EpisodesResult, FloatArray
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.novelty import NoveltyArchive, sound_archive
@@ -211,22 +212,8 @@ class CentreEvaluations(Sequence[CentreEvaluation]):
             self.descriptor_N_B[index],
             float(self.population_max_N[index]),
             self.episodes,
-            None if self.results is None else _one_of(self.results, index),
+            None if self.results is None else one_of(self.results, index),
         )
-
-
-def _one_of(results: EpisodesResult, index: int) -> EpisodesResult:
-    """The results of one centre, [E], from those of all, [N, E]."""
-    return EpisodesResult(
-        fitness=results.fitness[index],
-        returns=results.returns[index],
-        descriptor=results.descriptor[index],
-        steps=results.steps[index],
-        goal_distance=results.goal_distance[index],
-        moments=None,
-        trace_T_B=None if results.trace_T_B is None else results.trace_T_B[index],
-        outputs={name: array[index] for name, array in results.outputs.items()},
-    )
 
 
 def in_columns(evaluations: Sequence[CentreEvaluation]) -> CentreEvaluations:

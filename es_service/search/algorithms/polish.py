@@ -29,6 +29,7 @@ from es_service.config.fields import Count
 from es_service.config.model import RunConfig
 from es_service.config.presets import same
 from es_service.config.search import CandidatesConfig
+from es_service.protocol.episodes import each
 from es_service.protocol.messages import EpisodesResult
 from es_service.search.algorithms.base import Algorithm, Ask, CentreEvaluation, SearchState, read_only
 from es_service.search.algorithms.common import novelty_search, population
@@ -96,12 +97,5 @@ def mean_ranks(results: list[EpisodesResult], search: CandidatesConfig) -> NDArr
         results: results of each candidate's evaluation [E].
         search: its objective; of novelty and of a mixture, fitness counts.
     """
-    together = EpisodesResult(
-        fitness=np.stack([one.fitness for one in results]),
-        returns=np.stack([one.returns for one in results]),
-        descriptor=np.stack([one.descriptor for one in results]),
-        steps=np.stack([one.steps for one in results]),
-        goal_distance=np.stack([one.goal_distance for one in results]),
-        moments=None,
-    )
+    together = each(lambda *arrays: np.stack(arrays), *results)
     return centred_ranks(values(search.objective, together)).mean(axis=1)

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from es_service.config.fields import Count
 from es_service.config.model import RunConfig
-from es_service.config.parts import Objectives
+from es_service.config.parts import Objectives, outputs_of
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.errors import ConfigError
 
@@ -108,3 +108,7 @@ class EmittersSettings(PopulationConfig):
     def spread_keys(self) -> tuple[str, ...]:
         """The key that makes more populations."""
         return ("search.emitters",)
+
+    def outputs(self) -> tuple[str, ...]:
+        """What the objectives read."""
+        return outputs_of(self.objectives or ())

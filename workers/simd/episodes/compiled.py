@@ -21,7 +21,7 @@ from workers.environments import Environment
 from workers.episode import Carry, Episodes
 from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import Target, host_target
-from workers.simd.backend.words import ALIGNMENT, aligned, filled, pack, require, unpack, words_of
+from workers.simd.backend.words import ALIGNMENT, Words, aligned, filled, pack, require, unpack, words_of
 from workers.simd.episodes.kernel import Check, compile_resets, no_check
 from workers.simd.episodes.layout import Network
 from workers.simd.episodes.program import EpisodeProgram, write_episodes
@@ -46,6 +46,8 @@ class EpisodeKernel:
     """Shapes and dtypes of a carry."""
     episode_words: int
     """Number of words of an episode's result."""
+    of_steps: dict[str, range]
+    """Words of a carry that have an output of each step, by its name."""
     _call: Callable[..., None]
 
     def run(
@@ -72,20 +74,37 @@ class EpisodeKernel:
                 stay at their reset.
         """
         lanes = len(reset_keys_L)
-        carries, go = self.started(weights, unit, mean_O, std_O, noise_keys_P, reset_keys_L, action_keys_L)
+        steps = self.spec.episode_steps
+        kept = self._room_for_steps(-(-lanes // self.network.width), steps)
+        carries, go = self.started(weights, unit, mean_O, std_O, noise_keys_P, reset_keys_L, action_keys_L, kept)
         if wanted_L is not None:
             require(wanted_L.shape == (lanes,) and wanted_L.dtype == bool, "wanted_L must have a bool for each lane")
             lane_L = np.flatnonzero(~wanted_L)
             carries[lane_L // self.network.width, self.alive_word, lane_L % self.network.width] = 0
-        go(self.spec.episode_steps)
+        go(steps)
         # The result of an episode is the last part of a carry.
         leaves, structure = jax.tree.flatten(self.carry.episode)
         found = structure.unflatten(unpack(carries[:, -self.episode_words :], leaves, lanes))
+        found = found.with_steps(self._steps_kept(kept, lanes))
         if not self.training or len(self.inputs_O) == self.spec.policy.widths[0]:
             return found
         sums = [np.zeros((lanes, self.spec.policy.widths[0]), np.float32) for _ in range(2)]
         sums[0][:, self.inputs_O], sums[1][:, self.inputs_O] = found.shifted_sum_O, found.shifted_square_sum_O
         return found._replace(shifted_sum_O=sums[0], shifted_square_sum_O=sums[1])
+
+    def _room_for_steps(self, blocks: int, steps: int) -> Words:
+        """Memory for the outputs of each step: [block, step, word, lane]."""
+        return aligned((blocks, steps, sum(map(len, self.of_steps.values())), self.network.width))
+
+    def _steps_kept(self, kept: Words, lanes: int) -> dict[str, np.ndarray]:
+        """The outputs of each step by name, [lane, step, ...]."""
+        found, end = {}, 0
+        for name, place in self.of_steps.items():
+            start, end = end, end + len(place)
+            one, steps = self.carry.episode.outputs[name], kept.shape[1]
+            words = kept[:, :, start:end].reshape(len(kept), steps * len(place), -1)
+            (found[name],) = unpack(words, [jax.ShapeDtypeStruct((steps, *one.shape), one.dtype)], lanes)
+        return found
 
     def watch(self, weights: np.ndarray, mean_O: np.ndarray, std_O: np.ndarray, reset_key: np.ndarray) -> Carry:
         """Run one evaluation episode step by step; returns its carries until it is done, with leading axis [T]."""
@@ -106,8 +125,14 @@ class EpisodeKernel:
         noise_keys_P: np.ndarray | None,
         reset_keys_L: np.ndarray,
         action_keys_L: np.ndarray,
+        kept: Words | None = None,
     ) -> tuple[np.ndarray, Callable[[int], None]]:
-        """Words of the carries after the reset [block, word, lane], and a function that runs so many more steps."""
+        """Words of the carries after the reset [block, word, lane], and a function that runs so many more steps.
+
+        Args:
+            kept: memory for the outputs of as many steps as the function runs, which begin anew at each call; None:
+                they are not wanted.
+        """
         width, lanes = self.network.width, len(reset_keys_L)
         require(
             (noise_keys_P is not None) == self.training
@@ -142,7 +167,9 @@ class EpisodeKernel:
         )
 
         def go(steps: int) -> None:
-            self._call(*[array.ctypes.data for array in arrays], np.float32(unit), blocks, steps)
+            steps_kept = self._room_for_steps(blocks, steps) if kept is None else kept
+            require(steps_kept.shape[:2] == (blocks, steps), "there is no room for the outputs of these steps")
+            self._call(*[array.ctypes.data for array in (*arrays, steps_kept)], np.float32(unit), blocks, steps)
 
         return carries, go
 
@@ -176,7 +203,7 @@ def compile_episodes(
     target = target or host_target()
     program = write_episodes(environment, spec, inputs_O, target.width, training=training, own_weights=own_weights)
     begin = compile_resets(program.steps.begin, target, folder, check_resets)
-    signature = [*[ctypes.c_void_p] * 8, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
+    signature = [*[ctypes.c_void_p] * 9, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
 
     def kernel(native: Native) -> EpisodeKernel:
         return EpisodeKernel(
@@ -187,6 +214,7 @@ def compile_episodes(
             network=program.network,
             begin=begin,
             alive_word=program.alive_word,
+            of_steps=program.of_steps,
             carry=program.carry,
             episode_words=sum(map(words_of, jax.tree.leaves(program.carry.episode))),
             _call=native.function(*signature),

@@ -8,8 +8,9 @@ weights and the observation statistics of the centre, or with `own_weights` each
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from itertools import accumulate, pairwise
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ import numpy as np
 
 from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
+from es_service.protocol.outputs import OF_STEPS
 from workers.environments import Environment
 from workers.episode import Carry, EpisodeSteps, episode_steps
 from workers.simd.backend.emit import graph_function
@@ -43,6 +45,8 @@ class EpisodeProgram(NamedTuple):
     alive_word: int
     """Index of the word of a carry that says whether the episode is alive."""
     network: Network
+    of_steps: dict[str, range]
+    """Words of a carry that have an output of each step, by its name."""
     name: str
     """Complete description of what the IR computes."""
     text: Callable[[], str]
@@ -82,17 +86,26 @@ def write_episodes(
         )
     alive_word = sum(words_of(aval) for aval in jax.tree.leaves(carry.state))
     words = sum(map(words_of, leaves))
+    of_steps = {name: place for name, place in _places(carry).episode.outputs.items() if name in OF_STEPS}
 
     @functools.cache
     def graphs() -> tuple[Traced, Traced]:
         return trace_jaxpr(look), trace_jaxpr(move)
 
     def text() -> str:
-        return _module(*graphs(), network, len(inputs_O), words, alive_word, weights)
+        kept = [word for place in of_steps.values() for word in place]
+        return _module(*graphs(), network, len(inputs_O), words, alive_word, weights, kept)
 
     digests = f"{definition()} {jaxpr_digest(look)} {jaxpr_digest(move)}"
     name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {training}{' own' * own_weights}"
-    return EpisodeProgram(steps, carry, alive_word, network, name, text, graphs)
+    return EpisodeProgram(steps, carry, alive_word, network, of_steps, name, text, graphs)
+
+
+def _places(carry: Carry) -> Any:
+    """The words of each array of a carry, in its place."""
+    leaves, structure = jax.tree.flatten(carry)
+    ends = list(accumulate(map(words_of, leaves), initial=0))
+    return structure.unflatten([range(*place) for place in pairwise(ends)])
 
 
 def _module(
@@ -103,14 +116,18 @@ def _module(
     words: int,
     alive_word: int,
     weights: Weights,
+    kept: Sequence[int],
 ) -> str:
     """LLVM IR of whole episodes, the function
 
     void kernel(ptr carries, ptr action_keys, ptr constants, ptr centre, ptr keys, ptr places, ptr noise, ptr room,
-                float unit, i64 blocks, i64 steps)
+                ptr kept, float unit, i64 blocks, i64 steps)
 
     With own weights, constants are those of each block, centre has the lanes' addresses, and noise is memory for the
     single weights of a block.
+
+    Args:
+        kept: words of a carry that are copied to `kept` [block, step, word, lane] after each step.
     """
     width = network.width
     actions = network.outputs
@@ -126,7 +143,7 @@ def _module(
     before = {"perturbed": [fill_code, *keep_code], "own": [singles_function(network)], "shared": []}[weights]
     own, noisy = weights == "own", weights == "perturbed"
 
-    pointers = ["carries", "action_keys", "constants", "centre", "keys", "places", "noise", "room"]
+    pointers = ["carries", "action_keys", "constants", "centre", "keys", "places", "noise", "room", "kept"]
     builder = FunctionBuilder(
         "inside", [*(f"ptr noalias %{name}" for name in pointers), "float %unit", "i64 %blocks", "i64 %steps"], width
     )
@@ -149,10 +166,18 @@ def _module(
             if network.keeps_weights:
                 builder.do("call void @keep(ptr %centre, ptr %noise, float %unit)")
 
-        def step(_: str, __: Values) -> Values:
+        def keep(number_of_step: str) -> None:
+            row = builder.value(f"add i64 {builder.value(f'mul i64 {number}, %steps')}, {number_of_step}")
+            copies = builder.at("%kept", builder.index((row, len(kept))), vector)
+            for place, word in enumerate(kept):
+                builder.store(vector, builder.load(vector, carry, word), copies, place)
+
+        def step(number_of_step: str, _: Values) -> Values:
             builder.do(f"call void @look(ptr {carry}, ptr {constants}, ptr {seen})")
             builder.do(f"call void @policy(ptr {seen}, ptr {alive}, ptr {policies}, {given}ptr {hidden}, ptr {action})")
             builder.do(f"call void @move(ptr {carry}, ptr {constants}, ptr {action}, ptr {action_key})")
+            if kept:
+                keep(number_of_step)
             return []
 
         def all_done() -> str:

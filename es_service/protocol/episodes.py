@@ -1,0 +1,42 @@
+"""Results of episodes array by array: changed, joined, and those of one of several policies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from es_service.protocol.messages import EpisodesResult
+
+ARRAYS = "fitness", "returns", "descriptor", "steps", "goal_distance"
+"""Arrays that every result has."""
+
+
+def each(change: Callable[..., np.ndarray], *results: EpisodesResult) -> EpisodesResult:
+    """A function of the arrays of results with equal names, array by array; without moments and outputs of steps."""
+    traces = [one.trace_T_B for one in results if one.trace_T_B is not None]
+    return EpisodesResult(
+        *(change(*(getattr(one, name) for one in results)) for name in ARRAYS),
+        moments=None,
+        trace_T_B=change(*traces) if len(traces) == len(results) else None,
+        outputs={name: change(*(one.outputs[name] for one in results)) for name in results[0].outputs},
+    )
+
+
+def joined(results: Sequence[EpisodesResult], count: int | None = None) -> EpisodesResult:
+    """Results along the first axis, one after another, of which the first `count` are kept; without moments."""
+    found = each(lambda *arrays: np.concatenate(arrays)[:count], *results)
+    names, rows = results[0].of_steps, int(found.steps.sum(dtype=np.int64))
+    return replace(
+        found, of_steps={name: np.concatenate([one.of_steps[name] for one in results])[:rows] for name in names}
+    )
+
+
+def one_of(results: EpisodesResult, index: int) -> EpisodesResult:
+    """The results at an index of the first axis, such as those of one policy [E] from those of all [N, E]."""
+    found = each(lambda array: array[index], results)
+    if not results.of_steps:
+        return found
+    first, rows = (int(steps.sum(dtype=np.int64)) for steps in (results.steps[:index], results.steps[index]))
+    return replace(found, of_steps={name: array[first : first + rows] for name, array in results.of_steps.items()})
