@@ -22,11 +22,12 @@ test: .venv/installed-dev
 	  $(MAKE) --no-print-directory tests && ended=$$(date +%s) && \
 	  echo "make test: lint $$((linted - began)) s, tests $$((ended - linted)) s, all $$((ended - $(START))) s"
 
-# Those of the system start processes of their own, so two at a time; those that look at clocks, one after another.
+# Those of the system start processes of their own, so two at a time; those that look at clocks run when nothing else
+# computes, and mostly wait.
 tests: .venv/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile tests/es_service tests/laws tests/workers
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not alone and not long and not image' tests/system
-	$(BIN)/python -m pytest -m 'alone and not long and not image' tests/system
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'alone and not long and not image' tests/system
 
 # Before an issue is closed: fifty kills in one run, a cluster whose hosts come, go, hang and die, browsers.
 long: .venv/installed-dev
