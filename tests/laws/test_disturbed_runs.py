@@ -36,6 +36,17 @@ CHANGES = {
         "search": {"algorithm": "nsra_es", "update": "all", "fitness_weight_patience": 1}
     },
     "ars, a linear policy": {"search": {"algorithm": "ars", "shaping": {"count": 5}}, "policy": {"hidden": []}},
+    "es, one of two actions": {
+        "search": {"algorithm": "es"},
+        "task": {"environment": "tests.examples.cart_pole:CartPole", "episode_steps": 40},
+        "policy": {"output": "categorical"},
+    },
+    "es, a policy with a memory": {
+        "search": {"algorithm": "es"},
+        "task": {"environment": "tests.examples.swing_up:SwingUp", "episode_steps": 20},
+        "policy": {"memory": 3},
+        "compute": {"inline_workers": "processes"},
+    },
 }
 """Name -> settings of a run that are none of a method's own."""
 KILLS = ("before_begin", "mid_transaction", "before_commit", "after_commit")
@@ -50,10 +61,10 @@ def config_of(name: str, **compute: object) -> dict:
     small = {"chunk_pairs": 4, "gradient_block_pairs": 4}
     used = {key: value for key, value in small.items() if has_effect(f"compute.{key}", settings_of_method)}
     return config | {
-        **{section: config[section] | settings for section, settings in changes.items()},
+        **{section: config.get(section, {}) | settings for section, settings in changes.items()},
         "budget": {"generations": GENERATIONS},
         "store": {"keep_every": KEPT},
-        "compute": config["compute"] | used | compute,
+        "compute": config["compute"] | changes.get("compute", {}) | used | compute,
     }
 
 

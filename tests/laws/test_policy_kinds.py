@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from es_service import api
+from es_service.runs.certification import certify_run
+from es_service.runs.certified import Certified
 from es_service.runs.export import export
 from es_service.runs.replay import record
 from es_service.runs.verification import verify
@@ -32,6 +34,43 @@ def config_of(kind, **more):
         "budget": {"generations": 3},
         "compute": {"engine": "inline", "workers": 1},
     } | more
+
+
+def certified(folder, search, **sections) -> Certified:
+    """The certified policy of an ES with a hidden layer, in 256 episodes."""
+    config = sections | {
+        "search": {"algorithm": "es", "sigma": 0.1, "evaluation_episodes": 16, **search},
+        "map": {"enabled": False},
+        "compute": {"engine": "inline", "workers": 1},
+    }
+    api.run(config, folder)
+    return certify_run(folder)[0]
+
+
+def test_a_policy_that_chooses_an_action_balances_a_pole(tmp_path):
+    found = certified(
+        tmp_path / "run",
+        {"pairs": 32, "step": {"kind": "adam", "learning_rate": 0.05, "l2": 0.0}},
+        task={"environment": "tests.examples.cart_pole:CartPole"},
+        policy={"hidden": [8], "output": "categorical"},
+        budget={"env_steps": 800_000},
+    )
+    assert found.episodes.return_E.mean() > 190.0, "of 200 steps"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("memory", [16, None])
+def test_a_policy_with_a_memory_swings_up_a_pendulum_whose_velocity_is_hidden(tmp_path, memory):
+    found = certified(
+        tmp_path / "run",
+        {"pairs": 128, "step": {"kind": "adam", "learning_rate": 0.03, "l2": 0.0}},
+        task={"environment": "tests.examples.swing_up:SwingUp", "episodes_per_member": 2},
+        policy={"hidden": [16], "memory": memory, "action_noise": 0.0},
+        budget={"env_steps": 20_000_000},
+    )
+    assert found.episodes.success_E is not None
+    swung_up = int(found.episodes.success_E.sum())
+    assert swung_up >= 240 if memory else swung_up < 128, "of 256"
 
 
 @pytest.mark.parametrize("kind", KINDS)
