@@ -8,8 +8,10 @@ from __future__ import annotations
 import os
 import pickle
 import socket
-from typing import TYPE_CHECKING
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
 
+from es_service.protocol.kept_parents import KeptParents, LackingError, with_parents
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import Work, WorkerPlace
 from es_service.protocol.process_environment import worker_environment
@@ -36,6 +38,7 @@ class WorkerActor:
         self._spec, self._index, self._gpus, self._cores = spec, index, gpus, cores
         self._environment = ""
         self._run_chunks: Compilable | None = None
+        self._parents: KeptParents[Any] = KeptParents(0, attrgetter("nbytes"))
 
     def __repr__(self) -> str:
         return f"worker-{self._index}@{socket.gethostname()}"
@@ -63,34 +66,41 @@ class WorkerActor:
         from workers.rollouts import BACKENDS
 
         self._environment = spec.environment
+        self._parents = KeptParents(spec.parent_cache_bytes, attrgetter("nbytes"))
         with sendable(self._environment):
             self._run_chunks = make_worker_with_cores(spec, self._cores)
         if not self._gpus:
             return platform_text(platform_info())
         return platform_text(platform_info() | {"device": BACKENDS[spec.rollout].device()})
 
-    def compile(self, chunks: bytes, *subjects: bytes) -> float:
+    def compile(self, chunks: bytes, *parts: bytes) -> float:
         """Compile for chunks without running them; returns the seconds that it took. The arguments are those of `run`.
 
         The engine calls this before the first call of `run` for each kind of chunk.
         """
         assert self._run_chunks is not None, "compile was called before build"
         with sendable(self._environment):
-            return self._run_chunks.seconds_to_compile(_unpacked(chunks, subjects))
+            return self._run_chunks.seconds_to_compile(self._unpacked(chunks, parts))
 
-    def run(self, chunks: bytes, *subjects: bytes) -> bytes:
-        """Run chunks; returns the pickled results.
+    def run(self, chunks: bytes, *parts: bytes) -> bytes:
+        """Run chunks; returns the pickled results, or None if it lacks parents of policies.
 
         Args:
-            chunks: pickled [(index of its subject in `subjects`, Chunk)].
-            subjects: each one pickled.
+            chunks: pickled [(index of its subject in `parts`, Chunk)].
+            parts: subjects, each one pickled, and pickled parents of policies by name.
         """
         assert self._run_chunks is not None, "run was called before build"
         with sendable(self._environment):
-            return pickle.dumps(self._run_chunks(_unpacked(chunks, subjects)), pickle.HIGHEST_PROTOCOL)
+            try:
+                work = self._unpacked(chunks, parts)
+            except LackingError:
+                return pickle.dumps(None)
+            return pickle.dumps(self._run_chunks(work), pickle.HIGHEST_PROTOCOL)
 
-
-def _unpacked(chunks: bytes, subjects: tuple[bytes, ...]) -> list[Work]:
-    """The chunks of a call with their subjects."""
-    known = [pickle.loads(subject) for subject in subjects]
-    return [(known[index], chunk) for index, chunk in pickle.loads(chunks)]
+    def _unpacked(self, chunks: bytes, parts: tuple[bytes, ...]) -> list[Work]:
+        """The chunks of a call with their subjects. Raises LackingError."""
+        known = [pickle.loads(part) for part in parts]
+        for part in known:
+            for name, parameters_D in part.items() if isinstance(part, dict) else ():
+                self._parents.add(name, parameters_D)
+        return with_parents([(known[index], chunk) for index, chunk in pickle.loads(chunks)], self._parents)

@@ -16,6 +16,7 @@ from multiprocessing import get_context
 from typing import Any, NamedTuple, TypeVar
 
 from es_service.protocol.gradient_tree import with_neighbours_added
+from es_service.protocol.kept_parents import with_made_policies
 from es_service.protocol.messages import ChunkResult, Work, WorkerSpec
 from es_service.protocol.parent import end_with
 from es_service.protocol.raised import sendable
@@ -58,8 +59,8 @@ def make_worker_with_cores(spec: WorkerSpec, cores: int) -> Compilable:
     pool = ProcessPoolExecutor(cores, context, _begin_child, given)
     _together(pool, _meet, [()] * cores)  # from now on there is a child for each core
     return Compilable(
-        lambda work: divided(pool, _run_child, work, cores),
-        lambda work: _together(pool, _compile_in_child, [(work,)] * cores),
+        lambda work: divided(pool, _run_child, with_made_policies(work), cores),
+        lambda work: _together(pool, _compile_in_child, [(with_made_policies(work),)] * cores),
     )
 
 

@@ -14,7 +14,8 @@ import traceback
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from es_service.protocol.messages import Subject, forget_oldest
+from es_service.protocol.kept_parents import KeptParents, LackingError, with_parents
+from es_service.protocol.messages import Subject, WorkerSpec, forget_oldest
 from es_service.protocol.parent import end_with
 from es_service.protocol.raised import RaisedError, raised
 from es_service.protocol.sources import why_refused
@@ -29,10 +30,11 @@ def main(descriptor: int, parent: int) -> None:
     """Serve workers until the parent closes its end of the socket `descriptor`.
 
     The parent sends over this socket the WorkerSpec, and then for each worker one byte with the descriptor of the
-    worker's socket. A worker receives ("subject", number, Subject) and ("chunks", item, attempt, [(number, Chunk)]);
-    `item` names their work item, and `number` the subject of each. It sends ("broken", RaisedError), or ("up",) and
-    then for each work item ("results", item, attempt, [ChunkResult]) or ("failure", item, attempt, RaisedError). Before
-    it computes the first work item of a kind, it compiles for it and sends ("compiled", kind, seconds).
+    worker's socket. A worker receives ("subject", number, Subject), ("parent", name, parameters) and ("chunks", item,
+    attempt, [(number, Chunk)]); `item` names their work item, and `number` the subject of each. It sends ("broken",
+    RaisedError), or ("up",) and then for each work item ("results", item, attempt, [ChunkResult]), ("failure", item,
+    attempt, RaisedError) or, if it has not been sent the parents of policies, ("lacks", item, attempt). Before it
+    computes the first work item of a kind, it compiles for it and sends ("compiled", kind, seconds).
     """
     end_with(parent)
     with socket.socket(fileno=descriptor) as control:
@@ -40,7 +42,7 @@ def main(descriptor: int, parent: int) -> None:
             spec = receive(control)
             run_chunks = _make_run_chunks(spec)
             while (given := _descriptor(control)) is not None:
-                threading.Thread(target=_work, args=(given, run_chunks, spec.environment), daemon=True).start()
+                threading.Thread(target=_work, args=(given, run_chunks, spec), daemon=True).start()
         except Exception:
             traceback.print_exc()
     os._exit(0)  # do not wait for threads, which may be in the middle of a chunk
@@ -73,39 +75,44 @@ def _make_run_chunks(spec: Any) -> Compilable | RaisedError:
         return raised(error, spec.environment)
 
 
-def _work(descriptor: int, run_chunks: Compilable | RaisedError, environment: str) -> None:
+def _work(descriptor: int, run_chunks: Compilable | RaisedError, spec: WorkerSpec) -> None:
     """Run one worker until the parent closes its end. After any other end, the parent sees that and the reason."""
     with socket.socket(fileno=descriptor) as parent:
         try:
-            _serve(parent, run_chunks, environment)
+            _serve(parent, run_chunks, spec)
         except (EOFError, ConnectionError):
             pass
         except Exception:
             traceback.print_exc()
 
 
-def _serve(parent: socket.socket, run_chunks: Compilable | RaisedError, environment: str) -> None:
+def _serve(parent: socket.socket, run_chunks: Compilable | RaisedError, spec: WorkerSpec) -> None:
     """Receive chunks and send their results; does not return unless the worker is broken."""
     if isinstance(run_chunks, RaisedError):
         parent.sendall(framed(("broken", run_chunks)))
         return
     parent.sendall(framed(("up",)))
     subjects: dict[int, Subject] = {}
+    parents: KeptParents[Any] = KeptParents(spec.parent_cache_bytes, attrgetter("nbytes"))
     compiled: set[str] = set()
     while True:
         match receive(parent):
             case ("subject", number, subject):
                 subjects[number] = subject
+            case ("parent", name, parameters_D):
+                parents.add(name, parameters_D)
             case ("chunks", item, attempt, chunks):
                 try:
-                    work = [(subjects[number], chunk) for number, chunk in chunks]
+                    work = with_parents([(subjects[number], chunk) for number, chunk in chunks], parents)
                     if (kind := type(work[0][1]).__name__) not in compiled:
                         seconds = run_chunks.seconds_to_compile(work)
                         compiled.add(kind)
                         parent.sendall(framed(("compiled", kind, seconds)))
                     answer = ("results", item, attempt, run_chunks(work))
+                except LackingError:
+                    answer = ("lacks", item, attempt)
                 except BaseException as error:  # also sys.exit in an environment
-                    answer = ("failure", item, attempt, raised(error, environment))
+                    answer = ("failure", item, attempt, raised(error, spec.environment))
                 parent.sendall(framed(answer))
                 forget_oldest(subjects, attrgetter("nbytes"))
 

@@ -19,6 +19,7 @@ from es_service.protocol.messages import (
     Chunk,
     ChunkResult,
     EvaluationChunk,
+    FloatArray,
     GradientChunk,
     GradientResult,
     Policies,
@@ -31,6 +32,7 @@ from es_service.protocol.messages import (
 )
 from es_service.protocol.noise import NORMAL_STD, Domain, Keys, evaluation_reset_keys, stream_keys
 from es_service.protocol.policies import slots
+from es_service.protocol.recipes import Recipes
 from workers.compilable import Compilable
 from workers.results import evaluation_result, policies_result, training_result
 from workers.rollouts import BACKENDS
@@ -141,11 +143,11 @@ def _kinds(spec: WorkerSpec, functions: ChunkFunctions) -> dict[type[Chunk], _Ki
         TrainingChunk: _Kind(functions.training, training_arguments, training_results),
         EvaluationChunk: _Kind(functions.evaluation, evaluation_arguments, evaluation_results),
         GradientChunk: _Kind(Compilable(gradient_sums, compile_gradient_sum), gradient_arguments, gradient_results),
-        PolicyChunk: _Kind(functions.policies, _policy_arguments, _policy_results),
+        PolicyChunk: _Kind(functions.policies, partial(_policy_arguments, spec), _policy_results),
     }
 
 
-def _policy_arguments(work: Sequence[tuple[Policies, PolicyChunk]]) -> tuple[Any, ...]:
+def _policy_arguments(spec: WorkerSpec, work: Sequence[tuple[Policies, PolicyChunk]]) -> tuple[Any, ...]:
     policies, chunk = work[0]
     together = list({id(one): one for one, _ in work}.values())
     ends = accumulate(len(one.parameters_N_D) for one in together)
@@ -156,13 +158,22 @@ def _policy_arguments(work: Sequence[tuple[Policies, PolicyChunk]]) -> tuple[Any
     )
     number_L = np.concatenate([one.first + policy_L for (one, _), (policy_L, _) in zip(work, slots_C, strict=True)])
     episode_L = np.concatenate([episode_L for _, episode_L in slots_C])
+    given = [one.parameters_N_D for one in together]
+    inputs = spec.policy.widths[0]
     return (
-        [one.parameters_N_D for one in together],
-        np.concatenate([one.observation_mean_N_O for one in together])[row_L],
-        np.concatenate([one.observation_std_N_O for one in together])[row_L],
+        [one.made() if isinstance(one, Recipes) else one for one in given],
+        np.concatenate([_statistics(one, one.observation_mean_N_O, 0.0, inputs) for one in together])[row_L],
+        np.concatenate([_statistics(one, one.observation_std_N_O, 1.0, inputs) for one in together])[row_L],
         row_L,
         evaluation_reset_keys(policies.seed, chunk.generation, episode_L, chunk.ask, number_L, policies.domain),
     )
+
+
+def _statistics(policies: Policies, given_N_O: FloatArray | None, value: float, inputs: int) -> FloatArray:
+    """Means or standard deviations of the policies' observations; all have one value if none are given."""
+    if given_N_O is not None:
+        return given_N_O
+    return np.full((len(policies.parameters_N_D), inputs), value, np.float32)
 
 
 def _policy_results(work: Sequence[tuple[Policies, PolicyChunk]], episodes: Episodes) -> list[ChunkResult]:

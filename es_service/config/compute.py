@@ -97,6 +97,11 @@ class ComputeConfig(Section):
         description="Seconds without a live worker, after the first had come up, after which the run stops. A worker "
         "that has not started after half of this time is replaced; on a busy machine a start takes up to ten seconds.",
     )
+    parent_cache_mb: Count = Field(
+        256,
+        description="Most MiB of elites' parameters that each worker keeps, of which it makes the policies of "
+        "map_elites; what it does not keep is sent again. It never changes results.",
+    )
     dispatch_log: Switch = Field(
         False,
         description="Whether the run folder gets a dispatch.jsonl: what was sent to each worker, what it answered, and "

@@ -224,5 +224,6 @@ def worker_spec(config: RunConfig, task: TaskSpec, outputs: tuple[str, ...] = ()
         gradient_block_pairs=compute.gradient_block_pairs,
         rollout=compute.rollout,
         outputs=tuple(sorted({*outputs, *search.outputs()})),
+        parent_cache_bytes=compute.parent_cache_mb * 2**20,
         sources=worker_sources(settings.environment),
     )

@@ -24,6 +24,7 @@ from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
+from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
 from es_service.protocol.messages import Subject, Work, WorkerSpec, forget_oldest
 from es_service.protocol.parent import start_child
 from es_service.protocol.process_environment import child_environment
@@ -74,10 +75,12 @@ class _Worker:
 
     child: _Child
     channel: Channel
+    parents: KeptParents[int]
+    """Sizes of the parents of policies that it keeps."""
     subjects: dict[int, int] = field(default_factory=dict)
     """Numbers of the subjects that it has, in the order in which they were sent, and their bytes."""
-    unanswered: int = 0
-    """Number of work items that it was sent and has not answered."""
+    unanswered: dict[tuple[Hashable, int], Sequence[Work]] = field(default_factory=dict)
+    """Work items that it was sent and has not answered, by id and attempt."""
 
 
 class ChildProcesses:
@@ -85,6 +88,7 @@ class ChildProcesses:
 
     def __init__(self, spec: WorkerSpec, *, threads: bool = False) -> None:
         self._spec, self._threads = framed(spec), threads
+        self._parent_cache_bytes = spec.parent_cache_bytes
         self._workers: dict[int, _Worker] = {}
         self._by_descriptor: dict[int, int] = {}
         self._poll = select.poll()
@@ -124,7 +128,7 @@ class ChildProcesses:
         return self._lose(child, f"worker {worker}, a thread of the same process, was killed", bystanders=True)
 
     def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
-        """Send the chunks, after those of their subjects that the worker does not have."""
+        """Send the chunks, after those of their subjects and of the parents of policies that the worker lacks."""
         to = self._workers.get(worker)
         if to is None:
             return  # lost with another thread of its child, which `receive` is going to report
@@ -135,9 +139,10 @@ class ChildProcesses:
                 to.subjects[number] = subject.nbytes
                 frames.append(frame)
             numbered.append((number, chunk))
+        frames += [framed(("parent", *one)) for one in parents_to_send(work, to.parents).items()]
         forget_oldest(to.subjects, int)
         forget_oldest(self._subjects, lambda entry: entry[0].nbytes)
-        to.unanswered += 1
+        to.unanswered[item_id, attempt] = work
         to.channel.send(*frames, framed(("chunks", item_id, attempt, numbered)))
         self._watch(to.channel)
 
@@ -178,13 +183,13 @@ class ChildProcesses:
     def _framed_subject(self, subject: Subject) -> tuple[int, bytes]:
         """Number and message of a subject. One that was forgotten meanwhile gets another number."""
         if (known := self._subjects.get(id(subject))) is None:
-            frame = framed(("subject", self._next_subject, subject))
+            frame = framed(("subject", self._next_subject, as_sent(subject)))
             known = self._subjects[id(subject)] = subject, self._next_subject, frame
             self._next_subject += 1
         return known[1:]
 
     def _add(self, number: int, child: _Child, ours: socket.socket) -> None:
-        self._workers[number] = _Worker(child, Channel(ours))
+        self._workers[number] = _Worker(child, Channel(ours), KeptParents(self._parent_cache_bytes, int))
         self._by_descriptor[ours.fileno()] = number
         self._poll.register(ours, select.POLLIN)
 
@@ -216,11 +221,14 @@ class ChildProcesses:
                     case ("compiled", kind, seconds):
                         self._ready.append(Compiled(number, kind, seconds))
                     case ("results", item_id, attempt, results):
-                        worker.unanswered -= 1
+                        worker.unanswered.pop((item_id, attempt), None)
                         self._ready.append(Answer(number, item_id, attempt, results))
                     case ("failure", item_id, attempt, error):
-                        worker.unanswered -= 1
+                        worker.unanswered.pop((item_id, attempt), None)
                         self._ready.append(Failure(number, item_id, attempt, error.message, error.traceback))
+                    case ("lacks", item_id, attempt):
+                        worker.parents.clear()
+                        self.send(number, item_id, attempt, worker.unanswered[item_id, attempt])
                     case ("broken", error):
                         return error
                     case _:

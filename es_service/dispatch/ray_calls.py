@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import pickle
 from collections import deque
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
-from es_service.protocol.messages import Subject, Work, forget_oldest
+from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
+from es_service.protocol.messages import KEPT_BYTES, FloatArray, Subject, Work, forget_oldest
 
 IN_CALL_BYTES = 64 * 2**10
-"""Largest size in bytes of a subject sent with every call; a larger one is stored, and fetched once per node."""
+"""Largest size in bytes of a subject or of a parent of policies that is sent with every call; a larger one is stored,
+and fetched once per node."""
 MANY = 64
 """Number of workers above which all answers that are there are looked for at once, since Ray looks at every call."""
 
@@ -26,6 +29,7 @@ class Call:
     """Method that was called: place, build, compile or run."""
     item_id: Hashable = None
     attempt: int = 0
+    work: Sequence[Work] = ()
     kind: str = ""
     """Kind of chunks for which it compiles."""
 
@@ -85,6 +89,13 @@ class Calls:
         return oldest
 
 
+class _Stored(NamedTuple):
+    """A parent that Ray has stored."""
+
+    ref: Any
+    nbytes: int
+
+
 class Arguments:
     """Arguments of calls that get chunks. A large subject is stored once for all calls that share it."""
 
@@ -92,25 +103,46 @@ class Arguments:
         self._ray = ray
         self._subjects: dict[int, tuple[Subject, Any]] = {}
         """By `id`, which the subject in the entry keeps from being reused."""
+        self._parents: KeptParents[_Stored] = KeptParents(KEPT_BYTES, attrgetter("nbytes"))
+        """Large parents that are stored."""
 
-    def of(self, work: Sequence[Work]) -> tuple[Any, ...]:
-        """The chunks, and their subjects without repetitions, as `WorkerActor.run` takes them."""
+    def of(self, work: Sequence[Work], kept: KeptParents[int]) -> tuple[Any, ...]:
+        """The chunks, their subjects without repetitions, and the parents that a worker lacks, as `WorkerActor.run`
+        takes them.
+
+        Args:
+            kept: see `parents_to_send`.
+        """
         subjects: dict[int, Any] = {}
         for subject, _ in work:
             if id(subject) not in subjects:
                 subjects[id(subject)] = self._packed(subject)
         index = {key: number for number, key in enumerate(subjects)}
         chunks = pickle.dumps([(index[id(subject)], chunk) for subject, chunk in work], pickle.HIGHEST_PROTOCOL)
-        return chunks, *subjects.values()
+        return chunks, *subjects.values(), *self._packed_parents(parents_to_send(work, kept))
 
     def forget(self) -> None:
-        """Forget all subjects, so that Ray need not keep them."""
+        """Forget all that is stored, so that Ray need not keep it."""
         self._subjects.clear()
+        self._parents.clear()
+
+    def _packed_parents(self, parents: Mapping[bytes, FloatArray]) -> list[Any]:
+        """Parents by name: small ones together, and for each large one the reference under which Ray has stored it."""
+        small = {name: values for name, values in parents.items() if values.nbytes <= IN_CALL_BYTES}
+        packed: list[Any] = [pickle.dumps(small, pickle.HIGHEST_PROTOCOL)] if small else []
+        large = {name: values for name, values in parents.items() if name not in small}
+        for name, values in large.items():
+            if name not in self._parents:
+                ref = self._ray.put(pickle.dumps({name: values}, pickle.HIGHEST_PROTOCOL))
+                self._parents.add(name, _Stored(ref, values.nbytes))
+        packed += [self._parents[name].ref for name in large]
+        self._parents.needed(large)
+        return packed
 
     def _packed(self, subject: Subject) -> Any:
         """The subject, pickled, or the reference under which Ray has stored that."""
         if (known := self._subjects.get(id(subject))) is None:
-            pickled = pickle.dumps(subject, pickle.HIGHEST_PROTOCOL)
+            pickled = pickle.dumps(as_sent(subject), pickle.HIGHEST_PROTOCOL)
             known = subject, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
             self._subjects[id(subject)] = known
             forget_oldest(self._subjects, lambda entry: entry[0].nbytes)

@@ -27,6 +27,7 @@ from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_faults import fault_reason, raised_in_actor
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
 from es_service.dispatch.ray_refusals import Refusals
+from es_service.protocol.kept_parents import KeptParents
 from es_service.protocol.messages import Work, WorkerPlace, WorkerSpec
 from es_service.protocol.sources import OtherCodeError
 
@@ -126,6 +127,9 @@ class Actors:
         self._inbox: deque[Message] = deque()
         self._compiled: dict[int, set[str]] = {}
         """Worker id -> kinds of chunks for which it was told to compile."""
+        self._parent_cache_bytes = spec.parent_cache_bytes
+        self._parents: dict[int, KeptParents[int]] = {}
+        """Worker id -> sizes of the parents of policies that it keeps."""
         self._refusals = Refusals(on_refusal)
 
     def places(self) -> dict[int, WorkerPlace]:
@@ -138,6 +142,7 @@ class Actors:
             at = self._class.options(**self._where(worker))
             handle = at.remote(self._spec, worker, self._claim.gpus, 1 if self._claim.gpus else self._claim.cpus)
             self._handles[worker], self._compiled[worker] = handle, set()
+            self._parents[worker] = KeptParents(self._parent_cache_bytes, int)
             self._calls[handle.place.remote()] = Call(worker, "place")
             self._calls[handle.build.remote()] = Call(worker, "build")
         except self._ray.exceptions.RayError as error:
@@ -148,7 +153,7 @@ class Actors:
         self._has_lost = True
         self._calls.forget(worker)
         self._up.discard(worker)
-        for known in (self._places, self._planned, self._compiled):
+        for known in (self._places, self._planned, self._compiled, self._parents):
             known.pop(worker, None)
         if (handle := self._handles.pop(worker, None)) is not None:
             with contextlib.suppress(self._ray.exceptions.RayError, ValueError):
@@ -165,7 +170,7 @@ class Actors:
         if worker not in self._handles:
             return  # it has just been lost when it was sent other chunks, which `receive` is going to report
         try:
-            arguments, kind = self._arguments.of(work), type(work[0][1]).__name__
+            arguments, kind = self._arguments.of(work, self._parents[worker]), type(work[0][1]).__name__
             if worker in self._to_ask:
                 self._to_ask.discard(worker)
                 self._calls[self._handles[worker].place.remote()] = Call(worker, "place")
@@ -176,7 +181,7 @@ class Actors:
         except self._ray.exceptions.RayError as error:
             self._lose(worker, fault_reason(error))
             return
-        self._calls[ref] = Call(worker, "run", item_id, attempt)
+        self._calls[ref] = Call(worker, "run", item_id, attempt, work)
 
     def platforms(self) -> frozenset[str]:
         """`machine.platform_text` of each kind of actor that has come up."""
@@ -244,7 +249,11 @@ class Actors:
             return self._lost(call.worker, f"{where or 'before it had a place'}: {fault_reason(error)}")
         del self._calls[ref]
         if call.what == "run":
-            return Answer(call.worker, call.item_id, call.attempt, pickle.loads(value))
+            if (results := pickle.loads(value)) is None:  # it lacks parents of policies
+                self._parents[call.worker].clear()
+                self.send(call.worker, call.item_id, call.attempt, call.work)
+                return None
+            return Answer(call.worker, call.item_id, call.attempt, results)
         if call.what == "compile":
             return Compiled(call.worker, call.kind, value)
         if call.what == "build":

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.errors import EvaluationError, WayOut
 from es_service.protocol.messages import Centre, EpisodesResult
+from es_service.protocol.recipes import Recipes
 from es_service.search.algorithms.base import Ask, PolicyAsk, SearchState
 
 LEARNING_RATE = "search.step.learning_rate"
@@ -69,11 +70,20 @@ def require_weights(weights_P: object, asked: Ask, generation: int) -> None:
 
 def _wrong_policies(ask: PolicyAsk, size: int, observation_size: int) -> str:
     """Why policies cannot be evaluated; empty if they can."""
+    if isinstance(ask.parameters_N_D, Recipes):
+        if problem := ask.parameters_N_D.problem(size):
+            return f"the recipes of the policies {problem}"
+        return _wrong_statistics(ask, len(ask.parameters_N_D), observation_size)
     count = len(ask.parameters_N_D) if isinstance(ask.parameters_N_D, np.ndarray) and ask.parameters_N_D.ndim else 1
     if problem := _not_floats(ask.parameters_N_D, (max(1, count), size)):
         return f"the parameters of the policies {problem}"
     if not np.isfinite(ask.parameters_N_D).all():
         return "the parameters of the policies are not all finite"
+    return _wrong_statistics(ask, count, observation_size)
+
+
+def _wrong_statistics(ask: PolicyAsk, count: int, observation_size: int) -> str:
+    """Why policies cannot be evaluated with their observation statistics; empty if they can."""
     statistics = {"mean": ask.observation_mean_N_O, "standard deviation": ask.observation_std_N_O}
     if all(given is None for given in statistics.values()):
         return ""

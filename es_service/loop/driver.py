@@ -262,7 +262,7 @@ def record(
         env_steps=before.env_steps + int(evaluated.env_steps_N.sum()),
         episodes=before.episodes + episodes + results.fitness.size,
         wall_clock_s=clock.total(),
-        elites=entered(learned, told, evaluated.point, results.trace_T_B),
+        elites=entered(learned, told, evaluated.points, results.trace_T_B),
     )
     table = evaluated_table(evaluated, search.task, learned.map, generation, proposal.start_cells, updated.novelty_N)
     at = fittest(told)  # the history's row is about this one

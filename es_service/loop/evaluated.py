@@ -41,14 +41,23 @@ class Evaluated:
     env_steps_N: NDArray[np.int64]
     """Environment steps of the evaluation and of the population."""
 
-    def point(self, row: int) -> Centre:
-        """What was evaluated, with its observation statistics, in arrays of its own."""
+    def points(self, rows: Sequence[int]) -> list[Centre]:
+        """What was evaluated, with its observation statistics, in arrays that are not parts of others."""
+        found: dict[int, Centre] = {}
+        first = 0
         for subject in self.subjects:
-            count = 1 if isinstance(subject, Centre) else len(subject.parameters_N_D)
-            if row < count:
-                return subject if isinstance(subject, Centre) else subject.policy(row)
-            row -= count
-        raise IndexError(row)
+            end = first + (1 if isinstance(subject, Centre) else len(subject.parameters_N_D))
+            here = [row for row in rows if first <= row < end]
+            if isinstance(subject, Centre):
+                found |= dict.fromkeys(here, subject)
+            elif here:
+                found |= zip(here, subject.policies([row - first for row in here]), strict=True)
+            first = end
+        return [found[row] for row in rows]
+
+    def point(self, row: int) -> Centre:
+        """One of them."""
+        return self.points([row])[0]
 
 
 @dataclass(frozen=True)

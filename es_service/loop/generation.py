@@ -222,7 +222,7 @@ def fittest(told: CentreEvaluations) -> int:
 def entered(
     state: SearchState,
     told: CentreEvaluations,
-    point: Callable[[int], Centre],
+    points: Callable[[Sequence[int]], Sequence[Centre]],
     trace_N_T_B: FloatArray | None,
 ) -> dict[int, Elite]:
     """The policies of elites that the store does not have, by their cells: those of the centres just evaluated that are
@@ -231,16 +231,17 @@ def entered(
     The map decides this and not `CentreState.cell`, which a search of the user need not set.
 
     Args:
-        point: function from an index in `told` to what was evaluated.
+        points: function from indices in `told` to what was evaluated.
     """
     if state.map is None:
         return {}
     filled = set(state.map.cell_N.tolist()) if state.elites else set()
     found = {cell: elite for cell, elite in state.elites.items() if cell in filled}
     cell_N = state.map.cells_with(told.generation, told.centre_N)
-    for row in np.flatnonzero(cell_N != EMPTY).tolist():
+    rows = np.flatnonzero(cell_N != EMPTY).tolist()
+    for row, point in zip(rows, points(rows), strict=True):
         assert trace_N_T_B is not None, "an evaluation has a trace"
-        found[int(cell_N[row])] = make_elite(point(row), trace_N_T_B[row].copy())
+        found[int(cell_N[row])] = make_elite(point, trace_N_T_B[row].copy())
     return found
 
 

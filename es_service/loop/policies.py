@@ -1,4 +1,4 @@
-"""Explicit policies: the chunks in which they travel to the workers, and their results.
+"""Policies that are evaluated as they are: the chunks in which they travel to the workers, and their results.
 
 Axes: N policies, E episodes, D policy parameters, O observation, T points of a trace, B descriptor dimensions.
 """
@@ -6,7 +6,7 @@ Axes: N policies, E episodes, D policy parameters, O observation, T points of a 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,28 +14,46 @@ from es_service.protocol.episodes import each, joined
 from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, Policies, PolicyChunk, Work, around
 from es_service.protocol.noise import Domain
 from es_service.protocol.policies import POLICY_SLOTS, chunks_of
+from es_service.protocol.recipes import Recipes
 
 
 @dataclass(frozen=True)
 class PolicyWork:
     """An ask for policies: the policies with their observation statistics, and the chunks in which they travel."""
 
-    parameters_N_D: FloatArray
+    parameters_N_D: FloatArray | Recipes
     observation_mean_N_O: FloatArray
     observation_std_N_O: FloatArray
     episodes: int
     """Episodes of each policy."""
     work: list[Work]
+    _made: dict[int, FloatArray] = field(default_factory=dict)
+    """Parameters of policies that were made of their recipes here."""
+
+    def policies(self, numbers: Sequence[int]) -> list[Centre]:
+        """Some of the policies, each as a centre without a population, in arrays that are not parts of others."""
+        generation = self.work[0][1].generation
+        statistics = self.observation_mean_N_O, self.observation_std_N_O
+        return [
+            Centre(generation, parameters_D, 0.0, *(array[number].copy() for array in statistics))
+            for number, parameters_D in zip(numbers, self._parameters(numbers), strict=True)
+        ]
 
     def policy(self, number: int) -> Centre:
-        """One of the policies, as a centre without a population, in arrays of its own."""
-        arrays = self.parameters_N_D, self.observation_mean_N_O, self.observation_std_N_O
-        parameters_D, mean_O, std_O = (array[number].copy() for array in arrays)
-        return Centre(self.work[0][1].generation, parameters_D, 0.0, mean_O, std_O)
+        """One of them."""
+        return self.policies([number])[0]
+
+    def _parameters(self, numbers: Sequence[int]) -> list[FloatArray]:
+        if not isinstance(self.parameters_N_D, Recipes):
+            return [self.parameters_N_D[number].copy() for number in numbers]
+        if missing := [number for number in dict.fromkeys(numbers) if number not in self._made]:
+            made = self.parameters_N_D.part(missing).made()
+            self._made.update((number, parameters_D.copy()) for number, parameters_D in zip(missing, made, strict=True))
+        return [self._made[number] for number in numbers]
 
 
 def policy_work(
-    parameters_N_D: FloatArray,
+    parameters_N_D: FloatArray | Recipes,
     statistics: tuple[FloatArray, FloatArray],
     episodes: int,
     *,
@@ -51,16 +69,24 @@ def policy_work(
     alone.
 
     Args:
+        parameters_N_D: parameters of each, or recipes.
         statistics: mean and standard deviation of observations, [N, O] each.
     """
     work: list[Work] = []
+    mean_N_O, std_N_O = statistics
+    has_none = not (mean_N_O.any() or np.signbit(mean_N_O).any()) and bool((std_N_O == 1.0).all())
     for first in range(0, len(parameters_N_D), POLICY_SLOTS):
         of = slice(first, first + POLICY_SLOTS)
-        arrays = [np.ascontiguousarray(array[of]) for array in (parameters_N_D, *statistics)]
-        policies = Policies(first, episodes, seed, traces, *arrays, domain=domain)
+        given = parameters_N_D.part(of) if isinstance(parameters_N_D, Recipes) else _own(parameters_N_D[of])
+        of_each = () if has_none else (_own(array[of]) for array in statistics)
+        policies = Policies(first, episodes, seed, traces, given, *of_each, domain=domain)
         parts = range(chunks_of(len(policies.parameters_N_D), episodes))
         work += around(policies, [PolicyChunk(generation, len(work) + part, ask, part) for part in parts])
     return PolicyWork(parameters_N_D, *statistics, episodes, work)
+
+
+def _own(array: FloatArray) -> FloatArray:
+    return np.ascontiguousarray(array)
 
 
 def no_statistics(policies: int, observation_size: int) -> tuple[FloatArray, FloatArray]:

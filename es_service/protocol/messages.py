@@ -102,6 +102,8 @@ class WorkerSpec:
     """What computes episodes and gradients: a name in `workers.rollouts.BACKENDS`."""
     outputs: tuple[str, ...] = ()
     """Outputs of episodes besides those of every result; names of `protocol.outputs`."""
+    parent_cache_bytes: int = 2**28
+    """Most bytes of parents that the worker keeps; see `kept_parents.py`."""
     sources: dict[str, str] = field(default_factory=dict)
     """`sources.worker_sources` of the driver, which a worker must have as well; empty if this is not checked."""
 

@@ -1,5 +1,5 @@
-"""Messages about explicit policies: parameter vectors that are evaluated as they are, without noise in parameters or
-actions.
+"""Messages about policies that are evaluated as they are, without noise in parameters or actions: explicit ones, whose
+parameters travel, and those that are made of recipes where they are evaluated.
 
 Axes: N policies that travel together, L slots of a chunk, D policy parameters, O observation.
 """
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.noise import Domain
+from es_service.protocol.recipes import Recipes
 
 POLICY_SLOTS = 16
 """Slots of a policy chunk, each of which is one episode of one policy. This is a constant so that the shape that is
@@ -30,16 +31,17 @@ class Policies:
     """Seed of the resets. In a run it is the seed of the run."""
     traces: bool
     """Whether the results have the trace of the first episode of each policy."""
-    parameters_N_D: NDArray[np.float32]
-    observation_mean_N_O: NDArray[np.float32]
-    observation_std_N_O: NDArray[np.float32]
-    """Observation statistics of each policy; 0 and 1 if there are none."""
+    parameters_N_D: NDArray[np.float32] | Recipes
+    """Parameters of each policy, or recipes by which they are made."""
+    observation_mean_N_O: NDArray[np.float32] | None = None
+    observation_std_N_O: NDArray[np.float32] | None = None
+    """Observation statistics of each policy; None stands for 0 and 1."""
     domain: Domain = Domain.EVALUATION_RESET
     """Purpose of the episodes, which is part of the addresses of their resets."""
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the parameters."""
+        """Bytes of the parameters, or of the recipes."""
         return self.parameters_N_D.nbytes
 
 

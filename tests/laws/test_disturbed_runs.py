@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import random
 import shutil
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -28,6 +28,7 @@ from es_service.store.digest import digest_parts
 from es_service.store.reader import read_generation
 from tests.helpers import worker_here
 from tests.laws.test_readers import config_of as config_of_method
+from tests.laws.test_recipes import Worker
 
 pytestmark = pytest.mark.usefixtures("workers_here")
 GENERATIONS, KEPT = 6, 2
@@ -50,6 +51,8 @@ CHANGES = {
 }
 """Name -> settings of a run that are none of a method's own."""
 KILLS = ("before_begin", "mid_transaction", "before_commit", "after_commit")
+KEPT_PARENTS = 6
+"""Parents of policies that a worker keeps: far fewer than it needs."""
 FAULTS = ("answers", "answers twice", "fails", "is lost")
 
 
@@ -76,13 +79,14 @@ class FaultyWorkers:
         self.inbox: deque[Message] = deque()
         self.running: list[tuple[int, Hashable, int, Sequence[Work]]] = []
         self.compiled: set[tuple[int, str]] = set()
+        self.parents: defaultdict[int, Worker] = defaultdict(lambda: Worker(KEPT_PARENTS))
         self.seen: Counter[str] = Counter()
 
     def start(self, worker: int) -> None:
         self.inbox.append(WorkerUp(worker))
 
     def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
-        self.running.append((worker, item_id, attempt, work))
+        self.running.append((worker, item_id, attempt, self.parents[worker].item(work)))
 
     def receive(self, timeout_s: float) -> Message | None:
         if not self.inbox and timeout_s and self.running:

@@ -12,10 +12,11 @@ from es_service.loop.history import history_columns
 from es_service.loop.parts import elite_part
 from es_service.protocol.messages import PolicyChunk
 from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
+from es_service.protocol.recipes import IsoLine, variation
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation
 from es_service.search.algorithms.common import first_state
-from es_service.search.algorithms.map_elites import LARGE, PARENT_CHOICE, parent_cells, variation
+from es_service.search.algorithms.map_elites import PARENT_CHOICE, parent_cells
 from es_service.search.maps.behaviour_map import Elite, empty_map, insert
 from es_service.search.maps.geometry import Grid
 from es_service.store.codec import decode_part, encode_part
@@ -56,10 +57,9 @@ def evaluated(evaluator, generation):
         results = [of for at, _, of in asked if at is policies]
         fitness = np.concatenate([of.fitness for of in results]).reshape(policies.episodes, -1)
         place = np.concatenate([of.descriptor for of in results]).reshape(policies.episodes, -1, 2)
-        assert not policies.observation_mean_N_O.any()
-        assert (policies.observation_std_N_O == 1.0).all()
+        assert policies.observation_mean_N_O is policies.observation_std_N_O is None
         means = fitness.mean(0, dtype=np.float64), place.mean(0, dtype=np.float64)
-        found += zip(policies.parameters_N_D, *means, strict=True)
+        found += zip(policies.parameters_N_D.made(), *means, strict=True)
     return found
 
 
@@ -137,8 +137,10 @@ def test_only_the_elites_of_the_parents_are_needed():
     nothing = np.zeros(0, np.float32)
     elites = {cell: Elite(np.full(3, cell, np.float32), nothing, nothing, nothing) for cell in needed}
     (asked,) = search.ask(replace(state, elites=elites), 1)
-    assert asked.parameters_N_D.shape == (2, 3)
-    assert asked.parameters_N_D.dtype == np.float32
+    made_N_D = asked.parameters_N_D.made()
+    assert made_N_D.shape == (2, 3)
+    assert made_N_D.dtype == np.float32
+    assert len(asked.parameters_N_D.parents) == len(needed)
 
 
 def test_while_the_map_is_empty_the_parents_are_the_centres():
@@ -146,20 +148,20 @@ def test_while_the_map_is_empty_the_parents_are_the_centres():
     search = ALGORITHMS["map_elites"](config_of(batch=64, iso_sigma=0.0, line_sigma=0.0))
     assert search.parents(elites_in([]), 1) == []
     (asked,) = search.ask(elites_in([]), 1)
-    assert {tuple(row) for row in asked.parameters_N_D.tolist()} == {(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)}
+    assert {tuple(row) for row in asked.parameters_N_D.made().tolist()} == {(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)}
 
 
 def test_a_child_is_its_first_parent_plus_noise_plus_a_step_along_the_line_to_the_second():
     x_D, y_D = (np.random.default_rng(seed).normal(size=20_000).astype(np.float32) for seed in (0, 1))
     key = stream_keys(0, Domain.VARIATION, 1, 0)
-    np.testing.assert_array_equal(variation(x_D, y_D, key, 0.0, 0.0), x_D)
-    noise_D = variation(x_D, x_D, key, 0.005, 0.05) - x_D  # no line from a parent to itself
+    np.testing.assert_array_equal(variation(x_D, y_D, key, IsoLine(0.0, 0.0)), x_D)
+    noise_D = variation(x_D, x_D, key, IsoLine(0.005, 0.05)) - x_D  # no line from a parent to itself
     assert noise_D.std() == pytest.approx(0.005, rel=4 / np.sqrt(2 * 20_000))
     assert abs(np.corrcoef(noise_D, x_D)[0, 1]) < 4 / np.sqrt(20_000)
     steps = []
     for n in range(2000):
         key = stream_keys(0, Domain.VARIATION, 1, n)
-        step_D = variation(x_D[:4], y_D[:4], key, 0.0, 0.05) - x_D[:4]
+        step_D = variation(x_D[:4], y_D[:4], key, IsoLine(0.0, 0.05)) - x_D[:4]
         shares = step_D / (y_D - x_D)[:4]
         np.testing.assert_allclose(shares, shares[0], atol=1e-5)
         steps.append(shares[0])
@@ -167,14 +169,17 @@ def test_a_child_is_its_first_parent_plus_noise_plus_a_step_along_the_line_to_th
     assert np.mean(steps) == pytest.approx(0.0, abs=4 * 0.05 / np.sqrt(2000))
 
 
-def test_large_policies_made_by_several_threads_are_the_same():
-    config, size = config_of(batch=5), LARGE
+def test_a_policy_made_with_others_is_the_same_as_one_made_alone():
+    config, size = config_of(batch=19), 999
     noise = [normals(key, size) for key in stream_keys(0, Domain.PARAMETER_NOISE, 1, np.arange(2))]
     state, search = first_state(noise, 1, 1.0, elites_in([]).map), ALGORITHMS["map_elites"](config)
     (asked,) = search.ask(state, 3)
+    made_N_D = asked.parameters_N_D.made()
     for n, (x, y) in enumerate(parent_cells(config, state, 3)):
         key = stream_keys(0, Domain.VARIATION, 3, n)
-        np.testing.assert_array_equal(asked.parameters_N_D[n], variation(noise[x], noise[y], key, ISO, LINE))
+        alone_D = variation(noise[x], noise[y], key, IsoLine(ISO, LINE))
+        np.testing.assert_array_equal(made_N_D[n], alone_D)
+        np.testing.assert_array_equal(asked.parameters_N_D.part([n, 0]).made()[0], alone_D)
 
 
 def test_an_invalid_policy_and_one_no_fitter_than_the_elite_enter_no_map():

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from es_service.config.parts import Objective
 from es_service.protocol.episodes import one_of
 from es_service.protocol.messages import EpisodesResult, FloatArray
+from es_service.protocol.recipes import Recipes
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.novelty import NoveltyArchive, sound_archive
 from es_service.search.state_parts import freeze, read_only
@@ -148,8 +149,8 @@ class PolicyAsk:
     of the generation that are for policies.
     """
 
-    parameters_N_D: FloatArray
-    """Parameters of each policy."""
+    parameters_N_D: FloatArray | Recipes
+    """Parameters of each policy, or recipes by which workers make them."""
     observation_mean_N_O: FloatArray | None = None
     observation_std_N_O: FloatArray | None = None
     """Mean and standard deviation with which each policy's episodes normalise observations; None: 0 and 1."""

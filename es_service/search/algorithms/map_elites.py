@@ -7,7 +7,8 @@ y, which are drawn with equal probability from all filled cells, and is their is
     x + iso_sigma * a + line_sigma * b * (y - x)
 
 a has a standard normal variate for each parameter, b is a single one. The default standard deviations 0.005 and 0.05
-are those of the examples of QDax. Both parents may be the same elite.
+are those of the examples of QDax. Both parents may be the same elite. The policies are asked for as recipes, which
+workers follow: only the parents travel, once to each worker (`protocol.recipes`).
 
 The map begins with `centres` random policies, which are the initial centres; later they matter only as elites. Our own
 choices: while the map is empty (a fork emptied it), the parents are these. Policies run with mean 0 and standard
@@ -16,9 +17,7 @@ deviation 1 of observations, since nothing gathers statistics. The novelty archi
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -29,8 +28,8 @@ from es_service.config.fields import Count, NotNegative
 from es_service.config.model import RunConfig
 from es_service.config.presets import same
 from es_service.config.search import SearchConfig
-from es_service.protocol.messages import FloatArray
-from es_service.protocol.noise import Domain, Keys, normals, stream_keys, uniforms
+from es_service.protocol.noise import Domain, stream_keys, uniforms
+from es_service.protocol.recipes import IsoLine, recipes_of
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, PolicyAsk, SearchState, in_columns
 from es_service.search.algorithms.common import archived_and_mapped
 from es_service.search.algorithms.method import method
@@ -39,10 +38,6 @@ from es_service.search.maps.batches import insert_each
 
 PARENT_CHOICE = 3
 """Last id of the random stream of Domain.SELECTION that draws the parents."""
-LARGE = 1 << 19
-"""Number of a batch's parameters from which several threads make it sooner than one does."""
-TOGETHER = 8
-"""Policies that are made together. Those of a small network stay in the cache of a core."""
 
 
 class MapElitesSettings(SearchConfig):
@@ -87,22 +82,11 @@ def map_elites(config: RunConfig) -> Algorithm:
     def ask(state: SearchState, generation: int) -> tuple[PolicyAsk, ...]:
         known = {cell: elite.centre_D for cell, elite in state.elites.items()}
         known = known or {index: centre.centre_D for index, centre in enumerate(state.centres)}
-        drawn_N_2 = parent_cells(config, state, generation)
+        drawn, drawn_N_2 = np.unique(parent_cells(config, state, generation), return_inverse=True)
         key_N_4 = stream_keys(config.seed, Domain.VARIATION, generation, np.arange(search.batch))
-        policy_N_D = np.empty((search.batch, state.centres[0].centre_D.size), np.float32)
-
-        def vary(first: int) -> None:
-            part = slice(first, first + TOGETHER)
-            x_N_D, y_N_D = (np.stack([known[one] for one in drawn]) for drawn in drawn_N_2[part].T.tolist())
-            policy_N_D[part] = variation(x_N_D, y_N_D, key_N_4[part], search.iso_sigma, search.line_sigma)
-
-        firsts = range(0, search.batch, TOGETHER)
-        if policy_N_D.size < LARGE:
-            list(map(vary, firsts))
-        else:
-            with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:  # the workers wait meanwhile
-                list(pool.map(vary, firsts))
-        return (PolicyAsk(policy_N_D),)
+        parents = [known[one] for one in drawn.tolist()]
+        rule = IsoLine(search.iso_sigma, search.line_sigma)
+        return (PolicyAsk(recipes_of(rule, parents, drawn_N_2.reshape(-1, 2), key_N_4)),)
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         if evaluations[0].generation == 0:
@@ -127,17 +111,3 @@ def parent_cells(config: RunConfig, state: SearchState, generation: int) -> NDAr
     )
     drawn_N_2 = uniforms(key, np.arange(2 * batch, dtype=np.uint32)).reshape(-1, 2)
     return among[(drawn_N_2.astype(np.float64) * among.size).astype(np.int64)]
-
-
-def variation(x: FloatArray, y: FloatArray, keys: Keys, iso_sigma: float, line_sigma: float) -> FloatArray:
-    """The iso+line variation of each x [..., D], whose line goes through its y, with noise of a stream for each.
-
-    Args:
-        keys: of the streams [..., 4]; their coordinates 0 to D - 1 are those of the parameters, coordinate D is that of
-            the line.
-    """
-    noise = normals(keys, x.shape[-1] + 1)
-    iso, line = np.float32(iso_sigma) * noise[..., :-1], np.float32(line_sigma) * noise[..., -1:]
-    iso += x
-    iso += line * (y - x)
-    return iso

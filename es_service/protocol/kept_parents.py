@@ -1,0 +1,135 @@
+"""Parents that a worker keeps, so that each is sent to it once: what worker and sender both do, in the same order.
+
+For each work item, the sender sends the parents of recipes that the worker lacks, and then the item. The worker keeps
+their parameters in a `KeptParents`, and the sender their sizes in another one. Both make the same changes, and so the
+sender knows what the worker has, without asking. Should a worker lack something all the same, it says so, the sender
+takes it to have nothing (`KeptParents.clear`) and sends the item again: that is no failed attempt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.messages import Subject, Work
+from es_service.protocol.policies import Policies
+from es_service.protocol.recipes import Recipes
+
+Value = TypeVar("Value")
+FloatArray = NDArray[np.float32]
+
+
+class LackingError(Exception):
+    """A worker lacks parents of policies that it must make."""
+
+
+class KeptParents(Mapping[bytes, Value], Generic[Value]):
+    """Parents by name, of which those are forgotten that were not needed for the longest time.
+
+    What the worker has and its sender does not know of is always older than the rest, and so forgotten first.
+    """
+
+    def __init__(self, most_bytes: int, size_of: Callable[[Value], int]) -> None:
+        """Keep nothing yet.
+
+        Args:
+            most_bytes: limit of the sizes together. Parents that one work item needs are kept beyond it.
+        """
+        self._kept: dict[bytes, Value] = {}
+        self._most_bytes, self._size_of, self._bytes = most_bytes, size_of, 0
+
+    def add(self, name: bytes, value: Value) -> None:
+        """Keep a parent, as the newest."""
+        if (old := self._kept.pop(name, None)) is not None:
+            self._bytes -= self._size_of(old)
+        self._kept[name] = value
+        self._bytes += self._size_of(value)
+
+    def needed(self, names: Iterable[bytes]) -> None:
+        """Make the parents that a work item needs the newest, and forget the oldest others beyond the limit."""
+        wanted = dict.fromkeys(names)
+        for name in wanted:
+            if name in self._kept:
+                self._kept[name] = self._kept.pop(name)
+        for name in list(self._kept):
+            if self._bytes <= self._most_bytes or name in wanted:
+                return
+            self._bytes -= self._size_of(self._kept.pop(name))
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._kept.clear()
+        self._bytes = 0
+
+    def __getitem__(self, name: bytes) -> Value:
+        return self._kept[name]
+
+    def __iter__(self) -> Iterator[bytes]:
+        return iter(self._kept)
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+
+def parents_to_send(work: Sequence[Work], kept: KeptParents[int]) -> dict[bytes, FloatArray]:
+    """The parents that a work item needs and its worker lacks, by name.
+
+    Args:
+        kept: sizes of those that the worker has; now with the others.
+    """
+    needed: dict[bytes, FloatArray] = {}
+    for recipes in _recipes_in(work):
+        needed.update(zip(recipes.names, recipes.parents, strict=True))
+    missing = {name: parameters_D for name, parameters_D in needed.items() if name not in kept}
+    for name, parameters_D in missing.items():
+        kept.add(name, parameters_D.nbytes)
+    kept.needed(needed)
+    return missing
+
+
+def with_parents(work: Sequence[Work], kept: KeptParents[FloatArray]) -> list[Work]:
+    """A work item whose recipes have the parameters of their parents.
+
+    Args:
+        kept: parents that the worker has; some may be forgotten now.
+
+    Raises:
+        LackingError: the worker lacks some.
+    """
+    if not (found := list(_recipes_in(work))):
+        return list(work)
+    if any(name not in kept for recipes in found for name in recipes.names):
+        raise LackingError
+    subjects = {id(subject): _with(subject, lambda recipes: recipes.complete(kept)) for subject, _ in work}
+    kept.needed(name for recipes in found for name in recipes.names)
+    return [(subjects[id(subject)], chunk) for subject, chunk in work]
+
+
+def with_made_policies(work: Sequence[Work]) -> list[Work]:
+    """A work item with the parameters of policies in the place of their recipes, which need more bytes with the
+    parents."""
+    subjects = {id(subject): _with(subject, Recipes.made) for subject, _ in work}
+    return [(subjects[id(subject)], chunk) for subject, chunk in work]
+
+
+def as_sent(subject: Subject) -> Subject:
+    """A subject without the parameters of parents."""
+    return _with(subject, Recipes.as_sent)
+
+
+def _recipes_in(work: Sequence[Work]) -> Iterator[Recipes]:
+    """The recipes of a work item's subjects, each once, in their order."""
+    for subject in {id(subject): subject for subject, _ in work}.values():
+        if isinstance(subject, Policies) and isinstance(subject.parameters_N_D, Recipes):
+            yield subject.parameters_N_D
+
+
+def _with(subject: Subject, change: Callable[[Recipes], Recipes | FloatArray]) -> Subject:
+    """A subject with a function of its recipes in their place, if it has any."""
+    if isinstance(subject, Policies) and isinstance(subject.parameters_N_D, Recipes):
+        return replace(subject, parameters_N_D=change(subject.parameters_N_D))
+    return subject

@@ -1,0 +1,183 @@
+"""Recipes: policies that are made where they are evaluated, of parents and of noise that has an address.
+
+The parameters of a policy that descends from others need not travel: whoever has its parents makes it, with the same
+bits everywhere. Parents are known by their content, and workers keep those that they were sent (`kept_parents.py`).
+Such et al. 2017 (arXiv:1712.06567) encode individuals by the seeds of their noise in this spirit.
+
+Axes: N policies, D policy parameters.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.noise import KEY_WORDS, Keys, normals
+
+FloatArray = NDArray[np.float32]
+NAME_BYTES = 16
+"""Bytes of a parent's name: the first half of the SHA-256 of its parameters."""
+TOGETHER = 8
+"""Policies that are made together. Those of a small network stay in the cache of a core."""
+LARGEST_NOISE = 8.0
+"""Bound of the magnitude of a normal variate of `protocol.noise`."""
+
+
+class IsoLine(NamedTuple):
+    """The iso+line variation of two parents x and y (Vassiliades and Mouret 2018, arXiv:1804.03906):
+
+    x + iso_sigma * a + line_sigma * b * (y - x)
+
+    a has a standard normal variate for each parameter, b is a single one.
+    """
+
+    iso_sigma: float
+    line_sigma: float
+
+
+Variation = Callable[[FloatArray, FloatArray, Keys, IsoLine], FloatArray]
+"""Function with the arguments and the result of `variation`."""
+
+
+def variation(x: FloatArray, y: FloatArray, keys: Keys, rule: IsoLine) -> FloatArray:
+    """The iso+line variation of each x [..., D], whose line goes through its y, with noise of a stream for each.
+
+    This is the definition: each operation is rounded to float32, and none are fused.
+
+    Args:
+        keys: of the streams [..., 4]; their coordinates 0 to D - 1 are those of the parameters, coordinate D is that of
+            the line.
+    """
+    noise = normals(keys, x.shape[-1] + 1)
+    iso, line = np.float32(rule.iso_sigma) * noise[..., :-1], np.float32(rule.line_sigma) * noise[..., -1:]
+    iso += x
+    iso += line * (y - x)
+    return iso
+
+
+@dataclass(frozen=True, eq=False)
+class Recipes:
+    """How policies are made, each of two parents."""
+
+    rule: IsoLine
+    names: tuple[bytes, ...]
+    """Names of the parents, each of which occurs once."""
+    parents: tuple[FloatArray, ...]
+    """Their parameters; empty on the way to a worker, which has them by their names."""
+    parent_N_2: NDArray[np.int64]
+    """Indices of each policy's parents x and y among the names."""
+    key_N_4: Keys
+    """Key of the stream of each policy's noise."""
+
+    def __len__(self) -> int:
+        return len(self.parent_N_2)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes without those of the parents."""
+        return self.parent_N_2.nbytes + self.key_N_4.nbytes + NAME_BYTES * len(self.names)
+
+    def part(self, of: slice | Sequence[int]) -> Recipes:
+        """The recipes of some of the policies, with the parents that these need."""
+        used, parent_M_2 = np.unique(self.parent_N_2[of], return_inverse=True)
+        names, parents = (tuple(all_[index] for index in used.tolist()) for all_ in (self.names, self.parents))
+        return Recipes(self.rule, names, parents, parent_M_2.reshape(-1, 2), self.key_N_4[of])
+
+    def as_sent(self) -> Recipes:
+        """The recipes without the parents' parameters."""
+        return replace(self, parents=())
+
+    def complete(self, kept: Mapping[bytes, FloatArray]) -> Recipes:
+        """The recipes with the parents' parameters, which are taken from others by their names."""
+        return replace(self, parents=tuple(kept[name] for name in self.names))
+
+    def made(self, vary: Variation = variation) -> FloatArray:
+        """The parameters of the policies, [N, D].
+
+        Args:
+            vary: `variation`, or what has its bits.
+        """
+        policy_N_D = np.empty((len(self), self.parents[0].size), np.float32)
+        for first in range(0, len(self), TOGETHER):
+            part = slice(first, first + TOGETHER)
+            x_M_D, y_M_D = (np.stack([self.parents[index] for index in of]) for of in self.parent_N_2[part].T.tolist())
+            policy_N_D[part] = vary(x_M_D, y_M_D, self.key_N_4[part], self.rule)
+        return policy_N_D
+
+    def problem(self, parameters: int) -> str:
+        """In which way these are no recipes of finite policies with some number of parameters; empty if they are."""
+        count = len(self.parent_N_2)
+        for parent_D in self.parents:
+            if parent_D.dtype != np.float32 or parent_D.shape != (parameters,):
+                return f"have a parent that is {parent_D.dtype} {parent_D.shape}; must be float32 ({parameters},)"
+        indices = self.parent_N_2
+        if not count or indices.shape != (count, 2) or indices.dtype.kind != "i":
+            return f"have parents {indices.dtype} {indices.shape}; must be indices of shape (policies, 2)"
+        if indices.min() < 0 or indices.max() >= len(self.parents):
+            return f"have a parent {indices.min()} or {indices.max()}; there are {len(self.parents)}"
+        if self.key_N_4.dtype != np.uint32 or self.key_N_4.shape != (count, KEY_WORDS):
+            return f"have keys {self.key_N_4.dtype} {self.key_N_4.shape}; must be uint32 ({count}, {KEY_WORDS})"
+        if not all(0.0 <= sigma < np.inf for sigma in self.rule):
+            return f"have the standard deviations {tuple(self.rule)}; must be finite and not negative"
+        iso, line = (LARGEST_NOISE * sigma for sigma in self.rule)
+        largest = float(np.max([_facts(parent_D).largest for parent_D in self.parents]))
+        # No difference of parents may overflow either. NaN is not less than anything.
+        if not (1.0 + 2.0 * max(1.0, line)) * largest + iso < float(np.finfo(np.float32).max):
+            return f"make policies that may not be finite, of parents with values up to {largest:g}"
+        return ""
+
+
+def recipes_of(rule: IsoLine, parents: Sequence[FloatArray], parent_N_2: NDArray[np.int64], key_N_4: Keys) -> Recipes:
+    """Recipes of parents that are given by their parameters, [D] each.
+
+    Args:
+        parent_N_2: indices of each policy's parents x and y.
+        key_N_4: key of the stream of each policy's noise.
+
+    Raises:
+        TypeError: a parent is no array.
+    """
+    return Recipes(rule, tuple(map(name_of, parents)), tuple(parents), parent_N_2, key_N_4)
+
+
+def name_of(parameters_D: FloatArray) -> bytes:
+    """Name of a policy by its content.
+
+    Raises:
+        TypeError: it is no array.
+    """
+    return _facts(parameters_D).name
+
+
+class _Facts(NamedTuple):
+    """What is known of an array."""
+
+    of: weakref.ref[FloatArray]
+    name: bytes
+    largest: float
+    """Largest magnitude; NaN if a value is NaN."""
+
+
+_KNOWN: dict[int, _Facts] = {}
+"""Facts by the `id` of a read-only array, as long as it lives: the same elites are parents again and again."""
+
+
+def _facts(parameters_D: FloatArray) -> _Facts:
+    if not isinstance(parameters_D, np.ndarray):
+        raise TypeError(f"a parent is {type(parameters_D).__name__}; must be a float32 array [D]")
+    number = id(parameters_D)
+    if (known := _KNOWN.get(number)) is not None and known.of() is parameters_D:
+        return known
+    values = np.ascontiguousarray(parameters_D)
+    name = hashlib.sha256(values.data).digest()[:NAME_BYTES]
+    largest = float(np.abs(values).max(initial=0.0))
+    facts = _Facts(weakref.ref(parameters_D, lambda _: _KNOWN.pop(number, None)), name, largest)
+    if not parameters_D.flags.writeable:
+        _KNOWN[number] = facts
+    return facts

@@ -1,0 +1,233 @@
+"""Recipes: policies made of parents and noise, on which sides what is kept, and what of them is refused."""
+
+from __future__ import annotations
+
+import pickle
+import random
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from es_service.errors import EvaluationError
+from es_service.loop.policies import no_statistics, policy_work
+from es_service.protocol.kept_parents import (
+    KeptParents,
+    LackingError,
+    as_sent,
+    parents_to_send,
+    with_made_policies,
+    with_parents,
+)
+from es_service.protocol.messages import Policies, around
+from es_service.protocol.noise import Domain, stream_keys
+from es_service.protocol.policies import POLICY_SLOTS, PolicyChunk
+from es_service.protocol.recipes import IsoLine, Recipes, name_of, recipes_of, variation
+from es_service.search.algorithms.base import PolicyAsk
+from tests.laws.me_es_runs import SHAPE, config_of, run_in_memory
+from tests.laws.test_policies import only
+
+RULE = IsoLine(0.3, 0.6)
+SIZE = SHAPE.parameters
+PARENTS = list(np.random.default_rng(0).normal(size=(40, SIZE)).astype(np.float32))
+
+
+def recipes(count: int, generation: int = 1, parents=tuple(PARENTS), rule=RULE) -> Recipes:
+    drawn_N_2 = np.random.default_rng(generation).integers(len(parents), size=(count, 2))
+    used, index_N_2 = np.unique(drawn_N_2, return_inverse=True)
+    keys = stream_keys(0, Domain.VARIATION, generation, np.arange(count))
+    return recipes_of(rule, [parents[one] for one in used], index_N_2.reshape(-1, 2), keys)
+
+
+def bits(array: np.ndarray) -> bytes:
+    return array.tobytes()
+
+
+def work_of(count: int, generation: int = 1, **given):
+    asked = recipes(count, generation, **given)
+    return policy_work(asked, no_statistics(count, 2), 1, seed=0, generation=generation).work
+
+
+def made(work) -> list[bytes]:
+    """The parameters of each chunk's policies."""
+    return [bits(subject.parameters_N_D.made()) for subject, _ in work]
+
+
+def test_how_policies_are_grouped_changes_no_bit():
+    asked = recipes(41)
+    whole_N_D = asked.made()
+    for n in range(41):
+        x, y = (asked.parents[index] for index in asked.parent_N_2[n])
+        assert bits(variation(x, y, asked.key_N_4[n], RULE)) == bits(whole_N_D[n])
+        assert bits(asked.part([n]).made()[0]) == bits(whole_N_D[n])
+    for first, last in ((0, 16), (5, 6), (17, 41)):
+        assert bits(asked.part(slice(first, last)).made()) == bits(whole_N_D[first:last])
+    assert len({bits(row) for row in whole_N_D}) == 41
+
+
+def test_the_driver_makes_a_policy_with_the_bits_that_a_worker_makes():
+    asked = recipes(20)
+    work = policy_work(asked, no_statistics(20, 2), 1, seed=0, generation=1)
+    theirs = np.concatenate([subject.parameters_N_D.made() for subject, _ in work.work])
+    for number, centre in zip([3, 19, 3, 0], work.policies([3, 19, 3, 0]), strict=True):
+        assert bits(centre.parameters_D) == bits(theirs[number])
+    assert bits(work.policy(7).parameters_D) == bits(theirs[7])
+
+
+def test_a_name_is_that_of_the_content():
+    one, other = PARENTS[0].copy(), PARENTS[0].copy()
+    assert name_of(one) == name_of(other)
+    before = name_of(one)
+    one[3] += 1.0  # it was writable, so nothing of it is remembered
+    assert name_of(one) != before
+    one.flags.writeable = False
+    assert name_of(one) == name_of(one.copy()) != before
+    assert len({name_of(parent) for parent in PARENTS}) == len(PARENTS)
+
+
+# What travels
+
+
+def test_no_parameters_travel_with_a_subject():
+    (subject, _) = work_of(POLICY_SLOTS)[0]
+    sent = pickle.loads(data := pickle.dumps(as_sent(subject), pickle.HIGHEST_PROTOCOL))
+    assert sent.parameters_N_D.parents == ()
+    assert len(data) < 3000 < PARENTS[0].nbytes * 20
+    assert subject.nbytes < 1500
+    assert bits(sent.parameters_N_D.complete(dict(zip(map(name_of, PARENTS), PARENTS, strict=True))).made()) == bits(
+        subject.parameters_N_D.made()
+    )
+
+
+def test_statistics_travel_only_if_there_are_any():
+    for mean, std, travel in ((0.0, 1.0, False), (-0.0, 1.0, True), (0.0, 2.0, True), (0.5, 1.0, True)):
+        statistics = tuple(np.full((3, 2), value, np.float32) for value in (mean, std))
+        (subject, _) = policy_work(recipes(3), statistics, 1, seed=0, generation=1).work[0]
+        assert isinstance(subject, Policies)
+        assert (subject.observation_mean_N_O is not None, subject.observation_std_N_O is not None) == (travel, travel)
+
+
+class Worker:
+    """A worker that is sent items as a transport sends them, and its sender."""
+
+    def __init__(self, most_parents: int, theirs: int | None = None) -> None:
+        limit = PARENTS[0].nbytes
+        self.known: KeptParents[int] = KeptParents(most_parents * limit, int)
+        self.kept: KeptParents[np.ndarray] = KeptParents((theirs or most_parents) * limit, lambda values: values.nbytes)
+        self.received = 0
+
+    def item(self, work):
+        for name, values in parents_to_send(work, self.known).items():
+            self.kept.add(name, pickle.loads(pickle.dumps(values)))
+            self.received += 1
+        subjects = {id(subject): pickle.loads(pickle.dumps(as_sent(subject))) for subject, _ in work}
+        return with_parents([(subjects[id(subject)], chunk) for subject, chunk in work], self.kept)
+
+
+def test_a_parent_travels_once_while_it_is_kept():
+    worker, work = Worker(40), work_of(64)
+    for _ in range(3):
+        assert made(worker.item(work)) == made(work)
+    assert worker.received == len({name for subject, _ in work for name in subject.parameters_N_D.names})
+
+
+@pytest.mark.parametrize("most", [1, 12, 25])
+def test_with_any_limit_a_worker_has_what_its_sender_believes_and_keeps_no_more(most):
+    rng, worker, sent = random.Random(most), Worker(most), 0
+    for generation in range(60):
+        work = work_of(rng.choice([1, 5, 16, 40]), generation)
+        first = rng.randrange(len(work))
+        item = work[first : first + rng.choice([1, 2, 3])]
+        assert made(worker.item(item)) == made(item)
+        assert list(worker.kept) == list(worker.known)
+        needed = {name for subject, _ in item for name in subject.parameters_N_D.names}
+        assert needed <= set(worker.kept)
+        assert len(worker.kept) <= max(most, len(needed))
+        sent += len(needed)
+    assert 40 < worker.received < sent
+
+
+def test_a_worker_that_lacks_parents_says_so_and_computes_when_it_is_sent_all_again():
+    """As if it kept less than its sender believes; also while other items are on their way."""
+    rng, worker, lacked = random.Random(0), Worker(40, theirs=3), 0
+    for generation in range(60):
+        work = work_of(rng.choice([1, 2, 3]), generation)
+        try:
+            item = worker.item(work)
+        except LackingError:
+            lacked += 1
+            worker.known.clear()
+            item = worker.item(work)
+        assert made(item) == made(work)
+    assert lacked > 10
+
+
+def test_what_a_sender_does_not_know_of_is_forgotten_first():
+    """After an answer `lacks`, the sender knows less than the worker has; it must not know more, later."""
+    rng, worker = random.Random(1), Worker(10)
+    for generation in range(200):
+        if rng.random() < 0.1:
+            worker.known.clear()
+        item = work_of(rng.choice([1, 2, 4]), generation)
+        assert made(worker.item(item)) == made(item)
+        assert set(worker.known) <= set(worker.kept)
+
+
+def test_a_worker_whose_cores_are_processes_gives_them_the_policies():
+    work = work_of(20)
+    found = with_made_policies(work)
+    assert [bits(subject.parameters_N_D) for subject, _ in found] == made(work)
+    assert found[0][0] is not work[0][0]
+    explicit = around(found[0][0], [PolicyChunk(1, 0), PolicyChunk(1, 1)])
+    assert with_made_policies(explicit) == explicit
+    assert with_parents(explicit, KeptParents(0, int)) == explicit
+
+
+# What is refused
+
+GOOD = recipes(18)
+
+
+@pytest.mark.parametrize(
+    ("asked", "sentence"),
+    [
+        (replace(GOOD, parents=(PARENTS[0].astype(float), *GOOD.parents[1:])), "parent that is float64"),
+        (replace(GOOD, parents=(PARENTS[0][1:], *GOOD.parents[1:])), rf"must be float32 \({SIZE},\)"),
+        (replace(GOOD, parent_N_2=GOOD.parent_N_2[:, :1]), r"parents int64 \(18, 1\); must be indices"),
+        (replace(GOOD, parent_N_2=GOOD.parent_N_2[:0]), r"parents int64 \(0, 2\); must be indices"),
+        (replace(GOOD, parent_N_2=GOOD.parent_N_2 - 1), "a parent -1 or"),
+        (replace(GOOD, parent_N_2=GOOD.parent_N_2 + 1), rf"; there are {len(GOOD.parents)}"),
+        (replace(GOOD, key_N_4=GOOD.key_N_4[:, :3]), r"keys uint32 \(18, 3\); must be uint32 \(18, 4\)"),
+        (replace(GOOD, key_N_4=GOOD.key_N_4[:1]), r"keys uint32 \(1, 4\)"),
+        (replace(GOOD, rule=IsoLine(-0.1, 0.0)), r"deviations \(-0.1, 0.0\); must be finite and not negative"),
+        (replace(GOOD, rule=IsoLine(0.1, np.inf)), "must be finite"),
+        (replace(GOOD, rule=IsoLine(0.1, 1e38)), "may not be finite, of parents with values up to"),
+        (recipes(18, parents=[np.full(SIZE, np.nan, np.float32)] * 40), "may not be finite.*nan"),
+        (recipes(18, parents=[np.full(SIZE, 3e38, np.float32)] * 40), r"may not be finite.* values up to 3e\+38"),
+    ],
+)
+def test_recipes_of_which_no_policies_can_be_made_are_an_error_with_a_sentence(asked, sentence):
+    few = config_of(generations=1, algorithm="es")
+    algorithm = replace(only(PARENTS[0]), ask=lambda state, generation: (PolicyAsk(asked),))
+    with pytest.raises(EvaluationError, match=f"generation 1: the recipes of the policies .*{sentence}") as error:
+        run_in_memory(few, algorithm=algorithm)
+    assert error.value.field == "search.algorithm"
+
+
+def test_a_parent_that_is_no_array_is_a_type_error():
+    with pytest.raises(TypeError, match="a parent is list; must be a float32 array"):
+        recipes_of(RULE, [[1.0]], np.zeros((1, 2), int), GOOD.key_N_4[:1])
+
+
+def test_policies_by_recipe_have_the_results_of_explicit_ones():
+    """Whatever search asks for them, also with observation statistics."""
+    few = config_of(generations=2, algorithm="es")
+    statistics = np.full((18, 2), 0.3, np.float32), np.full((18, 2), 2.0, np.float32)
+    found = []
+    for asked in (GOOD, GOOD.made()):
+        for given in ((), statistics):
+            algorithm = replace(only(None), ask=lambda s, g, asked=asked, given=given: (PolicyAsk(asked, *given),))
+            _, store, _ = run_in_memory(few, algorithm=algorithm)
+            found.append((store.evaluated, store.parts["best"]))
+    found = [repr(one) for one in found]
+    assert found[0] == found[2] != found[1] == found[3]
