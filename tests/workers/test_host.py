@@ -13,6 +13,7 @@ from es_service.config.tasks import TASKS, task_of
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
 from es_service.protocol.noise import NORMAL_STD, Domain, evaluation_reset_keys, normal_integers, stream_keys
+from es_service.protocol.outputs import AT_THE_END, OF_STEPS
 from es_service.protocol.policies import Policies, PolicyChunk
 from es_service.runs.replay import record
 from es_service.runs.session import dispatch_limits
@@ -174,6 +175,30 @@ def test_only_the_episodes_that_are_wanted_are_computed():
     np.testing.assert_array_equal(every.trace_T_B[-1], every.descriptor[0])
     np.testing.assert_array_equal(every.outputs["success"], np.abs(every.descriptor[:, 0]) < 0.1)
     np.testing.assert_allclose(every.outputs["last_reward"], -np.abs(every.descriptor[:, 0]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("episodes", [1, 2])
+def test_outputs_of_steps_are_what_happened_in_training_and_in_evaluations(episodes):
+    names = (*AT_THE_END, *OF_STEPS)
+    worker_spec = drift(outputs=names, episodes_per_member=episodes, action_noise=0.2)
+    for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0, episodes=5)):
+        [found] = make_worker(worker_spec)([(centre_of(worker_spec, sigma=0.5), chunk)])
+        steps, total = found.of_steps, found.steps.sum()
+        assert {name: len(array) for name, array in steps.items()} == dict.fromkeys(OF_STEPS, total)
+        place_K = steps["observation"][:, 0]
+        starts_K = steps["observation"][:, 2] == 0.0
+        assert starts_K.sum() == (8 * episodes if isinstance(chunk, TrainingChunk) else 5)
+        np.testing.assert_array_equal(steps["step_descriptor"][:-1, 0][~starts_K[1:]], place_K[1:][~starts_K[1:]])
+        np.testing.assert_allclose(steps["reward"], -np.abs(steps["step_descriptor"][:, 0]), rtol=1e-6)
+        np.testing.assert_array_equal(steps["done"], np.abs(steps["step_descriptor"][:, 0]) > 3.0)
+        np.testing.assert_allclose(
+            steps["reward"].sum(), found.returns.sum() * (episodes if starts_K.sum() > 5 else 1), rtol=1e-4
+        )
+        moved_K = steps["step_descriptor"][:, 0] - place_K + 0.05
+        pushed_K = 0.3 * np.clip(0.5 + steps["action"][:, 0], -0.5, 1.5)
+        assert np.abs(moved_K - pushed_K).max() < 0.05 * 6
+    with pytest.raises(ValueError, match="no output of episodes has the name 'nothing'"):
+        make_worker(drift(outputs=("nothing",)))([(centre_of(worker_spec), EvaluationChunk(1, 0))])
 
 
 @pytest.mark.usefixtures("no_jax")

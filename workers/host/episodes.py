@@ -5,23 +5,16 @@ Axes: L lanes, O observation, A action, B descriptor, T points of a trace.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.messages import TRACE_POINTS, FloatArray, WorkerSpec
 from workers.environments.host_task import HostEnvironment, HostTask
+from workers.host.outputs import Outputs, Step
 from workers.host.policies import LanePolicies
 from workers.rollouts.backend import Episodes
-
-OUTPUTS: dict[str, tuple[Any, Callable[[HostEnvironment, float], Any]]] = {
-    "success": (bool, lambda environment, reward: environment.success()),
-    "last_reward": (np.float32, lambda environment, reward: reward),
-}
-"""Outputs of evaluation episodes by name: dtype, and function of an environment at the end of its episode and of its
-last reward."""
 
 
 class Watched(NamedTuple):
@@ -63,7 +56,7 @@ def run_episodes(
 
     Args:
         mean: observation statistics, from which sums of observations are shifted, [O] or [L, O].
-        training: whether sums of observations are computed; otherwise traces and outputs are.
+        training: whether sums of observations are computed; otherwise traces are.
         runs_L: which lanes run; None for all. The results of the others are 0.
         watched: filled with the episode of one lane.
 
@@ -84,7 +77,7 @@ def run_episodes(
     goal_distance_L_2 = np.full((count, 2), np.nan, np.float32)
     sum_L_O, square_L_O = np.zeros((2, count, size if training else 0), np.float32)
     trace_L_T_B = np.zeros((count, 0 if training else points, task.descriptor_size), np.float32)
-    outputs = {} if training else {name: np.zeros(count, OUTPUTS[name][0]) for name in spec.outputs}
+    outputs = Outputs(spec.outputs, spec, task, count)
 
     def watch(lane: int, environment: HostEnvironment) -> None:
         if watched is not None and watched.lane == lane:
@@ -101,7 +94,8 @@ def run_episodes(
         for step in range(1, spec.episode_steps + 1):
             if not running:
                 break
-            actions_L = task.actions(policies(observation_L_O, step - 1))
+            action_L_A = policies(observation_L_O, step - 1)
+            actions_L = task.actions(action_L_A)
             if training:
                 with np.errstate(over="ignore", invalid="ignore"):
                     shifted_L_O = np.where(alive_L[:, None], observation_L_O - mean, np.float32(0.0))
@@ -109,22 +103,24 @@ def run_episodes(
                     square_L_O += shifted_L_O * shifted_L_O
             still = []
             for lane, environment in running:
-                observation_L_O[lane], reward, done = environment.step(actions_L[lane])
-                done = done or step == spec.episode_steps
+                seen_O, reward, done = environment.step(actions_L[lane])
+                is_last = done or step == spec.episode_steps
+                if outputs:
+                    now = Step(environment, observation_L_O[lane], action_L_A[lane], seen_O, reward, done)
+                    outputs.note(lane, step - 1, now, is_last=is_last)
+                observation_L_O[lane] = seen_O
                 reward_L[lane], steps_L[lane] = reward, step
                 returns_L[lane] += reward
                 if task.goal_distance is not None:
                     distance = environment.goal_distance()
                     goal_distance_L_2[lane] = distance, np.fmin(goal_distance_L_2[lane, 1], distance)
-                if done or step in traced:
+                if is_last or step in traced:
                     descriptor_L_B[lane] = environment.descriptor()
                     if not training:
                         trace_L_T_B[lane, last_steps_T >= step] = descriptor_L_B[lane]
                 watch(lane, environment)
-                if done:
+                if is_last:
                     alive_L[lane] = False
-                    for name, values in outputs.items():
-                        values[lane] = OUTPUTS[name][1](environment, reward)
                 else:
                     still.append((lane, environment))
             running = still
@@ -143,7 +139,8 @@ def run_episodes(
         shifted_sum_O=sum_L_O,
         shifted_square_sum_O=square_L_O,
         trace_T_B=trace_L_T_B,
-        outputs=outputs,
+        outputs=outputs.at_the_end,
+        of_steps=outputs.of_steps,
     )
 
 

@@ -120,8 +120,12 @@ def _in_lanes(array: np.ndarray, lanes: int) -> np.ndarray:
 
 def _stacked(by_episode: Sequence[Episodes]) -> Episodes:
     """Episodes [L] of each of a member's episodes as [L, E]."""
-    columns = zip(*(one[:-1] for one in by_episode), strict=True)
-    return Episodes._make([*(np.stack(arrays, axis=1) for arrays in columns), {}])
+    columns = (np.stack(arrays, axis=1) for arrays in zip(*(one[:-2] for one in by_episode), strict=True))
+    named = (
+        {name: np.stack([one[field][name] for one in by_episode], axis=1) for name in by_episode[0][field]}
+        for field in (-2, -1)
+    )
+    return Episodes._make([*columns, *named])
 
 
 def _recording(lanes: Lanes, spec: WorkerSpec, request: RecordRequest) -> Recording:
