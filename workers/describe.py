@@ -1,4 +1,5 @@
-"""Describe a task such as `brax:ant` or `package.module:Class`, in a separate process because this imports JAX.
+"""Describe a task such as `brax:ant` or `package.module:Class`, in a separate process because this imports JAX, or code
+of the user.
 
     python -m workers.describe NAME
 
@@ -23,7 +24,8 @@ def described(name: str) -> TaskSpec:
         TaskError: the task does not exist or cannot be used.
     """
     task = describe_environment(name)
-    reasons = {rollout: why for rollout, one in BACKENDS.items() if (why := one.examine(task))}
+    able = {name: one for name, one in BACKENDS.items() if task.kind in one.task_kinds}
+    reasons = {name: why for name, one in able.items() if (why := one.examine(task))}
     return dataclasses.replace(task, unsupported=reasons)
 
 

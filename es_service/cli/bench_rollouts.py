@@ -45,13 +45,15 @@ def bench_rollouts(
     for task in tasks:
         if task not in TASKS:
             raise ConfigError(
-                f"--task {task}: unknown task; must be {one_of(TASKS)}, or brax:NAME, or module:Class"
+                f"--task {task}: unknown task; must be {one_of(TASKS)}, or brax:NAME, python:module:Class, or "
+                f"module:Class"
                 f"{did_you_mean(task, TASKS)}"
             )
-    every, rollouts = sorted({1, cores()}), rollouts or tuple(ROLLOUTS)
+    every = sorted({1, cores()})
     for task in tasks or TASKS:
         cannot: set[str] = set()
-        for policy, rollout in itertools.product(policies, rollouts):
+        asked = rollouts or [name for name, one in ROLLOUTS.items() if TASKS[task].kind in one.task_kinds]
+        for policy, rollout in itertools.product(policies, asked):
             if rollout in cannot:
                 continue
             for batch, count in itertools.product(batches or BATCHES.get(task, ANT_BATCHES), every):
@@ -65,7 +67,7 @@ def bench_rollouts(
                     "rollout": rollout,
                 }
                 row = _row(arguments, count)
-                if "note" in row and set(rollouts) == {rollout}:
+                if "note" in row and set(asked) == {rollout}:
                     raise EvaluationError(f"{task}: {row['note']}")
                 yield row
                 if "note" in row:

@@ -59,7 +59,8 @@ class ComputeConfig(Section):
     )
     rollout: Text = Field(
         description="How episodes are computed. simd: by code compiled for this kind of processor, about twenty times "
-        "faster. xla: by JAX, for GPUs and for tasks that simd cannot compile. auto: simd where it is possible."
+        "faster. xla: by JAX, for GPUs and for tasks that simd cannot compile. host: by the Python code of a task "
+        "that is not in JAX. auto: the fastest that can."
     )
     chunk_pairs: Count = Field(
         description="Pairs in one chunk; must divide search.pairs. auto: the largest divisor of search.pairs up to an "

@@ -41,6 +41,7 @@ from es_service.config.resolution import (
     rollout_problems,
     shape_problems,
     task_problems,
+    values_of_task,
 )
 from es_service.config.search import SearchConfig
 from es_service.config.shipped import read_config
@@ -140,7 +141,7 @@ def _load(
     found: dict[str, Any] = {}
     unknown: list[Problem] = []
     for key, what, known, besides in (
-        ("task.environment", "task", tasks, "brax:NAME, or module:Class"),
+        ("task.environment", "task", tasks, "brax:NAME, python:module:Class, or module:Class"),
         ("search.algorithm", "algorithm", algorithms, "module:function"),
     ):
         given = chosen.get(key)
@@ -163,7 +164,8 @@ def _load(
     if resolved:
         values = without_followers(values, wanted, algorithms)
     values = {**defaults, **{key: value for key, value in values.items() if key not in foreign}} | wanted
-    filled = {} if settings is None or "search" in unusable else filled_in(values, settings)
+    by_task = {} if task is None else values_of_task(task)
+    filled = {} if settings is None or "search" in unusable else by_task | filled_in(by_task | values, settings)
     wrong = key_problems(filled | values, wanted, settings, algorithms)
     problems += wrong.values()
     unused = settings.unused if settings is not None else ()

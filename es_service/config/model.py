@@ -37,7 +37,8 @@ class TaskConfig(Section):
     """The task that is to be learned. Constants of the run."""
 
     environment: Text = Field(
-        description="Name of the task: a shipped one, brax:NAME, or module:Class for one of your own."
+        description="Name of the task: a shipped one, brax:NAME, or one of your own: module:Class in JAX, or "
+        "python:module:Class."
     )
     episode_steps: Count = Field(description="Length of an episode in control steps. null: the task's own length.")
     fitness: Literal["sum", "final"] = Field(

@@ -146,6 +146,11 @@ def resolve(
     return values
 
 
+def values_of_task(task: TaskSpec) -> dict[str, Any]:
+    """Values that a task fills in where the config leaves them out: an output that chooses one of several actions."""
+    return {"policy.output": DISCRETE_OUTPUTS[0]} if task.discrete_actions else {}
+
+
 def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     """The problem of a fitness that the task does not support."""
     if values.get("task.fitness") != "final" or task.final_fitness:
@@ -164,6 +169,9 @@ def policy_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     if spec.output in DISCRETE_OUTPUTS and task.action_size < 2:
         why = f" for {task.name}, whose action is one number: {spec.output} chooses among several"
         problems.append(not_allowed("policy.output", spec.output, "tanh, linear or gaussian", why=why))
+    if task.discrete_actions and spec.output not in DISCRETE_OUTPUTS:
+        why = f" for {task.name}, whose action is one of {task.action_size} to choose from"
+        problems.append(not_allowed("policy.output", spec.output, one_of(DISCRETE_OUTPUTS), why=why))
     if spec.parameters <= MOST_PARAMETERS:
         return problems
     hidden = list(spec.widths[1:-1])
@@ -254,15 +262,17 @@ def rollout_problems(values: Mapping[str, Any], task: TaskSpec | None, rollouts:
     """The problem of a rollout that does not exist, or that cannot be used for this config."""
     if (name := values.get("compute.rollout")) is None:
         return []
+    fit = [other for other, one in rollouts.items() if task is None or task.kind in one.task_kinds]
     if (rollout := rollouts.get(name)) is None:
-        return [wrong_value("compute.rollout", name, f"auto or {one_of(rollouts)}", [*rollouts])]
+        return [wrong_value("compute.rollout", name, f"auto or {one_of(fit)}", fit)]
     if _on_gpu(values) and not rollout.runs_on_gpus:
         why = f"{name} runs only on CPUs, but {RESOURCES}gpu is {show(_value(values, f'{RESOURCES}gpu'))}"
     elif task is not None and (reason := rollout.why_not(task, _policy_spec(values, task))):
         why = f"{name} cannot run {task.name}: {reason}"
     else:
         return []
-    allowed = f"auto or {one_of([other for other in rollouts if other != name])}"
+    others = [other for other in fit if other != name]
+    allowed = f"auto or {one_of(others)}" if others else "auto"
     return [unfit("compute.rollout", name, f"{why}; must be {allowed}", allowed=allowed)]
 
 
@@ -277,11 +287,11 @@ def config_warnings(config: RunConfig, task: TaskSpec, rollouts: Rollouts) -> li
     warnings = [
         f"compute.rollout: {chosen} is used because {name} cannot run {task.name}: {why}"
         for name in faster
-        if (why := why_not(rollouts[name], task, shape, here=here))
+        if task.kind in rollouts[name].task_kinds and (why := why_not(rollouts[name], task, shape, here=here))
     ]
     pairs = config.search.pairs if isinstance(config.search, PopulationConfig) else WITHOUT_PAIRS
     chunk = config.compute.chunk_pairs
-    if chunk < FEW_CHUNK_PAIRS and pairs > MOST_CHUNK_PAIRS:
+    if chunk < min(FEW_CHUNK_PAIRS, rollouts[chosen].chunk_pairs[0]) and pairs > MOST_CHUNK_PAIRS:
         near = round(pairs / MOST_CHUNK_PAIRS) * MOST_CHUNK_PAIRS
         auto = default_chunk_pairs(pairs)
         hint = (

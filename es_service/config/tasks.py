@@ -1,7 +1,7 @@
 """Descriptions of tasks by name, for the driver.
 
-Shipped tasks are in a table. `brax:NAME` and `package.module:Class` are described by a child process, because this
-imports JAX and Brax; it is described again only if its code has changed.
+Shipped tasks are in a table. All others are described by a child process, because this imports JAX and Brax, or code of
+the user; a task is described again only if its code has changed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ DESCRIBE_S = 120.0
 
 
 class Tasks(Mapping[str, TaskSpec]):
-    """Tasks by name. Iteration yields the shipped tasks; lookup also finds `brax:NAME` and `module:Class`."""
+    """Tasks by name. Iteration yields the shipped tasks; lookup also finds `brax:NAME`, `module:Class` and
+    `python:module:Class`."""
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is not shipped, ConfigError for another that cannot be described."""

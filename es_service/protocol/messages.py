@@ -21,6 +21,8 @@ from es_service.protocol.policy_spec import PolicySpec
 FloatArray = NDArray[np.float32]
 Bounds = tuple[tuple[float, float], ...]
 Segment = tuple[tuple[float, float], tuple[float, float]]
+TaskKind = Literal["jax", "python"]
+"""What a task is made of: functions that JAX traces, or Python objects with `reset` and `step`."""
 SIGNS = (1.0, -1.0)
 """Signs of the noise of the two members of a pair, in the order of axis S."""
 TRACE_POINTS = 64
@@ -66,6 +68,10 @@ class TaskSpec:
     """Which episodes succeed, in words; empty if the task does not say."""
     unsupported: dict[str, str] = field(default_factory=dict)
     """Rollouts that were found to be unable to compute episodes of this task, by name, each with the reason."""
+    kind: TaskKind = "jax"
+    """What the task is made of, on which it depends which rollouts can compute it."""
+    discrete_actions: bool = False
+    """Whether an action is a choice of one of `action_size` actions, so that the policy has to choose one."""
 
 
 def with_options(task: TaskSpec, options: Mapping[str, OptionValue]) -> TaskSpec:

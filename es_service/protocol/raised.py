@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from es_service.protocol.sources import OURS, SHARED_FOLDERS, is_own
+from es_service.protocol.sources import OURS, SHARED_FOLDERS, own_path
 
 _PROJECT = Path(__file__).parents[2]
 _HIDDEN = (*(f"{_PROJECT / package}/" for package in OURS), f"{sysconfig.get_path('stdlib')}/", "<")
@@ -65,7 +65,7 @@ def why_not_imported(module: str, error: Exception) -> str:
 
 def users_error(error: BaseException, *names: str) -> str:
     """What the user's code raised, with its frames in the user's files; empty if it was not the user's code."""
-    packages = {name.partition(":")[0].partition(".")[0] for name in names if is_own(name)}
+    packages = {path.partition(":")[0].partition(".")[0] for path in map(own_path, names) if path}
     texts, is_users, one = [], False, error
     while one is not None:
         frames = _frames(one, packages)

@@ -8,11 +8,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
-from es_service.protocol.messages import PolicySpec, TaskSpec
+from es_service.protocol.messages import PolicySpec, TaskKind, TaskSpec
 
 CHUNK_PAIRS = (16, 64)
 """Fewest pairs of a chunk, so that the cost of messages does not exceed the gain from distributing a small population,
 and most: enough to fill vector units and to outweigh the cost of a message; a lost chunk costs little."""
+
+
+IN_WORDS: Mapping[TaskKind, str] = {"jax": "tasks in JAX", "python": "tasks of Python objects"}
+"""Kind of a task -> what the tasks of this kind are called."""
 
 
 class Rollout(Protocol):
@@ -20,12 +24,16 @@ class Rollout(Protocol):
 
     name: str
     """The value of `compute.rollout`."""
+    task_kinds: tuple[TaskKind, ...] = ("jax",)
+    """Kinds of tasks that it can compute."""
     runs_in_threads: bool = False
     """Whether threads of one process compute side by side, without the interpreter's lock. If not, each core has a
     process."""
     runs_on_gpus: bool = False
     takes_chunks_together: bool = False
     """Whether an episode's bits do not depend on the others of its call, so that neighbouring chunks may share one."""
+    copies_late_items: bool = True
+    """Whether a work item may be sent to a second worker while a first one, which is late with it, still lives."""
     compile_s: tuple[int, int]
     """About how many seconds a worker takes to start and to compile for a kind of chunk, the first time and with the
     code on disk, for tasks with physics (tests/benchmarks/README.md). Other tasks have compiled before it is said."""
@@ -35,8 +43,12 @@ class Rollout(Protocol):
     def why_not(self, task: TaskSpec, policy: PolicySpec) -> str:
         """Reason why it cannot compute episodes of a task with a policy; empty if it can.
 
-        Unless a rollout says otherwise, the reason is what the description of the task has found.
+        Unless a rollout says otherwise, the reason is the kind of the task, or what the description of the task has
+        found.
         """
+        if task.kind not in self.task_kinds:
+            able = " and ".join(IN_WORDS[kind] for kind in self.task_kinds)
+            return f"it computes {able}, and not {IN_WORDS[task.kind]}"
         return task.unsupported.get(self.name, "")
 
     def why_not_here(self) -> str:
@@ -49,8 +61,8 @@ Rollouts = Mapping[str, Rollout]
 
 
 def choose(rollouts: Rollouts, task: TaskSpec, policy: PolicySpec, *, gpu: bool, here: bool) -> str:
-    """Name of the rollout that `compute.rollout: auto` means: the fastest that can run; the slowest if none can, whose
-    reason is then reported.
+    """Name of the rollout that `compute.rollout: auto` means: the fastest that can run; the slowest for tasks of this
+    kind if none can, whose reason is then reported.
 
     Args:
         gpu: whether the workers use GPUs.
@@ -58,7 +70,7 @@ def choose(rollouts: Rollouts, task: TaskSpec, policy: PolicySpec, *, gpu: bool,
     """
     fits = {name: one for name, one in rollouts.items() if one.runs_on_gpus or not gpu}
     able = [name for name, one in fits.items() if not why_not(one, task, policy, here=here)]
-    return able[-1] if able else next(iter(rollouts))
+    return able[-1] if able else next(name for name, one in rollouts.items() if task.kind in one.task_kinds)
 
 
 def why_not(rollout: Rollout, task: TaskSpec, policy: PolicySpec, *, here: bool) -> str:

@@ -27,6 +27,8 @@ WORKERS = ("workers", "es_service.protocol")
 """Packages with which workers compute."""
 DRIVER = ("es_service.loop", "es_service.search", "es_service.config")
 """Packages with which the driver computes besides."""
+PATH_FOLLOWS = ("python",)
+"""Kinds of tasks, the first word of their names, that are followed by the path of a user's code."""
 SHARED_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders in which the packages of several projects are installed side by side."""
 
@@ -55,7 +57,8 @@ def driver_sources(algorithm: str) -> dict[str, str]:
 
 def user_sources(path: str) -> dict[str, str]:
     """Sources of a task or an algorithm of a user, as they are now; empty if the name is none of a user."""
-    return {own.source: own.sha256 for own in modules_of(path).user.values()} if is_own(path) else {}
+    own = own_path(path)
+    return {one.source: one.sha256 for one in modules_of(own).user.values()} if own else {}
 
 
 def other_files(ours: Sources, theirs: Sources) -> list[str]:
@@ -88,9 +91,21 @@ def why_refused(expected: Sources, environment: str) -> str:
     )
 
 
+def own_path(name: str) -> str:
+    """The user's code that a task or an algorithm names, as `package.module:name`; empty if it names none.
+
+    `brax:NAME` is none. What is simulated by Python has the kind of the task before the path, as in
+    `python:package.module:Class`.
+    """
+    kind, colon, rest = name.partition(":")
+    if kind == "brax":
+        return ""
+    return rest if kind in PATH_FOLLOWS and ":" in rest else name if colon else ""
+
+
 def is_own(name: str) -> bool:
-    """Whether a task or an algorithm is the user's, `package.module:name`."""
-    return ":" in name and not name.startswith("brax:")
+    """Whether a task or an algorithm is the user's."""
+    return bool(own_path(name))
 
 
 @cache

@@ -36,6 +36,7 @@ from es_service.store.codec import Part
 from es_service.store.writer import RunStore
 from workers.actor import WorkerActor
 from workers.policies.policy import initial_parameters
+from workers.rollouts import BACKENDS
 
 _LOG = logger(__name__)
 LIMIT_NAMES = {
@@ -189,6 +190,7 @@ def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
         place_timeout_s=math.inf if compute.place_timeout_s is None else compute.place_timeout_s,
         no_worker_timeout_s=compute.no_worker_timeout_s,
         names=LIMIT_NAMES,
+        late_factor=Limits.late_factor if BACKENDS[compute.rollout].copies_late_items else math.inf,
     )
 
 

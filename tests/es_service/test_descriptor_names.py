@@ -6,7 +6,7 @@ from es_service import api
 from es_service.cli.tables.evaluations import row_of
 from es_service.runs.evaluation import candidates, evaluate
 from tests.examples.sorting import Sorting
-from workers.environments import TaskError, user_task
+from workers.environments import TaskError, declared, user_task
 
 SORTING = "tests.examples.sorting:Sorting"
 CONFIG = {
@@ -36,7 +36,7 @@ def test_the_columns_that_names_are_held_against_are_those_of_a_run(tmp_path):
         columns_of(api.run(api.load_config(CONFIG, overrides), tmp_path / name).run)
         for name, overrides in (("grid", []), ("cvt", ["map.kind=cvt", "map.cells=[9]"]))
     )
-    for table, (ours, others) in user_task.TABLES.items():
+    for table, (ours, others) in declared.TABLES.items():
         named = {form.format(name) for form in ours for name in ("x", "y")}
         assert set(grid[table]) | set(cvt[table]) == named | set(others), table
 

@@ -137,8 +137,9 @@ def test_the_guides_agree_on_how_long_all_tests_take():
 
 
 def test_every_attribute_that_a_task_may_have_is_explained():
-    source = (ROOT / "workers" / "environments" / "user_task.py").read_text()
-    _, docstring, code = source.split('"""', 2)
+    folder = ROOT / "workers" / "environments"
+    _, docstring, code = (folder / "user_task.py").read_text().split('"""', 2)
+    code += (folder / "declared.py").read_text()
     known = {*re.findall(r'(?:getattr|hasattr)\(task, "(\w+)"', code), "options"}  # `declared_options` reads the latter
     table = TEXT["workers/README.md"].partition("A class may also have:")[2].partition("\n\n`")[0]
     rows = {name for row in table.splitlines() for name in re.findall(r"`(\w+)[^`]*`", row.partition(" | ")[0])}

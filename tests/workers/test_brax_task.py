@@ -14,7 +14,15 @@ from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.options import Option
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from tests.workers.steps import of_many, resets_of, steps_of
-from workers.environments import TaskError, brax_parts, brax_task, describe_environment, make_environment, user_task
+from workers.environments import (
+    TaskError,
+    brax_parts,
+    brax_task,
+    declared,
+    describe_environment,
+    make_environment,
+    user_task,
+)
 from workers.simd.episodes.kernel import compile_kernel
 
 pytestmark = [
@@ -100,7 +108,7 @@ def test_what_each_environment_can_tell_of_an_episode():
     assert brax_task.describe("swimmer").options["backend"].choices == ("generalized",)
     for name in ("ant", "halfcheetah", "reacher"):
         for names, _ in brax_task.describe(name).descriptors.values():
-            assert not user_task.clashes(names)
+            assert not declared.clashes(names)
     ant = with_options(brax_task.describe("ant"), {"descriptor": "feet_contact"})
     assert ant.descriptor_names == ("foot_1", "foot_2", "foot_3", "foot_4")
     assert ant.descriptor_bounds == ((0.0, 1.0),) * 4

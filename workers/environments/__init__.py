@@ -5,11 +5,15 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.options import choice
+from es_service.protocol.sources import own_path
 from workers.viewer import Viewer
+
+if TYPE_CHECKING:  # it imports this module
+    from workers.environments.host_task import HostTask
 
 
 class TaskError(Exception):
@@ -128,8 +132,24 @@ def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
     return user_task.make(name, options)
 
 
+def make_host_task(name: str, options: Mapping[str, Any]) -> HostTask:
+    """A task of Python objects; imports its module, but no JAX.
+
+    Args:
+        name: `python:package.module:Class`.
+        options: options of the task and their values.
+
+    Raises:
+        TaskError: the task does not exist or cannot be used.
+    """
+    from workers.environments import python_task
+
+    return python_task.make(name.partition(":")[2], options)
+
+
 def describe_environment(name: str) -> TaskSpec:
-    """Description of the task `brax:NAME` or `package.module:Class`, from its module; imports JAX.
+    """Description of a task that is no shipped one, from its module. Only `brax:NAME` and `package.module:Class` import
+    JAX.
 
     Raises:
         TaskError: the task does not exist or cannot be used.
@@ -139,6 +159,10 @@ def describe_environment(name: str) -> TaskSpec:
         from workers.environments import brax_task
 
         return brax_task.describe(rest)
+    if own_path(name) == rest:
+        from workers.environments import python_task
+
+        return python_task.describe(rest)
     from workers.environments import user_task
 
     return user_task.describe(name)

@@ -1,0 +1,101 @@
+"""Tasks of Python objects for tests: PointMaze from the corner, as another rollout computes it, and small ones."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+from es_service.protocol.options import Option
+from tests.twins import point_maze
+
+
+class CornerMaze:
+    """a point must reach a goal in a square; it starts in a corner"""
+
+    observation_size = action_size = 2
+    episode_steps = 200
+    descriptor_names, descriptor_bounds = ("x", "y"), ((-1.0, 1.0), (-1.0, 1.0))
+    final_fitness = True
+    least_reward = -2.3431
+
+    def __init__(self):
+        self.place, self.distance, self.reached = (0.9, -0.9), 0.0, False
+
+    def reset(self, seed):
+        self.__init__()
+        return self.place
+
+    def step(self, action):
+        x, y, reward, self.reached = point_maze.step(*self.place, tuple(map(float, action)))
+        self.place, self.distance = (x, y), -reward
+        return self.place, reward, self.reached
+
+    def descriptor(self):
+        return self.place
+
+    def goal_distance(self):
+        return self.distance
+
+    def success(self):
+        """The point is in the goal square."""
+        return self.reached
+
+
+class Drift:
+    """A point on a line is to come near 0; its start depends on the seed, and its episode ends where it leaves."""
+
+    observation_size, action_size, episode_steps = 3, 1, 40
+    action_bounds = (-0.5, 1.5)
+    descriptor_names, descriptor_bounds = ("place",), ((-3.0, 3.0),)
+    options = {"wind": Option(0.05, low=0.0)}  # noqa: RUF012
+
+    def __init__(self, wind=0.05):
+        self.wind = wind
+
+    def reset(self, seed):
+        self.random = np.random.default_rng(seed)
+        self.place, self.steps = self.random.normal(), 0
+        return self.look(), {"why": "a pair, as Gymnasium returns"}
+
+    def look(self):
+        return np.array([self.place, self.place**2, self.steps])
+
+    def step(self, action):
+        assert -0.5 <= action[0] <= 1.5
+        self.place += 0.3 * float(action[0]) - self.wind + 0.05 * self.random.normal()
+        self.steps += 1
+        return self.look(), -abs(self.place), abs(self.place) > 3.0, False, {"is_success": abs(self.place) < 0.1}
+
+    def descriptor(self):
+        return [self.place]
+
+
+class Slow(Drift):
+    """A drift whose first step in a worker that finds a file with this process's kind of fault has that fault."""
+
+    def step(self, action):
+        fault = Path(os.environ["HOST_FAULT"])
+        try:
+            kind = fault.read_text()
+            fault.unlink()  # only one worker finds it
+        except FileNotFoundError:
+            kind = ""
+        if kind == "hang":
+            time.sleep(1000.0)
+        elif kind == "exit":
+            os._exit(7)
+        elif kind:
+            raise ValueError(kind)
+        return super().step(action)
+
+
+class Fragile(Drift):
+    """A drift that cannot do the fifth step."""
+
+    def step(self, action):
+        if self.steps == 4:
+            raise ValueError("the fifth step cannot be done")
+        return super().step(action)

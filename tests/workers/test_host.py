@@ -1,0 +1,344 @@
+"""Tasks of Python objects: the rollout `host`, whose workers import no JAX, keeps every promise of the others."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from es_service import api, load_config
+from es_service.config.tasks import TASKS, task_of
+from es_service.errors import ConfigError, EvaluationError
+from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
+from es_service.protocol.noise import NORMAL_STD, Domain, evaluation_reset_keys, normal_integers, stream_keys
+from es_service.protocol.outputs import AT_THE_END, OF_STEPS
+from es_service.protocol.policies import Policies, PolicyChunk
+from es_service.runs.replay import record
+from es_service.runs.session import dispatch_limits
+from tests.helpers import centre, random_parameters, spec
+from tests.workers import host_tasks
+from workers.environments import TaskError, describe_environment, make_host_task
+from workers.host.episodes import Lanes
+from workers.host.policies import LanePolicies
+from workers.worker import make_worker
+
+MODULE = "tests.workers.host_tasks"
+MAZE, DRIFT = f"python:{MODULE}:CornerMaze", f"python:{MODULE}:Drift"
+NO_JAX = """
+import sys
+
+class NoJax:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("jax", "jaxlib", "brax", "llvmlite"):
+            raise ImportError(f"{name} is not needed")
+
+sys.meta_path.insert(0, NoJax())
+"""
+ES = {"algorithm": "es", "pairs": 16, "sigma": 0.1, "evaluation_episodes": 3}
+MAP_ELITES = {"algorithm": "map_elites", "batch": 20, "centres": 3, "iso_sigma": 0.2}
+
+
+def config_of(environment, search=ES, **compute):
+    return {
+        "task": {"environment": environment, "episode_steps": 30},
+        "policy": {"hidden": [8]},
+        "search": search,
+        "map": {"cells": [8, 8] if environment != DRIFT else [16]},
+        "budget": {"generations": 4},
+        "compute": {"engine": "inline", "workers": 2} | compute,
+    }
+
+
+@pytest.fixture
+def no_jax(tmp_path, monkeypatch):
+    """No new process can import JAX."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(NO_JAX)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+
+
+@pytest.mark.parametrize("search", [ES, MAP_ELITES], ids=lambda search: search["algorithm"])
+def test_a_run_and_its_replays_are_those_of_xla(search, tmp_path, request):
+    """PointMaze from its corner, whose reset draws nothing."""
+    of_xla = config_of("point_maze", search, rollout="xla")
+    of_xla["task"]["options"] = {"start": "corner"}
+    of_xla["compute"]["workers"] = 1
+    if search is ES:
+        of_xla["compute"]["chunk_pairs"] = 8
+    xla = api.run(of_xla, tmp_path / "xla").run
+    request.getfixturevalue("no_jax")
+    run = api.run(config_of(MAZE, search), tmp_path / "host").run
+    assert run.config["compute"]["rollout"] == "host"
+    for column in ("best_fitness", "env_steps", "coverage", "goal_distance_min", "population_return_median"):
+        np.testing.assert_allclose(run.history[column], xla.history[column], rtol=2e-3, err_msg=column)
+    np.testing.assert_allclose(run.policy("best").parameters_D, xla.policy("best").parameters_D, atol=1e-3)
+    cells = list(run.map[["cell_x", "cell_y"]].head(2).itertuples(index=False, name=None))
+    replays, recordings = record(run, best=True, cells=cells)
+    assert [one.is_the_stored for one in replays] == [True] * (1 + len(cells))
+    assert len(recordings.recordings[0].descriptor_T_B) == 31
+
+
+def drift(**changes):
+    """A spec of Drift."""
+    shape = PolicySpec((3, 8, 1))
+    return spec(environment=DRIFT, episode_steps=40, policy=shape, rollout="host", chunk_pairs=4, **changes)
+
+
+def parameters_of(worker_spec, seed=0):
+    return random_parameters(seed, worker_spec.policy.parameters)
+
+
+def centre_of(worker_spec, **changes):
+    return centre(parameters_of(worker_spec), observation_size=3, **changes)
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [
+        PolicySpec((3, 8, 1)),
+        PolicySpec((3, 8, 1), memory=4),
+        PolicySpec((3, 1), output="gaussian", bias=False),
+        PolicySpec((3, 5, 1), activation="relu", output="linear"),
+    ],
+    ids=repr,
+)
+def test_an_episode_depends_on_its_address_and_its_policy_alone(policy):
+    """Not on its slot, on the others of its chunk, or on what its environment has done before."""
+    worker_spec = replace(drift(), policy=policy)
+    run = make_worker(worker_spec)
+    parameters_N_D = np.stack([parameters_of(worker_spec, seed) for seed in range(5)])
+    mean_N_O, std_N_O = np.full((5, 3), 0.1, np.float32), np.full((5, 3), 1.5, np.float32)
+
+    def policies(first, rows, episodes=2):
+        return Policies(first, episodes, 3, True, parameters_N_D[rows], mean_N_O[rows], std_N_O[rows])
+
+    [together] = run([(policies(0, slice(0, 5)), PolicyChunk(7, 0))])
+    for row in range(5):
+        [alone] = run([(policies(row, slice(row, row + 1)), PolicyChunk(7, row))])
+        for name in ("fitness", "descriptor", "steps"):
+            np.testing.assert_array_equal(getattr(alone, name), getattr(together, name)[row::5], err_msg=name)
+        np.testing.assert_array_equal(alone.trace_T_B, together.trace_T_B[row : row + 1])
+    assert len(np.unique(together.fitness)) == 10
+
+
+def test_members_are_the_centre_and_its_noise_with_the_action_noise_of_their_address():
+    """Each member once more by itself: its parameters, its resets and its actions."""
+    worker_spec = drift(action_noise=0.3, episodes_per_member=2, observation_clip=2.0)
+    subject, chunk = centre_of(worker_spec, sigma=0.4), TrainingChunk(5, 1)
+    [result] = make_worker(worker_spec)([(subject, chunk)])
+    count, total = worker_spec.policy.parameters, 0
+    fitness_P_S, sums = np.zeros((4, 2)), []
+    for p in range(4):
+        noise_D = normal_integers(
+            np, stream_keys(3, Domain.PARAMETER_NOISE, 5, 4 + p), np.arange(count, dtype=np.uint32)
+        ).astype(np.float32)
+        for s, sign in enumerate((1.0, -1.0)):
+            member_D = subject.parameters_D + np.float32(sign) * (np.float32(0.4 / NORMAL_STD) * noise_D)
+            for episode in range(2):
+                reset_key, action_key = stream_keys(
+                    3, (Domain.TRAINING_RESET, Domain.ACTION_NOISE), 5, 4 + p, 0, episode
+                )
+                environment = Lanes(make_host_task(DRIFT, {"wind": 0.05}))[0]
+                policy = LanePolicies(
+                    worker_spec, member_D[None], subject.observation_mean_O, subject.observation_std_O, action_key[None]
+                )
+                seen_O, done, step = environment.reset(int(reset_key[0]) >> 1), False, 0
+                while not done and step < 40:
+                    sums.append(seen_O)
+                    action_1_A = policy(seen_O[None], step)
+                    noise = normal_integers(np, action_key, np.array([step], np.uint32))[0] / NORMAL_STD
+                    quiet = LanePolicies(
+                        worker_spec, member_D[None], subject.observation_mean_O, subject.observation_std_O
+                    )(seen_O[None], step)
+                    np.testing.assert_allclose(action_1_A, quiet + 0.3 * noise, rtol=1e-5, atol=1e-6)
+                    action = np.clip(0.5 + action_1_A[0], -0.5, 1.5)
+                    seen_O, reward, done = environment.step(action)
+                    fitness_P_S[p, s] += reward / 2
+                    step += 1
+                total += step
+    np.testing.assert_allclose(result.fitness, fitness_P_S, rtol=1e-4)
+    assert result.steps.sum() == total == result.moments.count == len(sums)
+    np.testing.assert_allclose(result.moments.mean_O, np.mean(sums, axis=0), rtol=1e-4)
+    np.testing.assert_allclose(result.moments.m2_O, np.var(sums, axis=0) * len(sums), rtol=1e-3)
+
+
+def test_only_the_episodes_that_are_wanted_are_computed():
+    worker_spec = drift(outputs=("success", "last_reward"))
+    [three] = make_worker(worker_spec)([(centre_of(worker_spec), EvaluationChunk(2, 0, episodes=3))])
+    [every] = make_worker(worker_spec)([(centre_of(worker_spec), EvaluationChunk(2, 0))])
+    assert three.fitness.shape == (3,)
+    assert every.fitness.shape == (16,)
+    np.testing.assert_array_equal(three.fitness, every.fitness[:3])
+    np.testing.assert_array_equal(three.trace_T_B, every.trace_T_B)
+    np.testing.assert_array_equal(every.trace_T_B[-1], every.descriptor[0])
+    np.testing.assert_array_equal(every.outputs["success"], np.abs(every.descriptor[:, 0]) < 0.1)
+    np.testing.assert_allclose(every.outputs["last_reward"], -np.abs(every.descriptor[:, 0]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("episodes", [1, 2])
+def test_outputs_of_steps_are_what_happened_in_training_and_in_evaluations(episodes):
+    names = (*AT_THE_END, *OF_STEPS)
+    worker_spec = drift(outputs=names, episodes_per_member=episodes, action_noise=0.2)
+    for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0, episodes=5)):
+        [found] = make_worker(worker_spec)([(centre_of(worker_spec, sigma=0.5), chunk)])
+        steps, total = found.of_steps, found.steps.sum()
+        assert {name: len(array) for name, array in steps.items()} == dict.fromkeys(OF_STEPS, total)
+        place_K = steps["observation"][:, 0]
+        starts_K = steps["observation"][:, 2] == 0.0
+        assert starts_K.sum() == (8 * episodes if isinstance(chunk, TrainingChunk) else 5)
+        np.testing.assert_array_equal(steps["step_descriptor"][:-1, 0][~starts_K[1:]], place_K[1:][~starts_K[1:]])
+        np.testing.assert_allclose(steps["reward"], -np.abs(steps["step_descriptor"][:, 0]), rtol=1e-6)
+        np.testing.assert_array_equal(steps["done"], np.abs(steps["step_descriptor"][:, 0]) > 3.0)
+        np.testing.assert_allclose(
+            steps["reward"].sum(), found.returns.sum() * (episodes if starts_K.sum() > 5 else 1), rtol=1e-4
+        )
+        moved_K = steps["step_descriptor"][:, 0] - place_K + 0.05
+        pushed_K = 0.3 * np.clip(0.5 + steps["action"][:, 0], -0.5, 1.5)
+        assert np.abs(moved_K - pushed_K).max() < 0.05 * 6
+    with pytest.raises(ValueError, match="no output of episodes has the name 'nothing'"):
+        make_worker(drift(outputs=("nothing",)))([(centre_of(worker_spec), EvaluationChunk(1, 0))])
+
+
+@pytest.mark.usefixtures("no_jax")
+@pytest.mark.parametrize("fault", ["", "exit", "it raises this once", pytest.param("hang", marks=pytest.mark.slow)])
+def test_workers_a_resume_and_faults_change_no_bit(fault, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOST_FAULT", str(tmp_path / "fault"))
+    slow = f"python:{MODULE}:Slow"
+    config = config_of(slow, ES | {"pairs": 24}, chunk_timeout_s=1.0, first_chunk_timeout_s=2.0) | {
+        "map": {"cells": [16]}
+    }
+    undisturbed = api.run(config | {"compute": {"workers": 1}}, tmp_path / "one").run.digest()
+    if not fault:
+        three = api.run(config | {"compute": {"workers": 3}}, tmp_path / "three").run
+        assert three.digest() == undisturbed
+        api.run(config | {"budget": {"generations": 2}}, tmp_path / "two")
+        assert api.resume(tmp_path / "two", ["budget.generations=4"]).run.digest() == undisturbed
+        return
+    (tmp_path / "fault").write_text(fault)
+    notices: list[str] = []
+    run = api.run(config, tmp_path / "faulty", on_notice=notices.append).run
+    lost, retries = run.history[["lost_workers", "retries"]].sum()
+    assert retries > 0
+    assert (lost, len(notices)) == (0, 0) if fault == "it raises this once" else (1, 1), notices
+    assert run.digest() == undisturbed
+
+
+def test_what_cannot_be_computed_is_named_with_its_seed_so_that_it_can_be_run_alone(tmp_path):
+    config = config_of(f"python:{MODULE}:Fragile", max_attempts=1, workers=1) | {"map": {"cells": [16]}}
+    with pytest.raises(EvaluationError, match="ValueError: the fifth step cannot be done") as caught:
+        api.run(config, tmp_path / "run")
+    step, seed = re.findall(r"raised in step (\d+) of the episode whose reset has the seed (\d+)", str(caught.value))[0]
+    assert int(step) == 5
+    assert int(seed) == int(evaluation_reset_keys(0, 0, 0)[0]) >> 1
+
+
+def test_a_task_says_what_it_is():
+    task = TASKS[DRIFT]
+    assert (task.kind, task.observation_size, task.action_size, task.episode_steps) == ("python", 3, 1, 40)
+    assert task.options["wind"].default == 0.05
+    assert task.success == "the info of the last step has a true is_success"
+    assert TASKS[MAZE].success == "The point is in the goal square"
+    assert TASKS[MAZE].has_goal
+    config = load_config(config_of(DRIFT), ["task.options.wind=0.2"])
+    assert config.compute.rollout == "host"
+    assert config.compute.chunk_pairs == 8
+    assert task_of(config).descriptor_names == ("place",)
+    assert dispatch_limits(config).late_factor == np.inf, "an object may have effects outside of its process"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "problem"),
+    [
+        (["compute.rollout=xla"], "xla cannot run .*: it computes tasks in JAX, and not tasks of Python objects"),
+        (
+            ["task.environment=point_maze", "compute.rollout=host"],
+            "it computes tasks of Python objects, and not tasks in",
+        ),
+        (["compute.engine=ray", "compute.worker_resources.gpu=1"], "host runs only on CPUs"),
+        (["task.options.wind=-1"], "must be a number, at least 0"),
+        (["policy.output=argmax"], "whose action is one number"),
+    ],
+)
+def test_what_a_config_cannot_have_is_named(overrides, problem):
+    with pytest.raises(ConfigError, match=problem):
+        load_config(config_of(DRIFT), overrides)
+
+
+class Chooser:
+    """One of three numbers is to be chosen."""
+
+    observation_size, action_size, episode_steps = 1, 3, 5
+    discrete_actions = True
+
+    def reset(self, seed):
+        self.wanted = seed % 3
+        return self.wanted
+
+    def step(self, action):
+        reward, self.wanted = float(action == self.wanted), (self.wanted + 1) % 3
+        assert type(action) is int
+        return self.wanted, reward, False
+
+
+def test_actions_to_choose_from_are_numbers_and_a_task_without_a_descriptor_has_its_length():
+    name = f"python:{__name__}:Chooser"
+    task = describe_environment(name)
+    assert (task.discrete_actions, task.descriptor_names, task.descriptor_bounds) == (True, ("length",), ((0.0, 5.0),))
+    settings = {"task": {"environment": name}, "search": ES, "budget": {"generations": 1}}
+    config = load_config(settings)
+    assert (config.policy.output, config.policy.action_noise) == ("argmax", 0.0)
+    assert load_config(settings, ["policy.output=categorical"]).policy.output == "categorical"
+    with pytest.raises(
+        ConfigError, match=r"policy.output: tanh is not allowed .*one of 3 to choose from; must be argmax"
+    ):
+        load_config(settings, ["policy.output=tanh"])
+    for output in ("argmax", "categorical"):
+        worker_spec = spec(
+            environment=name,
+            episode_steps=5,
+            policy=PolicySpec((1, 8, 3), output=output),
+            action_noise=0.0,
+            rollout="host",
+            chunk_pairs=8,
+        )
+        subject = centre(random_parameters(1, worker_spec.policy.parameters), observation_size=1, sigma=1.0)
+        [found] = make_worker(worker_spec)([(subject, TrainingChunk(1, 0))])
+        assert 0.0 < found.fitness.mean() < 5.0
+        assert (found.descriptor == 5.0).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "problem"),
+    [
+        ("observation_size", 4, "an observation has 3 numbers, not 4"),
+        ("observation_size", 4.0, "observation_size = 4.0 is not of type int"),
+        ("episode_steps", 0, "episode_steps = 0 is not positive"),
+        ("action_bounds", (1.0, -1.0), r"action_bounds: \(1.0, -1.0\) is not a pair"),
+        ("action_bounds", ((0.0, 1.0),) * 2, "action_bounds has 2 pairs, but action_size is 1"),
+        ("discrete_actions", True, "action_bounds = .* has no meaning with discrete_actions"),
+        ("descriptor_bounds", ((0.0, 1.0),) * 2, "1 descriptor_names but 2 descriptor_bounds"),
+        ("descriptor", lambda self: [1.0, 2.0], "the descriptor has 2 numbers, not 1"),
+        ("step", lambda self, action: (0.0, 1.0), r"step returned 2 values; it must return \(observation, reward"),
+        ("step", lambda self, action: 1 / 0, "cannot do a step: ZeroDivisionError"),
+        ("step", None, "cannot do a step"),
+        ("options", {"wind": 3}, "option 'wind' = 3 is neither an Option nor a tuple"),
+    ],
+)
+def test_a_class_that_contradicts_itself_is_refused(name, value, problem, monkeypatch):
+    monkeypatch.setattr(host_tasks.Drift, name, value, raising=False)
+    with pytest.raises(TaskError, match=rf"^{DRIFT}.*{problem}"):
+        describe_environment(DRIFT)
+
+
+def test_a_constructor_must_not_change_what_a_run_takes_from_the_class(monkeypatch):
+    monkeypatch.setattr(host_tasks.Drift, "__init__", lambda self, wind: setattr(self, "episode_steps", 7))
+    with pytest.raises(TaskError, match=rf"^{DRIFT}: its constructor changes episode_steps \(40 -> 7\)"):
+        describe_environment(DRIFT)
+
+
+@pytest.mark.parametrize("name", ["python:no_such:Class", f"python:{MODULE}:Nothing", "python:pathlib:Path"])
+def test_what_is_no_task_is_named(name):
+    with pytest.raises(TaskError, match=r"cannot import no_such|has no class Nothing|has no observation_size"):
+        describe_environment(name)

@@ -1,0 +1,162 @@
+"""What a user's class declares of itself as a task: its import, its attributes, and what is wrong with them.
+
+Tasks in JAX and tasks of Python objects share this; nothing here imports JAX.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from es_service.protocol.messages import Bounds, TaskKind, TaskSpec
+from es_service.protocol.options import Option
+from es_service.protocol.raised import why_not_imported
+from es_service.protocol.user_code import import_user_module, in_no_file
+from workers.environments import TaskError
+
+TABLES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "the history": (
+        ("centre_{}", "centre_{}_std"),
+        ("centre_fitness_mean", "centre_fitness_std", "centre_return_mean", "centre_return_std", "centre_novelty"),
+    ),
+    "the map": (("{}", "cell_{}"), ("cell", "fitness", "generation", "centre")),
+    "the novelty archive": (("{}",), ("generation", "centre")),
+    "evaluate --out": (
+        ("{}", "{}_std"),
+        (
+            "run",
+            "policy",
+            "generation",
+            "episodes",
+            "stored_fitness",
+            "fresh_fitness",
+            "fresh_standard_error",
+            "successes",
+        ),
+    ),
+}
+"""Tables of a run with columns named after the descriptor: (patterns of these columns, other columns)."""
+
+
+def import_named(path: str, what: str = "class") -> Any:
+    """What `package.module:name` names.
+
+    Args:
+        what: the word for it in messages.
+
+    Raises:
+        TaskError: the module cannot be imported, or has nothing of this name.
+    """
+    module, _, name = path.partition(":")
+    if problem := in_no_file(path):
+        raise TaskError(problem)
+    try:
+        found = import_user_module(path)
+    except Exception as error:  # the user's code can raise anything
+        raise TaskError(f"{path}: {why_not_imported(module, error)}") from error
+    if not hasattr(found, name):
+        raise TaskError(f"{path}: the module {module} has no {what} {name}")
+    return getattr(found, name)
+
+
+def wrong_values(task: Any, names: Any, bounds: Any, sizes: tuple[str, ...]) -> list[str]:
+    """Problems of the attributes of a class whose types are right.
+
+    Args:
+        names, bounds: of the descriptor.
+        sizes: attributes that are positive whole numbers.
+    """
+    wrong = []
+    if len(names) != len(bounds) or not len(names):
+        wrong.append(f"{len(names)} descriptor_names but {len(bounds)} descriptor_bounds")
+    wrong += wrong_pairs("descriptor_bounds", bounds)
+    wrong += clashes(tuple(map(str, names)))
+    if not _are_walls(getattr(task, "walls", None)):
+        wrong.append(f"walls = {task.walls!r} is not a tuple of segments ((x, y), (x, y))")
+    least = getattr(task, "least_reward", None)
+    goal = getattr(task, "goal", None)
+    if goal is not None and not (are_finite(goal) and len(goal) == 2):
+        wrong.append(f"goal = {goal!r} is not a place (x, y) of finite numbers")
+    numbers = {
+        "wall_clearance": getattr(task, "wall_clearance", 0.0),
+        "least_reward": 0.0 if least is None else least,
+    }
+    wrong += [f"{name} = {x!r} is not a finite number" for name, x in numbers.items() if not are_finite((x,))]
+    return wrong + [f"{name} = {size} is not positive" for name in sizes if (size := getattr(task, name)) < 1]
+
+
+def task_of_class(
+    path: str, task: Any, kind: TaskKind, descriptor: tuple[tuple[str, ...], Bounds], options: dict[str, Option]
+) -> TaskSpec:
+    """Description of a class whose declarations are right.
+
+    Args:
+        path: name of the task.
+        descriptor: names and bounds of its dimensions.
+    """
+    names, bounds = descriptor
+    return TaskSpec(
+        name=path,
+        observation_size=task.observation_size,
+        action_size=task.action_size,
+        episode_steps=task.episode_steps,
+        descriptor_names=tuple(map(str, names)),
+        descriptor_bounds=tuple((float(low), float(high)) for low, high in bounds),
+        final_fitness=bool(getattr(task, "final_fitness", False)),
+        has_goal=hasattr(task, "goal_distance"),
+        options=options,
+        summary=(task.__doc__ or "").strip().partition("\n")[0],
+        walls=getattr(task, "walls", None),
+        wall_clearance=float(getattr(task, "wall_clearance", 0.0)),
+        goal=getattr(task, "goal", None),
+        least_reward=getattr(task, "least_reward", None),
+        success=_success_in_words(task),
+        kind=kind,
+    )
+
+
+def _success_in_words(task: Any) -> str:
+    """The first line of the docstring of a class's method `success`; empty if it has no such method."""
+    if not hasattr(task, "success"):
+        return ""
+    return (task.success.__doc__ or "").strip().partition("\n")[0].rstrip(".") or "as the task's method success says"
+
+
+def wrong_pairs(name: str, bounds: tuple) -> list[str]:
+    """Problems of the bounds that an attribute has."""
+    return [
+        f"{name}: {pair!r} is not a pair (low, high) of finite numbers with low < high"
+        for pair in bounds
+        if not (are_finite(pair) and len(pair) == 2 and pair[0] < pair[1])
+    ]
+
+
+def clashes(names: tuple[str, ...]) -> list[str]:
+    """Problems of the names of a descriptor's dimensions, whose columns must not exist already in a table of a run."""
+    wrong: dict[str, str] = {}
+    for table, (ours, others) in TABLES.items():
+        taken = {column.casefold() for column in others}  # SQL does not distinguish upper and lower case
+        for name in names:
+            for column in (form.format(name) for form in ours):
+                if column.casefold() in taken:
+                    wrong.setdefault(
+                        name,
+                        f"descriptor_names: {name!r} would be the column {column} of {table}, which already has a "
+                        "column of that name; choose another name",
+                    )
+                taken.add(column.casefold())
+    return list(wrong.values())
+
+
+def _are_walls(walls: Any) -> bool:
+    """Whether a value is None or a tuple of segments, each between two different places."""
+    return walls is None or (
+        isinstance(walls, tuple)
+        and all(isinstance(wall, tuple) and len(wall) == 2 and wall[0] != wall[1] for wall in walls)
+        and all(are_finite(end) and len(end) == 2 for wall in walls for end in wall)
+    )
+
+
+def are_finite(numbers: Any) -> bool:
+    """Whether a value is a tuple of finite numbers."""
+    return isinstance(numbers, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in numbers)

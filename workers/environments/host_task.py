@@ -1,0 +1,187 @@
+"""Tasks of Python objects: what the rollout of such tasks steps, one object for each episode at a time.
+
+An object has a state of its own, and only `reset` starts its next episode. So its results are pure functions of the
+seed and the actions as far as the object keeps nothing from one episode to the next.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.messages import FloatArray
+from es_service.protocol.raised import raised
+from workers.environments import TaskError
+
+IS_SUCCESS = "is_success"
+"""Key of `info` that says whether an episode has succeeded."""
+SUCCESS_OF_INFO = f"the info of the last step has a true {IS_SUCCESS}"
+TRIED_STEPS = 3
+"""Steps that are done with a new task, to see what its object returns."""
+LENGTH = "length"
+"""Name of the descriptor of a task that declares none: the number of steps of the episode."""
+
+
+@dataclass
+class HostEpisode:
+    """What a Python object has done in its present episode so far."""
+
+    environment: Any
+    """The object itself."""
+    observation_O: FloatArray
+    """The newest observation, flat."""
+    info: Mapping[str, Any] = field(default_factory=dict)
+    """What the object has said besides with the newest observation."""
+    steps: int = 0
+
+
+@dataclass(frozen=True)
+class HostTask:
+    """A task of Python objects as functions; only what they make has a state."""
+
+    name: str
+    make: Callable[[], Any]
+    """Makes an object with `reset(seed)` and `step(action)`, which return what those of Gymnasium return, or only an
+    observation, and (observation, reward, done)."""
+    observation_size: int
+    flat: Callable[[Any], Any]
+    """Function from an observation of the object to numbers, in any shape."""
+    actions: Callable[[FloatArray], Any]
+    """Function from actions of a policy [L, A] to a sequence [L] of actions of the object."""
+    descriptor_size: int
+    descriptor: Callable[[HostEpisode], Any]
+    """Function from an episode that ends now to its descriptor [B]."""
+    success: Callable[[HostEpisode], Any]
+    """Function from an episode that ends now to whether it has succeeded."""
+    goal_distance: Callable[[HostEpisode], Any] | None = None
+    """Function from an episode to the present distance to the goal; None if there is no goal."""
+
+
+class HostEnvironment:
+    """A Python object as an environment: one episode after another, with observations as flat arrays."""
+
+    def __init__(self, task: HostTask) -> None:
+        self._task, self._object = task, task.make()
+        self._episode = HostEpisode(self._object, np.zeros(0, np.float32))
+
+    def reset(self, seed: int) -> FloatArray:
+        """Start an episode, and return its first observation [O]."""
+        found = self._object.reset(seed=seed)
+        observation, info = found if _is_pair(found) else (found, {})
+        self._episode = HostEpisode(self._object, self._observed(observation), info)
+        return self._episode.observation_O
+
+    def step(self, action: Any) -> tuple[FloatArray, float, bool]:
+        """Do one step: (observation [O], reward, whether the episode has ended)."""
+        found = self._object.step(action)
+        if len(found) not in (3, 5):
+            raise TaskError(
+                f"{self._task.name}: step returned {len(found)} values; it must return (observation, reward, done), or "
+                "(observation, reward, terminated, truncated, info)"
+            )
+        observation, reward, *ends = found
+        before = self._episode
+        info = ends[2] if len(ends) == 3 else {}
+        self._episode = HostEpisode(self._object, self._observed(observation), info, before.steps + 1)
+        return self._episode.observation_O, float(reward), any(map(bool, ends[:2]))
+
+    @property
+    def info(self) -> Mapping[str, Any]:
+        """What the object has said with its newest observation besides."""
+        return self._episode.info
+
+    def descriptor(self) -> FloatArray:
+        """Descriptor [B] of the episode if it ends now."""
+        found_B = np.asarray(self._task.descriptor(self._episode), np.float32).reshape(-1)
+        if found_B.size != self._task.descriptor_size:
+            raise TaskError(
+                f"{self._task.name}: the descriptor has {found_B.size} numbers, not {self._task.descriptor_size}"
+            )
+        return found_B
+
+    def goal_distance(self) -> float:
+        """Present distance to the goal, NaN without one."""
+        return math.nan if self._task.goal_distance is None else float(self._task.goal_distance(self._episode))
+
+    def success(self) -> bool:
+        """Whether the episode has succeeded if it ends now."""
+        return bool(self._task.success(self._episode))
+
+    def _observed(self, observation: Any) -> FloatArray:
+        # A copy, since an object may change the array that it has returned.
+        flat_O = np.array(self._task.flat(observation), np.float32).reshape(-1)
+        if flat_O.size != self._task.observation_size:
+            raise TaskError(
+                f"{self._task.name}: an observation has {flat_O.size} numbers, not {self._task.observation_size}"
+            )
+        return flat_O
+
+
+def length(episode: HostEpisode) -> float:
+    """Number of steps of an episode."""
+    return float(episode.steps)
+
+
+def said_success(episode: HostEpisode) -> bool:
+    """Whether the newest `info` says that the episode has succeeded."""
+    return bool(episode.info.get(IS_SUCCESS, False))
+
+
+def try_out(task: HostTask, action_size: int) -> set[str]:
+    """Do some steps with actions of zeros; returns the keys of the `info` that the steps have.
+
+    Raises:
+        TaskError: the object raises, or does not return what the task declares.
+    """
+    keys: set[str] = set()
+    try:
+        environment = HostEnvironment(task)
+        (action,) = task.actions(np.zeros((1, action_size), np.float32))
+        done = True
+        for seed in range(TRIED_STEPS):
+            if done:
+                environment.reset(seed)
+            _, _, done = environment.step(action)
+            for ask in (environment.descriptor, environment.goal_distance, environment.success):
+                ask()
+            keys |= {*environment.info}
+    except TaskError:
+        raise
+    except Exception as error:  # the user's code can raise anything
+        raise TaskError(f"{task.name} cannot do a step: {raised(error, task.name)}") from error
+    return keys
+
+
+def within_bounds(bounds: Any, dtype: Any = np.float32) -> Callable[[FloatArray], NDArray[Any]]:
+    """Function from actions of a policy to actions between bounds: -1 and 1 become the bounds, and what is beyond is
+    clipped. A bound that is infinite clips nothing, and its dimension is not scaled.
+
+    Args:
+        bounds: (low, high) of each dimension, or of all.
+    """
+    low_A, high_A = np.asarray(bounds, np.float32).reshape(-1, 2).T
+    is_finite_A = np.isfinite(low_A) & np.isfinite(high_A)
+    with np.errstate(invalid="ignore", over="ignore"):
+        middle_A = np.where(is_finite_A, 0.5 * low_A + 0.5 * high_A, 0.0).astype(np.float32)
+        half_A = np.where(is_finite_A, 0.5 * high_A - 0.5 * low_A, 1.0).astype(np.float32)
+    return lambda action_L_A: np.clip(middle_A + half_A * action_L_A, low_A, high_A).astype(dtype, copy=False)
+
+
+def chosen(action_L_A: FloatArray) -> list[int]:
+    """Actions of a policy that chooses among several, as the numbers of the chosen ones."""
+    return np.argmax(action_L_A, axis=-1).tolist()
+
+
+def unchanged(action_L_A: FloatArray) -> FloatArray:
+    """Actions of a policy as they are."""
+    return action_L_A
+
+
+def _is_pair(found: Any) -> bool:
+    """Whether a reset has returned (observation, info), as those of Gymnasium do."""
+    return isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Mapping)

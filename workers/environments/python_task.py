@@ -1,0 +1,150 @@
+"""Classes of users that simulate in Python, as tasks named `python:package.module:Class`. Such a class must have:
+
+    class Class:
+        observation_size: int
+        action_size: int
+        episode_steps: int
+
+        def reset(self, seed): ...     # whole number below 2^31 -> observation [observation_size]
+        def step(self, action): ...    # float32 [action_size] -> (observation, reward, done)
+
+`reset` starts an episode that depends only on the seed, and `step` continues it. They may also return what those of
+Gymnasium return: (observation, info), and (observation, reward, terminated, truncated, info). A class may also have:
+
+- `descriptor(self)`: the descriptor of an episode that ends now, with the attributes `descriptor_names` and
+  `descriptor_bounds`, tuples as in `workers.environments.user_task`. Without it, the descriptor is the number of steps;
+- `action_bounds`: (low, high) of every action, or a tuple of such pairs, one for each. Actions -1 and 1 of a policy
+  then become the bounds, and what is beyond is clipped; without them, `step` gets what the policy puts out;
+- `discrete_actions = True`: `step` gets the number of one of `action_size` actions, which the policy chooses;
+- `goal_distance(self)` and `success(self)`, of an episode that ends now; without the latter, an episode succeeds if the
+  `info` of its last step has a true `is_success`, where the first steps have one;
+- `final_fitness`, `options`, `walls`, `wall_clearance`, `goal`, `least_reward` and a docstring, as in
+  `workers.environments.user_task`.
+
+A worker makes several objects of the class and uses each for one episode after another. Several processes do so at the
+same time, and a chunk that was lost is computed again: an object must not write to files that others use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from es_service.protocol.messages import TaskSpec
+from es_service.protocol.options import OptionValue, declared_options
+from workers.environments import TaskError
+from workers.environments.declared import are_finite, import_named, task_of_class, wrong_pairs, wrong_values
+from workers.environments.host_task import (
+    IS_SUCCESS,
+    LENGTH,
+    SUCCESS_OF_INFO,
+    HostTask,
+    chosen,
+    length,
+    said_success,
+    try_out,
+    unchanged,
+    within_bounds,
+)
+
+SIZES = ("observation_size", "action_size", "episode_steps")
+METHODS = ("reset", "step")
+DESCRIPTOR = ("descriptor_names", "descriptor_bounds")
+KEPT = (*SIZES, *DESCRIPTOR, "action_bounds", "discrete_actions", "walls", "wall_clearance", "goal", "least_reward",
+        "final_fitness")  # fmt: skip
+"""Attributes that a constructor must not change, since a run takes them from the class."""
+PREFIX = "python:"
+
+
+def describe(path: str) -> TaskSpec:
+    """Description of a user's class as a task.
+
+    Raises:
+        TaskError: the class cannot be imported, its attributes or methods are missing or wrong, or they do not fit.
+    """
+    task, name = import_named(path), PREFIX + path
+    needed = (*SIZES, *METHODS, *(DESCRIPTOR if hasattr(task, "descriptor") else ()))
+    if missing := [one for one in needed if not hasattr(task, one)]:
+        raise TaskError(
+            f"{name} has no {', '.join(missing)}; workers/environments/python_task.py lists what such a task must have"
+        )
+    wrong = [
+        f"{one} = {getattr(task, one)!r} is not of type int" for one in SIZES if type(getattr(task, one)) is not int
+    ]
+    names, bounds = descriptor_of(task)
+    wrong += [
+        f"{one} = {value!r} is not of type tuple"
+        for one, value in zip(DESCRIPTOR, (names, bounds), strict=True)
+        if not isinstance(value, tuple)
+    ]
+    options, wrong_options = declared_options(task)
+    wrong += wrong_options
+    if not wrong:
+        wrong += wrong_values(task, names, bounds, SIZES) + _wrong_actions(task)
+    if wrong:
+        raise TaskError(f"{name}: {'; '.join(wrong)}")
+    spec = task_of_class(name, task, "python", (names, bounds), options)
+    told = try_out(make(path, {one: option.default for one, option in options.items()}), task.action_size)
+    if not spec.success and IS_SUCCESS in told:
+        spec = replace(spec, success=SUCCESS_OF_INFO)
+    return replace(spec, discrete_actions=bool(getattr(task, "discrete_actions", False)))
+
+
+def descriptor_of(task: Any) -> tuple[Any, Any]:
+    """Names and bounds of the descriptor that a class declares; those of the length of an episode if it has none."""
+    if hasattr(task, "descriptor"):
+        return tuple(getattr(task, one) for one in DESCRIPTOR)
+    return (LENGTH,), ((0.0, float(task.episode_steps)),)
+
+
+def make(path: str, options: Mapping[str, OptionValue]) -> HostTask:
+    """A user's class as a task, whose objects are constructed with the task's options."""
+    kind, name = import_named(path), PREFIX + path
+
+    def construct() -> Any:
+        one = kind(**options)
+        for attribute in KEPT:
+            of_class, of_object = getattr(kind, attribute, None), getattr(one, attribute, None)
+            if repr(of_class) != repr(of_object):
+                raise TaskError(
+                    f"{name}: its constructor changes {attribute} ({of_class!r} -> {of_object!r}), but a run uses the "
+                    "value of the class; options may change only what the methods compute"
+                )
+        return one
+
+    actions = unchanged
+    if getattr(kind, "discrete_actions", False):
+        actions = chosen
+    elif getattr(kind, "action_bounds", None) is not None:
+        actions = within_bounds(kind.action_bounds)
+    has_descriptor = hasattr(kind, "descriptor")
+    return HostTask(
+        name=name,
+        make=construct,
+        observation_size=kind.observation_size,
+        flat=lambda observation: observation,
+        actions=actions,
+        descriptor_size=len(descriptor_of(kind)[0]),
+        descriptor=(lambda episode: episode.environment.descriptor()) if has_descriptor else length,
+        success=(lambda episode: episode.environment.success()) if hasattr(kind, "success") else said_success,
+        goal_distance=(lambda episode: episode.environment.goal_distance()) if hasattr(kind, "goal_distance") else None,
+    )
+
+
+def _wrong_actions(task: Any) -> list[str]:
+    """Problems of what a class says of its actions."""
+    bounds, size = getattr(task, "action_bounds", None), task.action_size
+    if getattr(task, "discrete_actions", False):
+        if bounds is not None:
+            return [f"action_bounds = {bounds!r} has no meaning with discrete_actions"]
+        return [] if size > 1 else [f"discrete_actions with action_size = {size}: there must be several to choose from"]
+    if bounds is None:
+        return []
+    if not isinstance(bounds, tuple):
+        return [f"action_bounds = {bounds!r} is not a tuple"]
+    pairs = (bounds,) if are_finite(bounds) else bounds
+    wrong = wrong_pairs("action_bounds", pairs)
+    if not wrong and len(pairs) not in (1, size):
+        wrong.append(f"action_bounds has {len(pairs)} pairs, but action_size is {size}")
+    return wrong

@@ -1,0 +1,149 @@
+"""Episodes in lanes that step side by side, each with an environment of its own.
+
+Axes: L lanes, O observation, A action, B descriptor, T points of a trace.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.messages import TRACE_POINTS, FloatArray, WorkerSpec
+from workers.environments.host_task import HostEnvironment, HostTask
+from workers.host.outputs import Outputs, Step
+from workers.host.policies import LanePolicies
+from workers.rollouts.backend import Episodes
+
+
+class Watched(NamedTuple):
+    """What is kept of one lane for a replay, from the reset on."""
+
+    lane: int
+    descriptors: list[FloatArray]
+    returns: list[float]
+
+
+class Lanes:
+    """The environments of a worker's lanes, made when they are first needed and used for one episode after another."""
+
+    def __init__(self, task: HostTask) -> None:
+        self.task = task
+        self._environments: dict[int, HostEnvironment] = {}
+
+    def __getitem__(self, lane: int) -> HostEnvironment:
+        if lane not in self._environments:
+            self._environments[lane] = HostEnvironment(self.task)
+        return self._environments[lane]
+
+
+def run_episodes(
+    lanes: Lanes,
+    spec: WorkerSpec,
+    policies: LanePolicies,
+    mean: FloatArray,
+    reset_keys_L_4: NDArray[np.uint32],
+    *,
+    training: bool,
+    runs_L: NDArray[np.bool_] | None = None,
+    watched: Watched | None = None,
+) -> Episodes:
+    """One episode in each lane.
+
+    Lanes whose episode has ended, and those that do not run, keep their policy with an observation that does not
+    change, so that the shapes of all products stay the same.
+
+    Args:
+        mean: observation statistics, from which sums of observations are shifted, [O] or [L, O].
+        training: whether sums of observations are computed; otherwise traces are.
+        runs_L: which lanes run; None for all. The results of the others are 0.
+        watched: filled with the episode of one lane.
+
+    Returns:
+        Episodes with leading axis [L].
+    """
+    count, size, task = len(reset_keys_L_4), spec.policy.widths[0], lanes.task
+    alive_L = np.ones(count, bool) if runs_L is None else runs_L.copy()
+    environments = [lanes[lane] if alive_L[lane] else None for lane in range(count)]
+    running = [(lane, one) for lane, one in enumerate(environments) if one is not None]
+    points = min(TRACE_POINTS, spec.episode_steps + 1)
+    last_steps_T = np.arange(points) * spec.episode_steps // (points - 1)
+    traced = frozenset() if training else frozenset(last_steps_T.tolist())
+
+    observation_L_O = np.zeros((count, size), np.float32)
+    returns_L, reward_L, steps_L = np.zeros(count), np.zeros(count), np.zeros(count, np.int32)
+    descriptor_L_B = np.zeros((count, task.descriptor_size), np.float32)
+    goal_distance_L_2 = np.full((count, 2), np.nan, np.float32)
+    sum_L_O, square_L_O = np.zeros((2, count, size if training else 0), np.float32)
+    trace_L_T_B = np.zeros((count, 0 if training else points, task.descriptor_size), np.float32)
+    outputs = Outputs(spec.outputs, spec, task, count)
+
+    def watch(lane: int, environment: HostEnvironment) -> None:
+        if watched is not None and watched.lane == lane:
+            watched.descriptors.append(environment.descriptor())
+            watched.returns.append(returns_L[lane])
+
+    lane = step = 0
+    try:
+        for lane, environment in running:
+            observation_L_O[lane] = environment.reset(seed_of(reset_keys_L_4[lane]))
+            if not training:
+                trace_L_T_B[lane] = environment.descriptor()
+            watch(lane, environment)
+        for step in range(1, spec.episode_steps + 1):
+            if not running:
+                break
+            action_L_A = policies(observation_L_O, step - 1)
+            actions_L = task.actions(action_L_A)
+            if training:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    shifted_L_O = np.where(alive_L[:, None], observation_L_O - mean, np.float32(0.0))
+                    sum_L_O += shifted_L_O
+                    square_L_O += shifted_L_O * shifted_L_O
+            still = []
+            for lane, environment in running:
+                seen_O, reward, done = environment.step(actions_L[lane])
+                is_last = done or step == spec.episode_steps
+                if outputs:
+                    now = Step(environment, observation_L_O[lane], action_L_A[lane], seen_O, reward, done)
+                    outputs.note(lane, step - 1, now, is_last=is_last)
+                observation_L_O[lane] = seen_O
+                reward_L[lane], steps_L[lane] = reward, step
+                returns_L[lane] += reward
+                if task.goal_distance is not None:
+                    distance = environment.goal_distance()
+                    goal_distance_L_2[lane] = distance, np.fmin(goal_distance_L_2[lane, 1], distance)
+                if is_last or step in traced:
+                    descriptor_L_B[lane] = environment.descriptor()
+                    if not training:
+                        trace_L_T_B[lane, last_steps_T >= step] = descriptor_L_B[lane]
+                watch(lane, environment)
+                if is_last:
+                    alive_L[lane] = False
+                else:
+                    still.append((lane, environment))
+            running = still
+    except BaseException as error:
+        place = f"step {step}" if step else "the reset"
+        error.add_note(f"raised in {place} of the episode whose reset has the seed {seed_of(reset_keys_L_4[lane])}")
+        raise
+    with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, which makes the episode invalid
+        returns_L, reward_L = returns_L.astype(np.float32), reward_L.astype(np.float32)
+    return Episodes(
+        fitness=reward_L if spec.fitness == "final" else returns_L,
+        returns=returns_L,
+        descriptor=descriptor_L_B,
+        steps=steps_L,
+        goal_distance=goal_distance_L_2,
+        shifted_sum_O=sum_L_O,
+        shifted_square_sum_O=square_L_O,
+        trace_T_B=trace_L_T_B,
+        outputs=outputs.at_the_end,
+        of_steps=outputs.of_steps,
+    )
+
+
+def seed_of(reset_key_4: NDArray[np.uint32]) -> int:
+    """The seed of a reset, a whole number below 2^31, which every generator accepts, from its stream key."""
+    return int(reset_key_4[0]) >> 1

@@ -1,0 +1,155 @@
+"""The rollout `host`: environments that are Python objects, stepped by their own code, and policies in NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, SIGNS, TaskSpec, WorkerSpec
+from es_service.protocol.noise import (
+    NORMAL_STD,
+    Domain,
+    evaluation_reset_keys,
+    normal_integers,
+    normals,
+    stream_keys,
+)
+from es_service.protocol.options import OptionValue
+from es_service.protocol.policies import POLICY_SLOTS
+from es_service.protocol.recordings import Recording, Recordings, RecordRequest
+from workers.compilable import Compilable
+from workers.environments import make_host_task
+from workers.host.episodes import Lanes, Watched, run_episodes, seed_of
+from workers.host.policies import LanePolicies
+from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
+
+
+class Host(RolloutBackend):
+    """The environments of a chunk step side by side; those of a worker are used again for its next chunk.
+
+    An episode's bits depend on its address and its policy, as far as the environments keep nothing from one episode to
+    the next and repeat themselves.
+    """
+
+    name = "host"
+    task_kinds = ("python",)
+    compile_s = (1, 1)
+    chunk_pairs = (8, 8)
+    copies_late_items = False
+
+    def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
+        """Functions that share the environments of a worker."""
+        lanes = Lanes(make_host_task(spec.environment, spec.environment_options))
+
+        def training(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
+            noise_P_D = _noise(noise_keys_P, spec.policy.parameters)
+            parameters_P_S_D = centre_D + np.multiply.outer(noise_P_D, np.float32(unit) * _SIGNS_S).swapaxes(1, 2)
+            parameters_L_D = parameters_P_S_D.reshape(-1, spec.policy.parameters)
+            keys_E_L = (_by_episode(keys) for keys in (reset_keys_P_S_E, action_keys_P_S_E))
+            by_episode = []
+            for reset_keys_L, action_keys_L in zip(*keys_E_L, strict=True):
+                policies = LanePolicies(spec, parameters_L_D, mean_O, std_O, action_keys_L)
+                by_episode.append(run_episodes(lanes, spec, policies, mean_O, reset_keys_L, training=True))
+            return _stacked(by_episode).map(lambda array: array.reshape(len(noise_keys_P), 2, *array.shape[1:]))
+
+        def evaluation(centre_D, mean_O, std_O, reset_keys_E, wanted_E):
+            policies = LanePolicies(spec, _in_lanes(centre_D, len(reset_keys_E)), mean_O, std_O)
+            return run_episodes(lanes, spec, policies, mean_O, reset_keys_E, training=False, runs_L=wanted_E)
+
+        def of_policies(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
+            policies = LanePolicies(spec, np.concatenate(parameters_G_N_D)[policy_L], mean_L_O, std_L_O)
+            return run_episodes(lanes, spec, policies, mean_L_O, reset_keys_L, training=False)
+
+        def gradient_sum(weights_P, noise_keys_P):
+            sum_D = np.zeros(spec.policy.parameters, np.float32)
+            for weight, key in zip(weights_P, noise_keys_P, strict=True):
+                sum_D += weight * _noise(key, spec.policy.parameters)
+            return sum_D * np.float32(1.0 / NORMAL_STD)
+
+        functions = (training, evaluation, of_policies, gradient_sum)
+        return ChunkFunctions(*(Compilable(function, lambda *_: None) for function in functions))
+
+    def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
+        """Recordings by the loop of the evaluations, in the slots of whole chunks."""
+        lanes = Lanes(make_host_task(spec.environment, spec.environment_options))
+        return Recordings(tuple(_recording(lanes, spec, request) for request in requests), (), 0.0)
+
+    def random_steps(
+        self, task: TaskSpec, options: Mapping[str, OptionValue], batch: int, steps: int
+    ) -> Callable[[int], int]:
+        """Steps of each environment of the batch in turn; one that ends is reset."""
+        made = make_host_task(task.name, options)
+        lanes = Lanes(made)
+        coordinates_A = np.arange(task.action_size, dtype=np.uint32)
+        reset_keys_L_4 = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(batch))
+        for lane in range(batch):
+            lanes[lane].reset(seed_of(reset_keys_L_4[lane]))
+
+        def call(number: int) -> int:
+            key = stream_keys(0, Domain.TRAINING_RESET, number, np.arange(batch)).T[:, :, None]
+            for step in range(steps):
+                noise_L_A = normal_integers(np, key, coordinates_A + np.uint32(step * 1024)).astype(np.float32)
+                actions_L = made.actions(np.clip(noise_L_A / np.float32(NORMAL_STD), -1.0, 1.0))
+                for lane in range(batch):
+                    if lanes[lane].step(actions_L[lane])[2]:
+                        lanes[lane].reset(seed_of(reset_keys_L_4[lane]))
+            return batch * steps
+
+        return call
+
+
+_SIGNS_S = np.asarray(SIGNS, np.float32)
+
+
+def _noise(keys: np.ndarray, parameters: int) -> np.ndarray:
+    """`normal_integers` of streams at all coordinates, as float32 [..., D]."""
+    noise = normals(keys, parameters)
+    noise *= np.float32(NORMAL_STD)
+    return np.rint(noise, out=noise)
+
+
+def _by_episode(keys_P_S_E_4: np.ndarray) -> np.ndarray:
+    """Keys of the episodes of a chunk's members as [E, L, 4], where both members of a pair are neighbours."""
+    return np.moveaxis(keys_P_S_E_4, 2, 0).reshape(keys_P_S_E_4.shape[2], -1, keys_P_S_E_4.shape[-1])
+
+
+def _in_lanes(array: np.ndarray, lanes: int) -> np.ndarray:
+    return np.broadcast_to(array, (lanes, *array.shape))
+
+
+def _stacked(by_episode: Sequence[Episodes]) -> Episodes:
+    """Episodes [L] of each of a member's episodes as [L, E]."""
+    columns = (np.stack(arrays, axis=1) for arrays in zip(*(one[:-2] for one in by_episode), strict=True))
+    named = (
+        {name: np.stack([one[field][name] for one in by_episode], axis=1) for name in by_episode[0][field]}
+        for field in (-2, -1)
+    )
+    return Episodes._make([*columns, *named])
+
+
+def _recording(lanes: Lanes, spec: WorkerSpec, request: RecordRequest) -> Recording:
+    centre, slot = request.centre, request.slot
+    count = EVALUATION_EPISODES_PER_CHUNK if request.policy is None else POLICY_SLOTS
+    key = evaluation_reset_keys(request.seed, centre.generation, request.episode, request.ask, request.policy)
+    policies = LanePolicies(
+        spec, _in_lanes(centre.parameters_D, count), centre.observation_mean_O, centre.observation_std_O
+    )
+    watched = Watched(slot, [], [])
+    episodes = run_episodes(
+        lanes,
+        spec,
+        policies,
+        centre.observation_mean_O,
+        _in_lanes(key, count),
+        training=False,
+        runs_L=np.arange(count) == slot,
+        watched=watched,
+    )
+    return Recording(
+        descriptor_T_B=np.stack(watched.descriptors),
+        returns_T=np.array(watched.returns, np.float32),
+        poses_T_L_7=None,
+        fitness=float(episodes.fitness[slot]),
+        trace_T_B=episodes.trace_T_B[slot],
+    )
