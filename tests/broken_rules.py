@@ -158,6 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 NOVELTY, COMMON = "es_service/search/novelty.py", "es_service/search/algorithms/common.py"
 NSRA, STARTS = "es_service/search/algorithms/nsra_es.py", "es_service/search/algorithms/starts.py"
 MAP_ELITES, BASE = "es_service/search/algorithms/map_elites.py", "es_service/search/algorithms/base.py"
+RECIPES = "es_service/protocol/recipes.py"
 ADAM, SHAPING = "es_service/search/steps/adam.py", "es_service/search/shaping.py"
 BEHAVIOUR_MAP, PARTS = "es_service/search/maps/behaviour_map.py", "es_service/loop/parts.py"
 GENERATION, TREE = "es_service/loop/generation.py", "es_service/protocol/gradient_tree.py"
@@ -321,7 +322,7 @@ CASES = [
         ("count", EPISODE, "jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)", "after"),
         ("revive an episode", EPISODE, "alive & ~done, carry", "~done, carry"),
         ("one too many, xla", XLA, "(step < spec.episode_steps)", "(step <= spec.episode_steps)"),
-        ("one too many, simd", COMPILED, "go(self.spec.episode_steps)", "go(self.spec.episode_steps + 1)"),
+        ("one too many, simd", COMPILED, "steps = self.spec.episode_steps\n", "steps = self.spec.episode_steps + 1\n"),
     ),
     *cases(
         "a duplicate answer",
@@ -453,7 +454,7 @@ CASES = [
             "Domain.VARIATION, generation, np.arange(search.batch)",
             "Domain.PARAMETER_NOISE, generation, np.arange(search.batch)",
         ),
-        ("has a line for each parameter", MAP_ELITES, "noise[..., -1:]", "noise[..., 1:]"),
+        ("has a line for each parameter", RECIPES, "noise[..., -1:]", "noise[..., 1:]"),
     ),
     *cases(
         "an elite's fitness",

@@ -41,6 +41,8 @@ RIGHT, PARTLY, OTHER = "right", "partly right", "another answer"
 OLDER = "right but for the recent generations"
 RECENT = ("weight of fitness", "not known")
 """Lines of `status` about the recent generations, whose damage hides nothing else of a run."""
+CERTIFIED = "certified"
+"""The line about certified policies, of which the run has none."""
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 10},
     "policy": {"hidden": [4]},
@@ -183,7 +185,8 @@ def examined(example: Example, number: int) -> Iterator[str]:
 
 
 def judged(name: str, answer: Any, right: Any) -> str:
-    """Whether a reader's answer is that of the undamaged run; `status` may say that recent generations are unknown."""
+    """Whether a reader's answer is that of the undamaged run; `status` may say that recent generations, or certified
+    policies, are not known."""
     if answer == right:
         return RIGHT
     known = {"status": status_without_recent, "status --json": json_without_recent}.get(name)
@@ -191,9 +194,11 @@ def judged(name: str, answer: Any, right: Any) -> str:
 
 
 def status_without_recent(answer: str) -> tuple[object, bool]:
-    """What `status` says of all but the recent generations, and whether it says that these are not known."""
+    """What `status` says of all but the recent generations, and whether it says that these, or certified policies, are
+    not known."""
     lines = literal_eval(answer).splitlines()
-    return [line for line in lines if not line.startswith(RECENT)], any(line.startswith("not known") for line in lines)
+    unknown = any(line.startswith("not known") or line.split()[:3] == [CERTIFIED, "not", "known:"] for line in lines)
+    return [line for line in lines if not line.startswith((*RECENT, CERTIFIED))], unknown
 
 
 def json_without_recent(answer: str) -> tuple[object, bool]:
@@ -219,6 +224,7 @@ def shown(report: RunData) -> set[Any]:
     map_ = {} if report.map is None else {field.name: getattr(report.map, field.name) for field in fields(report.map)}
     map_ = {name: values for name, values in map_.items() if values is not None}
     geometry = map_.pop("geometry", None)
+    map_.pop("order_N", None)  # with gaps where an entry cannot be read
     single = {"best": report.best, "geometry": geometry, "description": report.meta}
     found = {(name, repr(value)) for name, value in single.items() if value is not None}
     if report.standing.row:
