@@ -1,8 +1,9 @@
 """Describe a task such as `brax:ant` or `package.module:Class`, in a separate process because this imports JAX, or code
 of the user.
 
-    python -m workers.describe NAME
+    python -m workers.describe NAME [SETTINGS]
 
+SETTINGS is JSON, what `settings_of_description` of `workers.environments` returns.
 Prints one line of JSON: {"task": fields of a TaskSpec} or {"problem": text}.
 """
 
@@ -11,32 +12,38 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
 
 from es_service.protocol.messages import TaskSpec
 from workers.environments import TaskError, describe_environment
 from workers.rollouts import BACKENDS
 
 
-def described(name: str) -> TaskSpec:
+def described(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> TaskSpec:
     """Description of a task that is no shipped one, with the reasons of the rollouts that cannot run it.
+
+    Args:
+        settings: what a config chooses for it, as far as the description depends on it.
 
     Raises:
         TaskError: the task does not exist or cannot be used.
     """
-    task = describe_environment(name)
+    task = describe_environment(name, settings)
     able = {name: one for name, one in BACKENDS.items() if task.kind in one.task_kinds}
     reasons = {name: why for name, one in able.items() if (why := one.examine(task))}
     return dataclasses.replace(task, unsupported=reasons)
 
 
-def main(name: str) -> None:
+def main(name: str, settings: str = "{}") -> None:
     """Print the description of a task, or the problem with it, as JSON."""
     try:
-        answer = {"task": dataclasses.asdict(described(name))}
+        answer = {"task": dataclasses.asdict(described(name, json.loads(settings)))}
     except TaskError as error:
         answer = {"problem": str(error)}
     print(json.dumps(answer))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

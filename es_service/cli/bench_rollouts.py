@@ -45,8 +45,8 @@ def bench_rollouts(
     for task in tasks:
         if task not in TASKS:
             raise ConfigError(
-                f"--task {task}: unknown task; must be {one_of(TASKS)}, or brax:NAME, python:module:Class, or "
-                f"module:Class"
+                f"--task {task}: unknown task; must be {one_of(TASKS)}, or brax:NAME, gymnasium:ID, "
+                f"python:module:Class, or module:Class"
                 f"{did_you_mean(task, TASKS)}"
             )
     every = sorted({1, cores()})

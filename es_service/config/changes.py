@@ -27,6 +27,7 @@ from es_service.errors import ConfigError, Problem, WayOut
 STATE_KEYS = (
     "task.environment",
     "task.options.descriptor",
+    "task.descriptor",
     "policy.hidden",
     "policy.activation",
     "policy.memory",
@@ -49,6 +50,7 @@ _FOLLOWERS = {
     "task.episode_steps": ("map.qd_offset",),
     "task.fitness": ("map.qd_offset",),
     f"{TASK_OPTIONS}descriptor": _MAP,
+    "task.descriptor": _MAP,
     "map.kind": ("map.cells",),
     "policy.observation_normalization": ("policy.observation_clip",),
     "policy.output": ("policy.action_noise",),
@@ -103,7 +105,7 @@ def foreign_keys(
     found: dict[str, str] = {}
     if is_replaced("task.environment"):
         why = f"{wanted['task.environment']} replaces its task"
-        found |= {key: why for key in values if key.startswith(TASK_OPTIONS)}
+        found |= {key: why for key in values if key.startswith(TASK_OPTIONS) or key == "task.descriptor"}
     if settings is None:
         return found
     chosen = filled_in({**values, **wanted}, settings) | dict(values) | dict(wanted)

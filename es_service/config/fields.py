@@ -57,6 +57,13 @@ CellCounts = Annotated[
 ]
 
 
+Descriptor = Annotated[
+    Text | tuple[Annotated[int, Field(ge=0)], ...],
+    BeforeValidator(as_tuple),
+    "a list of whole numbers, such as [0, 1], or the name of a key of info, or module:function",
+]
+
+
 class Section(BaseModel):
     """Base of the config sections: frozen, no unknown keys, no conversion of types except from int to float."""
 

@@ -31,7 +31,7 @@ from es_service.config.methods import (
 )
 from es_service.config.model import RunConfig
 from es_service.config.objective_rules import objective_problems
-from es_service.config.options import options_of, read_options
+from es_service.config.options import TaskTable, options_of, read_options, settings_of_task
 from es_service.config.problems import nearest, not_allowed, one_of, unfit, wrong_value
 from es_service.config.resolution import (
     LEFT_OPEN,
@@ -141,14 +141,19 @@ def _load(
     found: dict[str, Any] = {}
     unknown: list[Problem] = []
     for key, what, known, besides in (
-        ("task.environment", "task", tasks, "brax:NAME, python:module:Class, or module:Class"),
+        ("task.environment", "task", tasks, "brax:NAME, gymnasium:ID, python:module:Class, or module:Class"),
         ("search.algorithm", "algorithm", algorithms, "module:function"),
     ):
         given = chosen.get(key)
         if key not in chosen and key.split(".")[0] not in unusable:
             unknown.append(unfit(key, None, f"missing; must be {one_of(known)}", allowed=one_of(known)))
         try:
-            found[key] = known[given] if isinstance(given, str) and given else None
+            if not isinstance(given, str) or not given:
+                found[key] = None
+            elif isinstance(known, TaskTable):
+                found[key] = known.chosen(given, **settings_of_task(values, wanted))
+            else:
+                found[key] = known[given]
         except KeyError:
             allowed, meant = f"{one_of(known)}, or {besides}", nearest(given, known)
             hint = f"; did you mean {meant}?" if meant else ""

@@ -10,7 +10,7 @@ from es_service.config.options import options_of
 from es_service.config.problems import not_allowed, unfit
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
-from es_service.protocol.messages import TaskSpec, with_options
+from es_service.protocol.messages import UNBOUNDED, Bounds, TaskSpec, with_options
 
 MOST_AUTO_CELLS = 10_000
 MOST_CELLS = 10_000_000
@@ -21,6 +21,13 @@ MOST_GRID_DIMENSIONS = 6
 """Largest number of descriptor dimensions for which `kind: auto` is a grid."""
 LARGEST = 1e30
 """Largest absolute value of bounds and offsets, so that their sums and differences stay finite."""
+
+
+def default_bounds(values: Mapping[str, Any], task: TaskSpec) -> Bounds | None:
+    """The bounds of the descriptor; None if a map needs them and the descriptor has none."""
+    if UNBOUNDED in task.descriptor_bounds and values.get("map.enabled", True):
+        return None
+    return tuple((-1.0, 1.0) if one == UNBOUNDED else one for one in task.descriptor_bounds)
 
 
 def default_kind(dimensions: int) -> str:
@@ -54,6 +61,9 @@ def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     names = with_options(task, options_of(values)).descriptor_names
     bounds, cells, kind = values.get("map.bounds"), values.get("map.cells"), values.get("map.kind")
     qd_offset = values.get("map.qd_offset", 0.0)
+    if bounds is None and "map.bounds" in values:
+        what = f"missing, since the descriptor of {task.name} has no bounds; give [low, high] for each of"
+        problems.append(unfit("map.bounds", None, f"{what} {', '.join(names)}, or set map.enabled = false"))
     for key, numbers in (("map.bounds", [x for pair in bounds or () for x in pair]), ("map.qd_offset", [qd_offset])):
         if any(abs(number) > LARGEST for number in numbers):
             problems.append(not_allowed(key, values[key], f"within {LARGEST:g} of 0"))

@@ -16,6 +16,7 @@ from es_service.config.fields import (
     BoundPairs,
     CellCounts,
     Count,
+    Descriptor,
     NotNegative,
     Number,
     Options,
@@ -37,8 +38,8 @@ class TaskConfig(Section):
     """The task that is to be learned. Constants of the run."""
 
     environment: Text = Field(
-        description="Name of the task: a shipped one, brax:NAME, or one of your own: module:Class in JAX, or "
-        "python:module:Class."
+        description="Name of the task: a shipped one, brax:NAME, gymnasium:ID, or one of your own: module:Class in "
+        "JAX, or python:module:Class."
     )
     episode_steps: Count = Field(description="Length of an episode in control steps. null: the task's own length.")
     fitness: Literal["sum", "final"] = Field(
@@ -48,6 +49,12 @@ class TaskConfig(Section):
     )
     episodes_per_member: Count = Field(
         1, description="Training episodes of each member of the population; its fitness is their mean."
+    )
+    descriptor: Descriptor | None = Field(
+        None,
+        description="Descriptor of an episode, for tasks of Python objects. A list, such as [0, 1]: these numbers of "
+        "the last observation. A name: this key of the last step's info. module:function: a function of the episode. "
+        "null: that of the task.",
     )
     options: Options = Field(
         default_factory=dict, description="Settings of the task, such as `start`, which the task declares."
@@ -213,6 +220,8 @@ def worker_spec(config: RunConfig, task: TaskSpec, outputs: tuple[str, ...] = ()
         seed=config.seed,
         environment=settings.environment,
         environment_options=dict(settings.options),
+        descriptor=settings.descriptor,
+        descriptor_size=0 if settings.descriptor is None else len(task.descriptor_names),
         policy=policy_spec(config, task),
         episode_steps=settings.episode_steps,
         fitness=settings.fitness,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,8 +10,36 @@ from es_service.config.fields import TASK_OPTIONS
 from es_service.config.problems import nearest, one_of, unfit, wrong_value
 from es_service.config.yaml_text import in_line, show
 from es_service.errors import Problem
-from es_service.protocol.messages import TaskSpec
+from es_service.protocol.messages import DescriptorChoice, TaskSpec
 from es_service.protocol.options import Option, OptionValue, is_within
+
+
+class TaskTable(Mapping[str, TaskSpec]):
+    """Tasks by name, of which some are described only with what a config chooses for them."""
+
+    @abstractmethod
+    def chosen(self, name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None) -> TaskSpec:
+        """The task with options and a descriptor; raises what a lookup raises. Most tasks do not depend on them."""
+        raise NotImplementedError
+
+
+def settings_of_task(values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
+    """What a config chooses for its task besides its name, as arguments of `TaskTable.chosen`.
+
+    Values of types that no task takes are left out; they are reported elsewhere.
+
+    Args:
+        values: those of the file.
+        wanted: those of overrides. If they choose another task, what the file says of its own is left out.
+    """
+    name = "task.environment"
+    chosen = dict(wanted) if name in wanted and wanted[name] != values.get(name) else {**values, **wanted}
+    descriptor = chosen.get("task.descriptor")
+    if isinstance(descriptor, list):
+        descriptor = tuple(descriptor)
+    is_chosen = descriptor and (isinstance(descriptor, str) or all(type(one) is int for one in descriptor))
+    options = {key: value for key, value in options_of(chosen).items() if isinstance(value, bool | int | float | str)}
+    return {"options": options, "descriptor": descriptor if is_chosen else None}
 
 
 def options_of(values: Mapping[str, Any]) -> dict[str, Any]:

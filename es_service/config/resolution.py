@@ -14,7 +14,7 @@ from typing import Any
 
 from es_service.config.fields import RESOURCES
 from es_service.config.keys import FIELDS, policy_of
-from es_service.config.map_rules import default_cells, default_kind, default_qd_offset
+from es_service.config.map_rules import default_bounds, default_cells, default_kind, default_qd_offset
 from es_service.config.methods import default_centres
 from es_service.config.model import RunConfig, policy_spec
 from es_service.config.options import options_of
@@ -114,7 +114,7 @@ def resolve(
             values["map.kind"] = default_kind(len(chosen.descriptor_names))
         kind = values.get("map.kind")
         if "map.bounds" in left_open:
-            values["map.bounds"] = chosen.descriptor_bounds
+            values["map.bounds"] = default_bounds(values, chosen)
         if "map.cells" in left_open and kind is not None:
             values["map.cells"] = default_cells(kind, len(chosen.descriptor_names))
         if "map.qd_offset" in left_open:
@@ -152,11 +152,15 @@ def values_of_task(task: TaskSpec) -> dict[str, Any]:
 
 
 def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
-    """The problem of a fitness that the task does not support."""
-    if values.get("task.fitness") != "final" or task.final_fitness:
-        return []
-    why = f" for {task.name}, whose last reward says little about the episode"
-    return [not_allowed("task.fitness", "final", "sum", why=why)]
+    """Problems of a fitness or a choice of a descriptor that the task does not support, and of missing bounds."""
+    problems = []
+    if values.get("task.fitness") == "final" and not task.final_fitness:
+        why = f" for {task.name}, whose last reward says little about the episode"
+        problems.append(not_allowed("task.fitness", "final", "sum", why=why))
+    if (chosen := values.get("task.descriptor")) is not None and task.kind == "jax":
+        why = f" for {task.name}, whose descriptor is its own"
+        problems.append(not_allowed("task.descriptor", chosen, "null", why=why))
+    return problems
 
 
 def policy_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:

@@ -15,10 +15,11 @@ from functools import cache
 from typing import Any
 
 from es_service.config.model import RunConfig
+from es_service.config.options import TaskTable
 from es_service.config.yaml_text import show
 from es_service.errors import ConfigError
-from es_service.protocol.messages import TaskSpec, with_options
-from es_service.protocol.options import Option, choice
+from es_service.protocol.messages import DescriptorChoice, TaskSpec, with_options
+from es_service.protocol.options import Option, OptionValue, choice
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.rollouts import Rollouts
 from es_service.protocol.sources import user_sources
@@ -29,13 +30,24 @@ DESCRIBE_S = 120.0
 """Longest wait for a description, in seconds; the first import of Brax from a slow disk can take long."""
 
 
-class Tasks(Mapping[str, TaskSpec]):
-    """Tasks by name. Iteration yields the shipped tasks; lookup also finds `brax:NAME`, `module:Class` and
-    `python:module:Class`."""
+class Tasks(TaskTable):
+    """Tasks by name. Iteration yields the shipped tasks; lookup also finds `brax:NAME`, `gymnasium:ID`,
+    `module:Class` and `python:module:Class`."""
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is not shipped, ConfigError for another that cannot be described."""
-        return _described(name, tuple(user_sources(name).items())) if ":" in name else environments.SHIPPED[name]
+        return self.chosen(name, {}, None)
+
+    def chosen(self, name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None) -> TaskSpec:
+        """Raises as a lookup."""
+        if ":" not in name:
+            return environments.SHIPPED[name]
+        settings = environments.settings_of_description(name, options, descriptor)
+        if isinstance(descriptor, str) and ":" in descriptor:
+            code = {**user_sources(name), **user_sources(descriptor)}
+        else:
+            code = user_sources(name)
+        return _described(name, json.dumps(settings, sort_keys=True), tuple(code.items()))
 
     def __iter__(self) -> Iterator[str]:
         return iter(environments.SHIPPED)
@@ -56,7 +68,8 @@ def task_of(config: RunConfig) -> TaskSpec:
     Raises ConfigError if the task has changed since its values were filled into the config, such as its episode length:
     the run would have some values of the old task and some of the new one.
     """
-    task, before = TASKS[config.task.environment], config.resolved_with
+    settings, before = config.task, config.resolved_with
+    task = TASKS.chosen(settings.environment, settings.options, settings.descriptor)
     changes = [] if before is None else _changes(before, task)
     if changes:
         raise ConfigError(
@@ -75,11 +88,15 @@ def _changes(before: TaskSpec, now: TaskSpec) -> list[str]:
 
 
 @cache
-def _described(name: str, code: tuple[tuple[str, str], ...]) -> TaskSpec:
-    """Description of a task whose code has these hashes."""
+def _described(name: str, settings: str, code: tuple[tuple[str, str], ...]) -> TaskSpec:
+    """Description of a task whose code has these hashes.
+
+    Args:
+        settings: what a config chooses for it, as JSON.
+    """
     try:
         process = subprocess.run(
-            [sys.executable, "-m", "workers.describe", name],
+            [sys.executable, "-m", "workers.describe", name, settings],
             env=child_environment(),
             capture_output=True,
             text=True,

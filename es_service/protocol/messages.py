@@ -23,6 +23,11 @@ Bounds = tuple[tuple[float, float], ...]
 Segment = tuple[tuple[float, float], tuple[float, float]]
 TaskKind = Literal["jax", "python"]
 """What a task is made of: functions that JAX traces, or Python objects with `reset` and `step`."""
+DescriptorChoice = str | tuple[int, ...]
+"""Descriptor that a config chooses for a task of Python objects: a key of `info`, `module:function`, or the indices of
+numbers of the last observation."""
+UNBOUNDED = (-1e30, 1e30)
+"""Bounds of a dimension of a descriptor that has none."""
 SIGNS = (1.0, -1.0)
 """Signs of the noise of the two members of a pair, in the order of axis S."""
 TRACE_POINTS = 64
@@ -106,6 +111,10 @@ class WorkerSpec:
     """Pairs whose weighted noise is summed into one partial gradient."""
     rollout: str
     """What computes episodes and gradients: a name in `workers.rollouts.BACKENDS`."""
+    descriptor: DescriptorChoice | None = None
+    """Descriptor that the config chooses; None: that of the task."""
+    descriptor_size: int = 0
+    """How many numbers that descriptor has; 0 if it is the task's."""
     outputs: tuple[str, ...] = ()
     """Outputs of episodes besides those of every result; names of `protocol.outputs`."""
     parent_cache_bytes: int = 2**28

@@ -17,6 +17,7 @@ import socket
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +30,8 @@ DRIVER = ("es_service.loop", "es_service.search", "es_service.config")
 """Packages with which the driver computes besides."""
 PATH_FOLLOWS = ("python",)
 """Kinds of tasks, the first word of their names, that are followed by the path of a user's code."""
+LIBRARY = "gymnasium"
+"""Kind of the tasks that are environments of this library, and the library's package."""
 SHARED_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders in which the packages of several projects are installed side by side."""
 
@@ -58,7 +61,17 @@ def driver_sources(algorithm: str) -> dict[str, str]:
 def user_sources(path: str) -> dict[str, str]:
     """Sources of a task or an algorithm of a user, as they are now; empty if the name is none of a user."""
     own = own_path(path)
-    return {one.source: one.sha256 for one in modules_of(own).user.values()} if own else {}
+    found = {one.source: one.sha256 for one in modules_of(own).user.values()} if own else {}
+    return found | _version(LIBRARY) if path.startswith(f"{LIBRARY}:") else found
+
+
+def _version(package: str) -> dict[str, str]:
+    """The version of a package whose environments are a task, in the place of the hash of its files; empty if it is
+    not installed."""
+    try:
+        return {package: metadata.version(package)}
+    except metadata.PackageNotFoundError:
+        return {}
 
 
 def other_files(ours: Sources, theirs: Sources) -> list[str]:
@@ -95,11 +108,15 @@ def own_path(name: str) -> str:
     """The user's code that a task or an algorithm names, as `package.module:name`; empty if it names none.
 
     `brax:NAME` is none. What is simulated by Python has the kind of the task before the path, as in
-    `python:package.module:Class`.
+    `python:package.module:Class`. An environment of Gymnasium is the user's if it is named with the module that
+    registers it, as in `gymnasium:package.module:Name-v0`, or else with a module's name as its namespace.
     """
     kind, colon, rest = name.partition(":")
     if kind == "brax":
         return ""
+    if kind == LIBRARY:
+        module, separator, environment = rest.partition(":" if ":" in rest else "/")
+        return f"{module}:{environment}" if separator else ""
     return rest if kind in PATH_FOLLOWS and ":" in rest else name if colon else ""
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from es_service.protocol.messages import TaskSpec
-from es_service.protocol.options import choice
-from es_service.protocol.sources import own_path
+from es_service.protocol.messages import DescriptorChoice, TaskSpec
+from es_service.protocol.options import OptionValue, choice
+from es_service.protocol.sources import LIBRARY, PATH_FOLLOWS
 from workers.viewer import Viewer
 
 if TYPE_CHECKING:  # it imports this module
@@ -132,37 +133,75 @@ def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
     return user_task.make(name, options)
 
 
-def make_host_task(name: str, options: Mapping[str, Any]) -> HostTask:
+def is_host_task(name: str) -> bool:
+    """Whether a name is that of a task of Python objects."""
+    kind, _, rest = name.partition(":")
+    return kind == LIBRARY or (kind in PATH_FOLLOWS and ":" in rest)
+
+
+def make_host_task(
+    name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None = None, descriptor_size: int = 0
+) -> HostTask:
     """A task of Python objects; imports its module, but no JAX.
 
     Args:
-        name: `python:package.module:Class`.
+        name: `python:package.module:Class`, or `gymnasium:ID`.
         options: options of the task and their values.
+        descriptor, descriptor_size: the descriptor that the config chooses, and how many numbers it has; None for that
+            of the task.
 
     Raises:
         TaskError: the task does not exist or cannot be used.
     """
+    from workers.environments.host_descriptors import with_descriptor
+
+    kind, _, rest = name.partition(":")
+    if kind == LIBRARY:
+        from workers.environments import gymnasium_task
+
+        return with_descriptor(gymnasium_task.make(rest, options), descriptor, descriptor_size)
     from workers.environments import python_task
 
-    return python_task.make(name.partition(":")[2], options)
+    return with_descriptor(python_task.make(rest, options), descriptor, descriptor_size)
 
 
-def describe_environment(name: str) -> TaskSpec:
+def settings_of_description(
+    name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None
+) -> dict[str, Any]:
+    """What of a config's choices the description of a task depends on, as plain data; of most tasks it is nothing."""
+    found: dict[str, Any] = {}
+    if name.startswith(f"{LIBRARY}:"):
+        found["options"] = dict(options)
+    if is_host_task(name) and descriptor is not None:
+        found["descriptor"] = descriptor if isinstance(descriptor, str) else list(descriptor)
+    return found
+
+
+def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> TaskSpec:
     """Description of a task that is no shipped one, from its module. Only `brax:NAME` and `package.module:Class` import
     JAX.
 
+    Args:
+        settings: `settings_of_description`.
+
     Raises:
         TaskError: the task does not exist or cannot be used.
     """
-    prefix, _, rest = name.partition(":")
-    if prefix == "brax":
+    kind, _, rest = name.partition(":")
+    if kind == "brax":
         from workers.environments import brax_task
 
         return brax_task.describe(rest)
-    if own_path(name) == rest:
+    if is_host_task(name):
+        chosen = settings.get("descriptor")
+        descriptor = tuple(chosen) if isinstance(chosen, list) else chosen
+        if kind == LIBRARY:
+            from workers.environments import gymnasium_task
+
+            return gymnasium_task.describe(rest, settings.get("options", {}), descriptor)
         from workers.environments import python_task
 
-        return python_task.describe(rest)
+        return python_task.describe(rest, descriptor)
     from workers.environments import user_task
 
     return user_task.describe(name)

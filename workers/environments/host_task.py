@@ -37,7 +37,13 @@ class HostEpisode:
     """The newest observation, flat."""
     info: Mapping[str, Any] = field(default_factory=dict)
     """What the object has said besides with the newest observation."""
+    said: dict[str, Any] = field(default_factory=dict)
+    """The newest value of every key that `info` has had in this episode."""
     steps: int = 0
+    observations: list[FloatArray] = field(default_factory=list)
+    """All observations from the reset on, and"""
+    rewards: list[float] = field(default_factory=list)
+    """all rewards, if the descriptor is a function of the episode that the config names; else empty."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,8 @@ class HostTask:
     """Function from an episode that ends now to whether it has succeeded."""
     goal_distance: Callable[[HostEpisode], Any] | None = None
     """Function from an episode to the present distance to the goal; None if there is no goal."""
+    keeps_all: bool = False
+    """Whether `HostEpisode` has all observations and rewards."""
 
 
 class HostEnvironment:
@@ -73,7 +81,9 @@ class HostEnvironment:
         """Start an episode, and return its first observation [O]."""
         found = self._object.reset(seed=seed)
         observation, info = found if _is_pair(found) else (found, {})
-        self._episode = HostEpisode(self._object, self._observed(observation), info)
+        self._episode = HostEpisode(self._object, self._observed(observation), info, dict(info))
+        if self._task.keeps_all:
+            self._episode.observations.append(self._episode.observation_O)
         return self._episode.observation_O
 
     def step(self, action: Any) -> tuple[FloatArray, float, bool]:
@@ -85,10 +95,14 @@ class HostEnvironment:
                 "(observation, reward, terminated, truncated, info)"
             )
         observation, reward, *ends = found
-        before = self._episode
-        info = ends[2] if len(ends) == 3 else {}
-        self._episode = HostEpisode(self._object, self._observed(observation), info, before.steps + 1)
-        return self._episode.observation_O, float(reward), any(map(bool, ends[:2]))
+        episode, reward = self._episode, float(reward)
+        episode.observation_O, episode.steps = self._observed(observation), episode.steps + 1
+        episode.info = ends[2] if len(ends) == 3 else {}
+        episode.said |= episode.info
+        if self._task.keeps_all:
+            episode.observations.append(episode.observation_O)
+            episode.rewards.append(reward)
+        return episode.observation_O, reward, any(map(bool, ends[:2]))
 
     @property
     def info(self) -> Mapping[str, Any]:
@@ -103,6 +117,10 @@ class HostEnvironment:
                 f"{self._task.name}: the descriptor has {found_B.size} numbers, not {self._task.descriptor_size}"
             )
         return found_B
+
+    def measured_size(self) -> int:
+        """How many numbers the descriptor has, for a task that does not know it yet."""
+        return np.asarray(self._task.descriptor(self._episode), np.float32).size
 
     def goal_distance(self) -> float:
         """Present distance to the goal, NaN without one."""

@@ -27,14 +27,16 @@ same time, and a chunk that was lost is computed again: an object must not write
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from es_service.protocol.messages import TaskSpec
+from es_service.protocol.messages import DescriptorChoice, TaskSpec
 from es_service.protocol.options import OptionValue, declared_options
 from workers.environments import TaskError
 from workers.environments.declared import are_finite, import_named, task_of_class, wrong_pairs, wrong_values
+from workers.environments.host_descriptors import describe_descriptor
 from workers.environments.host_task import (
     IS_SUCCESS,
     LENGTH,
@@ -57,8 +59,11 @@ KEPT = (*SIZES, *DESCRIPTOR, "action_bounds", "discrete_actions", "walls", "wall
 PREFIX = "python:"
 
 
-def describe(path: str) -> TaskSpec:
+def describe(path: str, descriptor: DescriptorChoice | None = None) -> TaskSpec:
     """Description of a user's class as a task.
+
+    Args:
+        descriptor: the descriptor that the config chooses; None for that of the class.
 
     Raises:
         TaskError: the class cannot be imported, its attributes or methods are missing or wrong, or they do not fit.
@@ -85,9 +90,14 @@ def describe(path: str) -> TaskSpec:
     if wrong:
         raise TaskError(f"{name}: {'; '.join(wrong)}")
     spec = task_of_class(name, task, "python", (names, bounds), options)
-    told = try_out(make(path, {one: option.default for one, option in options.items()}), task.action_size)
+    made = make(path, {one: option.default for one, option in options.items()})
+    told = try_out(made, task.action_size)
     if not spec.success and IS_SUCCESS in told:
         spec = replace(spec, success=SUCCESS_OF_INFO)
+    if descriptor is not None:
+        no_bounds = [(-math.inf, math.inf)] * task.observation_size
+        names, bounds = describe_descriptor(made, descriptor, no_bounds, task.action_size)
+        spec = replace(spec, descriptor_names=names, descriptor_bounds=bounds)
     return replace(spec, discrete_actions=bool(getattr(task, "discrete_actions", False)))
 
 

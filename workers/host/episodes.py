@@ -128,6 +128,8 @@ def run_episodes(
         place = f"step {step}" if step else "the reset"
         error.add_note(f"raised in {place} of the episode whose reset has the seed {seed_of(reset_keys_L_4[lane])}")
         raise
+    for trace_T_B in trace_L_T_B:
+        known_from_the_start(trace_T_B)
     with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, which makes the episode invalid
         returns_L, reward_L = returns_L.astype(np.float32), reward_L.astype(np.float32)
     return Episodes(
@@ -142,6 +144,14 @@ def run_episodes(
         outputs=outputs.at_the_end,
         of_steps=outputs.of_steps,
     )
+
+
+def known_from_the_start(descriptor_T_B: FloatArray) -> None:
+    """Give the first points of a path the first known descriptor, since some are known only after a step."""
+    unknown_T = np.asarray(np.isnan(descriptor_T_B).any(axis=1))
+    if unknown_T[:1].any() and not unknown_T.all():
+        first = int(np.argmin(unknown_T))
+        descriptor_T_B[:first] = descriptor_T_B[first]
 
 
 def seed_of(reset_key_4: NDArray[np.uint32]) -> int:

@@ -20,7 +20,8 @@ from es_service.protocol.policies import POLICY_SLOTS
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from workers.compilable import Compilable
 from workers.environments import make_host_task
-from workers.host.episodes import Lanes, Watched, run_episodes, seed_of
+from workers.environments.host_task import HostTask
+from workers.host.episodes import Lanes, Watched, known_from_the_start, run_episodes, seed_of
 from workers.host.policies import LanePolicies
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 
@@ -40,7 +41,7 @@ class Host(RolloutBackend):
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """Functions that share the environments of a worker."""
-        lanes = Lanes(make_host_task(spec.environment, spec.environment_options))
+        lanes = Lanes(_task(spec))
 
         def training(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
             noise_P_D = _noise(noise_keys_P, spec.policy.parameters)
@@ -72,7 +73,7 @@ class Host(RolloutBackend):
 
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
         """Recordings by the loop of the evaluations, in the slots of whole chunks."""
-        lanes = Lanes(make_host_task(spec.environment, spec.environment_options))
+        lanes = Lanes(_task(spec))
         return Recordings(tuple(_recording(lanes, spec, request) for request in requests), (), 0.0)
 
     def random_steps(
@@ -97,6 +98,10 @@ class Host(RolloutBackend):
             return batch * steps
 
         return call
+
+
+def _task(spec: WorkerSpec) -> HostTask:
+    return make_host_task(spec.environment, spec.environment_options, spec.descriptor, spec.descriptor_size)
 
 
 _SIGNS_S = np.asarray(SIGNS, np.float32)
@@ -146,8 +151,10 @@ def _recording(lanes: Lanes, spec: WorkerSpec, request: RecordRequest) -> Record
         runs_L=np.arange(count) == slot,
         watched=watched,
     )
+    descriptor_T_B = np.stack(watched.descriptors)
+    known_from_the_start(descriptor_T_B)
     return Recording(
-        descriptor_T_B=np.stack(watched.descriptors),
+        descriptor_T_B=descriptor_T_B,
         returns_T=np.array(watched.returns, np.float32),
         poses_T_L_7=None,
         fitness=float(episodes.fitness[slot]),

@@ -1,0 +1,175 @@
+"""Tasks that are environments of Gymnasium: their episodes are those of a loop written by hand."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+from es_service import api, load_config
+from es_service.config.model import policy_spec
+from es_service.config.tasks import TASKS, task_of
+from es_service.errors import ConfigError
+from es_service.protocol.messages import EvaluationChunk
+from es_service.protocol.noise import evaluation_reset_keys
+from es_service.protocol.sources import own_path, user_sources
+from es_service.runs.moment import Policy
+from es_service.runs.replay import record
+from tests.helpers import centre, random_parameters, spec
+from tests.workers.test_host import NO_JAX
+from workers.environments import TaskError, describe_environment
+from workers.worker import make_worker
+
+MODULE = "tests.workers.gymnasium_environments"
+REACH = f"gymnasium:{MODULE}:tests/Reach-v0"
+CLASSIC = {
+    "CartPole-v1": (4, 2, 500, True),
+    "Pendulum-v1": (3, 1, 200, False),
+    "MountainCarContinuous-v0": (2, 1, 999, False),
+    "Acrobot-v1": (6, 3, 500, True),
+    "MountainCar-v0": (2, 3, 200, True),
+    "FrozenLake-v1": (16, 4, 100, True),
+    "Swimmer-v5": (8, 2, 1000, False),
+}
+"""Environment -> sizes of observation and action, steps, whether actions are to be chosen from."""
+
+
+def config_of(environment, **task):
+    return {
+        "task": {"environment": environment, "episode_steps": 20} | task,
+        "policy": {"hidden": [8]},
+        "search": {"algorithm": "es", "pairs": 16, "evaluation_episodes": 3, "sigma": 0.3},
+        "map": {"enabled": False},
+        "budget": {"generations": 2},
+        "compute": {"engine": "inline", "workers": 1},
+    }
+
+
+@pytest.mark.parametrize("name", CLASSIC)
+def test_episodes_are_those_of_a_loop_by_hand(name):
+    """With the environment as Gymnasium makes it, with its checks and its limit, and actions by its spaces."""
+    task = describe_environment(f"gymnasium:{name}")
+    assert (task.observation_size, task.action_size, task.episode_steps, task.discrete_actions) == CLASSIC[name]
+    steps = min(task.episode_steps, 210)
+    config = load_config(config_of(task.name, episode_steps=steps))
+    shape = policy_spec(config, task)
+    assert shape.output == ("argmax" if task.discrete_actions else "tanh")
+    worker_spec = spec(
+        environment=task.name,
+        environment_options={one: option.default for one, option in task.options.items()},
+        episode_steps=steps,
+        policy=shape,
+        rollout="host",
+    )
+    subject = centre(random_parameters(2, shape.parameters), observation_size=task.observation_size)
+    [found] = make_worker(worker_spec)([(subject, EvaluationChunk(4, 0, episodes=3))])
+    policy = Policy(shape, subject.parameters_D, subject.observation_mean_O, subject.observation_std_O, 5.0)
+    with gymnasium.make(name) as environment:
+        space = environment.action_space
+        for episode in range(3):
+            seed = int(evaluation_reset_keys(3, 4, episode)[0]) >> 1
+            seen, _ = environment.reset(seed=seed)
+            total, count, ended = 0.0, 0, False
+            while not ended and count < steps:
+                if isinstance(environment.observation_space, gymnasium.spaces.Discrete):
+                    seen = np.eye(task.observation_size)[seen]
+                action = policy(seen)
+                if isinstance(space, gymnasium.spaces.Discrete):
+                    action = np.argmax(action)
+                else:
+                    action = space.low + (action + 1.0) / 2.0 * (space.high - space.low)
+                seen, reward, terminated, truncated, _ = environment.step(action)
+                total, count, ended = total + reward, count + 1, terminated or truncated
+            assert count == found.steps[episode] == found.descriptor[episode, 0]
+            np.testing.assert_allclose(found.fitness[episode], total, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("descriptor", "names", "bounds"),
+    [
+        ([1, 0], ("observation_1", "observation_0"), ((-2.0, 2.0),) * 2),
+        ("place", ("place_0", "place_1"), ((-1e30, 1e30),) * 2),
+        (f"{MODULE}:turning", ("rewards", "places"), ((-60.0, 0.0), (-60.0, 60.0))),
+        (None, ("length",), ((0.0, 25.0),)),
+    ],
+)
+def test_a_config_chooses_the_descriptor(descriptor, names, bounds, tmp_path, monkeypatch):
+    """A key of info that the reset lacks is known from the first step on, in traces and replays, too."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(NO_JAX)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    config = config_of(REACH, descriptor=descriptor)
+    config["map"] = {"cells": [5] * len(names)} | ({"bounds": [[-2, 2], [-2, 2]]} if descriptor == "place" else {})
+    task = task_of(load_config(config))
+    assert (task.descriptor_names, task.descriptor_bounds) == (names, bounds)
+    assert task.success == "the info of the last step has a true is_success"
+    run = api.run(config, tmp_path / "one").run
+    found = run.map[list(names)].to_numpy()
+    assert np.isfinite(found).all()
+    if descriptor is None:
+        assert (found == 20.0).all()
+        return
+    [replay], recordings = record(run, best=False, cells=[run.map[[f"cell_{one}" for one in names]].iloc[0].tolist()])
+    assert replay.is_the_stored
+    seen_T_B = recordings.recordings[0].descriptor_T_B
+    assert np.isfinite(seen_T_B).all()
+    if descriptor == "place":
+        np.testing.assert_array_equal(seen_T_B[0], seen_T_B[1])
+        other = api.run(config | {"task": config["task"] | {"descriptor": [0, 1]}}, tmp_path / "two").run
+        np.testing.assert_array_equal(found, other.map[["observation_0", "observation_1"]].to_numpy())
+        with pytest.raises(ConfigError, match=r"map.bounds: missing, since the descriptor of .* has no bounds"):
+            load_config(config | {"map": {}})
+
+
+def test_options_are_arguments_of_make_and_constants_of_the_run(tmp_path):
+    config = config_of(REACH, options={"reach": 0.5, "limit": 7})
+    task = task_of(load_config(config))
+    assert {name: option.default for name, option in task.options.items()} == {"reach": 0.2, "limit": 7}
+    run = api.run(config, tmp_path / "run").run
+    assert run.config["task"]["options"] == {"reach": 0.5, "limit": 7}
+    assert run.history.env_steps.iloc[-1] == 7 * (3 * 3 + 2 * 32), "the environment truncates after the limit"
+    resumed = api.resume(tmp_path / "run", ["budget.generations=3"]).run
+    whole = api.run(config | {"budget": {"generations": 3}, "compute": {"workers": 2}}, tmp_path / "whole").run
+    assert resumed.digest() == whole.digest()
+    with pytest.raises(ConfigError, match=r"cannot be made with the options .*unexpected keyword argument 'reech'"):
+        load_config(config_of(REACH, options={"reech": 0.5}))
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("gymnasium:CartPol-v1", r"is not registered in Gymnasium .*; did you mean gymnasium:CartPole-v1\?"),
+        (f"gymnasium:{MODULE}:tests/Words-v0", r"has observations of the space Text.*; Box and Discrete are supported"),
+        (f"gymnasium:{MODULE}:tests/Pairs-v0", r"has actions of the space MultiDiscrete.*; Box and Discrete are"),
+        ("gymnasium:no_such_module:Name-v0", "no_such_module"),
+    ],
+)
+def test_what_cannot_be_a_task_is_named(name, problem):
+    with pytest.raises(TaskError, match=problem):
+        describe_environment(name)
+
+
+@pytest.mark.parametrize(
+    ("descriptor", "problem"),
+    [
+        ([2], "observations of .* have 2 numbers, which are named 0 to 1"),
+        ("speed", r"the info of .* has is_success, place after 20 steps"),
+        (f"{MODULE}:nothing", "has no function nothing"),
+    ],
+)
+def test_a_descriptor_that_there_is_not_is_named(descriptor, problem):
+    with pytest.raises(ConfigError, match=problem):
+        load_config(config_of(REACH, descriptor=descriptor))
+    with pytest.raises(
+        ConfigError, match=r"task.descriptor: .* is not allowed for point_maze, whose descriptor is its own"
+    ):
+        load_config(config_of("point_maze", descriptor=descriptor))
+
+
+def test_the_code_of_an_environment_is_its_module_and_the_library_s_version():
+    assert own_path("gymnasium:Ant-v5") == ""
+    assert own_path("gymnasium:my_package/My-v0") == "my_package:My-v0"
+    assert own_path("gymnasium:my_package.inner:other/My-v0") == "my_package.inner:other/My-v0"
+    assert user_sources("gymnasium:Ant-v5") == {"gymnasium": gymnasium.__version__}
+    assert "tests/workers/gymnasium_environments.py" in user_sources(REACH)
+    assert TASKS[REACH].summary == "Reach of Gymnasium"

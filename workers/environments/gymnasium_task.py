@@ -1,0 +1,192 @@
+"""Environments of Gymnasium as tasks, named `gymnasium:ID`, such as `gymnasium:Ant-v5`.
+
+An ID may have the module that registers it before it, `gymnasium:package.module:Name-v0`; else, if it has a namespace
+that is the name of a module, that module is imported. Observations are those of a Box, flattened, or of a Discrete, one
+number for each value; actions those of a Box, between whose bounds the actions of a policy are put, or of a Discrete,
+among which the policy chooses. `task.options` are keyword arguments of `gymnasium.make`.
+
+An episode ends where the environment says that it is terminated or truncated, or after `task.episode_steps`; the time
+limit that Gymnasium adds is left out, and its number of steps is the default. The checks that Gymnasium adds to each
+step are left out, too.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+import inspect
+from collections.abc import Callable, Mapping
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+
+from es_service.protocol.messages import DescriptorChoice, TaskSpec
+from es_service.protocol.options import Option, OptionValue
+from es_service.protocol.raised import users_error, why_not_imported
+from es_service.protocol.sources import LIBRARY, own_path
+from es_service.protocol.user_code import import_user_module
+from workers.environments import TaskError
+from workers.environments.host_descriptors import describe_descriptor
+from workers.environments.host_task import (
+    IS_SUCCESS,
+    LENGTH,
+    SUCCESS_OF_INFO,
+    HostTask,
+    chosen,
+    length,
+    said_success,
+    try_out,
+    within_bounds,
+)
+
+EPISODE_STEPS = 1000
+"""Default length of an episode where the environment has no limit."""
+
+
+def describe(name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None) -> TaskSpec:
+    """Description of the environment with the ID `name`.
+
+    Args:
+        options: keyword arguments of `gymnasium.make`.
+        descriptor: the descriptor that the config chooses; None for the length of an episode.
+
+    Raises:
+        TaskError: there is no such environment, it cannot be made, or its spaces are not supported.
+    """
+    task, spec = make(name, options), _registered(name)
+    made = task.make()
+    observations, actions = made.observation_space, made.action_space
+    size = int(actions.n) if _is(actions, "Discrete") else int(np.prod(actions.shape))
+    told = try_out(task, size)
+    steps = spec.max_episode_steps or EPISODE_STEPS
+    names, bounds = (LENGTH,), ((0.0, float(steps)),)
+    if descriptor is not None:
+        names, bounds = describe_descriptor(task, descriptor, _bounds(observations), size)
+    return TaskSpec(
+        name=task.name,
+        observation_size=task.observation_size,
+        action_size=size,
+        episode_steps=steps,
+        descriptor_names=names,
+        descriptor_bounds=bounds,
+        final_fitness=False,
+        has_goal=False,
+        options=_options(made, spec, options),
+        summary=f"{type(made.unwrapped).__name__} of Gymnasium",
+        success=SUCCESS_OF_INFO if IS_SUCCESS in told else "",
+        kind="python",
+        discrete_actions=_is(actions, "Discrete"),
+    )
+
+
+def make(name: str, options: Mapping[str, OptionValue]) -> HostTask:
+    """The environment with the ID `name` as a task of Python objects."""
+    gymnasium, spec, task = _gymnasium(), copy.deepcopy(_registered(name)), f"{LIBRARY}:{name}"
+    spec.order_enforce = False  # a wrapper that would check the order of calls
+
+    def construct() -> Any:
+        try:
+            return gymnasium.make(spec, max_episode_steps=-1, disable_env_checker=True, **options)
+        except Exception as error:  # the environment's code can raise anything
+            why = users_error(error, task) or f"{type(error).__name__}: {error}"
+            raise TaskError(f"{task} cannot be made with the options {dict(options)}: {why}") from error
+
+    one = construct()
+    size, flat = _observed(task, one.observation_space)
+    return HostTask(
+        name=task,
+        make=construct,
+        observation_size=size,
+        flat=flat,
+        actions=_acted(task, one.action_space),
+        descriptor_size=1,
+        descriptor=length,
+        success=said_success,
+    )
+
+
+def _gymnasium() -> Any:
+    try:
+        import gymnasium
+    except ModuleNotFoundError:
+        raise TaskError(
+            "the package gymnasium is not installed; install es-service with its extra: pip install "
+            "'es-service[gymnasium]'"
+        ) from None
+    return gymnasium
+
+
+def _registered(name: str) -> Any:
+    """The specification under which an environment is registered, after its module has been imported."""
+    gymnasium, own = _gymnasium(), own_path(f"{LIBRARY}:{name}")
+    module = own.partition(":")[0]
+    try:
+        if own and (":" in name or _exists(module)):
+            import_user_module(own)
+    except Exception as error:  # the user's code can raise anything
+        raise TaskError(f"{LIBRARY}:{name}: {why_not_imported(module, error)}") from error
+    environment = name.partition(":")[2] if ":" in name else name
+    try:
+        return gymnasium.spec(environment)
+    except gymnasium.error.Error as error:
+        near = get_close_matches(environment, gymnasium.registry, 1, 0.5)
+        hint = f"; did you mean {LIBRARY}:{near[0]}?" if near else ""
+        raise TaskError(f"{LIBRARY}:{name} is not registered in Gymnasium ({error}){hint}") from error
+
+
+def _exists(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def _is(space: Any, kind: str) -> bool:
+    return isinstance(space, getattr(_gymnasium().spaces, kind))
+
+
+def _observed(task: str, space: Any) -> tuple[int, Callable[[Any], Any]]:
+    """(size of an observation, function from an observation to numbers)."""
+    if _is(space, "Box"):
+        return int(np.prod(space.shape)), np.asarray
+    if _is(space, "Discrete"):
+        values = np.arange(space.n) + space.start
+        return int(space.n), lambda observation: values == observation
+    raise TaskError(
+        f"{task} has observations of the space {space}; Box and Discrete are supported. Register the environment with "
+        "a wrapper that makes a Box of them, such as gymnasium.wrappers.FlattenObservation"
+    )
+
+
+def _acted(task: str, space: Any) -> Callable[[Any], Any]:
+    """Function from actions of a policy [L, A] to actions of an environment."""
+    if _is(space, "Box"):
+        bounded = within_bounds(np.stack([space.low.reshape(-1), space.high.reshape(-1)], axis=-1), space.dtype)
+        return lambda action_L_A: bounded(action_L_A).reshape(-1, *space.shape)
+    if _is(space, "Discrete"):
+        first = int(space.start)
+        return chosen if first == 0 else lambda action_L_A: [first + one for one in chosen(action_L_A)]
+    raise TaskError(
+        f"{task} has actions of the space {space}; Box and Discrete are supported. Register the environment with a "
+        "wrapper that takes one of these, such as gymnasium.wrappers.TransformAction"
+    )
+
+
+def _bounds(space: Any) -> list[tuple[float, float]]:
+    """Bounds of each number of a flat observation."""
+    if _is(space, "Discrete"):
+        return [(0.0, 1.0)] * int(space.n)
+    low_O, high_O = ([float(str(one)) for one in bound.reshape(-1)] for bound in (space.low, space.high))
+    return list(zip(low_O, high_O, strict=True))  # by their texts, since -1.2 in float32 is -1.2000000476837158
+
+
+def _options(made: Any, spec: Any, given: Mapping[str, OptionValue]) -> dict[str, Option]:
+    """The keyword arguments that a config can set: those with a plain default, and those that it sets."""
+    parameters = inspect.signature(type(made.unwrapped).__init__).parameters
+    defaults = {name: one.default for name, one in parameters.items()} | spec.kwargs
+    plain = {name: value for name, value in defaults.items() if type(value) in (bool, int, float, str)}
+    for name, value in given.items():
+        if name not in plain or (type(plain[name]), type(value)) == (int, float):
+            plain[name] = value  # a whole number as a default does not say that others are not allowed
+    return {name: Option(value) for name, value in plain.items()}
