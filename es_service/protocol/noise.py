@@ -48,6 +48,8 @@ class Domain(IntEnum):
     """Resets of episodes that choose among the candidates of a certification."""
     CERTIFICATION_RESET = 8
     """Resets of episodes that only report the value of what was chosen."""
+    ENVIRONMENT_RESET = 9
+    """Resets of our tasks as environments of other libraries."""
 
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)

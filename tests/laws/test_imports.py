@@ -20,6 +20,8 @@ LAYERS = (
     "cli",
     "api",
     "watch",
+    "gymnasium",
+    "environments",
     "report",
     "runs",
     "dispatch",
@@ -37,6 +39,10 @@ LOWEST = ("protocol", "errors", "logs")
 ENTRIES = {"es_service.__init__": "api", "es_service.__main__": "cli"}
 """Module outside the layers -> the layer whose rules it follows."""
 JOINERS = {
+    "es_service.gymnasium",
+    "es_service.environments.single",
+    "es_service.environments.spaces",
+    "es_service.environments.vector",
     "es_service.runs.compiling",
     "es_service.runs.moment",
     "es_service.runs.scaling",
@@ -194,6 +200,7 @@ def test_every_file_of_es_service_is_in_a_layer():
         "__main__.py",
         "api.py",
         "errors.py",
+        "gymnasium.py",
         "logs.py",
     }
     layers = {path.name for path in (ROOT / "es_service").iterdir() if path.is_dir() and path.name != "__pycache__"}

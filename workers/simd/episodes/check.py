@@ -31,11 +31,19 @@ class WrongCodeError(Exception):
 
 def check_resets(kernel: Kernel, graph: Graph, outputs: list[int], environment: str) -> None:
     """Raise WrongCodeError unless the resets of 16 episodes have the bits of their definition."""
-    keys_L = reset_keys()
-    words = pack([keys_L], kernel.target.width)
+    check_kernel(kernel, graph, outputs, reset_keys(), f"a reset of {environment}")
+
+
+def check_kernel(kernel: Kernel, graph: Graph, outputs: list[int], given_L: np.ndarray, what: str) -> None:
+    """Raise WrongCodeError unless a kernel gives the bits of its definition for the words [lane, word] of 16 lanes.
+
+    Args:
+        what: what it computes, for the message.
+    """
+    words = pack([given_L], kernel.target.width)
     found = aligned((len(words), kernel.words_out, kernel.target.width))
     kernel.run(words, found)
-    require_same(_by_lane(found), _words(evaluate(graph, outputs, keys_L.T)), f"a reset of {environment}")
+    require_same(_by_lane(found), _words(evaluate(graph, outputs, np.ascontiguousarray(given_L.T))), what)
 
 
 def check_episodes(kernel: EpisodeKernel, program: EpisodeProgram) -> None:

@@ -1,0 +1,74 @@
+"""Our tasks as single environments of Gymnasium: one lane of the compiled step. A `TaskVectorEnv` has many."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from es_service.environments.spaces import action_space, info_of, observation_space, random_seed, seed_given
+from es_service.protocol.options import OptionValue
+from workers.lanes import Lanes, LanesState, Seen
+
+_FIRST = np.zeros(1, np.intp)
+
+
+class TaskEnv(gymnasium.Env[Any, Any]):
+    """One environment of a task, with the bits of an environment of `TaskVectorEnv` with the same seed.
+
+    `info` has `descriptor` [B] (where the episode would end in the map), `success`, and `goal_distance` if the task has
+    a goal. Actions outside of [-1, 1] are clipped. It has no limit of steps: `gymnasium.make` adds that of the task.
+    """
+
+    def __init__(
+        self, task: str, *, task_options: Mapping[str, OptionValue] | None = None, render_mode: None = None
+    ) -> None:
+        """Arguments and errors are those of `TaskVectorEnv`."""
+        if render_mode is not None:
+            raise ValueError(f"render_mode = {render_mode!r}; must be None, since nothing is drawn")
+        self.metadata = {"render_modes": []}
+        self._lanes = Lanes(task, task_options or {}, 1)
+        self.task = self._lanes.task
+        self.observation_space, self.action_space = observation_space(self.task), action_space(self.task)
+        self._is_seeded = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode.
+
+        Args:
+            seed: None: its episodes go on, and have a random seed if it never had one.
+            options: not used.
+        """
+        super().reset(seed=seed)
+        if seed is not None or not self._is_seeded:
+            self._lanes.seed_N[0] = random_seed() if seed is None else seed_given(seed)
+            self._lanes.episode_N[0] = -1
+            self._is_seeded = True
+        seen = self._lanes.reset(_FIRST)
+        return seen.observation[0], self._info(seen)
+
+    def step(self, action: ArrayLike) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Step with an action [A]. Raises ValueError if it has another shape."""
+        action_A = np.asarray(action, np.float32)
+        if action_A.shape != self.action_space.shape:
+            raise ValueError(f"action has the shape {action_A.shape}; must be {self.action_space.shape}")
+        seen = self._lanes.step(action_A[None])
+        return seen.observation[0], float(seen.reward[0]), bool(seen.done[0]), False, self._info(seen)
+
+    def get_state(self) -> LanesState:
+        """State of the environment, from which `set_state` of another one of the task goes on, bit for bit."""
+        return self._lanes.state()
+
+    def set_state(self, state: LanesState) -> None:
+        """Go on from what `get_state` has returned."""
+        self._lanes.set_state(state)
+        self._is_seeded = True
+
+    def _info(self, seen: Seen) -> dict[str, Any]:
+        shown = {name: array[0] for name, array in info_of(self.task, seen).items()}
+        return shown | {"success": bool(shown["success"])}

@@ -1,0 +1,204 @@
+"""Our tasks as a vector environment of Gymnasium, over one call of the compiled step for all environments.
+
+Axes: N environments, O observation, A action, B descriptor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from es_service.environments.spaces import action_space, info_of, observation_space, random_seed, seed_given
+from es_service.protocol.options import OptionValue
+from workers.lanes import Lanes, LanesState, Seen
+
+Returned = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+
+
+class TaskVectorEnv(VectorEnv[Any, Any, Any]):
+    """Environments of a task side by side.
+
+    Environment i has the same bits whatever `num_envs` and `threads` are and on whatever processor: they depend on its
+    seed, the number of its episodes since then, and its actions. `SyncVectorEnv` of as many `TaskEnv` gives the same.
+
+    `info` has, for every environment, `descriptor` [N, B] (where the episode would end in the map), `success` [N], and
+    `goal_distance` [N] if the task has a goal. Actions outside of [-1, 1] are clipped.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        *,
+        max_episode_steps: int | None = None,
+        task_options: Mapping[str, OptionValue] | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        threads: int = 1,
+        render_mode: None = None,
+    ) -> None:
+        """Compile the task's step, or take it from the cache.
+
+        Args:
+            task: a shipped task (point_maze, ant_maze, ant_trap) or module:Class of a class in JAX.
+            num_envs: number of environments.
+            max_episode_steps: steps after which an episode is truncated; None: the task's own number.
+            task_options: options of the task, such as {"start": "corner"}.
+            autoreset_mode: what happens after an episode. SAME_STEP: the step returns the next episode's first
+                observation, and `info["final_obs"]` and `info["final_info"]` what the episode ended with. NEXT_STEP:
+                the next step ignores its action and returns that observation. DISABLED: the caller resets, with
+                `reset(options={"reset_mask": ...})`.
+            threads: threads that step the environments; results do not depend on it.
+            render_mode: only None, since nothing is drawn; `es-service replay` draws episodes of a run.
+
+        Raises:
+            TaskError: there is no such task or option, or the task cannot be compiled.
+            ValueError: another argument is wrong.
+        """
+        for name, value in (("num_envs", num_envs), ("threads", threads)):
+            if value < 1:
+                raise ValueError(f"{name} = {value!r}; must be at least 1")
+        if render_mode is not None:
+            raise ValueError(f"render_mode = {render_mode!r}; must be None, since nothing is drawn")
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
+        self._lanes = Lanes(task, task_options or {}, num_envs, threads)
+        self.num_envs = num_envs
+        self.task = self._lanes.task
+        self.max_episode_steps = max_episode_steps or self.task.episode_steps
+        self.single_observation_space, self.single_action_space = observation_space(self.task), action_space(self.task)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._is_seeded_N = np.zeros(num_envs, bool)
+        self._is_over_N = np.zeros(num_envs, bool)
+        self._observation_N_O = np.zeros((num_envs, self.task.observation_size), np.float32)
+
+    def reset(  # the base class takes only one number
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode in every environment, or in those of `options["reset_mask"]`.
+
+        Args:
+            seed: environment i gets seed + i, or the i-th of a list; None: its episodes go on, with a random seed if it
+                never had one.
+            options: `reset_mask`, an array of `num_envs` bools of which at least one is true.
+
+        Returns:
+            The observations of all environments, and the info of those that were reset.
+        """
+        seeds = self._seeds(seed)
+        lane_M = np.flatnonzero(self._mask(options))
+        for lane in lane_M.tolist():
+            if (given := seeds[lane]) is not None or not self._is_seeded_N[lane]:
+                self._lanes.seed_N[lane] = random_seed() if given is None else given
+                self._lanes.episode_N[lane] = -1
+        self._is_seeded_N[lane_M] = True
+        info = self._info(self._begin(lane_M), lane_M)
+        return self._observation_N_O.copy(), info
+
+    def step(self, actions: ArrayLike) -> Returned:
+        """Step every environment with its action [N, A].
+
+        Raises:
+            ValueError: the actions have another shape, or an episode is over that the caller has to reset.
+        """
+        action_N_A = np.asarray(actions, np.float32)
+        if action_N_A.shape != self.action_space.shape:
+            raise ValueError(f"actions have the shape {action_N_A.shape}; must be {self.action_space.shape}")
+        if not self._is_seeded_N.all():
+            raise ValueError("call reset before step")
+        over_before_N = self._is_over_N
+        if self.autoreset_mode == AutoresetMode.DISABLED and over_before_N.any():
+            which = np.flatnonzero(over_before_N)
+            raise ValueError(
+                f"the episode of environment {which[0]} is over; reset it with options={{'reset_mask': ...}}, or "
+                "choose another autoreset_mode"
+            )
+        seen = self._lanes.step(action_N_A)
+        terminated_N, truncated_N = seen.done, self._lanes.steps_N >= self.max_episode_steps
+        reward_N = seen.reward.astype(np.float64)
+        self._observation_N_O[:] = seen.observation
+        info: dict[str, Any] = {}
+        shown = {name: array.copy() for name, array in info_of(self.task, seen).items()}
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP and over_before_N.any():
+            lane_M = np.flatnonzero(over_before_N)
+            self._put(shown, self._begin(lane_M), lane_M)
+            reward_N[lane_M], terminated_N[lane_M], truncated_N[lane_M] = 0.0, False, False
+        elif self.autoreset_mode == AutoresetMode.SAME_STEP and (terminated_N | truncated_N).any():
+            lane_M = np.flatnonzero(terminated_N | truncated_N)
+            last = Seen(*(array[lane_M] for array in seen))
+            final_obs = np.full(self.num_envs, None, object)
+            for lane in lane_M.tolist():
+                final_obs[lane] = seen.observation[lane].copy()
+            info |= self._masked({"final_obs": final_obs, "final_info": self._info(last, lane_M)}, lane_M)
+            self._put(shown, self._begin(lane_M), lane_M)
+        self._is_over_N = terminated_N | truncated_N
+        info |= self._masked(shown, np.arange(self.num_envs))
+        return self._observation_N_O.copy(), reward_N, terminated_N, truncated_N, info
+
+    def get_state(self) -> tuple[LanesState, NDArray[np.bool_]]:
+        """State of all environments, from which `set_state` of as many of the same task goes on, bit for bit."""
+        return self._lanes.state(), self._is_over_N.copy()
+
+    def set_state(self, state: tuple[LanesState, NDArray[np.bool_]]) -> None:
+        """Go on from what `get_state` has returned; the next step is that of those environments."""
+        lanes, is_over_N = state
+        self._lanes.set_state(lanes)
+        self._is_over_N = is_over_N.copy()
+        self._is_seeded_N[:] = True
+
+    def close_extras(self, **_: Any) -> None:
+        """End the threads."""
+        self._lanes.close()
+
+    def _begin(self, lane_M: NDArray[np.intp]) -> Seen:
+        """Reset some environments; returns what is seen in these."""
+        seen = self._lanes.reset(lane_M)
+        self._observation_N_O[lane_M] = seen.observation
+        self._is_over_N[lane_M] = False
+        return seen
+
+    def _put(self, shown: dict[str, NDArray], seen: Seen, lane_M: NDArray[np.intp]) -> None:
+        for name, array in info_of(self.task, seen).items():
+            shown[name][lane_M] = array
+
+    def _info(self, seen: Seen, lane_M: NDArray[np.intp]) -> dict[str, Any]:
+        """The info of some environments, as Gymnasium has it: zeros for the others, and a mask for each name."""
+        shown = {}
+        for name, array in info_of(self.task, seen).items():
+            shown[name] = np.zeros((self.num_envs, *array.shape[1:]), array.dtype)
+            shown[name][lane_M] = array
+        return self._masked(shown, lane_M)
+
+    def _masked(self, shown: Mapping[str, Any], lane_M: NDArray[np.intp]) -> dict[str, Any]:
+        mask_N = np.zeros(self.num_envs, bool)
+        mask_N[lane_M] = True
+        return {key: one for name, array in shown.items() for key, one in ((name, array), (f"_{name}", mask_N.copy()))}
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            return [seed_given(int(seed) + lane) for lane in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(
+                f"seed is a list of {len(seed)}; must have one for each of the {self.num_envs} environments"
+            )
+        return [None if one is None else seed_given(int(one)) for one in seed]
+
+    def _mask(self, options: Mapping[str, Any] | None) -> NDArray[np.bool_]:
+        mask_N = (options or {}).get("reset_mask")
+        if mask_N is None:
+            return np.ones(self.num_envs, bool)
+        if not isinstance(mask_N, np.ndarray) or mask_N.dtype != bool:
+            raise TypeError(f"options['reset_mask'] is {type(mask_N).__name__}; must be a NumPy array of bools")
+        if mask_N.shape != (self.num_envs,) or not mask_N.any():
+            raise ValueError(
+                f"options['reset_mask'] has the shape {mask_N.shape} and {int(mask_N.sum())} true values; must have "
+                f"one value for each of the {self.num_envs} environments, and at least one true"
+            )
+        return mask_N

@@ -1,0 +1,38 @@
+"""Our tasks as environments of Gymnasium; importing this module registers them.
+
+    import gymnasium
+    envs = gymnasium.make_vec("es_service.gymnasium:es_service/AntTrap-v0", num_envs=256)
+    env = gymnasium.make("es_service.gymnasium:es_service/AntTrap-v0")
+
+It has an id for each shipped task, and `es_service/Task-v0` for one of your own: `task="my_module:Class"`. The classes
+are `environments.vector.TaskVectorEnv` and `environments.single.TaskEnv`. It needs the extra `gymnasium`.
+"""
+
+from __future__ import annotations
+
+import gymnasium
+
+from workers.environments import SHIPPED
+
+SINGLE = "es_service.environments.single:TaskEnv"
+VECTOR = "es_service.environments.vector:TaskVectorEnv"
+
+
+def id_of(task: str) -> str:
+    """Gymnasium's id of a shipped task: that of `ant_trap` is `es_service/AntTrap-v0`."""
+    return f"es_service/{task.title().replace('_', '')}-v0"
+
+
+def _register() -> None:
+    gymnasium.register("es_service/Task-v0", entry_point=SINGLE, vector_entry_point=VECTOR)
+    for name, task in SHIPPED.items():
+        gymnasium.register(
+            id_of(name),
+            entry_point=SINGLE,
+            vector_entry_point=VECTOR,
+            max_episode_steps=task.episode_steps,
+            kwargs={"task": name},
+        )
+
+
+_register()

@@ -1,0 +1,230 @@
+"""Our tasks as environments of Gymnasium: one environment has the bits that it has among many, on any processor."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+import warnings
+from functools import partial
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+from es_service.environments.single import TaskEnv
+from es_service.environments.vector import TaskVectorEnv
+from es_service.gymnasium import id_of
+from es_service.protocol.noise import Domain, stream_keys
+from tests.workers.simd.rollouts import targets
+from tests.workers.steps import environment_of
+from workers import lanes as module
+from workers.environments import SHIPPED, TaskError
+from workers.simd.episodes import kernel
+
+POLE = "tests.examples.cart_pole:CartPole"
+"""A task whose episodes end by themselves."""
+
+
+def same(one: Any, other: Any, name: str = "") -> None:
+    """Both have the same bits, whatever they are made of."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys(), name
+        for key in one:
+            same(one[key], other[key], f"{name}.{key}")
+    elif isinstance(one, tuple | list):
+        for index, pair in enumerate(zip(one, other, strict=True)):
+            same(*pair, f"{name}[{index}]")
+    elif isinstance(one, np.ndarray) and one.dtype == object:
+        same(list(one), list(other), name)
+    elif one is None:
+        assert other is None, name
+    else:
+        assert np.asarray(one).dtype == np.asarray(other).dtype, name
+        assert np.asarray(one).tobytes() == np.asarray(other).tobytes(), name
+
+
+def actions_of(envs: Any, steps: int, seed: int = 0) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [rng.uniform(-1.5, 1.5, envs.action_space.shape).astype(np.float32) for _ in range(steps)]
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
+@pytest.mark.parametrize("task", ["point_maze", POLE])
+def test_many_are_as_many_single_ones_in_each_mode(task, mode):
+    limit = 13
+    single = partial(gymnasium.make, "es_service/Task-v0", max_episode_steps=limit, task=task, disable_env_checker=True)
+    theirs = SyncVectorEnv([single] * 5, autoreset_mode=mode)
+    ours = TaskVectorEnv(task, 5, max_episode_steps=limit, autoreset_mode=mode)
+    assert (ours.observation_space, ours.action_space) == (theirs.observation_space, theirs.action_space)
+    for options in (None, {"reset_mask": np.array([True, False, True, False, False])}):
+        for seed in (11, None, [5, None, 7, None, 9]):
+            same(*(envs.reset(seed=seed, options=options and dict(options)) for envs in (ours, theirs)))
+    ends = set()
+    for number, actions in enumerate(actions_of(ours, 45)):
+        found = ours.step(actions)
+        same(found, theirs.step(actions), f"step {number}")
+        over = found[2] | found[3]
+        ends |= {(int(term), int(trunc)) for term, trunc in zip(found[2], found[3], strict=True)}
+        if mode == AutoresetMode.DISABLED and over.any():
+            same(*(envs.reset(options={"reset_mask": over.copy()}) for envs in (ours, theirs)))
+    assert (0, 1) in ends
+    assert ((1, 0) in ends) == (task == POLE)
+
+
+@pytest.mark.parametrize("task", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.slow)])
+def test_an_environment_depends_neither_on_the_others_nor_on_threads_nor_on_the_width_of_vectors(task, monkeypatch):
+    steps, lane = 12, 3
+
+    def seen(envs: TaskVectorEnv, lane: int) -> list[bytes]:
+        """Of an environment with seed 20."""
+        found = [envs.reset(seed=[20 if number == lane else number for number in range(envs.num_envs)])[0][lane]]
+        rng = np.random.default_rng(1)
+        for actions in actions_of(envs, steps, seed=envs.num_envs):
+            actions[lane] = rng.uniform(-1, 1, actions.shape[1])
+            observation, reward, _, _, info = envs.step(actions)
+            found += [observation[lane], reward[lane], info["descriptor"][lane]]
+        return [np.asarray(one).tobytes() for one in found]
+
+    expected = seen(TaskVectorEnv(task, 1, max_episode_steps=5), 0)
+    for target in targets():
+        monkeypatch.setattr(kernel, "host_target", lambda target=target: target)
+        module._kernels.cache_clear()
+        for count, threads in ((4, 1), (70, 1), (70, 3), (200, 2)):
+            envs = TaskVectorEnv(task, count, max_episode_steps=5, threads=threads)
+            assert seen(envs, lane) == expected
+            envs.close()
+    module._kernels.cache_clear()
+
+
+@pytest.mark.parametrize("task", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.slow)])
+def test_steps_are_those_of_the_task(task):
+    """The functions that xla and simd compile for runs, in JAX."""
+    envs, functions = TaskVectorEnv(task, 3), environment_of(task)
+    observation, info = envs.reset(seed=[4, 9, 4])
+    keys = stream_keys(0, Domain.ENVIRONMENT_RESET, 0, np.array([4, 9, 4], np.uint64), np.zeros(3, np.int64))
+    states = jax.vmap(functions.reset)(keys)
+    step, observe = jax.jit(jax.vmap(functions.step)), jax.jit(jax.vmap(functions.observe))
+    for actions in actions_of(envs, 3):
+        np.testing.assert_allclose(observation, observe(states), atol=2e-4)
+        states, rewards, _ = step(states, actions)
+        observation, reward, _, _, info = envs.step(actions)
+        np.testing.assert_allclose(reward, rewards, atol=2e-3)
+        np.testing.assert_allclose(info["descriptor"], jax.vmap(functions.descriptor)(states), atol=2e-4)
+
+
+def test_the_state_goes_on_in_other_environments():
+    envs, others = (TaskVectorEnv(POLE, 20, max_episode_steps=9) for _ in range(2))
+    envs.reset(seed=3)
+    actions = actions_of(envs, 30)
+    for one in actions[:10]:
+        envs.step(one)
+    others.set_state(envs.get_state())
+    for one in actions[10:]:
+        same(envs.step(one), others.step(one))
+    with pytest.raises(ValueError, match=r"state has words of shape \(20, 5\), but 3 environments of "):
+        TaskVectorEnv(POLE, 3).set_state(envs.get_state())
+    single, other = TaskEnv("point_maze"), TaskEnv("point_maze")
+    single.reset(seed=1)
+    other.set_state(single.get_state())
+    same(single.step([0.5, -0.5]), other.step([0.5, -0.5]))
+
+
+@pytest.mark.parametrize("task", SHIPPED)
+def test_each_shipped_task_is_registered_with_its_length_and_passes_gymnasium_s_check(task):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert gymnasium.spec(id_of(task)).max_episode_steps == SHIPPED[task].episode_steps
+        if task != "point_maze":
+            return  # a step of an ant takes seconds to compile, and Gymnasium's check makes no use of what it is
+        envs = gymnasium.make_vec(f"es_service.gymnasium:{id_of(task)}", num_envs=3, threads=2)
+        assert envs.unwrapped.max_episode_steps == 200
+        statistics = RecordEpisodeStatistics(envs)
+        statistics.reset(seed=0)
+        for actions in actions_of(envs, 200):
+            info = statistics.step(actions)[-1]
+        assert (info["episode"]["l"] == 200).all()
+        warnings.filterwarnings("ignore", ".*A Box observation space (minimum|maximum) value is")
+        check_env(gymnasium.make(id_of(task)).unwrapped, skip_render_check=True)
+
+
+def test_a_caller_s_mode_of_jax_changes_no_bit():
+    program = """
+import hashlib, jax
+if {x64}: jax.config.update("jax_enable_x64", True)
+from tests.es_service.test_environments import TaskVectorEnv, actions_of
+envs = TaskVectorEnv("point_maze", 3)
+seen = [envs.reset(seed=0)[0], *(envs.step(actions)[0] for actions in actions_of(envs, 5))]
+print(hashlib.sha256(b"".join(one.tobytes() for one in seen)).hexdigest())
+"""
+    said = [
+        subprocess.run([sys.executable, "-c", program.format(x64=x64)], capture_output=True, text=True, check=True)
+        for x64 in (False, True)
+    ]
+    assert said[0].stdout == said[1].stdout
+
+
+def test_an_environment_without_a_seed_has_a_random_one_and_its_episodes_go_on():
+    envs = TaskVectorEnv("point_maze", 2)
+    first, again = envs.reset()[0], TaskVectorEnv("point_maze", 2).reset()[0]
+    assert not np.array_equal(first, again)
+    assert not np.array_equal(first[0], first[1])
+    envs.reset(seed=1)
+    second = envs.reset()[0]
+    envs.reset(seed=1)
+    assert np.array_equal(envs.reset()[0], second)
+
+
+def test_the_options_of_a_task_are_its_own():
+    corner = TaskVectorEnv("point_maze", 2, task_options={"start": "corner"}).reset(seed=0)[0]
+    np.testing.assert_allclose(corner, [[0.9, -0.9]] * 2)
+
+
+def many(task="point_maze", count=2, **settings: Any) -> TaskVectorEnv:
+    return TaskVectorEnv(task, count, **settings)
+
+
+MASK = {"reset_mask": np.zeros(2, bool)}
+OF_BOOLS = "0 true values; must have one value for each of the 2 environments, and at least one true"
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "sentence"),
+    [
+        (lambda: many("point_mase"), TaskError, "'point_mase' is not shipped; choose among point_maze, ant_maze"),
+        (lambda: many("brax:ant"), TaskError, "'brax:ant' is an environment of another library"),
+        (lambda: many(task_options={"begin": 1}), TaskError, "no option 'begin'; its options: start"),
+        (lambda: many(count=0), ValueError, "num_envs = 0; must be at least 1"),
+        (lambda: many(threads=0), ValueError, "threads = 0; must be at least 1"),
+        (lambda: many(render_mode="human"), ValueError, "must be None, since nothing is drawn"),
+        (lambda: many().step(np.zeros((2, 2))), ValueError, "call reset before step"),
+        (lambda: many().reset(seed=[1]), ValueError, "a list of 1; must have one for each of the 2"),
+        (lambda: many().reset(seed=-1), ValueError, r"seed = -1; must be from 0 to 2\*\*63 - 1"),
+        (lambda: many().reset(options={"reset_mask": [True]}), TypeError, "is list; must be a NumPy"),
+        (lambda: many().reset(options=MASK), ValueError, OF_BOOLS),
+        (lambda: TaskEnv("point_maze").step([0.0]), ValueError, r"the shape \(1,\); must be \(2,\)"),
+    ],
+)
+def test_a_wrong_argument_is_an_error_that_says_what_is_allowed(call, error, sentence):
+    with pytest.raises(error, match=sentence):
+        call()
+
+
+def test_a_finished_episode_is_not_stepped_where_the_caller_resets():
+    envs = TaskVectorEnv("point_maze", 2, max_episode_steps=1, autoreset_mode="Disabled")
+    envs.reset(seed=0)
+    envs.step(np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="the episode of environment 0 is over; reset it"):
+        envs.step(np.zeros((2, 2)))
+
+
+def test_the_service_does_not_import_it():
+    loaded = "import sys, es_service.api; print([name for name in sys.modules if name.startswith('gymnasium')])"
+    done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    assert importlib.import_module("es_service.gymnasium").id_of("ant_trap") == "es_service/AntTrap-v0"
