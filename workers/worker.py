@@ -36,7 +36,7 @@ from es_service.protocol.recipes import Recipes
 from workers.compilable import Compilable
 from workers.results import evaluation_result, policies_result, training_result
 from workers.rollouts import BACKENDS
-from workers.rollouts.backend import ChunkFunctions, Episodes
+from workers.rollouts.backend import Episodes, RolloutBackend
 
 AnyChunk = TypeVar("AnyChunk", TrainingChunk, EvaluationChunk, GradientChunk)
 POLICY_CHUNKS_TOGETHER = 8
@@ -61,7 +61,7 @@ def make_worker(spec: WorkerSpec) -> Compilable:
     names the chunk that raised it. Gradient blocks are added as far as the work item has the neighbours.
     """
     backend = BACKENDS[spec.rollout]
-    kinds = _kinds(spec, backend.chunk_functions(spec))
+    kinds = _kinds(spec, backend)
     groups = partial(_groups, together=backend.takes_chunks_together)
 
     def compile_group(kind: _Kind, work: Sequence[Work]) -> list[ChunkResult]:
@@ -88,8 +88,9 @@ def make_worker(spec: WorkerSpec) -> Compilable:
     return Compilable(run, lambda work: [named(compile_group, group) for group in groups(work)])
 
 
-def _kinds(spec: WorkerSpec, functions: ChunkFunctions) -> dict[type[Chunk], _Kind]:
+def _kinds(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], _Kind]:
     """How a run's chunks of each kind are computed."""
+    functions = backend.chunk_functions(spec)
     gradient_sum = functions.gradient_sum
 
     def training_arguments(work: Sequence[tuple[Centre, TrainingChunk]]) -> tuple[Any, ...]:
@@ -143,11 +144,13 @@ def _kinds(spec: WorkerSpec, functions: ChunkFunctions) -> dict[type[Chunk], _Ki
         TrainingChunk: _Kind(functions.training, training_arguments, training_results),
         EvaluationChunk: _Kind(functions.evaluation, evaluation_arguments, evaluation_results),
         GradientChunk: _Kind(Compilable(gradient_sums, compile_gradient_sum), gradient_arguments, gradient_results),
-        PolicyChunk: _Kind(functions.policies, partial(_policy_arguments, spec), _policy_results),
+        PolicyChunk: _Kind(functions.policies, partial(_policy_arguments, spec, backend.made), _policy_results),
     }
 
 
-def _policy_arguments(spec: WorkerSpec, work: Sequence[tuple[Policies, PolicyChunk]]) -> tuple[Any, ...]:
+def _policy_arguments(
+    spec: WorkerSpec, made: Callable[[Recipes], FloatArray], work: Sequence[tuple[Policies, PolicyChunk]]
+) -> tuple[Any, ...]:
     policies, chunk = work[0]
     together = list({id(one): one for one, _ in work}.values())
     ends = accumulate(len(one.parameters_N_D) for one in together)
@@ -161,7 +164,7 @@ def _policy_arguments(spec: WorkerSpec, work: Sequence[tuple[Policies, PolicyChu
     given = [one.parameters_N_D for one in together]
     inputs = spec.policy.widths[0]
     return (
-        [one.made() if isinstance(one, Recipes) else one for one in given],
+        [made(one) if isinstance(one, Recipes) else one for one in given],
         np.concatenate([_statistics(one, one.observation_mean_N_O, 0.0, inputs) for one in together])[row_L],
         np.concatenate([_statistics(one, one.observation_std_N_O, 1.0, inputs) for one in together])[row_L],
         row_L,

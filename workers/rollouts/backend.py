@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 from es_service.protocol.messages import TaskSpec, WorkerSpec
 from es_service.protocol.options import OptionValue
+from es_service.protocol.recipes import FloatArray, Recipes
 from es_service.protocol.recordings import Recordings, RecordRequest
 from es_service.protocol.rollouts import Rollout
 from workers.compilable import Compilable
@@ -99,6 +100,10 @@ class RolloutBackend(Rollout, Protocol):
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """The functions of a worker; makes the task."""
         raise NotImplementedError
+
+    def made(self, recipes: Recipes) -> FloatArray:
+        """The parameters of policies, [N, D], with the bits of `Recipes.made`."""
+        return recipes.made()
 
     @abstractmethod
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:

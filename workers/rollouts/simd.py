@@ -8,6 +8,7 @@ from functools import cache
 from es_service.protocol.messages import TaskSpec, WorkerSpec
 from es_service.protocol.options import OptionValue
 from es_service.protocol.policy_spec import PolicySpec
+from es_service.protocol.recipes import FloatArray, Recipes
 from es_service.protocol.recordings import Recordings, RecordRequest
 from workers import environments
 from workers.rollouts.backend import ChunkFunctions, RolloutBackend
@@ -48,6 +49,12 @@ class Simd(RolloutBackend):
             rollout.make_policy_rollout(environment, spec),
             rollout.make_gradient_sum(spec.policy.parameters),
         )
+
+    def made(self, recipes: Recipes) -> FloatArray:
+        """Those of one kernel."""
+        from workers.simd.episodes.variation import make_variation
+
+        return make_variation()(recipes)
 
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
         """Recordings by the kernels of the evaluations."""

@@ -1,6 +1,7 @@
 """Builder of the LLVM IR of functions on vectors, used by the emitter of graphs and by code written by hand.
 
-    void kernel(...)        the function called from outside; it rounds to nearest and treats denormal numbers as zeros
+    void kernel(...)        the function called from outside; it rounds to nearest and treats denormal numbers as zeros,
+                            unless its module says otherwise
     void anything(...)      functions that kernels call
 
 Floating-point instructions carry no fast-math flags. Nothing is reassociated, and only `fma` is fused, so the bits of a
@@ -16,6 +17,8 @@ MXCSR = 0x9FC0
 """Value of the processor's floating-point control register in kernels: round to nearest, no traps, and denormal results
 and operands count as zeros. XLA computes in the same mode, and denormal numbers would make a kernel five times slower.
 """
+EXACT_MXCSR = 0x1F80
+"""The same without treating denormal numbers as zeros, as NumPy computes."""
 SCALAR_TYPES = {"f": "float", "i": "i32", "b": "i1"}
 """LLVM type of one value for each dtype of a graph."""
 
@@ -202,15 +205,19 @@ class FunctionBuilder:
         return "\n".join([*lines, *self.memory, *self.lines, "  ret void", "}", ""])
 
 
-def module(functions: Sequence[FunctionBuilder]) -> str:
-    """LLVM IR of functions and of @kernel, which calls the last function; that one must be named "inside"."""
+def module(functions: Sequence[FunctionBuilder], mxcsr: int = MXCSR) -> str:
+    """LLVM IR of functions and of @kernel, which calls the last function; that one must be named "inside".
+
+    Args:
+        mxcsr: value of the floating-point control register meanwhile.
+    """
     inside = functions[-1]
     assert inside.name == "inside"
     parameters = [parameter.replace(" noalias", "") for parameter in inside.parameters]
     frame = KERNEL.format(
         parameters=", ".join(parameters),
         arguments=", ".join(parameters),
-        mxcsr=MXCSR,
+        mxcsr=mxcsr,
         declarations="\n".join(sorted(set().union(*(function.declarations for function in functions)))),
         bits=32 * inside.width,
     )

@@ -128,7 +128,7 @@ def gradient_module(width: int) -> str:
                 )
             return found
 
-        scale = builder.splat(_float(np.float32(1.0 / NORMAL_STD)))
+        scale = builder.splat(float_constant(np.float32(1.0 / NORMAL_STD)))
         for vector, one in enumerate(builder.loop("%pairs", add, [(floats, "zeroinitializer")] * UNROLLED)):
             scaled = builder.value(f"fmul {floats} {one}, {scale}")
             builder.store(floats, scaled, "%sums", builder.index((number, UNROLLED), (vector, 1)))
@@ -138,6 +138,6 @@ def gradient_module(width: int) -> str:
     return module([builder])
 
 
-def _float(value: np.float32) -> str:
+def float_constant(value: np.float32) -> str:
     """A float32 in LLVM's notation."""
     return f"0x{np.float64(value).view(np.uint64):016X}"
