@@ -8,10 +8,9 @@ from __future__ import annotations
 import os
 import pickle
 import socket
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from es_service.protocol.kept_parents import KeptParents, LackingError, with_parents
+from es_service.protocol.kept_parents import LackingError
 from es_service.protocol.machine import platform_info, platform_text
 from es_service.protocol.messages import Work, WorkerPlace
 from es_service.protocol.process_environment import worker_environment
@@ -19,8 +18,9 @@ from es_service.protocol.raised import sendable
 from es_service.protocol.sources import OtherCodeError, why_refused
 from workers.xla_cache import xla_cache_settings
 
-if TYPE_CHECKING:  # it imports JAX, whose settings are made here
+if TYPE_CHECKING:  # they import JAX, whose settings are made here
     from workers.compilable import Compilable
+    from workers.parents import Parents
 
 
 class WorkerActor:
@@ -38,7 +38,7 @@ class WorkerActor:
         self._spec, self._index, self._gpus, self._cores = spec, index, gpus, cores
         self._environment = ""
         self._run_chunks: Compilable | None = None
-        self._parents: KeptParents[Any] = KeptParents(0, attrgetter("nbytes"))
+        self._parents: Parents | None = None
 
     def __repr__(self) -> str:
         return f"worker-{self._index}@{socket.gethostname()}"
@@ -63,10 +63,11 @@ class WorkerActor:
             del os.environ[name]
         os.environ.update(environment | xla_cache_settings())
         from workers.cores import make_worker_with_cores
+        from workers.parents import Parents
         from workers.rollouts import BACKENDS
 
         self._environment = spec.environment
-        self._parents = KeptParents(spec.parent_cache_bytes, attrgetter("nbytes"))
+        self._parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
         with sendable(self._environment):
             self._run_chunks = make_worker_with_cores(spec, self._cores)
         if not self._gpus:
@@ -87,7 +88,7 @@ class WorkerActor:
 
         Args:
             chunks: pickled [(index of its subject in `parts`, Chunk)].
-            parts: subjects, each one pickled, and pickled parents of policies by name.
+            parts: subjects, each one pickled, and pickled parents of policies, as `Parents.receive` takes them.
         """
         assert self._run_chunks is not None, "run was called before build"
         with sendable(self._environment):
@@ -99,8 +100,9 @@ class WorkerActor:
 
     def _unpacked(self, chunks: bytes, parts: tuple[bytes, ...]) -> list[Work]:
         """The chunks of a call with their subjects. Raises LackingError."""
+        assert self._parents is not None, "build makes it, too"
         known = [pickle.loads(part) for part in parts]
         for part in known:
-            for name, parameters_D in part.items() if isinstance(part, dict) else ():
-                self._parents.add(name, parameters_D)
-        return with_parents([(known[index], chunk) for index, chunk in pickle.loads(chunks)], self._parents)
+            if isinstance(part, dict):
+                self._parents.receive(part)
+        return self._parents.complete([(known[index], chunk) for index, chunk in pickle.loads(chunks)])

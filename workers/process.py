@@ -14,12 +14,14 @@ import traceback
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from es_service.protocol.kept_parents import KeptParents, LackingError, with_parents
+from es_service.protocol.kept_parents import LackingError
 from es_service.protocol.messages import Subject, WorkerSpec, forget_oldest
 from es_service.protocol.parent import end_with
 from es_service.protocol.raised import RaisedError, raised
 from es_service.protocol.sources import why_refused
 from es_service.protocol.wire import framed, receive
+from workers.parents import Parents
+from workers.rollouts import BACKENDS
 from workers.xla_cache import xla_cache_settings
 
 if TYPE_CHECKING:  # it imports JAX, whose settings are made here
@@ -30,11 +32,12 @@ def main(descriptor: int, parent: int) -> None:
     """Serve workers until the parent closes its end of the socket `descriptor`.
 
     The parent sends over this socket the WorkerSpec, and then for each worker one byte with the descriptor of the
-    worker's socket. A worker receives ("subject", number, Subject), ("parent", name, parameters) and ("chunks", item,
-    attempt, [(number, Chunk)]); `item` names their work item, and `number` the subject of each. It sends ("broken",
-    RaisedError), or ("up",) and then for each work item ("results", item, attempt, [ChunkResult]), ("failure", item,
-    attempt, RaisedError) or, if it has not been sent the parents of policies, ("lacks", item, attempt). Before it
-    computes the first work item of a kind, it compiles for it and sends ("compiled", kind, seconds).
+    worker's socket. A worker receives ("subject", number, Subject), ("parents", {name: parameters or Origin}) and
+    ("chunks", item, attempt, [(number, Chunk)]); `item` names their work item, and `number` the subject of each. It
+    sends ("broken", RaisedError), or ("up",) and then for each work item ("results", item, attempt, [ChunkResult]),
+    ("failure", item, attempt, RaisedError) or, if it has not been sent the parents of policies, ("lacks", item,
+    attempt). Before it computes the first work item of a kind, it compiles for it and sends ("compiled", kind,
+    seconds).
     """
     end_with(parent)
     with socket.socket(fileno=descriptor) as control:
@@ -93,17 +96,17 @@ def _serve(parent: socket.socket, run_chunks: Compilable | RaisedError, spec: Wo
         return
     parent.sendall(framed(("up",)))
     subjects: dict[int, Subject] = {}
-    parents: KeptParents[Any] = KeptParents(spec.parent_cache_bytes, attrgetter("nbytes"))
+    parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
     compiled: set[str] = set()
     while True:
         match receive(parent):
             case ("subject", number, subject):
                 subjects[number] = subject
-            case ("parent", name, parameters_D):
-                parents.add(name, parameters_D)
+            case ("parents", given):
+                parents.receive(given)
             case ("chunks", item, attempt, chunks):
                 try:
-                    work = with_parents([(subjects[number], chunk) for number, chunk in chunks], parents)
+                    work = parents.complete([(subjects[number], chunk) for number, chunk in chunks])
                     if (kind := type(work[0][1]).__name__) not in compiled:
                         seconds = run_chunks.seconds_to_compile(work)
                         compiled.add(kind)

@@ -139,7 +139,8 @@ class ChildProcesses:
                 to.subjects[number] = subject.nbytes
                 frames.append(frame)
             numbered.append((number, chunk))
-        frames += [framed(("parent", *one)) for one in parents_to_send(work, to.parents).items()]
+        for name, given in parents_to_send(work, to.parents).items():
+            frames.append(framed(("parents", {name: given})))
         forget_oldest(to.subjects, int)
         forget_oldest(self._subjects, lambda entry: entry[0].nbytes)
         to.unanswered[item_id, attempt] = work

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
 from es_service.protocol.messages import KEPT_BYTES, FloatArray, Subject, Work, forget_oldest
+from es_service.protocol.recipes import Origin
 
 IN_CALL_BYTES = 64 * 2**10
 """Largest size in bytes of a subject or of a parent of policies that is sent with every call; a larger one is stored,
@@ -126,16 +127,21 @@ class Arguments:
         self._subjects.clear()
         self._parents.clear()
 
-    def _packed_parents(self, parents: Mapping[bytes, FloatArray]) -> list[Any]:
-        """Parents by name: small ones together, and for each large one the reference under which Ray has stored it."""
-        small = {name: values for name, values in parents.items() if values.nbytes <= IN_CALL_BYTES}
-        packed: list[Any] = [pickle.dumps(small, pickle.HIGHEST_PROTOCOL)] if small else []
-        large = {name: values for name, values in parents.items() if name not in small}
+    def _packed_parents(self, parents: Mapping[bytes, FloatArray | Origin]) -> list[Any]:
+        """Parents by name: for each large one the reference under which Ray has stored it, then the others together,
+        which may be made of the large ones."""
+        large = {
+            name: values
+            for name, values in parents.items()
+            if not isinstance(values, Origin) and values.nbytes > IN_CALL_BYTES
+        }
+        small = {name: values for name, values in parents.items() if name not in large}
         for name, values in large.items():
             if name not in self._parents:
                 ref = self._ray.put(pickle.dumps({name: values}, pickle.HIGHEST_PROTOCOL))
                 self._parents.add(name, _Stored(ref, values.nbytes))
-        packed += [self._parents[name].ref for name in large]
+        packed = [self._parents[name].ref for name in large]
+        packed += [pickle.dumps(small, pickle.HIGHEST_PROTOCOL)] if small else []
         self._parents.needed(large)
         return packed
 

@@ -14,7 +14,7 @@ from es_service.protocol.episodes import each, joined
 from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, Policies, PolicyChunk, Work, around
 from es_service.protocol.noise import Domain
 from es_service.protocol.policies import POLICY_SLOTS, chunks_of
-from es_service.protocol.recipes import Recipes
+from es_service.protocol.recipes import Recipes, remember
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,10 @@ class PolicyWork:
         if not isinstance(self.parameters_N_D, Recipes):
             return [self.parameters_N_D[number].copy() for number in numbers]
         if missing := [number for number in dict.fromkeys(numbers) if number not in self._made]:
-            made = self.parameters_N_D.part(missing).made()
-            self._made.update((number, parameters_D.copy()) for number, parameters_D in zip(missing, made, strict=True))
+            recipes = self.parameters_N_D.part(missing)
+            made = [parameters_D.copy() for parameters_D in recipes.made()]
+            remember(recipes, made)
+            self._made.update(zip(missing, made, strict=True))
         return [self._made[number] for number in numbers]
 
 

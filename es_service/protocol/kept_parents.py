@@ -1,6 +1,7 @@
 """Parents that a worker keeps, so that each is sent to it once: what worker and sender both do, in the same order.
 
-For each work item, the sender sends the parents of recipes that the worker lacks, and then the item. The worker keeps
+For each work item, the sender sends the parents of recipes that the worker lacks, and then the item. A parent that was
+made of others by a recipe is made again by the worker, if it has those, and only its origin travels. The worker keeps
 their parameters in a `KeptParents`, and the sender their sizes in another one. Both make the same changes, and so the
 sender knows what the worker has, without asking. Should a worker lack something all the same, it says so, the sender
 takes it to have nothing (`KeptParents.clear`) and sends the item again: that is no failed attempt.
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from es_service.protocol.messages import Subject, Work
 from es_service.protocol.policies import Policies
-from es_service.protocol.recipes import Recipes
+from es_service.protocol.recipes import Origin, Recipes, origin_of
 
 Value = TypeVar("Value")
 FloatArray = NDArray[np.float32]
@@ -75,8 +76,15 @@ class KeptParents(Mapping[bytes, Value], Generic[Value]):
         return len(self._kept)
 
 
-def parents_to_send(work: Sequence[Work], kept: KeptParents[int]) -> dict[bytes, FloatArray]:
-    """The parents that a work item needs and its worker lacks, by name.
+LEAST_BYTES = 1 << 12
+"""Bytes of the smallest parent whose origin travels instead of itself."""
+MOST_STEPS = 4
+"""Most policies that a worker makes for one parent that it lacks, which may descend from others that it lacks."""
+
+
+def parents_to_send(work: Sequence[Work], kept: KeptParents[int]) -> dict[bytes, FloatArray | Origin]:
+    """The parents that a work item needs and its worker lacks, by name: parameters, or the origins of those that it can
+    make of what it has and of what comes before.
 
     Args:
         kept: sizes of those that the worker has; now with the others.
@@ -84,11 +92,32 @@ def parents_to_send(work: Sequence[Work], kept: KeptParents[int]) -> dict[bytes,
     needed: dict[bytes, FloatArray] = {}
     for recipes in _recipes_in(work):
         needed.update(zip(recipes.names, recipes.parents, strict=True))
-    missing = {name: parameters_D for name, parameters_D in needed.items() if name not in kept}
-    for name, parameters_D in missing.items():
-        kept.add(name, parameters_D.nbytes)
+    sent: dict[bytes, FloatArray | Origin] = {}
+    for name, parameters_D in needed.items():
+        if name not in kept:
+            steps = _steps(name, kept) if parameters_D.nbytes >= LEAST_BYTES else None
+            for one, given in ({name: parameters_D} if steps is None else steps).items():
+                kept.add(one, parameters_D.nbytes)
+                sent[one] = given
     kept.needed(needed)
-    return missing
+    return sent
+
+
+def _steps(name: bytes, kept: KeptParents[int]) -> dict[bytes, Origin] | None:
+    """The origins of policies to make one after another, the last of which is the one that is named; None if they are
+    not remembered, or too many."""
+    steps: dict[bytes, Origin] = {}
+    waiting = [name]
+    while waiting:
+        one = waiting.pop(0)
+        if one in kept:
+            continue
+        if (origin := origin_of(one)) is None or (len(steps) == MOST_STEPS and one not in steps):
+            return None
+        steps.pop(one, None)  # what descends from it comes after it
+        steps[one] = origin
+        waiting += origin.x, origin.y
+    return dict(reversed(steps.items()))
 
 
 def with_parents(work: Sequence[Work], kept: KeptParents[FloatArray]) -> list[Work]:

@@ -133,6 +133,46 @@ class Recipes:
         return ""
 
 
+class Origin(NamedTuple):
+    """How one policy was made, so that it can be made again wherever its parents are."""
+
+    rule: IsoLine
+    x: bytes
+    y: bytes
+    """Names of its parents."""
+    key_4: Keys
+
+    def recipes(self, parents: Mapping[bytes, FloatArray]) -> Recipes:
+        """The recipe of the policy alone."""
+        given = parents[self.x], parents[self.y]
+        return Recipes(self.rule, (self.x, self.y), given, np.array([[0, 1]]), self.key_4[None])
+
+
+_ORIGINS: dict[bytes, Origin] = {}
+"""What `remember` has been told lately, by the name of the policy. A name is that of a content, so an entry is true
+wherever it comes from."""
+MOST_ORIGINS = 1 << 16
+"""Most entries of these."""
+
+
+def remember(recipes: Recipes, policy_N_D: Sequence[FloatArray]) -> None:
+    """Remember how policies were made, so that they need not travel if they become parents.
+
+    Args:
+        policy_N_D: what `recipes.made` has given.
+    """
+    for (x, y), key_4, parameters_D in zip(recipes.parent_N_2.tolist(), recipes.key_N_4, policy_N_D, strict=True):
+        origin = Origin(recipes.rule, recipes.names[x], recipes.names[y], key_4.copy())
+        _ORIGINS[name_of(parameters_D)] = origin
+    while len(_ORIGINS) > MOST_ORIGINS:
+        del _ORIGINS[next(iter(_ORIGINS))]
+
+
+def origin_of(name: bytes) -> Origin | None:
+    """How a policy was made; None if that is not remembered."""
+    return _ORIGINS.get(name)
+
+
 def recipes_of(rule: IsoLine, parents: Sequence[FloatArray], parent_N_2: NDArray[np.int64], key_N_4: Keys) -> Recipes:
     """Recipes of parents that are given by their parameters, [D] each.
 

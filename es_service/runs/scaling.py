@@ -7,7 +7,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
@@ -88,7 +88,7 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
     phases = _phases(config)
     works = [_work(phase, centres, spec, search.evaluation_episodes) for phase in phases]
     chunk_s, answers = _chunk_costs(spec, works)
-    message_s, way_s = _message_costs([work[0] for work in works], answers)
+    message_s, way_s = _message_costs(spec, [work[0] for work in works], answers)
     costs = Costs(chunk_s, message_s, way_s, _driver_cost(config, answers))
     steps = _steps(search, answers)
     for count in workers:
@@ -166,11 +166,19 @@ def _chunk_costs(spec: WorkerSpec, works: Sequence[Sequence[Work]]) -> tuple[dic
     return seconds, answers
 
 
+@dataclass(frozen=True)
+class _EchoSpec(WorkerSpec):
+    """What an `EchoActor` needs."""
+
+    answers: dict[str, ChunkResult] = field(default_factory=dict)
+    """Answer of each kind of chunk."""
+
+
 class EchoActor:
     """In the place of a worker's actor: it computes for SPIN_S and gives each chunk the recorded answer of its kind."""
 
     def __init__(self, spec: bytes, index: int, gpus: float, cores: int) -> None:
-        self._answers: dict[str, ChunkResult] = pickle.loads(pickle.loads(spec))
+        self._answers: dict[str, ChunkResult] = pickle.loads(spec).answers
 
     def place(self) -> WorkerPlace:
         """As `WorkerActor.place`."""
@@ -194,13 +202,13 @@ class EchoActor:
 
 
 def _message_costs(
-    chunks: Sequence[Work], answers: Mapping[str, ChunkResult]
+    spec: WorkerSpec, chunks: Sequence[Work], answers: Mapping[str, ChunkResult]
 ) -> tuple[dict[str, float], dict[str, float]]:
     """(seconds of the driver per work item, seconds of an item's way to a worker) through Ray, by kind of chunk."""
     message_s: dict[str, float] = {}
     way_s: dict[str, float] = {}
-    packed: Any = pickle.dumps(dict(answers))
-    with ray_engine(packed, Limits(1, item_s=0.0), actor=EchoActor) as engine:
+    echo = _EchoSpec(**vars(spec), answers=dict(answers))
+    with ray_engine(echo, Limits(1, item_s=0.0), actor=EchoActor) as engine:
         for work in chunks:
             engine.evaluate([work] * ECHO_ITEMS)
             began = time.process_time()  # also of Ray's threads in this process, but not while it waits

@@ -25,15 +25,15 @@ from es_service.dispatch.ray_calls import IN_CALL_BYTES
 from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE
 from es_service.loop.policies import no_statistics, policy_work
-from es_service.protocol.kept_parents import KeptParents
 from es_service.protocol.messages import Work
 from es_service.protocol.noise import Domain, stream_keys
-from es_service.protocol.recipes import IsoLine, recipes_of
+from es_service.protocol.recipes import IsoLine, Recipes, recipes_of
 from tests.es_service.test_ray_engine import PretendedRay
 from tests.helpers import spec
 from workers import process
 from workers.actor import WorkerActor
 from workers.compilable import Compilable
+from workers.parents import Parents
 
 PARENTS, WORKERS = 60, 2
 FAILING = 9
@@ -109,7 +109,7 @@ class ActorsHere(PretendedRay):
     def _start(self, spec: bytes, index: int, gpus: float, cores: int) -> Any:
         found, actor = super()._start(spec, index, gpus, cores), WorkerActor(spec, index)
         actor._run_chunks = COMPUTING
-        actor._parents = KeptParents(self.theirs, lambda values: values.nbytes)
+        actor._parents = Parents(self.theirs, Recipes.made)
 
         def remote(name: str) -> SimpleNamespace:
             def body(*parts: Any) -> Any:

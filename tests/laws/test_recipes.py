@@ -12,6 +12,7 @@ import pytest
 from es_service.errors import EvaluationError
 from es_service.loop.policies import no_statistics, policy_work
 from es_service.protocol.kept_parents import (
+    LEAST_BYTES,
     KeptParents,
     LackingError,
     as_sent,
@@ -22,10 +23,11 @@ from es_service.protocol.kept_parents import (
 from es_service.protocol.messages import Policies, around
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.policies import POLICY_SLOTS, PolicyChunk
-from es_service.protocol.recipes import IsoLine, Recipes, name_of, recipes_of, variation
+from es_service.protocol.recipes import IsoLine, Origin, Recipes, name_of, origin_of, recipes_of, remember, variation
 from es_service.search.algorithms.base import PolicyAsk
 from tests.laws.me_es_runs import SHAPE, config_of, run_in_memory
 from tests.laws.test_policies import only
+from workers.parents import Parents
 
 RULE = IsoLine(0.3, 0.6)
 SIZE = SHAPE.parameters
@@ -113,22 +115,25 @@ class Worker:
     def __init__(self, most_parents: int, theirs: int | None = None) -> None:
         limit = PARENTS[0].nbytes
         self.known: KeptParents[int] = KeptParents(most_parents * limit, int)
-        self.kept: KeptParents[np.ndarray] = KeptParents((theirs or most_parents) * limit, lambda values: values.nbytes)
-        self.received = 0
+        self.parents = Parents((theirs or most_parents) * limit, Recipes.made)
+        self.kept = self.parents.kept
+        self.received: list[bytes | Origin] = []
+        """The names of parents that it was sent, or their origins."""
 
     def item(self, work):
-        for name, values in parents_to_send(work, self.known).items():
-            self.kept.add(name, pickle.loads(pickle.dumps(values)))
-            self.received += 1
+        sent = parents_to_send(work, self.known)
+        self.received += [given if isinstance(given, Origin) else name for name, given in sent.items()]
+        self.parents.receive(pickle.loads(pickle.dumps(sent)))
         subjects = {id(subject): pickle.loads(pickle.dumps(as_sent(subject))) for subject, _ in work}
-        return with_parents([(subjects[id(subject)], chunk) for subject, chunk in work], self.kept)
+        return self.parents.complete([(subjects[id(subject)], chunk) for subject, chunk in work])
 
 
 def test_a_parent_travels_once_while_it_is_kept():
     worker, work = Worker(40), work_of(64)
     for _ in range(3):
         assert made(worker.item(work)) == made(work)
-    assert worker.received == len({name for subject, _ in work for name in subject.parameters_N_D.names})
+    names = [name for subject, _ in work for name in subject.parameters_N_D.names]
+    assert worker.received == list(dict.fromkeys(names))
 
 
 @pytest.mark.parametrize("most", [1, 12, 25])
@@ -144,7 +149,7 @@ def test_with_any_limit_a_worker_has_what_its_sender_believes_and_keeps_no_more(
         assert needed <= set(worker.kept)
         assert len(worker.kept) <= max(most, len(needed))
         sent += len(needed)
-    assert 40 < worker.received < sent
+    assert 40 < len(worker.received) < sent
 
 
 def test_a_worker_that_lacks_parents_says_so_and_computes_when_it_is_sent_all_again():
@@ -171,6 +176,51 @@ def test_what_a_sender_does_not_know_of_is_forgotten_first():
         item = work_of(rng.choice([1, 2, 4]), generation)
         assert made(worker.item(item)) == made(item)
         assert set(worker.known) <= set(worker.kept)
+
+
+def descendants(generations: int, size: int, policies: int = 32):
+    """Work of generations in which a few policies of each take the places of parents, as elites do."""
+    rng = np.random.default_rng(size)
+    parents = [rng.normal(size=size).astype(np.float32) for _ in range(20)]
+    for generation in range(generations):
+        asked = recipes(policies, generation, parents=parents)
+        work = policy_work(asked, no_statistics(policies, 2), 1, seed=0, generation=generation)
+        yield work.work
+        for number in rng.integers(policies, size=2).tolist():
+            parents[rng.integers(len(parents))] = work.policy(number).parameters_D
+
+
+@pytest.mark.parametrize("most", [1, 15, 1000])
+def test_of_a_parent_that_was_made_of_others_only_the_origin_travels(most):
+    """Unless the worker lacks what it was made of: then it may be made in a few steps, or travels itself."""
+    size = 2000
+    one, other = (Worker(most * size // SIZE + 1) for _ in range(2))
+    for work in descendants(40, size):
+        for worker, item in ((one, work[:1]), (other, work[1:])):
+            assert made(worker.item(item)) == made(item)
+            assert list(worker.kept) == list(worker.known)
+    origins = [sum(isinstance(given, Origin) for given in worker.received) for worker in (one, other)]
+    if most == 1000:
+        assert all(len(worker.received) - count < 25 for worker, count in zip((one, other), origins, strict=True))
+        assert min(origins) > 40
+    assert max(origins) > 0
+
+
+def test_a_small_parent_travels_itself():
+    worker = Worker(1000)
+    for work in descendants(10, LEAST_BYTES // 4 - 1):
+        assert made(worker.item(work)) == made(work)
+    assert not any(isinstance(given, Origin) for given in worker.received)
+
+
+def test_a_policy_has_the_origin_of_which_it_was_made():
+    asked = recipes(5, 77)
+    assert origin_of(name_of(asked.made()[3])) is None
+    remember(asked, asked.made())
+    origin = origin_of(name_of(asked.made()[3]))
+    assert isinstance(origin, Origin)
+    known = dict(zip(asked.names, asked.parents, strict=True))
+    assert bits(origin.recipes(known).made()[0]) == bits(asked.made()[3])
 
 
 def test_a_worker_whose_cores_are_processes_gives_them_the_policies():
