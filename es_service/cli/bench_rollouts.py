@@ -46,7 +46,7 @@ def bench_rollouts(
         if task not in TASKS:
             raise ConfigError(
                 f"--task {task}: unknown task; must be {one_of(TASKS)}, or brax:NAME, gymnasium:ID, "
-                f"python:module:Class, or module:Class"
+                f"python:module:Class, function:module:name, or module:Class"
                 f"{did_you_mean(task, TASKS)}"
             )
     every = sorted({1, cores()})

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from es_service.config.changes import foreign_keys, without_followers
-from es_service.config.fields import TASK_OPTIONS
+from es_service.config.fields import TASK_OPTIONS, as_tuple
 from es_service.config.keys import BUDGET, FIELDS, SECTIONS, Overrides, key_problems, parse_overrides, sort_keys
 from es_service.config.map_rules import map_problems
 from es_service.config.methods import (
@@ -36,6 +36,7 @@ from es_service.config.problems import nearest, not_allowed, one_of, unfit, wron
 from es_service.config.resolution import (
     LEFT_OPEN,
     engine_problems,
+    is_idle,
     policy_problems,
     resolve,
     rollout_problems,
@@ -141,7 +142,12 @@ def _load(
     found: dict[str, Any] = {}
     unknown: list[Problem] = []
     for key, what, known, besides in (
-        ("task.environment", "task", tasks, "brax:NAME, gymnasium:ID, python:module:Class, or module:Class"),
+        (
+            "task.environment",
+            "task",
+            tasks,
+            "brax:NAME, gymnasium:ID, python:module:Class, function:module:name, or module:Class",
+        ),
         ("search.algorithm", "algorithm", algorithms, "module:function"),
     ):
         given = chosen.get(key)
@@ -174,7 +180,7 @@ def _load(
     wrong = key_problems(filled | values, wanted, settings, algorithms)
     problems += wrong.values()
     unused = settings.unused if settings is not None else ()
-    idle = {key: value for key, value in values.items() if key in unused}
+    idle = {key: value for key, value in values.items() if key in unused or (task and is_idle(key, task))}
     left_open = {key for key, ask in LEFT_OPEN.items() if key in idle or _asks(values.get(key, ask), ask)}
     values = {key: value for key, value in values.items() if key not in {*wrong, *idle, *left_open}}
     values = {key: value for key, value in filled.items() if key not in left_open} | values
@@ -191,7 +197,7 @@ def _load(
         problems += map_problems(values, task)
         problems += objective_problems(values, with_options(task, options_of(values)))
     if settings is not None:
-        problems += _idle_problems(idle, values, algorithms) + method_problems(values, settings)
+        problems += _idle_problems(idle, values, algorithms, task) + method_problems(values, settings)
         problems += start_problems(values, settings) if new else []
     problems += rollout_problems(values, task, rollouts) + shape_problems(values) + engine_problems(values, rollouts)
     problems += folder_problems(values) if new else []
@@ -209,20 +215,24 @@ def _asks(value: object, ask: str | None) -> bool:
     return value is None if ask is None else isinstance(value, str) and value == ask
 
 
-def _idle_problems(idle: Mapping[str, Any], values: Mapping[str, Any], algorithms: Methods) -> list[Problem]:
+def _idle_problems(
+    idle: Mapping[str, Any], values: Mapping[str, Any], algorithms: Methods, task: TaskSpec | None
+) -> list[Problem]:
     """Problems of values of keys without effect. A value that the key has anyway is none, so that a resolved config can
     be loaded like any other.
 
     Args:
-        idle: keys without effect with the algorithm, and the values given for them.
+        idle: keys without effect with the algorithm or the task, and the values given for them.
         values: resolved values, without those of `idle`.
     """
     known = {key: field.default for key, field in FIELDS.items() if not field.is_required()} | dict(values)
     return [
-        no_effect(key, value, values["search.algorithm"], algorithms, known[key])
+        unfit(key, value, f"{show(value)} has no effect with {task.name}, which has no policy; leave it out")
+        if task is not None and is_idle(key, task)
+        else no_effect(key, value, values["search.algorithm"], algorithms, known[key])
         for key, value in idle.items()
         if key in known and not (key in LEFT_OPEN and _asks(value, LEFT_OPEN[key]))
-        if not (isinstance(value, int | float | str | None) and value == known[key])
+        if not (isinstance(value, int | float | str | list | tuple | None) and as_tuple(value) == known[key])
     ]
 
 

@@ -39,7 +39,7 @@ class TaskConfig(Section):
 
     environment: Text = Field(
         description="Name of the task: a shipped one, brax:NAME, gymnasium:ID, or one of your own: module:Class in "
-        "JAX, or python:module:Class."
+        "JAX, python:module:Class, or function:module:name."
     )
     episode_steps: Count = Field(description="Length of an episode in control steps. null: the task's own length.")
     fitness: Literal["sum", "final"] = Field(

@@ -59,6 +59,16 @@ FEW_CHUNK_PAIRS = 8
 """A chunk with fewer pairs is likely to cost more to send and start than to compute."""
 
 
+WITHOUT_POLICY = {
+    "policy.hidden": (),
+    "policy.output": "linear",
+    "policy.bias": False,
+    "policy.observation_normalization": False,
+    "policy.action_noise": 0.0,
+}
+"""The policy of a task that has none: its parameters are weights of one constant input, which are those of the task."""
+
+
 def default_chunk_pairs(pairs: int, limits: tuple[int, int] = CHUNK_PAIRS) -> int:
     """The largest divisor of `pairs` up to pairs / 8, within the limits (16 to 64); a multiple of 8 if possible.
 
@@ -132,7 +142,9 @@ def resolve(
     pairs = values.get("search.pairs") if has_pairs else WITHOUT_PAIRS
     if pairs is not None and "compute.chunk_pairs" in left_open:
         rollout = rollouts.get(values.get("compute.rollout", ""))
-        values["compute.chunk_pairs"] = default_chunk_pairs(pairs, rollout.chunk_pairs if rollout else CHUNK_PAIRS)
+        values["compute.chunk_pairs"] = default_chunk_pairs(
+            pairs, rollout.pair_limits(task) if rollout and task else CHUNK_PAIRS
+        )
     chunk_pairs = values.get("compute.chunk_pairs")
     if chunk_pairs is not None and task is not None:
         parameters = _policy_spec(values, task).parameters
@@ -147,8 +159,16 @@ def resolve(
 
 
 def values_of_task(task: TaskSpec) -> dict[str, Any]:
-    """Values that a task fills in where the config leaves them out: an output that chooses one of several actions."""
+    """Values that a task fills in where the config leaves them out: an output that chooses one of several actions; of a
+    function, which has no policy, a policy whose parameters are those of the function."""
+    if task.kind == "function":
+        return WITHOUT_POLICY | ({"search.evaluation_episodes": 1} if task.deterministic else {})
     return {"policy.output": DISCRETE_OUTPUTS[0]} if task.discrete_actions else {}
+
+
+def is_idle(key: str, task: TaskSpec) -> bool:
+    """Whether a key has no effect with a task, which has no policy."""
+    return task.kind == "function" and (key.startswith("policy.") or key in ("task.episode_steps", "task.descriptor"))
 
 
 def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
@@ -295,7 +315,7 @@ def config_warnings(config: RunConfig, task: TaskSpec, rollouts: Rollouts) -> li
     ]
     pairs = config.search.pairs if isinstance(config.search, PopulationConfig) else WITHOUT_PAIRS
     chunk = config.compute.chunk_pairs
-    if chunk < min(FEW_CHUNK_PAIRS, rollouts[chosen].chunk_pairs[0]) and pairs > MOST_CHUNK_PAIRS:
+    if chunk < min(FEW_CHUNK_PAIRS, rollouts[chosen].pair_limits(task)[0]) and pairs > MOST_CHUNK_PAIRS:
         near = round(pairs / MOST_CHUNK_PAIRS) * MOST_CHUNK_PAIRS
         auto = default_chunk_pairs(pairs)
         hint = (

@@ -20,6 +20,7 @@ from es_service.config.yaml_text import show
 from es_service.errors import ConfigError
 from es_service.protocol.messages import DescriptorChoice, TaskSpec, with_options
 from es_service.protocol.options import Option, OptionValue, choice
+from es_service.protocol.parameters import ParameterSpec
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.rollouts import Rollouts
 from es_service.protocol.sources import user_sources
@@ -32,7 +33,7 @@ DESCRIBE_S = 120.0
 
 class Tasks(TaskTable):
     """Tasks by name. Iteration yields the shipped tasks; lookup also finds `brax:NAME`, `gymnasium:ID`,
-    `module:Class` and `python:module:Class`."""
+    `module:Class`, `python:module:Class` and `function:module:name`."""
 
     def __getitem__(self, name: str) -> TaskSpec:
         """Raises KeyError for a plain name that is not shipped, ConfigError for another that cannot be described."""
@@ -136,6 +137,9 @@ def task_from_fields(fields: Mapping[str, Any]) -> TaskSpec:
             "descriptor_bounds": bounds(fields["descriptor_bounds"]),
             "walls": None if fields["walls"] is None else tuple(bounds(wall) for wall in fields["walls"]),
             "goal": None if fields.get("goal") is None else tuple(fields["goal"]),
+            "parameters": None
+            if fields.get("parameters") is None
+            else ParameterSpec.from_fields(*fields["parameters"]),
             "options": {name: option(found) for name, found in fields["options"].items()},
             "descriptors": {
                 name: (tuple(names), bounds(pairs)) for name, (names, pairs) in fields["descriptors"].items()

@@ -15,14 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.options import Option, OptionValue
+from es_service.protocol.parameters import ParameterSpec
 from es_service.protocol.policies import Policies, PolicyChunk
 from es_service.protocol.policy_spec import PolicySpec
 
 FloatArray = NDArray[np.float32]
 Bounds = tuple[tuple[float, float], ...]
 Segment = tuple[tuple[float, float], tuple[float, float]]
-TaskKind = Literal["jax", "python"]
-"""What a task is made of: functions that JAX traces, or Python objects with `reset` and `step`."""
+TaskKind = Literal["jax", "python", "function"]
+"""What a task is made of: functions that JAX traces; Python objects with `reset` and `step`; or one function of its
+parameters, without a policy."""
 DescriptorChoice = str | tuple[int, ...]
 """Descriptor that a config chooses for a task of Python objects: a key of `info`, `module:function`, or the indices of
 numbers of the last observation."""
@@ -77,6 +79,10 @@ class TaskSpec:
     """What the task is made of, on which it depends which rollouts can compute it."""
     discrete_actions: bool = False
     """Whether an action is a choice of one of `action_size` actions, so that the policy has to choose one."""
+    parameters: ParameterSpec | None = None
+    """Parameters of a function that is the task; None for all other tasks."""
+    deterministic: bool = False
+    """Whether the task declares that equal parameters have equal results."""
 
 
 def with_options(task: TaskSpec, options: Mapping[str, OptionValue]) -> TaskSpec:

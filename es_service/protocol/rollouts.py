@@ -15,7 +15,11 @@ CHUNK_PAIRS = (16, 64)
 and most: enough to fill vector units and to outweigh the cost of a message; a lost chunk costs little."""
 
 
-IN_WORDS: Mapping[TaskKind, str] = {"jax": "tasks in JAX", "python": "tasks of Python objects"}
+IN_WORDS: Mapping[TaskKind, str] = {
+    "jax": "tasks in JAX",
+    "python": "tasks of Python objects",
+    "function": "functions of parameters",
+}
 """Kind of a task -> what the tasks of this kind are called."""
 
 
@@ -50,6 +54,10 @@ class Rollout(Protocol):
             able = " and ".join(IN_WORDS[kind] for kind in self.task_kinds)
             return f"it computes {able}, and not {IN_WORDS[task.kind]}"
         return task.unsupported.get(self.name, "")
+
+    def pair_limits(self, task: TaskSpec) -> tuple[int, int]:
+        """Limits as `chunk_pairs`, for a task."""
+        return self.chunk_pairs
 
     def why_not_here(self) -> str:
         """Reason why it cannot run on this machine; empty if it can."""

@@ -28,7 +28,7 @@ WORKERS = ("workers", "es_service.protocol")
 """Packages with which workers compute."""
 DRIVER = ("es_service.loop", "es_service.search", "es_service.config")
 """Packages with which the driver computes besides."""
-PATH_FOLLOWS = ("python",)
+PATH_FOLLOWS = ("python", "function")
 """Kinds of tasks, the first word of their names, that are followed by the path of a user's code."""
 LIBRARY = "gymnasium"
 """Kind of the tasks that are environments of this library, and the library's package."""

@@ -265,7 +265,10 @@ def initial_statistics(start: Part | None) -> list[tuple[FloatArray, FloatArray]
 
 
 def initial_policy(config: RunConfig, centre: int) -> FloatArray:
-    """Random parameters [D] with which a centre of a run begins, by `policy.init` and the seed."""
+    """Parameters [D] with which a centre of a run begins: those of a policy are random, by `policy.init` and the seed;
+    those of a function begin at its start."""
+    if (parameters := task_of(config).parameters) is not None:
+        return parameters.first(config.seed, centre)
     return initial_parameters(policy_spec(config, task_of(config)), config.policy.init, config.seed, centre)
 
 

@@ -16,6 +16,7 @@ from es_service.config.yaml_text import read_yaml_file
 from es_service.errors import NotInRunError, WayOut
 from es_service.loop.parts import BEST, BLOCK_PREFIX, CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART, elite_part
 from es_service.protocol.messages import PolicySpec
+from es_service.protocol.parameters import ParameterSpec
 from es_service.runs.certified import certified_policies, newest_certified
 from es_service.runs.moment import Moment, Policy, descriptor_names, make_policy, policy_spec
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
@@ -230,6 +231,23 @@ class Run:
             raise ValueError(f"policy({which!r}): choose 'best', 'centre', 'certified', or a cell such as (3, 17)")
         elite = self.elite(which)
         return make_policy(self.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O)
+
+    def parameters(
+        self, which: Literal["best", "centre", "certified"] | int | Sequence[int] = "best"
+    ) -> dict[str, float]:
+        """Parameters of the function that is the run's task, by name, as the function gets them.
+
+        Args:
+            which: as for `policy`.
+
+        Raises as `policy`, and NotInRunError if the task is no function.
+        """
+        if (fields := self.meta.task.get("parameters")) is None:
+            raise NotInRunError(
+                f"{self.folder} has policies: its task {self.meta.task['name']} is no function of parameters",
+                run=self.folder,
+            )
+        return ParameterSpec.from_fields(*fields).named(self.policy(which).parameters_D)
 
 
 def _frame(columns: Columns) -> pd.DataFrame:

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from es_service.protocol.messages import DescriptorChoice, TaskSpec
 from es_service.protocol.options import OptionValue, choice
-from es_service.protocol.sources import LIBRARY, PATH_FOLLOWS
+from es_service.protocol.sources import LIBRARY
 from workers.viewer import Viewer
 
 if TYPE_CHECKING:  # it imports this module
+    from workers.environments.function_task import FunctionTask
     from workers.environments.host_task import HostTask
 
 
@@ -136,7 +137,27 @@ def make_environment(name: str, options: Mapping[str, Any]) -> Environment:
 def is_host_task(name: str) -> bool:
     """Whether a name is that of a task of Python objects."""
     kind, _, rest = name.partition(":")
-    return kind == LIBRARY or (kind in PATH_FOLLOWS and ":" in rest)
+    return kind == LIBRARY or (kind == "python" and ":" in rest)
+
+
+def is_function_task(name: str) -> bool:
+    """Whether a name is that of a function of parameters."""
+    kind, _, rest = name.partition(":")
+    return kind == "function" and ":" in rest
+
+
+def make_function_task(name: str, options: Mapping[str, OptionValue]) -> FunctionTask:
+    """A function that is a task; imports its module, but no JAX.
+
+    Args:
+        name: `function:package.module:name`.
+
+    Raises:
+        TaskError: the function does not exist or cannot be used.
+    """
+    from workers.environments import function_task
+
+    return function_task.make(name.partition(":")[2], options)
 
 
 def make_host_task(
@@ -202,6 +223,10 @@ def describe_environment(name: str, settings: Mapping[str, Any] = MappingProxyTy
         from workers.environments import python_task
 
         return python_task.describe(rest, descriptor)
+    if is_function_task(name):
+        from workers.environments import function_task
+
+        return function_task.describe(rest)
     from workers.environments import user_task
 
     return user_task.describe(name)

@@ -14,6 +14,7 @@ from es_service.protocol.messages import TRACE_POINTS, FloatArray, WorkerSpec
 from workers.environments.host_task import HostEnvironment, HostTask
 from workers.host.outputs import Outputs, Step
 from workers.host.policies import LanePolicies
+from workers.host.seeds import seed_of
 from workers.rollouts.backend import Episodes
 
 
@@ -152,8 +153,3 @@ def known_from_the_start(descriptor_T_B: FloatArray) -> None:
     if unknown_T[:1].any() and not unknown_T.all():
         first = int(np.argmin(unknown_T))
         descriptor_T_B[:first] = descriptor_T_B[first]
-
-
-def seed_of(reset_key_4: NDArray[np.uint32]) -> int:
-    """The seed of a reset, a whole number below 2^31, which every generator accepts, from its stream key."""
-    return int(reset_key_4[0]) >> 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -19,10 +20,11 @@ from es_service.protocol.options import OptionValue
 from es_service.protocol.policies import POLICY_SLOTS
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from workers.compilable import Compilable
-from workers.environments import make_host_task
-from workers.environments.host_task import HostTask
-from workers.host.episodes import Lanes, Watched, known_from_the_start, run_episodes, seed_of
+from workers.environments import is_function_task, make_function_task, make_host_task
+from workers.host.episodes import Lanes, Watched, known_from_the_start, run_episodes
+from workers.host.functions import run_calls
 from workers.host.policies import LanePolicies
+from workers.host.seeds import seed_of
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
 
 
@@ -34,47 +36,46 @@ class Host(RolloutBackend):
     """
 
     name = "host"
-    task_kinds = ("python",)
+    task_kinds = ("python", "function")
     compile_s = (1, 1)
     chunk_pairs = (8, 8)
     copies_late_items = False
 
+    def pair_limits(self, task: TaskSpec) -> tuple[int, int]:
+        """One pair of calls, which may take long, or as many environments as an evaluation has."""
+        return (1, 1) if task.kind == "function" else self.chunk_pairs
+
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """Functions that share the environments of a worker."""
-        lanes = Lanes(_task(spec))
+        run, count = make_runner(spec), spec.policy.parameters
 
         def training(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
-            noise_P_D = _noise(noise_keys_P, spec.policy.parameters)
+            noise_P_D = _noise(noise_keys_P, count)
             parameters_P_S_D = centre_D + np.multiply.outer(noise_P_D, np.float32(unit) * _SIGNS_S).swapaxes(1, 2)
-            parameters_L_D = parameters_P_S_D.reshape(-1, spec.policy.parameters)
+            parameters_L_D = parameters_P_S_D.reshape(-1, count)
             keys_E_L = (_by_episode(keys) for keys in (reset_keys_P_S_E, action_keys_P_S_E))
-            by_episode = []
-            for reset_keys_L, action_keys_L in zip(*keys_E_L, strict=True):
-                policies = LanePolicies(spec, parameters_L_D, mean_O, std_O, action_keys_L)
-                by_episode.append(run_episodes(lanes, spec, policies, mean_O, reset_keys_L, training=True))
+            by_episode = [run(parameters_L_D, mean_O, std_O, *keys) for keys in zip(*keys_E_L, strict=True)]
             return _stacked(by_episode).map(lambda array: array.reshape(len(noise_keys_P), 2, *array.shape[1:]))
 
         def evaluation(centre_D, mean_O, std_O, reset_keys_E, wanted_E):
-            policies = LanePolicies(spec, _in_lanes(centre_D, len(reset_keys_E)), mean_O, std_O)
-            return run_episodes(lanes, spec, policies, mean_O, reset_keys_E, training=False, runs_L=wanted_E)
+            return run(_in_lanes(centre_D, len(reset_keys_E)), mean_O, std_O, reset_keys_E, runs_L=wanted_E)
 
-        def of_policies(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
-            policies = LanePolicies(spec, np.concatenate(parameters_G_N_D)[policy_L], mean_L_O, std_L_O)
-            return run_episodes(lanes, spec, policies, mean_L_O, reset_keys_L, training=False)
+        def policies(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
+            return run(np.concatenate(parameters_G_N_D)[policy_L], mean_L_O, std_L_O, reset_keys_L)
 
         def gradient_sum(weights_P, noise_keys_P):
-            sum_D = np.zeros(spec.policy.parameters, np.float32)
+            sum_D = np.zeros(count, np.float32)
             for weight, key in zip(weights_P, noise_keys_P, strict=True):
-                sum_D += weight * _noise(key, spec.policy.parameters)
+                sum_D += weight * _noise(key, count)
             return sum_D * np.float32(1.0 / NORMAL_STD)
 
-        functions = (training, evaluation, of_policies, gradient_sum)
+        functions = (training, evaluation, policies, gradient_sum)
         return ChunkFunctions(*(Compilable(function, lambda *_: None) for function in functions))
 
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
         """Recordings by the loop of the evaluations, in the slots of whole chunks."""
-        lanes = Lanes(_task(spec))
-        return Recordings(tuple(_recording(lanes, spec, request) for request in requests), (), 0.0)
+        run = make_runner(spec)
+        return Recordings(tuple(_recording(run, request) for request in requests), (), 0.0)
 
     def random_steps(
         self, task: TaskSpec, options: Mapping[str, OptionValue], batch: int, steps: int
@@ -100,8 +101,53 @@ class Host(RolloutBackend):
         return call
 
 
-def _task(spec: WorkerSpec) -> HostTask:
-    return make_host_task(spec.environment, spec.environment_options, spec.descriptor, spec.descriptor_size)
+class Runner(Protocol):
+    """Function that runs one episode in each lane L, all of a policy of its own."""
+
+    def __call__(
+        self,
+        parameters_L_D: Any,
+        mean: Any,
+        std: Any,
+        reset_keys_L_4: Any,
+        action_keys_L_4: Any = None,
+        *,
+        runs_L: Any = None,
+        watched: Watched | None = None,
+    ) -> Episodes:
+        """Episodes with leading axis [L]; with keys of the action noise, those of training.
+
+        Args:
+            mean, std: observation statistics, [O] of all lanes or [L, O].
+            runs_L: which lanes run; None for all.
+            watched: filled with the episode of one lane.
+        """
+        ...
+
+
+def make_runner(spec: WorkerSpec) -> Runner:
+    """The runner of a worker, with its environments or its function."""
+    if is_function_task(spec.environment):
+        function = make_function_task(spec.environment, spec.environment_options)
+
+        def call(parameters_L_D, mean, std, reset_keys_L_4, action_keys_L_4=None, *, runs_L=None, watched=None):
+            training = action_keys_L_4 is not None
+            episodes = run_calls(function, spec, parameters_L_D, reset_keys_L_4, training=training, runs_L=runs_L)
+            if watched is not None:
+                watched.descriptors.extend([episodes.descriptor[watched.lane]] * 2)
+                watched.returns.extend([0.0, episodes.returns[watched.lane]])
+            return episodes
+
+        return call
+    lanes = Lanes(make_host_task(spec.environment, spec.environment_options, spec.descriptor, spec.descriptor_size))
+
+    def run(parameters_L_D, mean, std, reset_keys_L_4, action_keys_L_4=None, *, runs_L=None, watched=None):
+        policies = LanePolicies(spec, parameters_L_D, mean, std, action_keys_L_4)
+        training = action_keys_L_4 is not None
+        given = (lanes, spec, policies, mean, reset_keys_L_4)
+        return run_episodes(*given, training=training, runs_L=runs_L, watched=watched)
+
+    return run
 
 
 _SIGNS_S = np.asarray(SIGNS, np.float32)
@@ -133,21 +179,16 @@ def _stacked(by_episode: Sequence[Episodes]) -> Episodes:
     return Episodes._make([*columns, *named])
 
 
-def _recording(lanes: Lanes, spec: WorkerSpec, request: RecordRequest) -> Recording:
+def _recording(run: Runner, request: RecordRequest) -> Recording:
     centre, slot = request.centre, request.slot
     count = EVALUATION_EPISODES_PER_CHUNK if request.policy is None else POLICY_SLOTS
     key = evaluation_reset_keys(request.seed, centre.generation, request.episode, request.ask, request.policy)
-    policies = LanePolicies(
-        spec, _in_lanes(centre.parameters_D, count), centre.observation_mean_O, centre.observation_std_O
-    )
     watched = Watched(slot, [], [])
-    episodes = run_episodes(
-        lanes,
-        spec,
-        policies,
+    episodes = run(
+        _in_lanes(centre.parameters_D, count),
         centre.observation_mean_O,
+        centre.observation_std_O,
         _in_lanes(key, count),
-        training=False,
         runs_L=np.arange(count) == slot,
         watched=watched,
     )

@@ -1,0 +1,67 @@
+"""Functions of parameters as tasks for tests."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+from es_service.protocol.options import Option
+
+
+def hill(parameters):
+    """A hill whose top is at width 3 and height 0.2; its descriptor are the two."""
+    width, height, rest = parameters
+    return 10.0 - (width - 3.0) ** 2 - 100.0 * (height - 0.2) ** 2 - rest**2, (width, height)
+
+
+hill.parameters = {"width": (1.0, 5.0), "height": (0.0, 1.0), "rest": None}
+hill.start = {"height": 0.9, "rest": 0.5}
+hill.descriptor_names = ("wide", "high")
+hill.descriptor_bounds = hill.parameters["width"], hill.parameters["height"]
+hill.deterministic = True
+hill.least_fitness = -100.0
+
+
+class Noisy:
+    """A parabola with noise of the seed, in as many dimensions as one likes."""
+
+    parameters = 4
+    options = {"noise": Option(0.5, low=0.0)}  # noqa: RUF012
+
+    def __init__(self, noise):
+        self.noise = noise
+
+    def __call__(self, parameters, seed):
+        return -float(np.square(parameters - 1.0).sum()) + self.noise * np.random.default_rng(seed).normal()
+
+
+def fragile(parameters):
+    """It fails in three of four quarters, in three ways."""
+    x, y = parameters
+    if x > 0.0 and y > 0.0:
+        raise ValueError("this quarter is forbidden")
+    if x > 0.0:
+        return math.nan
+    return "many" if y > 0.0 else x + y
+
+
+fragile.parameters = ("x", "y")
+
+
+def slow(parameters):
+    """It hangs, or ends its process, once: where a file says so, and the first parameter is positive."""
+    fault = Path(os.environ["HOST_FAULT"])
+    kind = fault.read_text() if fault.exists() else ""
+    if kind and parameters[0] > 0.0:
+        fault.unlink(missing_ok=True)
+        if kind == "exit":
+            os._exit(3)
+        time.sleep(1000.0)
+    return float(parameters.sum())
+
+
+slow.parameters = 3

@@ -1,0 +1,168 @@
+"""Functions of parameters as tasks: all methods move them, there is no policy, and a call that fails is invalid."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+
+from es_service import api, load_config
+from es_service.config.model import policy_spec
+from es_service.config.tasks import TASKS, task_of
+from es_service.errors import ConfigError
+from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
+from es_service.protocol.noise import evaluation_reset_keys
+from tests.helpers import centre, spec
+from tests.workers import functions
+from tests.workers.test_host import NO_JAX
+from workers.environments import TaskError, describe_environment
+from workers.worker import make_worker
+
+MODULE = "tests.workers.functions"
+HILL, NOISY, FRAGILE = (f"function:{MODULE}:{name}" for name in ("hill", "Noisy", "fragile"))
+ES = {"algorithm": "es", "pairs": 8, "sigma": 0.1, "step": {"learning_rate": 0.05, "l2": 0.0}}
+MAP_ELITES = {"algorithm": "map_elites", "batch": 40, "iso_sigma": 0.2}
+
+
+def config_of(name, search=ES, generations=3, **compute):
+    return {
+        "task": {"environment": name},
+        "search": search,
+        "map": {"cells": [6, 6], "bounds": [[-2, 2], [-2, 2]]} if name != HILL else {"cells": [6, 6]},
+        "budget": {"generations": generations},
+        "compute": {"engine": "inline", "workers": 1} | compute,
+    }
+
+
+@pytest.fixture
+def no_jax(tmp_path, monkeypatch):
+    """No new process can import JAX."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(NO_JAX)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+
+
+def test_a_function_says_what_it_is():
+    task = TASKS[HILL]
+    assert (task.kind, task.action_size, task.episode_steps, task.deterministic) == ("function", 3, 1, True)
+    assert task.descriptor_names == ("wide", "high")
+    assert task.parameters == describe_environment(HILL).parameters
+    assert task.parameters.start == (3.0, 0.9, 0.5)
+    config = load_config(config_of(HILL))
+    assert (config.compute.rollout, config.compute.chunk_pairs, config.search.evaluation_episodes) == ("host", 1, 1)
+    assert policy_spec(config, task).parameters == 3
+    assert load_config(config_of(NOISY)).search.evaluation_episodes == 30
+    assert task_of(load_config(config_of(NOISY))).descriptor_names == ("x0", "x1")
+
+
+def test_what_a_search_moves_is_half_ranges_and_the_start_is_where_it_begins():
+    parameters = TASKS[HILL].parameters
+    np.testing.assert_allclose(parameters.values([-1.0, 1.0, 7.0]), [1.0, 1.0, 7.0])
+    np.testing.assert_allclose(parameters.values([[0.5, -3.0, -2.0], [0.0, 0.0, 0.0]]), [[4, 0, -2], [3, 0.5, 0]])
+    np.testing.assert_allclose(parameters.values(parameters.first(0, 0)), [3.0, 0.9, 0.5], rtol=1e-6)
+    first_N_D = np.array([parameters.first(4, number) for number in range(1, 200)])
+    assert (np.abs(first_N_D - [0.0, 0.0, 0.5]) <= 1.0).all()
+    assert first_N_D.std(axis=0).min() > 0.5
+
+
+def test_an_es_climbs_a_hill_and_every_worker_says_the_same(tmp_path, no_jax):
+    run = api.run(config_of(HILL, generations=60), tmp_path / "one").run
+    assert run.history.best_fitness.iloc[0] == pytest.approx(10.0 - 100 * 0.7**2 - 0.25)
+    assert run.history.best_fitness.iloc[-1] > 9.9
+    assert run.history.env_steps.iloc[-1] == 1 + 60 * (16 + 1)
+    np.testing.assert_allclose(list(run.parameters("best").values()), [3.0, 0.2, 0.0], atol=0.25)
+    assert list(run.parameters("best")) == ["width", "height", "rest"]
+    api.run(config_of(HILL, generations=20, workers=3), tmp_path / "three")
+    resumed = api.resume(tmp_path / "three", ["budget.generations=60", "compute.workers=2"]).run
+    assert resumed.digest() == run.digest()
+
+
+def test_map_elites_fills_a_map_of_descriptors(tmp_path, no_jax):
+    config = config_of(HILL, MAP_ELITES, generations=8)
+    run = api.run(config, tmp_path / "one").run
+    assert len(run.map) > 8
+    row = run.map.iloc[0]
+    values = run.parameters((int(row.cell_wide), int(row.cell_high)))
+    assert (values["width"], values["height"]) == pytest.approx((row.wide, row.high), rel=1e-5)
+    assert functions.hill(list(values.values()))[0] == pytest.approx(row.fitness, rel=1e-5)
+    assert api.run(config | {"compute": {"workers": 3}}, tmp_path / "three").run.digest() == run.digest()
+
+
+@pytest.mark.parametrize("search", [{"algorithm": "nsr_es", "pairs": 8}, {"algorithm": "ars", "pairs": 8}, MAP_ELITES])
+@pytest.mark.usefixtures("workers_here")
+def test_other_methods_move_a_noisy_function_of_any_number_of_parameters(search, tmp_path):
+    config = config_of(NOISY, search | {"evaluation_episodes": 4})
+    run = api.run(config, tmp_path / "run").run
+    assert np.isfinite(run.history.best_fitness).all()
+    assert list(run.parameters("best")) == ["x0", "x1", "x2", "x3"]
+
+
+@pytest.mark.usefixtures("workers_here")
+def test_calls_that_fail_are_invalid_and_named_with_their_parameters(tmp_path, capfd):
+    search = MAP_ELITES | {"max_invalid_fraction": 1.0, "evaluation_episodes": 1, "iso_sigma": 1.0}
+    run = api.run(config_of(FRAGILE, search), tmp_path / "run").run
+    assert (run.map[["x", "y"]] <= 0.0).all(axis=None)
+    assert run.history.invalid_members.iloc[1:].min() > 0
+    told = capfd.readouterr().err
+    for why in ("ValueError: this quarter is forbidden", "the fitness nan and", "returned the fitness 'many'; it must"):
+        (line, *_) = [one for one in told.splitlines() if why in one]
+        assert line.startswith(f"{FRAGILE} failed with x = "), line
+
+
+def test_a_seed_belongs_to_the_episode_and_both_of_a_pair_share_it():
+    worker_spec = spec(
+        environment=NOISY,
+        environment_options={"noise": 2.0},
+        episode_steps=1,
+        policy=PolicySpec((1, 4), output="linear", bias=False),
+        action_noise=0.0,
+        rollout="host",
+        chunk_pairs=2,
+    )
+    run, subject = make_worker(worker_spec), centre(np.zeros(4), observation_size=1, sigma=1e-12)
+    [found] = run([(subject, TrainingChunk(1, 0))])
+    np.testing.assert_array_equal(found.fitness[:, 0], found.fitness[:, 1])
+    assert found.fitness[0, 0] != found.fitness[1, 0]
+    [found] = run([(subject, EvaluationChunk(1, 0, episodes=2))])
+    seeds = [int(evaluation_reset_keys(3, 1, episode)[0]) >> 1 for episode in range(2)]
+    noise = [np.random.default_rng(seed).normal() for seed in seeds]
+    np.testing.assert_allclose(found.fitness, -4.0 + 2.0 * np.array(noise), rtol=1e-6)
+
+
+def test_a_policy_is_refused_and_a_resolved_config_is_not(tmp_path):
+    config = load_config(config_of(HILL))
+    assert load_config(yaml.safe_load(config.resolved_yaml())) == config
+    for key, value in (("policy.hidden", [4]), ("policy.output", "tanh"), ("task.episode_steps", 5)):
+        with pytest.raises(
+            ConfigError, match=rf"{key}: .* has no effect with {HILL}, which has no policy; leave it out"
+        ):
+            load_config(config_of(HILL), {key: value})
+    with pytest.raises(
+        ConfigError, match=r"xla cannot run .*: it computes tasks in JAX, and not functions of parameters"
+    ):
+        load_config(config_of(HILL), ["compute.rollout=xla"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "problem"),
+    [
+        ("parameters", {"width": (5.0, 1.0)}, r"parameters: \(5.0, 1.0\) is not a pair"),
+        ("parameters", {}, "parameters = {} is not a mapping from names to bounds"),
+        ("start", {"depth": 1.0}, "start has depth, which is none of the parameters"),
+        ("start", [1.0, 2.0], "start = .* has not one value for each of the 3 parameters"),
+        ("start", {"height": 2.0}, "start of height = 2 is not between its bounds 0 and 1"),
+        ("descriptor_bounds", ((0.0, 1.0),), "are not tuples of one length"),
+        ("descriptor_names", ("fitness", "high"), "'fitness' would be the column"),
+        ("least_fitness", "low", "least_fitness = 'low' is not a finite number"),
+    ],
+)
+def test_a_function_that_contradicts_itself_is_refused(name, value, problem, monkeypatch):
+    monkeypatch.setattr(functions.hill, name, value)
+    with pytest.raises(TaskError, match=rf"^{HILL}: .*{problem}"):
+        describe_environment(HILL)
+
+
+@pytest.mark.parametrize("name", ["function:math:pi", "function:math:sin", "function:math:nothing"])
+def test_what_is_no_such_function_is_named(name):
+    with pytest.raises(TaskError, match=r"is no function|has no attribute parameters|has no function nothing"):
+        describe_environment(name)

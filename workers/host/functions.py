@@ -1,0 +1,75 @@
+"""Calls of functions that are tasks: one for each lane, one after another. A call that fails is an invalid episode."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.messages import FloatArray, WorkerSpec
+from es_service.protocol.raised import raised
+from workers.environments.function_task import FunctionTask
+from workers.host.seeds import seed_of
+from workers.rollouts.backend import Episodes
+
+POINTS = 2
+"""Points of a trace, of an episode with one step."""
+
+
+def run_calls(
+    task: FunctionTask,
+    spec: WorkerSpec,
+    parameters_L_D: FloatArray,
+    reset_keys_L_4: NDArray[np.uint32],
+    *,
+    training: bool,
+    runs_L: NDArray[np.bool_] | None = None,
+) -> Episodes:
+    """One call for each lane that runs, in their order; see `workers.host.episodes.run_episodes`.
+
+    A call whose fitness or descriptor is not finite, or that raises, makes the episode invalid, and says so on stderr.
+    """
+    lanes = len(reset_keys_L_4)
+    fitness_L = np.zeros(lanes, np.float32)
+    descriptor_L_B = np.zeros((lanes, task.descriptor_size), np.float32)
+    for lane in range(lanes):
+        if runs_L is None or runs_L[lane]:
+            fitness_L[lane], descriptor_L_B[lane] = _called(task, parameters_L_D[lane], seed_of(reset_keys_L_4[lane]))
+    sums_L_O = np.zeros((lanes, 1 if training else 0), np.float32)
+    points = 0 if training else POINTS
+    return Episodes(
+        fitness=fitness_L,
+        returns=fitness_L,
+        descriptor=descriptor_L_B,
+        steps=np.ones(lanes, np.int32),
+        goal_distance=np.full((lanes, 2), np.nan, np.float32),
+        shifted_sum_O=sums_L_O,
+        shifted_square_sum_O=sums_L_O,
+        trace_T_B=np.repeat(descriptor_L_B[:, None], points, axis=1),
+        outputs={name: _output(name, fitness_L) for name in spec.outputs},
+        of_steps={},
+    )
+
+
+def _called(task: FunctionTask, parameters_D: FloatArray, seed: int) -> tuple[float, Any]:
+    """(fitness, descriptor) of a call; NaN if it fails."""
+    try:
+        with np.errstate(over="ignore"):  # beyond float32 is infinite, and invalid
+            fitness, descriptor_B = task(parameters_D, seed)
+            if np.isfinite(np.float32(fitness)) and np.isfinite(descriptor_B).all():
+                return fitness, descriptor_B
+        why = f"the fitness {fitness:g} and the descriptor {descriptor_B.tolist()} are not finite numbers"
+    except (Exception, SystemExit) as error:  # the user's code can raise anything
+        why = raised(error, task.name).message
+    named = ", ".join(f"{name} = {value!r}" for name, value in task.parameters.named(parameters_D).items())
+    print(f"{task.name} failed with {named} (seed {seed}): {why}", file=sys.stderr, flush=True)
+    return np.nan, np.full(task.descriptor_size, np.nan, np.float32)
+
+
+def _output(name: str, fitness_L: FloatArray) -> Any:
+    """The outputs of a call that `protocol.outputs` names."""
+    if name == "last_reward":
+        return fitness_L
+    raise ValueError(f"a function has no output {name!r}, since it has no policy and no steps")
