@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from es_service.api import Stop, evaluator, fork, load_config, open_run, resume, run, run_or_resume
+    from es_service.asking import ask_tell
     from es_service.report import plots
     from es_service.report.write import write_comparison, write_report
     from es_service.runs.certification import certify, certify_run
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Stop",
     "__version__",
+    "ask_tell",
     "certify",
     "certify_run",
     "evaluator",
@@ -37,6 +39,7 @@ __all__ = [
     "write_report",
 ]
 _MODULES = {
+    "ask_tell": "es_service.asking",
     "certify": "es_service.runs.certification",
     "certify_run": "es_service.runs.certification",
     "polish_config": "es_service.runs.polishing",

@@ -30,7 +30,7 @@ from es_service.runs.checked_config import accepted, changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.lineage import fork_config, forked, started
 from es_service.runs.resume_checks import columns, require_resumable
-from es_service.runs.session import OnGeneration, OnNotice, Outcome, require_cores, work
+from es_service.runs.session import Caller, OnGeneration, OnNotice, Outcome, require_cores, work
 from es_service.runs.view import Run, open_run
 from es_service.store.beginning import Beginning
 from es_service.store.create import remove_run_folder
@@ -51,7 +51,7 @@ def _draw_for_notebook(run: Run) -> str:
 view.draw_for_notebook = _draw_for_notebook
 
 
-def _warn(notice: str) -> None:
+def warn(notice: str) -> None:
     warnings.warn(notice, RuntimeWarning, stacklevel=2)
 
 
@@ -68,6 +68,7 @@ class _Listener:
     on_compile: OnNotice
     progress: bool
     hook: Callable[[str], None] = no_hook
+    caller: Caller | None = None
 
     @contextmanager
     def shown(self, folder: Path) -> Iterator[OnGeneration]:
@@ -87,10 +88,11 @@ def run(
     out: str | os.PathLike[str] | None = None,
     *,
     on_generation: OnGeneration | None = None,
-    on_notice: OnNotice = _warn,
+    on_notice: OnNotice = warn,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
+    caller: Caller | None = None,
 ) -> Outcome:
     """Start a run and continue it until its budget is spent.
 
@@ -105,6 +107,7 @@ def run(
             nothing.
         on_compile: called with a sentence when the workers compile for more than two seconds.
         hook: called with the name of each point of the store that is passed; for tests that kill the process there.
+        caller: for `ask_tell`, which computes the episodes of a task that has none of its own.
 
     Raises:
         ConfigError: the config is wrong. StoreError: the folder cannot be used. EvaluationError: the rollouts cannot
@@ -117,7 +120,7 @@ def run(
     parent, beginning = None, Beginning()
     if config.search.init_from is not None:
         parent, beginning = started(config, config.search.init_from, on_notice)
-    listener = _Listener(on_generation, on_notice, on_compile, progress, hook)
+    listener = _Listener(on_generation, on_notice, on_compile, progress, hook, caller)
     return _create_and_work(config, out, parent, beginning, again, listener)
 
 
@@ -127,7 +130,7 @@ def resume(
     *,
     strict: bool = False,
     on_generation: OnGeneration | None = None,
-    on_notice: OnNotice = _warn,
+    on_notice: OnNotice = warn,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
@@ -160,11 +163,15 @@ def run_or_resume(
     out: str | os.PathLike[str],
     *,
     on_generation: OnGeneration | None = None,
-    on_notice: OnNotice = _warn,
+    on_notice: OnNotice = warn,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
+    caller: Caller | None = None,
 ) -> Outcome:
     """Start a run, or resume it if the folder already holds it; the same call can be repeated after any interruption.
+
+    Args:
+        caller: as for `run`.
 
     Raises:
         ConfigError: the folder's run has other constants than `config` (all are listed). Otherwise as `run`.
@@ -173,9 +180,16 @@ def run_or_resume(
     wanted = config if isinstance(config, RunConfig) else load_config(config, new=not begun)
     if not begun:
         return run(
-            wanted, out, on_generation=on_generation, on_notice=on_notice, progress=progress, on_compile=on_compile
+            wanted,
+            out,
+            on_generation=on_generation,
+            on_notice=on_notice,
+            progress=progress,
+            on_compile=on_compile,
+            caller=caller,
         )
-    return _go_on(Path(out), lambda store: wanted, _Listener(on_generation, on_notice, on_compile, progress))
+    listener = _Listener(on_generation, on_notice, on_compile, progress, caller=caller)
+    return _go_on(Path(out), lambda store: wanted, listener)
 
 
 def _go_on(
@@ -231,7 +245,8 @@ def _session(
             return config, Outcome(open_run(folder), reason)
         with listener.shown(folder) as on_generation:
             until = targets.until_due(on_generation, folder, config)
-            return config, work(config, store, until, listener.on_notice, listener.on_compile, strict=strict)
+            told = listener.on_notice, listener.on_compile
+            return config, work(config, store, until, *told, strict=strict, caller=listener.caller)
 
 
 def fork(
@@ -241,7 +256,7 @@ def fork(
     generation: int | None = None,
     out: str | os.PathLike[str] | None = None,
     on_generation: OnGeneration | None = None,
-    on_notice: OnNotice = _warn,
+    on_notice: OnNotice = warn,
     progress: bool = True,
     on_compile: OnNotice = _ignore,
     hook: Callable[[str], None] = no_hook,
@@ -332,7 +347,7 @@ def _create_and_work(
         begun = store.generation
         try:
             until = targets.until_due(on_generation, folder, config)
-            outcome = work(config, store, until, listener.on_notice, listener.on_compile)
+            outcome = work(config, store, until, listener.on_notice, listener.on_compile, caller=listener.caller)
         except StartError as error:
             if store.generation != begun:
                 raise  # of something else that the caller started in a callback: this run has computed generations

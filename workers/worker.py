@@ -43,7 +43,7 @@ POLICY_CHUNKS_TOGETHER = 8
 """Most policy chunks in one call of the kernel: a call costs little then, and the copies of the weights stay small."""
 
 
-class _Kind(NamedTuple):
+class Kind(NamedTuple):
     """How the chunks of one kind are computed; a group of them runs together."""
 
     function: Compilable
@@ -61,19 +61,17 @@ def make_worker(spec: WorkerSpec) -> Compilable:
     names the chunk that raised it. Gradient blocks are added as far as the work item has the neighbours.
     """
     backend = BACKENDS[spec.rollout]
-    kinds = _kinds(spec, backend)
+    kinds = kinds_of(spec, backend)
     groups = partial(_groups, together=backend.takes_chunks_together)
 
-    def compile_group(kind: _Kind, work: Sequence[Work]) -> list[ChunkResult]:
+    def compile_group(kind: Kind, work: Sequence[Work]) -> list[ChunkResult]:
         kind.function.compile(*kind.arguments(work))
         return []
 
-    def run_group(kind: _Kind, work: Sequence[Work]) -> list[ChunkResult]:
+    def run_group(kind: Kind, work: Sequence[Work]) -> list[ChunkResult]:
         return kind.results(work, kind.function(*kind.arguments(work)))
 
-    def named(
-        function: Callable[[_Kind, Sequence[Work]], list[ChunkResult]], work: Sequence[Work]
-    ) -> list[ChunkResult]:
+    def named(function: Callable[[Kind, Sequence[Work]], list[ChunkResult]], work: Sequence[Work]) -> list[ChunkResult]:
         try:
             return function(kinds[type(work[0][1])], work)
         except BaseException as error:
@@ -88,7 +86,7 @@ def make_worker(spec: WorkerSpec) -> Compilable:
     return Compilable(run, lambda work: [named(compile_group, group) for group in groups(work)])
 
 
-def _kinds(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], _Kind]:
+def kinds_of(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], Kind]:
     """How a run's chunks of each kind are computed."""
     functions = backend.chunk_functions(spec)
     gradient_sum = functions.gradient_sum
@@ -141,10 +139,10 @@ def _kinds(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], _Kind
         return [GradientResult(np.array(sum_D)) for sum_D in sums_C_D]
 
     return {
-        TrainingChunk: _Kind(functions.training, training_arguments, training_results),
-        EvaluationChunk: _Kind(functions.evaluation, evaluation_arguments, evaluation_results),
-        GradientChunk: _Kind(Compilable(gradient_sums, compile_gradient_sum), gradient_arguments, gradient_results),
-        PolicyChunk: _Kind(functions.policies, partial(_policy_arguments, spec, backend.made), _policy_results),
+        TrainingChunk: Kind(functions.training, training_arguments, training_results),
+        EvaluationChunk: Kind(functions.evaluation, evaluation_arguments, evaluation_results),
+        GradientChunk: Kind(Compilable(gradient_sums, compile_gradient_sum), gradient_arguments, gradient_results),
+        PolicyChunk: Kind(functions.policies, partial(_policy_arguments, spec, backend.made), _policy_results),
     }
 
 

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from pydantic import Field, PrivateAttr, SerializeAsAny
 
+from es_service.config.caller import CALLER
 from es_service.config.compute import COMPUTE_CONSTANTS, ComputeConfig
 from es_service.config.fields import (
     BoundPairs,
@@ -29,6 +30,7 @@ from es_service.config.fields import (
 )
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.yaml_text import dump_yaml
+from es_service.errors import ConfigError
 from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.policy_spec import Activation, Output
 from es_service.protocol.sources import worker_sources
@@ -209,12 +211,24 @@ def policy_spec(config: RunConfig, task: TaskSpec) -> PolicySpec:
     return PolicySpec(widths, policy.activation, policy.output, policy.bias, policy.memory or 0)
 
 
-def worker_spec(config: RunConfig, task: TaskSpec, outputs: tuple[str, ...] = ()) -> WorkerSpec:
+def worker_spec(
+    config: RunConfig, task: TaskSpec, outputs: tuple[str, ...] = (), *, asks_caller: bool = False
+) -> WorkerSpec:
     """The message that every worker of the run receives once, when it starts.
 
     Args:
         outputs: see `WorkerSpec.outputs`; those that the search reads are added.
+        asks_caller: whether the caller computes the episodes of a task that has none of its own.
+
+    Raises ConfigError if the task has no episodes of its own, and the caller is not asked for them.
     """
+    if task.kind == CALLER and not asks_caller:
+        raise ConfigError(
+            "the episodes of this run are those of the program that asks it (es_service.ask_tell), so the service can "
+            "compute none",
+            field="task.environment",
+            value=CALLER,
+        )
     settings, policy, compute, search = config.task, config.policy, config.compute, config.search
     return WorkerSpec(
         seed=config.seed,

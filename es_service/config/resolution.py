@@ -161,14 +161,16 @@ def resolve(
 def values_of_task(task: TaskSpec) -> dict[str, Any]:
     """Values that a task fills in where the config leaves them out: an output that chooses one of several actions; of a
     function, which has no policy, a policy whose parameters are those of the function."""
-    if task.kind == "function":
+    if task.parameters is not None:
         return WITHOUT_POLICY | ({"search.evaluation_episodes": 1} if task.deterministic else {})
     return {"policy.output": DISCRETE_OUTPUTS[0]} if task.discrete_actions else {}
 
 
 def is_idle(key: str, task: TaskSpec) -> bool:
     """Whether a key has no effect with a task, which has no policy."""
-    return task.kind == "function" and (key.startswith("policy.") or key in ("task.episode_steps", "task.descriptor"))
+    return task.parameters is not None and (
+        key.startswith("policy.") or key in ("task.episode_steps", "task.descriptor")
+    )
 
 
 def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:

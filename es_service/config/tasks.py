@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any
 
+from es_service.config.caller import CALLER, caller_task
 from es_service.config.model import RunConfig
 from es_service.config.options import TaskTable
 from es_service.config.yaml_text import show
@@ -41,6 +42,8 @@ class Tasks(TaskTable):
 
     def chosen(self, name: str, options: Mapping[str, OptionValue], descriptor: DescriptorChoice | None) -> TaskSpec:
         """Raises as a lookup."""
+        if name == CALLER:
+            return caller_task(options)
         if ":" not in name:
             return environments.SHIPPED[name]
         settings = environments.settings_of_description(name, options, descriptor)

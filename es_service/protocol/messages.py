@@ -22,9 +22,9 @@ from es_service.protocol.policy_spec import PolicySpec
 FloatArray = NDArray[np.float32]
 Bounds = tuple[tuple[float, float], ...]
 Segment = tuple[tuple[float, float], tuple[float, float]]
-TaskKind = Literal["jax", "python", "function"]
-"""What a task is made of: functions that JAX traces; Python objects with `reset` and `step`; or one function of its
-parameters, without a policy."""
+TaskKind = Literal["jax", "python", "function", "caller"]
+"""What a task is made of: functions that JAX traces; Python objects with `reset` and `step`; one function of its
+parameters, without a policy; or nothing, because whoever asks the search computes the episodes."""
 DescriptorChoice = str | tuple[int, ...]
 """Descriptor that a config chooses for a task of Python objects: a key of `info`, `module:function`, or the indices of
 numbers of the last observation."""

@@ -19,6 +19,7 @@ IN_WORDS: Mapping[TaskKind, str] = {
     "jax": "tasks in JAX",
     "python": "tasks of Python objects",
     "function": "functions of parameters",
+    "caller": "episodes of the caller's own",
 }
 """Kind of a task -> what the tasks of this kind are called."""
 

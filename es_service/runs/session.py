@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.parts import moments_from_arrays
 from es_service.protocol.machine import platform_info
-from es_service.protocol.messages import FloatArray, Moments
+from es_service.protocol.messages import FloatArray, Moments, WorkerSpec
 from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
@@ -55,6 +55,10 @@ OnNotice = Callable[[str], None]
 """Called with each notice for the user, such as a repair of the run or a lost worker."""
 
 
+Caller = Callable[[WorkerSpec], AbstractContextManager[Any]]
+"""Makes an `Engine` that has the caller compute the episodes of a task that has none of its own."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """How a session of a run ended."""
@@ -72,12 +76,14 @@ def work(
     on_compile: OnNotice,
     *,
     strict: bool = False,
+    caller: Caller | None = None,
 ) -> Outcome:
     """Run generations until the budget is spent or `on_generation` returns a `Stop`.
 
     Args:
         on_compile: called when workers compile and nothing has been heard of the run for some time.
         strict: whether workers on another platform than the run's are an error.
+        caller: what computes the episodes instead of the configured engine, if the task has none of its own.
     """
     task = task_of(config)
     store.keep_every = config.store.keep_every
@@ -121,7 +127,7 @@ def work(
     code = code_of(config)
     tell_of_other_code(store, code, tell)
     in_generation(0 if store.generation is None else store.generation + 1)
-    compute, spec = config.compute, worker_spec(config, task)
+    compute, spec = config.compute, worker_spec(config, task, asks_caller=caller is not None)
     _LOG.info("working on %s: engine %s, rollout %s", store.folder, compute.engine, compute.rollout)
     _LOG.info(parallel_sentence(config))
     with (
@@ -135,7 +141,9 @@ def work(
             tell_wait,
             tell,
             tell_compiling,
-        ) as engine,
+        )
+        if caller is None
+        else caller(spec) as engine,
     ):
 
         def after_generation(row: Mapping[str, Any]) -> object:

@@ -18,6 +18,7 @@ from workers.rollouts import BACKENDS
 ROOT = Path(__file__).parents[2]
 LAYERS = (
     "cli",
+    "asking",
     "api",
     "watch",
     "gymnasium",
@@ -39,6 +40,7 @@ LOWEST = ("protocol", "errors", "logs")
 ENTRIES = {"es_service.__init__": "api", "es_service.__main__": "cli"}
 """Module outside the layers -> the layer whose rules it follows."""
 JOINERS = {
+    "es_service.asking",
     "es_service.gymnasium",
     "es_service.environments.single",
     "es_service.environments.spaces",
@@ -199,6 +201,7 @@ def test_every_file_of_es_service_is_in_a_layer():
         "__init__.py",
         "__main__.py",
         "api.py",
+        "asking.py",
         "errors.py",
         "gymnasium.py",
         "logs.py",

@@ -7,13 +7,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, SIGNS, TaskSpec, WorkerSpec
+from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, TaskSpec, WorkerSpec
 from es_service.protocol.noise import (
     NORMAL_STD,
     Domain,
     evaluation_reset_keys,
     normal_integers,
-    normals,
     stream_keys,
 )
 from es_service.protocol.options import OptionValue
@@ -23,6 +22,7 @@ from workers.compilable import Compilable
 from workers.environments import is_function_task, make_function_task, make_host_task
 from workers.host.episodes import Lanes, Watched, known_from_the_start, run_episodes
 from workers.host.functions import run_calls
+from workers.host.noise import gradient_summer, members
 from workers.host.policies import LanePolicies
 from workers.host.seeds import seed_of
 from workers.rollouts.backend import ChunkFunctions, Episodes, RolloutBackend
@@ -50,9 +50,7 @@ class Host(RolloutBackend):
         run, count = make_runner(spec), spec.policy.parameters
 
         def training(centre_D, unit, mean_O, std_O, noise_keys_P, reset_keys_P_S_E, action_keys_P_S_E):
-            noise_P_D = _noise(noise_keys_P, count)
-            parameters_P_S_D = centre_D + np.multiply.outer(noise_P_D, np.float32(unit) * _SIGNS_S).swapaxes(1, 2)
-            parameters_L_D = parameters_P_S_D.reshape(-1, count)
+            parameters_L_D = members(centre_D, unit, noise_keys_P).reshape(-1, count)
             keys_E_L = (_by_episode(keys) for keys in (reset_keys_P_S_E, action_keys_P_S_E))
             by_episode = [run(parameters_L_D, mean_O, std_O, *keys) for keys in zip(*keys_E_L, strict=True)]
             return _stacked(by_episode).map(lambda array: array.reshape(len(noise_keys_P), 2, *array.shape[1:]))
@@ -63,13 +61,7 @@ class Host(RolloutBackend):
         def policies(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
             return run(np.concatenate(parameters_G_N_D)[policy_L], mean_L_O, std_L_O, reset_keys_L)
 
-        def gradient_sum(weights_P, noise_keys_P):
-            sum_D = np.zeros(count, np.float32)
-            for weight, key in zip(weights_P, noise_keys_P, strict=True):
-                sum_D += weight * _noise(key, count)
-            return sum_D * np.float32(1.0 / NORMAL_STD)
-
-        functions = (training, evaluation, policies, gradient_sum)
+        functions = (training, evaluation, policies, gradient_summer(count))
         return ChunkFunctions(*(Compilable(function, lambda *_: None) for function in functions))
 
     def record(self, spec: WorkerSpec, requests: Sequence[RecordRequest]) -> Recordings:
@@ -148,16 +140,6 @@ def make_runner(spec: WorkerSpec) -> Runner:
         return run_episodes(*given, training=training, runs_L=runs_L, watched=watched)
 
     return run
-
-
-_SIGNS_S = np.asarray(SIGNS, np.float32)
-
-
-def _noise(keys: np.ndarray, parameters: int) -> np.ndarray:
-    """`normal_integers` of streams at all coordinates, as float32 [..., D]."""
-    noise = normals(keys, parameters)
-    noise *= np.float32(NORMAL_STD)
-    return np.rint(noise, out=noise)
 
 
 def _by_episode(keys_P_S_E_4: np.ndarray) -> np.ndarray:

@@ -1,0 +1,269 @@
+"""Ask and tell: our method, map, store and reports, and the caller's episodes. The mirror image of `evaluator`.
+
+The run goes on in a thread of its own, in which the driver waits for the caller wherever it would otherwise wait for
+workers. Gradients are computed in that thread, since they need no episodes.
+
+Axes: N rows, D policy parameters, O observation, A action, B descriptor dimensions.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from queue import Queue
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from es_service.api import run_or_resume, warn
+from es_service.config.caller import CALLER
+from es_service.config.loading import Source
+from es_service.config.model import RunConfig
+from es_service.config.tasks import task_of
+from es_service.errors import ConfigError, EvaluationError
+from es_service.protocol.evaluator import DispatchCounts
+from es_service.protocol.messages import ChunkResult, FloatArray, GradientChunk, Moments, Work, WorkerSpec
+from es_service.runs.checked_config import load_config
+from es_service.runs.session import OnNotice, Outcome
+from es_service.runs.view import Run, open_run
+from es_service.store.folder import holds_run
+from workers.asking import Rows, Told, gradients, results_of, rows_of
+from workers.host.policies import LanePolicies
+
+
+class _Closed(BaseException):
+    """The caller has left the block; raised in the thread of the run."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Episodes that the caller is to compute, one for each row."""
+
+    generation: int
+    """Generation that they belong to. Most have two asks: members of populations, and then the new centres."""
+    parameters: FloatArray
+    """[N, D]: the policies, or the parameters of what has no policy; members of populations have their noise."""
+    observation_mean: FloatArray
+    observation_std: FloatArray
+    """[N, O]: statistics with which each policy's observations are normalised; 0 and 1 if there are none."""
+    seed: NDArray[np.int64]
+    """[N]: seed of each episode, from 0 to 2**31 - 1. Members of a pair share it unless the config says otherwise."""
+    trains: NDArray[np.bool_]
+    """[N]: whether it is an episode of a member, whose observations update the statistics."""
+    _rows: Rows
+    _spec: WorkerSpec
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def act(self, observation: ArrayLike, step: int) -> FloatArray:
+        """Actions [N, A] of the policies, each for its own observation, with the action noise of those that train.
+
+        Args:
+            observation: [N, O], neither normalised nor clipped.
+            step: number of the step in its episode, from 0; call it for each step in turn, so that a memory goes on.
+        """
+        seen_N_O = np.asarray(observation, np.float32)
+        quiet, noisy = self._policies
+        actions = quiet(seen_N_O, step) if quiet is not None else None
+        if noisy is None:
+            assert actions is not None
+            return actions
+        with_noise = noisy(seen_N_O, step)
+        return with_noise if actions is None else np.where(self.trains[:, None], with_noise, actions)
+
+    @cached_property
+    def _policies(self) -> tuple[LanePolicies | None, LanePolicies | None]:
+        """Without and with noise, as far as a row needs them."""
+        arrays = self._spec, self.parameters, self.observation_mean, self.observation_std
+        return (
+            None if self.trains.all() else LanePolicies(*arrays),
+            LanePolicies(*arrays, self._rows.action_keys_N_4) if self.trains.any() else None,
+        )
+
+
+class AskTell:
+    """A run whose episodes the caller computes; `ask_tell` makes one. To be used from one thread."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.outcome: Outcome | None = None
+        """How the run ended; None while it goes on."""
+        self._from_run: Queue[Asked | Outcome | BaseException] = Queue()
+        self._to_run: Queue[Told | None] = Queue()
+        self._asked: Asked | None = None
+        self._dimensions = 0
+
+    @property
+    def run(self) -> Run:
+        """The run as it is stored, with what `tell` has told."""
+        return open_run(self.folder)
+
+    def ask(self) -> Asked | None:
+        """What is to be computed next; the same until it is told; None once the budget is spent.
+
+        Raises what `run` raises, if the run cannot continue.
+        """
+        if self._asked is None and self.outcome is None:
+            self._receive()
+        return self._asked
+
+    def tell(
+        self,
+        fitness: ArrayLike,
+        descriptor: ArrayLike | None = None,
+        *,
+        valid: ArrayLike | None = None,
+        steps: ArrayLike | None = None,
+        moments: tuple[float, ArrayLike, ArrayLike] | None = None,
+    ) -> None:
+        """Tell the results of what was asked, in the order of its rows; when it returns, a generation that is complete
+        has been committed.
+
+        Args:
+            fitness: [N], maximised: the return of each episode. NaN: the episode is invalid.
+            descriptor: [N, B]; None: the first B parameters of each row.
+            valid: [N] of bools, false for episodes that failed.
+            steps: [N], environment steps of each; None: 1 each.
+            moments: (count, mean [O], sum of squared deviations [O]) of all observations in the rows that train, for
+                the statistics with which observations are normalised; None: they stay.
+
+        Raises:
+            ConfigError: an argument is wrong; `field` names it. Otherwise as `ask`.
+        """
+        asked = self.ask()
+        if asked is None:
+            raise EvaluationError("the run has ended, so nothing is asked; resume it with a larger budget")
+        count, size = len(asked), asked.observation_mean.shape[1]
+        fitness_N = _array("fitness", fitness, (count,)).astype(np.float32)
+        is_valid_N = np.ones(count, bool) if valid is None else _array("valid", valid, (count,)).astype(bool)
+        fitness_N = np.where(is_valid_N, fitness_N, np.float32(np.nan))
+        if descriptor is None:
+            descriptor = asked.parameters[:, : self._dimensions]
+        descriptor_N_B = _array("descriptor", descriptor, (count, self._dimensions)).astype(np.float32)
+        steps_N = np.ones(count, np.int32) if steps is None else _array("steps", steps, (count,)).astype(np.int32)
+        if (steps_N < 1).any():
+            raise ConfigError(f"steps has {steps_N.min()}; must be at least 1", field="steps", allowed="at least 1")
+        found = Moments(0.0, np.zeros(size), np.zeros(size))
+        if moments is not None:
+            mean_O, m2_O = (_array("moments", one, (size,)).astype(np.float64) for one in moments[1:])
+            found = Moments(float(moments[0]), mean_O, m2_O)
+        self._asked = None
+        self._to_run.put(Told(fitness_N, descriptor_N_B, steps_N, found))
+        self._receive()
+
+    def _receive(self) -> None:
+        """Wait until the run asks, or ends."""
+        match self._from_run.get():
+            case Asked() as asked:
+                self._asked = asked
+            case Outcome() as outcome:
+                self.outcome = outcome
+            case BaseException() as error:
+                raise error
+
+
+class _CallersEpisodes:
+    """Engine whose worker is the caller."""
+
+    platforms: frozenset[str] = frozenset()
+    counts = DispatchCounts(workers=1)
+
+    def __init__(self, spec: WorkerSpec, between: AskTell) -> None:
+        self._spec, self._between = spec, between
+
+    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
+        """Ask the caller; gradients are computed here."""
+        if not work:
+            return []
+        if isinstance(work[0][1], GradientChunk):
+            return gradients(self._spec, work)
+        rows, between = rows_of(self._spec, work), self._between
+        shown = rows.parameters_N_D, rows.mean_N_O, rows.std_N_O, rows.seed_N, rows.is_noisy_N
+        between._from_run.put(Asked(work[0][1].generation, *shown, rows, self._spec))
+        if (told := between._to_run.get()) is None:
+            raise _Closed
+        return results_of(self._spec, work, told)
+
+    def wait_for_place(self) -> None:
+        """The caller is there."""
+
+    def last_loss(self, what: str = "") -> str:
+        """No worker is ever lost."""
+        return what
+
+
+@contextmanager
+def ask_tell(
+    config: RunConfig | Source, out: str | os.PathLike[str], *, on_notice: OnNotice = warn
+) -> Iterator[AskTell]:
+    """Begin or resume a run whose episodes the caller computes.
+
+        with ask_tell("my_config.yaml", "runs/mine") as search:
+            while (asked := search.ask()) is not None:
+                fitness, descriptor = simulate(asked.parameters)      # arrays [N] and [N, B]
+                search.tell(fitness, descriptor)
+
+    The task of the config is `caller`. Its options are either `parameters`, the number of parameters, or
+    `observation_size` and `action_size` of a policy, and `descriptor_size`. If the block is left before the end, the
+    call goes on from the last committed generation when it is made again, and asks the same; it ends with the same bits
+    if the caller's numbers are the same. `resume`, `evaluate`, `verify` and replays of the run say that its episodes
+    are the caller's; `status`, `report` and `export` know it like any other.
+
+    Args:
+        config: a RunConfig, or what `load_config` accepts.
+        out: folder of the run; one that holds this run is resumed.
+        on_notice: as for `run`.
+
+    Raises:
+        ConfigError: the config is wrong, its task is not `caller`, or the folder's run has other constants.
+    """
+    folder = Path(out)
+    wanted = config if isinstance(config, RunConfig) else load_config(config, new=not holds_run(folder))
+    if wanted.task.environment != CALLER:
+        raise ConfigError(
+            f"task.environment is {wanted.task.environment}; must be {CALLER}, since the caller computes the episodes",
+            field="task.environment",
+            value=wanted.task.environment,
+            allowed=CALLER,
+        )
+    search = AskTell(folder)
+    search._dimensions = len(task_of(wanted).descriptor_names)
+
+    @contextmanager
+    def caller(spec: WorkerSpec) -> Iterator[Any]:
+        yield _CallersEpisodes(spec, search)
+
+    def work() -> None:
+        try:
+            outcome = run_or_resume(wanted, folder, on_notice=on_notice, progress=False, caller=caller)
+            search._from_run.put(outcome)
+        except BaseException as error:  # also _Closed; the caller's thread raises it
+            search._from_run.put(error)
+
+    thread = threading.Thread(target=work, name=f"run in {folder}", daemon=True)
+    thread.start()
+    try:
+        yield search
+    finally:
+        search._to_run.put(None)
+        thread.join()
+
+
+def _array(name: str, given: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """An argument as an array of a shape. Raises ConfigError if it is none."""
+    array = np.asarray(given)
+    if array.shape != shape or array.dtype.kind not in "fiub":
+        raise ConfigError(
+            f"{name} has the shape {array.shape} and the type {array.dtype}; must be numbers of shape {shape}",
+            field=name,
+            value=array.shape,
+            allowed=f"numbers of shape {shape}",
+        )
+    return array

@@ -1,0 +1,184 @@
+"""Ask and tell: the bits of the service's own episodes, interruptions anywhere, and what other readers say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from es_service import api, ask_tell
+from es_service.asking import Asked
+from es_service.cli.main import app
+from es_service.errors import ConfigError, EvaluationError
+from es_service.store.digest import digest_parts
+from tests.examples import late_answers, own_loop
+from tests.workers.host_tasks import CornerMaze
+from workers.environments import make_host_task
+
+PARAMETERS = {"environment": "caller", "options": {"parameters": 4}}
+METHODS = ("es", "nsra_es", "me_es", "memes", "map_elites", "ars")
+
+
+def bowl(parameters):
+    return -float(((parameters - 0.5) ** 2).sum()), parameters[:2]
+
+
+bowl.parameters = dict.fromkeys("abcd")
+bowl.descriptor_names, bowl.descriptor_bounds = ("d0", "d1"), ((-1.0, 1.0), (-1.0, 1.0))
+
+
+def config_of(method="me_es", task=PARAMETERS, **sections):
+    small = {"batch": 12} if method == "map_elites" else {"pairs": 8, "sigma": 0.2}
+    return {
+        "task": task,
+        "search": {"algorithm": method, "evaluation_episodes": 2, **small},
+        "map": {"bounds": [[-1, 1], [-1, 1]], "cells": [4, 4]},
+        "budget": {"generations": 6},
+        "compute": {"engine": "inline", "workers": 1},
+    } | sections
+
+
+def told_of(asked: Asked):
+    found = [bowl(row.astype(np.float64)) for row in asked.parameters]
+    return np.array([one for one, _ in found]), np.array([place for _, place in found])
+
+
+def finished(config, folder):
+    with ask_tell(config, folder) as search:
+        while (asked := search.ask()) is not None:
+            search.tell(*told_of(asked))
+        assert search.outcome is not None
+        assert search.ask() is None
+        return search.run
+
+
+@pytest.mark.usefixtures("workers_here")
+@pytest.mark.parametrize("method", METHODS)
+def test_it_has_the_bits_of_a_function_that_workers_call(method, tmp_path):
+    ours = finished(config_of(method), tmp_path / "asked")
+    name = "function:tests.es_service.test_asking:bowl"
+    theirs = api.run(config_of(method, task={"environment": name}), tmp_path / "called").run
+    for column in ("best_fitness", "centre_fitness_mean", "update_norm", "qd_score", "env_steps"):
+        assert ours.history[column].equals(theirs.history[column]), column
+    assert np.array_equal(ours.policy("best").parameters_D, theirs.policy("best").parameters_D)
+    assert ours.map.equals(theirs.map)
+
+
+@pytest.mark.usefixtures("workers_here")
+@pytest.mark.parametrize("policy", [{}, {"memory": 3}, {"output": "gaussian", "action_noise": 0.0}], ids=str)
+def test_policies_act_as_in_the_service_s_own_episodes(policy, tmp_path):
+    sections = {"policy": {"hidden": [4], "observation_normalization": False, **policy}, "budget": {"generations": 3}}
+    name, steps = "python:tests.workers.host_tasks:CornerMaze", 12
+    sizes = {"observation_size": 2, "action_size": 2, "episode_steps": steps}
+    made = make_host_task(name, {})
+    with ask_tell(
+        config_of(task={"environment": "caller", "options": sizes}, **sections), tmp_path / "asked"
+    ) as search:
+        while (asked := search.ask()) is not None:
+            mazes = [CornerMaze() for _ in range(len(asked))]
+            seen = np.array([maze.reset(int(seed)) for maze, seed in zip(mazes, asked.seed, strict=True)])
+            returns = np.zeros(len(asked))
+            for step in range(steps):
+                taken = [maze.step(one) for maze, one in zip(mazes, made.actions(asked.act(seen, step)), strict=True)]
+                seen = np.array([place for place, *_ in taken])
+                returns += [reward for _, reward, _ in taken]
+            search.tell(returns, [maze.descriptor() for maze in mazes], steps=np.full(len(asked), steps))
+        ours = search.run
+    theirs = api.run(config_of(task={"environment": name, "episode_steps": steps}, **sections), tmp_path / "run").run
+    for column in ("best_fitness", "centre_fitness_mean", "update_norm", "env_steps"):
+        assert ours.history[column].equals(theirs.history[column]), column
+
+
+def test_left_anywhere_it_asks_the_same_again_and_ends_with_the_same_bits(tmp_path):
+    whole, folder, seen = finished(config_of(), tmp_path / "whole"), tmp_path / "left", {}
+    for leave_after in (0, 1, 2, 3, 2, 1, 4, 99):
+        with ask_tell(config_of(), folder) as search:
+            for number in range(leave_after + 1):
+                if (asked := search.ask()) is None or number == leave_after:
+                    break
+                key = asked.generation, len(asked), bool(asked.trains.any())
+                arrays = asked.parameters.tobytes(), asked.seed.tobytes()
+                assert seen.setdefault(key, arrays) == arrays
+                search.tell(*told_of(asked))
+    assert search.outcome is not None
+    assert digest_parts(folder) == digest_parts(whole.folder)
+
+
+def test_observations_that_are_told_normalise_later_ones(tmp_path):
+    sizes = {"observation_size": 2, "action_size": 1, "descriptor_size": 1}
+    config = config_of("es", {"environment": "caller", "options": sizes}, map={"bounds": [[-1, 1]], "cells": [4]})
+    with ask_tell(config, tmp_path / "run") as search:
+        while (asked := search.ask()) is not None and asked.generation < 3:
+            count = len(asked)
+            expected = ([0, 0], [1, 1]) if asked.generation < 2 else ([3, -1], [2, 0.5])
+            np.testing.assert_allclose(asked.observation_mean, [expected[0]] * count, rtol=1e-4)
+            np.testing.assert_allclose(asked.observation_std, [expected[1]] * count, rtol=1e-4)
+            moments = (1e8, [3.0, -1.0], [4e8, 0.25e8]) if asked.trains.any() else None
+            search.tell(np.arange(count), np.zeros((count, 1)), moments=moments)
+
+
+def test_rows_that_are_not_valid_are_invalid_members(tmp_path):
+    with ask_tell(config_of("es"), tmp_path / "run") as search:
+        while (asked := search.ask()) is not None and asked.generation < 2:
+            fitness, place = told_of(asked)
+            if asked.trains.any():
+                fitness[4] = np.nan
+            search.tell(fitness, place, valid=~asked.trains | (np.arange(len(asked)) != 3))
+        assert search.run.history["invalid_members"].tolist()[-1] == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "field"),
+    [
+        ({"fitness": [1.0]}, "fitness"),
+        ({"fitness": ["a", "b"]}, "fitness"),
+        ({"fitness": np.zeros(2), "descriptor": np.zeros((2, 3))}, "descriptor"),
+        ({"fitness": np.zeros(2), "steps": [0, 1]}, "steps"),
+        ({"fitness": np.zeros(2), "moments": (1.0, [0.0, 1.0], [0.0])}, "moments"),
+    ],
+)
+def test_a_wrong_argument_is_named_and_the_next_call_works(arguments, field, tmp_path):
+    with ask_tell(config_of("es"), tmp_path / "run") as search:
+        with pytest.raises(ConfigError) as caught:
+            search.tell(**arguments)
+        assert caught.value.field == field
+        asked = search.ask()
+        assert asked is not None
+        assert len(asked) == 2
+        search.tell(*told_of(asked))
+        assert search.run.generation == 0
+
+
+def test_what_is_no_task_of_the_caller_is_refused_and_so_is_telling_after_the_end(tmp_path):
+    with pytest.raises(ConfigError, match=r"task\.environment is point_maze; must be caller"):
+        ask_tell(config_of(task={"environment": "point_maze"}), tmp_path / "run").__enter__()
+    with ask_tell(config_of("es", budget={"generations": 1}), tmp_path / "run") as search:
+        while (asked := search.ask()) is not None:
+            search.tell(*told_of(asked))
+        with pytest.raises(EvaluationError, match="the run has ended, so nothing is asked"):
+            search.tell([0.0])
+
+
+def test_readers_know_the_run_and_whoever_would_compute_episodes_says_whose_they_are(tmp_path):
+    run = finished(config_of(), tmp_path / "run")
+    for words in (["status"], ["report"], ["digest"], ["export", "--to", "csv"]):
+        done = CliRunner().invoke(app, [words[0], str(run.folder), *words[1:]])
+        assert done.exit_code == 0, done.output
+    again = (
+        ["resume", "--set", "budget.generations=9"],
+        ["evaluate"],
+        ["evaluate", "--certify"],
+        ["verify"],
+        ["polish"],
+    )
+    for words in again:
+        done = CliRunner().invoke(app, [words[0], str(run.folder), *words[1:]])
+        assert done.exit_code, words
+        said = " ".join(str(done.exception or done.output).split())
+        assert "the episodes of this run are those of the program that asks it" in said, (words, said)
+
+
+@pytest.mark.slow
+def test_the_examples_are_what_they_say(tmp_path):
+    assert len(late_answers.search(tmp_path / "late").map) > 8
+    assert np.isfinite(own_loop.search(tmp_path / "loop").history["best_fitness"]).all()

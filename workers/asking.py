@@ -1,0 +1,174 @@
+"""What a caller is asked to compute: the episodes of chunks as rows, and results of the chunks from what it tells.
+
+Axes: N rows, D policy parameters, O observation, B descriptor dimensions, T points of a trace.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.gradient_tree import with_neighbours_added
+from es_service.protocol.messages import (
+    TRACE_POINTS,
+    ChunkResult,
+    EpisodesResult,
+    EvaluationChunk,
+    FloatArray,
+    GradientChunk,
+    Moments,
+    TrainingChunk,
+    Work,
+    WorkerSpec,
+)
+from es_service.protocol.noise import KEY_WORDS
+from workers.compilable import Compilable
+from workers.host.noise import gradient_summer, members
+from workers.host.seeds import seed_of
+from workers.rollouts.asked import Asked
+from workers.rollouts.backend import ChunkFunctions, Episodes
+from workers.worker import Kind, kinds_of
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Episodes to compute, one for each row; a member that has several episodes has as many rows."""
+
+    parameters_N_D: FloatArray
+    mean_N_O: FloatArray
+    std_N_O: FloatArray
+    seed_N: NDArray[np.int64]
+    action_keys_N_4: NDArray[np.uint32]
+    """Keys of the streams of the action noise; not used by rows without noise."""
+    is_noisy_N: NDArray[np.bool_]
+    """Whether a row is an episode of training, whose actions have noise."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the caller has computed."""
+
+    fitness_N: FloatArray
+    descriptor_N_B: FloatArray
+    steps_N: NDArray[np.int32]
+    moments: Moments
+    """Of all observations of the rows with noise."""
+
+
+def gradients(spec: WorkerSpec, work: Sequence[Work]) -> list[ChunkResult]:
+    """Results of gradient chunks, which need no episodes."""
+    kind = _kinds(spec)[GradientChunk]
+    return with_neighbours_added(
+        work, [result for one in work for result in kind.results([one], kind.function(*kind.arguments([one])))]
+    )
+
+
+def rows_of(spec: WorkerSpec, work: Sequence[Work]) -> Rows:
+    """The episodes of chunks, in their order."""
+    kinds, parts = _kinds(spec), []
+    for subject, chunk in work:
+        arguments = kinds[type(chunk)].arguments([(subject, chunk)])
+        if isinstance(chunk, TrainingChunk):
+            parts.append(_members(spec, *arguments))
+        elif isinstance(chunk, EvaluationChunk):
+            centre_D, mean_O, std_O, keys_E, is_wanted_E = arguments
+            parts.append(_quiet(centre_D, mean_O, std_O, keys_E[is_wanted_E]))
+        else:
+            parameters_G_N_D, mean_L, std_L, policy_L, keys_L = arguments
+            parts.append(_quiet(np.concatenate(parameters_G_N_D)[policy_L], mean_L, std_L, keys_L))
+    return Rows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def results_of(spec: WorkerSpec, work: Sequence[Work], told: Told) -> list[ChunkResult]:
+    """Results of the chunks of which `rows_of` has made rows."""
+    kinds, found, first = _kinds(spec), [], 0
+    for subject, chunk in work:
+        arguments = kinds[type(chunk)].arguments([(subject, chunk)])
+        if isinstance(chunk, TrainingChunk):
+            is_told = np.ones(arguments[5].shape[:-1], bool)  # of the keys of resets
+        elif isinstance(chunk, EvaluationChunk):
+            is_told = arguments[4]
+        else:
+            is_told = np.ones(len(arguments[4]), bool)
+        rows = slice(first, first := first + int(is_told.sum()))
+        episodes = _episodes(spec, told, rows, is_told, isinstance(chunk, TrainingChunk))
+        found += kinds[type(chunk)].results([(subject, chunk)], episodes)
+    return _with_moments(found, told.moments)
+
+
+def _with_moments(results: list[ChunkResult], moments: Moments) -> list[ChunkResult]:
+    """The results, of which the first one with moments has all of them."""
+    for place, result in enumerate(results):
+        if isinstance(result, EpisodesResult) and result.moments is not None:
+            results[place] = replace(result, moments=moments)
+            break
+    return results
+
+
+def _members(
+    spec: WorkerSpec,
+    centre_D: Any,
+    unit: Any,
+    mean_O: Any,
+    std_O: Any,
+    noise_P: Any,
+    resets_P_S_E: Any,
+    actions_P_S_E: Any,
+) -> tuple[Any, ...]:
+    """Columns of `Rows`: all episodes of the first member, of the second, ..., from keys [P, S, E, 4]."""
+    parameters_M_D = members(centre_D, unit, noise_P).reshape(-1, spec.policy.parameters)
+    parameters_N_D = np.repeat(parameters_M_D, resets_P_S_E.shape[2], axis=0)
+    columns = _quiet(parameters_N_D, mean_O, std_O, resets_P_S_E.reshape(-1, KEY_WORDS))
+    return (*columns[:4], actions_P_S_E.reshape(-1, KEY_WORDS), np.ones(len(parameters_N_D), bool))
+
+
+def _quiet(parameters: Any, mean: Any, std: Any, keys_N_4: Any) -> tuple[Any, ...]:
+    """Columns of `Rows` without noise; what all rows share is repeated."""
+    count = len(keys_N_4)
+    shared = (np.broadcast_to(array, (count, np.shape(array)[-1])) for array in (parameters, mean, std))
+    seeds = np.array([seed_of(key) for key in keys_N_4], np.int64)
+    return (*shared, seeds, keys_N_4, np.zeros(count, bool))
+
+
+def _episodes(spec: WorkerSpec, told: Told, rows: slice, is_told: Any, training: bool) -> Episodes:
+    """What a rollout would have computed; the observations are told as moments, so that their sums are 0."""
+    descriptor = np.zeros((*is_told.shape, told.descriptor_N_B.shape[1]), np.float32)
+    fitness, steps = np.zeros(is_told.shape, np.float32), np.zeros(is_told.shape, np.int32)
+    fitness[is_told], steps[is_told], descriptor[is_told] = (
+        told.fitness_N[rows],
+        told.steps_N[rows],
+        told.descriptor_N_B[rows],
+    )
+    sums = np.zeros((*is_told.shape, spec.policy.widths[0] if training else 0), np.float32)
+    points = 0 if training else min(TRACE_POINTS, spec.episode_steps + 1)
+    return Episodes(
+        fitness=fitness,
+        returns=fitness.copy(),
+        descriptor=descriptor,
+        steps=steps,
+        goal_distance=np.full((*is_told.shape, 2), np.nan, np.float32),
+        shifted_sum_O=sums,
+        shifted_square_sum_O=sums.copy(),
+        trace_T_B=np.repeat(descriptor[..., None, :], points, axis=-2),
+        outputs={},
+        of_steps={},
+    )
+
+
+def _kinds(spec: WorkerSpec) -> dict[Any, Kind]:
+    return kinds_of(spec, _Arguments())
+
+
+class _Arguments(Asked):
+    """Functions of which only the arguments matter, and that of gradients."""
+
+    def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
+        def nothing(*_: Any) -> None:
+            return None
+
+        functions = (nothing, nothing, nothing, gradient_summer(spec.policy.parameters))
+        return ChunkFunctions(*(Compilable(function, nothing) for function in functions))
