@@ -37,7 +37,7 @@ LAYERS = (
 """From the user's side down."""
 LOWEST = ("protocol", "errors", "logs")
 """Layers that import nothing of the project."""
-ENTRIES = {"es_service.__init__": "api", "es_service.__main__": "cli"}
+ENTRIES = {"es_service.__init__": "asking", "es_service.__main__": "cli"}
 """Module outside the layers -> the layer whose rules it follows."""
 JOINERS = {
     "es_service.asking",
