@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import count
 
 from es_service.dispatch import events
@@ -38,6 +38,12 @@ class Costs:
     answer arrives."""
     driver_s: float
     """Time of the driver in a generation for everything else: the search and the store."""
+    chunk_message_s: Mapping[str, float] = field(default_factory=dict)
+    """Kind of chunk -> further time of the driver for each chunk of a work item but the first; 0 if it is not named."""
+
+    def item_message_s(self, kind: str, chunks: int) -> float:
+        """Time of the driver to send a work item and to receive the answer."""
+        return self.message_s[kind] + (chunks - 1) * self.chunk_message_s.get(kind, 0.0)
 
 
 @dataclass(frozen=True)
@@ -124,8 +130,8 @@ class _Cluster:
         self._state, self._costs, self._seconds_of, self._clock = state, costs, seconds_of, clock
         self._free_s = dict.fromkeys(state.up, 0.0)
         """Worker -> time at which it has finished what it was sent."""
-        self._answers: list[tuple[float, int, str, events.Result]] = []
-        """Heap of (time of arrival, number, kind of chunk, answer)."""
+        self._answers: list[tuple[float, int, float, events.Result]] = []
+        """Heap of (time of arrival, number, time of the driver to receive it, answer)."""
         self._number = count()
 
     def play(self, phase: Phase, generation: int) -> None:
@@ -146,8 +152,8 @@ class _Cluster:
 
     def _read(self) -> None:
         """Wait for the next answer and receive it."""
-        arrives_s, _, kind, answer = heapq.heappop(self._answers)
-        self.now = max(self.now, arrives_s) + self._costs.message_s[kind] / 2
+        arrives_s, _, message_s, answer = heapq.heappop(self._answers)
+        self.now = max(self.now, arrives_s) + message_s
         self._step(answer)
 
     def _step(self, event: events.Event) -> None:
@@ -158,12 +164,13 @@ class _Cluster:
         for command in commands:
             if isinstance(command, events.Assign):
                 worker, item = command.worker, self._state.items[command.item_id].item
-                self.now += self._costs.message_s[item.kind] / 2
+                message_s = self._costs.item_message_s(item.kind, item.size) / 2
+                self.now += message_s
                 begins_s = max(self._free_s[worker], self.now + self._costs.way_s[item.kind])
                 end_s = self._free_s[worker] = begins_s + self._seconds_of(worker, item.kind, item.size)
                 answer = events.Result(worker, item.id, command.attempt)
                 arrives_s = end_s + self._costs.way_s[item.kind]
-                heapq.heappush(self._answers, (arrives_s, next(self._number), item.kind, answer))
+                heapq.heappush(self._answers, (arrives_s, next(self._number), message_s, answer))
 
 
 def _judge(phases: Sequence[Phase], costs: Costs, workers: int, taken: Mapping[str, float]) -> Prediction:

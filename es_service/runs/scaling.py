@@ -17,15 +17,16 @@ import numpy as np
 
 from es_service.config.model import RunConfig, worker_spec
 from es_service.config.parallel import chunks_of_phases
-from es_service.config.search import PopulationConfig
+from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.tasks import task_of
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.dispatch.ray_engine import ray_engine
 from es_service.dispatch.ray_nodes import actor_cores
-from es_service.dispatch.simulation import Costs, Phase, predict
-from es_service.errors import ConfigError
+from es_service.dispatch.simulation import NEVER_S, Costs, Phase, predict
 from es_service.loop import driver
+from es_service.loop.evaluated import policies_asked
+from es_service.loop.generation import initial_state
 from es_service.loop.history import evaluated_columns, history_columns
 from es_service.protocol.evaluator import DispatchCounts, Evaluator
 from es_service.protocol.machine import platform_text
@@ -36,12 +37,14 @@ from es_service.protocol.messages import (
     ChunkResult,
     EpisodesResult,
     GradientChunk,
+    Subject,
     TrainingChunk,
     Work,
     WorkerPlace,
     WorkerSpec,
     evaluation_chunks,
 )
+from es_service.protocol.policies import Policies, PolicyChunk, slots
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, SearchState
 from es_service.search.novelty import extended
@@ -62,34 +65,25 @@ REPLAYED, SCATTER = 64, 0.05
 """Different answers of each kind, and the standard deviation of an answer's descriptors as a share of their range."""
 UNBOUNDED = 1e3
 """In the place of a bound of the descriptor that is larger."""
-ECHO_ITEMS, SPIN_S = 100, 0.003
-"""Work items in each measurement of messages, and the time that the actor computes for one: while it does so, the
-driver falls asleep, and being woken is a part of what a message costs."""
+ECHO_ITEMS, ECHO_CHUNKS, SPIN_S = 100, 32, 0.003
+"""Work items in each measurement of messages, the chunks of one that has several, and the time that the actor computes
+for one: while it does so, the driver falls asleep, and being woken is a part of what a message costs."""
 
 
 def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int) -> Iterator[dict[str, Any]]:
     """Yield a row per number of workers: workers, seconds_per_generation, steps_per_second, efficiency, limit.
 
-    Measured are the duration of each kind of chunk on one core, with the initial policy; a generation of the driver and
-    the store with such results; and messages between the Ray engine and actors on this machine. A network makes
-    messages slower. Raises EvaluationError if Ray or the task cannot be used, ConfigError if the method asks for no
-    populations.
+    Measured are the duration of each kind of chunk on one core, with the initial policies; a generation of the driver
+    and the store with such results; and messages between the Ray engine and actors on this machine. A network makes
+    messages slower. Raises EvaluationError if Ray or the task cannot be used.
     """
-    search = config.search
-    if not isinstance(search, PopulationConfig):
-        name = search.algorithm
-        why = f"bench scaling cannot predict {name}, which has policies instead of populations"
-        raise ConfigError(why, field="search.algorithm", value=name)
-    task = task_of(config)
-    spec = worker_spec(config, task)
-    parameters = initial_parameters(spec.policy, config.policy.init, config.seed, 0)
-    zeros_O = np.zeros(task.observation_size, np.float32)
-    centres = [Centre(1, parameters, search.sigma, zeros_O, zeros_O + 1.0) for _ in range(search.populations())]
-    phases = _phases(config)
-    works = [_work(phase, centres, spec, search.evaluation_episodes) for phase in phases]
-    chunk_s, answers = _chunk_costs(spec, works)
-    message_s, way_s = _message_costs(spec, [work[0] for work in works], answers)
-    costs = Costs(chunk_s, message_s, way_s, _driver_cost(config, answers))
+    search, spec, phases = config.search, worker_spec(config, task_of(config)), _phases(config)
+    centres = _initial_centres(config, spec)
+    works = [_work(phase, centres, spec, config) for phase in phases]
+    initial = [(centres[0], chunk) for chunk in evaluation_chunks(1, search.evaluation_episodes)]
+    chunk_s, answers = _chunk_costs(spec, [*works, initial])
+    message_s, way_s, chunk_message_s = _message_costs(spec, works, answers)
+    costs = Costs(chunk_s, message_s, way_s, _driver_cost(config, answers), chunk_message_s)
     steps = _steps(search, answers)
     for count in workers:
         cores = actor_cores([cores_per_node], count, None)
@@ -103,14 +97,28 @@ def bench_scaling(config: RunConfig, workers: Sequence[int], cores_per_node: int
         }
 
 
+def _initial_centres(config: RunConfig, spec: WorkerSpec) -> list[Centre]:
+    """A centre for each population of a generation, or one."""
+    search, zeros_O = config.search, np.zeros(spec.policy.widths[0], np.float32)
+    parameters = initial_parameters(spec.policy, config.policy.init, config.seed, 0)
+    sigma = search.sigma if isinstance(search, PopulationConfig) else 0.0
+    return [Centre(1, parameters, sigma, zeros_O, zeros_O + 1.0) for _ in range(max(1, search.populations()))]
+
+
 def _phases(config: RunConfig) -> list[Phase]:
     """The chunks of a generation."""
+    if not isinstance(config.search, PopulationConfig):
+        return [Phase(name, "PolicyChunk", chunks) for name, chunks in chunks_of_phases(config).items()]
     kinds = {"rollout": "TrainingChunk", "gradient": "GradientChunk", "evaluation": "EvaluationChunk"}
     return [Phase(name, kinds[name], chunks) for name, chunks in chunks_of_phases(config).items()]
 
 
-def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec, evaluation_episodes: int) -> list[Work]:
-    """The chunks of a phase, in the order of the populations."""
+def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec, config: RunConfig) -> list[Work]:
+    """The chunks of a phase, in the order of the populations; of policies those that descend from the first ones."""
+    if phase.kind == "PolicyChunk":
+        search = _search(config)
+        asked = search.algorithm.ask(initial_state(search).search, 1)
+        return [one for policies in policies_asked(config, search.task, 1, asked) for one in policies.work]
     ids = range(phase.chunks // len(centres))
     weights_P = np.ones(spec.gradient_block_pairs, np.float32)
     if phase.name == "gradient":
@@ -120,12 +128,16 @@ def _work(phase: Phase, centres: Sequence[Centre], spec: WorkerSpec, evaluation_
     return [
         (centre, chunk)
         for ask, centre in enumerate(centres)
-        for chunk in evaluation_chunks(1, evaluation_episodes, ask=ask)
+        for chunk in evaluation_chunks(1, config.search.evaluation_episodes, ask=ask)
     ]
 
 
-def _steps(search: PopulationConfig, answers: Mapping[str, ChunkResult]) -> float:
+def _steps(search: SearchConfig, answers: Mapping[str, ChunkResult]) -> float:
     """Environment steps of a generation."""
+    if not isinstance(search, PopulationConfig):
+        answer = answers["PolicyChunk"]
+        assert isinstance(answer, EpisodesResult), "policies have episodes"
+        return search.policies() * search.evaluation_episodes * float(answer.steps.mean())
     episodes = {
         "TrainingChunk": 2 * search.pairs,  # the steps of a member are those of all of its episodes
         "EvaluationChunk": search.evaluation_episodes,
@@ -202,14 +214,16 @@ class EchoActor:
 
 
 def _message_costs(
-    spec: WorkerSpec, chunks: Sequence[Work], answers: Mapping[str, ChunkResult]
-) -> tuple[dict[str, float], dict[str, float]]:
-    """(seconds of the driver per work item, seconds of an item's way to a worker) through Ray, by kind of chunk."""
+    spec: WorkerSpec, works: Sequence[Sequence[Work]], answers: Mapping[str, ChunkResult]
+) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
+    """(seconds of the driver per work item of one chunk, seconds of an item's way to a worker, seconds of the driver
+    for each further chunk) through Ray, by kind of chunk."""
     message_s: dict[str, float] = {}
     way_s: dict[str, float] = {}
+    chunk_message_s: dict[str, float] = {}
     echo = _EchoSpec(**vars(spec), answers=dict(answers))
     with ray_engine(echo, Limits(1, item_s=0.0), actor=EchoActor) as engine:
-        for work in chunks:
+        for work in (chunks[0] for chunks in works):
             engine.evaluate([work] * ECHO_ITEMS)
             began = time.process_time()  # also of Ray's threads in this process, but not while it waits
             engine.evaluate([work] * ECHO_ITEMS)
@@ -220,7 +234,17 @@ def _message_costs(
                 engine.evaluate([work])
                 alone_s.append(time.perf_counter() - began)
             way_s[_kind(work)] = max(0.0, (statistics.median(alone_s) - SPIN_S - driver_s) / 2)
-    return message_s, way_s
+    with ray_engine(echo, Limits(1, item_s=NEVER_S), actor=EchoActor) as engine:
+        for work in works:
+            item = list(islice(cycle(work), ECHO_CHUNKS))
+            for _ in range(2):  # from now on it is known how long a chunk takes, and all of them are one item
+                engine.evaluate(item)
+            began = time.process_time()
+            for _ in range(ECHO_ITEMS):
+                engine.evaluate(item)
+            more_s = (time.process_time() - began) / ECHO_ITEMS - message_s[_kind(work[0])]
+            chunk_message_s[_kind(work[0])] = max(0.0, more_s / (ECHO_CHUNKS - 1))
+    return message_s, way_s, chunk_message_s
 
 
 class _Replay:
@@ -239,7 +263,18 @@ class _Replay:
         }
 
     def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
-        return [next(self._answers[_kind(one)]) for one in work]
+        return [_of_slots(next(self._answers[_kind(one)]), *one) for one in work]
+
+
+def _of_slots(answer: ChunkResult, subject: Subject, chunk: Chunk) -> ChunkResult:
+    """The recorded answer for a chunk of policies that may have fewer slots, and traces only of first episodes."""
+    if not (isinstance(answer, EpisodesResult) and isinstance(subject, Policies) and isinstance(chunk, PolicyChunk)):
+        return answer
+    _, episode_L = slots(subject, chunk)
+    names = "fitness", "returns", "descriptor", "steps", "goal_distance"
+    columns = {name: getattr(answer, name)[: len(episode_L)] for name in names}
+    firsts, trace_T_B = int((episode_L == 0).sum()), answer.trace_T_B
+    return replace(answer, **columns, trace_T_B=None if trace_T_B is None else trace_T_B[:firsts])
 
 
 def _moved(answer: ChunkResult, random: np.random.Generator, bounds_B_2: np.ndarray) -> ChunkResult:
@@ -266,20 +301,28 @@ def _with_past(algorithm: Algorithm, descriptor_N_B: np.ndarray) -> Algorithm:
     return replace(algorithm, tell=tell)
 
 
-def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float:
-    """Seconds of a generation in which only the driver and the store work."""
+def _search(config: RunConfig) -> driver.Search:
+    """The search of a run that begins with random centres."""
     task = task_of(config)
-    config = config.model_copy(update={"budget": config.budget.model_copy(update=_budget())})
     shape = worker_spec(config, task).policy
     centres = [initial_parameters(shape, config.policy.init, config.seed, i) for i in range(config.search.centres)]
-    random, bounds_B_2 = np.random.default_rng(0), np.clip(task.descriptor_bounds, -UNBOUNDED, UNBOUNDED)
-    past_N_B = random.uniform(*bounds_B_2.T, size=(PAST_ENTRIES, len(bounds_B_2)))
-    search = driver.Search(
+    return driver.Search(
         config=config,
-        algorithm=_with_past(ALGORITHMS[config.search.algorithm](config), past_N_B),
+        algorithm=ALGORITHMS[config.search.algorithm](config),
         initial=lambda: (centres, no_observations(task.observation_size)),
         task=task,
     )
+
+
+def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float:
+    """Seconds of a generation in which only the driver and the store work."""
+    config = config.model_copy(update={"budget": config.budget.model_copy(update=_budget())})
+    search = _search(config)
+    task = search.task
+    random, bounds_B_2 = np.random.default_rng(0), np.clip(task.descriptor_bounds, -UNBOUNDED, UNBOUNDED)
+    if isinstance(config.search, PopulationConfig):  # with policies, only the first ones enter the archive
+        past_N_B = random.uniform(*bounds_B_2.T, size=(PAST_ENTRIES, len(bounds_B_2)))
+        search = replace(search, algorithm=_with_past(search.algorithm, past_N_B))
     ends: list[float] = []
     meta = RunMeta(
         run_id="measurement",

@@ -38,6 +38,7 @@ from es_service.protocol.messages import (
     Work,
     around,
 )
+from tests.helpers import SPEC
 from tests.system.cluster import Cluster, missing
 from workers.actor import WorkerActor
 from workers.compilable import Compilable
@@ -104,8 +105,7 @@ def drive(address: str, case: Case) -> dict[str, Any]:
     workers = case.actors * case.cores
     limits = Limits(workers, late_factor=case.late_factor)
     seconds, driver_s = [], []
-    nothing: Any = None
-    with ray_engine(nothing, limits, actor=SleepingActor, address=address, cpus=case.cores) as engine:
+    with ray_engine(SPEC, limits, actor=SleepingActor, address=address, cpus=case.cores) as engine:
         for generation in range(GENERATIONS):
             training = [TrainingChunk(generation, i) for i in range(workers * case.training_chunks)]
             gradient = [GradientChunk(generation, i, weights_P) for i in range(workers)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -48,6 +49,15 @@ def test_messages_cost_the_driver_time_and_the_worker_time_on_their_way():
     behind = predicted(generation(100, 1, 1), costs(message_s=0.5, way_s=0.0), 100)
     assert behind.seconds > 50.0, "the driver sends and receives one hundred messages"
     assert behind.limit == "the driver"
+
+
+def test_each_further_chunk_of_an_item_may_cost_the_driver_time():
+    """A worker with eight cores takes eight chunks in a work item."""
+    paid = replace(costs(message_s=0.02), chunk_message_s={"TrainingChunk": 0.1})
+    phases = [Phase("rollout", "TrainingChunk", 8)]
+    assert predicted(phases, paid, 1, cores=8).seconds == pytest.approx(1.0 + 0.02 + 7 * 0.1)
+    assert predicted(phases, paid, 8).seconds == pytest.approx(1.0 + 8 * 0.02, abs=0.09)
+    assert predicted([Phase("rollout", "GradientChunk", 8)], paid, 1, cores=8).seconds == pytest.approx(0.1 + 0.02)
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,18 @@ def test_bench_scaling_predicts_a_row_per_number_of_workers():
     assert (code, "--workers 1,none: must be whole numbers" in printed) == (2, True)
 
 
+@pytest.mark.alone
+def test_bench_scaling_predicts_a_method_that_asks_for_policies():
+    """The last chunk of which is not full."""
+    config = ("point_maze_map_elites", "--set", "search.batch=72", "--set", "search.evaluation_episodes=3")
+    code, printed = es("bench", "scaling", *config, "--workers", "1,64", "--json")
+    assert code == 0, printed
+    one, many = json.loads(printed)
+    assert 0.2 < one["efficiency"] <= 1.0
+    assert many["efficiency"] < 0.3, "there are fourteen chunks"
+    assert many["steps_per_second"] > one["steps_per_second"] > 0
+
+
 @pytest.mark.slow
 def test_what_simd_cannot_compile_is_said_in_one_line_and_runs_on_xla():
     task = "tests.examples.sorting:Sorting"
