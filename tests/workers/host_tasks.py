@@ -102,3 +102,14 @@ class Fragile(Drift):
         if self.steps == 4:
             raise ValueError("the fifth step cannot be done")
         return super().step(action)
+
+
+class Forgetful(Drift):
+    """A drift whose seed is not all that it depends on: it goes on with the random numbers of the episode before."""
+
+    def reset(self, seed):
+        before = getattr(self, "random", None)
+        seen, info = super().reset(seed)
+        if before is not None:
+            self.random = before
+        return seen, info
