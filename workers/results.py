@@ -35,10 +35,10 @@ def training_result(episodes: Episodes, shift_O: Any) -> EpisodesResult:
     )
 
 
-def evaluation_result(episodes: Episodes, wanted: int) -> EpisodesResult:
-    """Results of each of the first `wanted` evaluation episodes and the trace of the first."""
-    result = _episodes_result(episodes.map(lambda array: np.asarray(array)[:wanted]))
-    return replace(result, trace_T_B=np.asarray(episodes.trace_T_B)[0].copy())
+def evaluation_result(episodes: Episodes, wanted: int, first: int = 0) -> EpisodesResult:
+    """Results of each of `wanted` evaluation episodes, from the episode `first` on, and the trace of that one."""
+    result = _episodes_result(episodes.map(lambda array: np.asarray(array)[first : first + wanted]))
+    return replace(result, trace_T_B=np.asarray(episodes.trace_T_B)[first].copy())
 
 
 def policies_result(episodes: Episodes, traced_L: Any) -> EpisodesResult:

@@ -115,12 +115,14 @@ def kinds_of(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], Kin
             centre.observation_mean_O,
             centre.observation_std_O,
             evaluation_reset_keys(spec.seed, first.generation, episodes_E, first.ask),
-            np.concatenate([np.arange(EVALUATION_EPISODES_PER_CHUNK) < chunk.episodes for chunk in chunks]),
+            np.concatenate([_wanted(chunk) for chunk in chunks]),
         )
 
     def evaluation_results(work: Sequence[tuple[Centre, EvaluationChunk]], episodes: Episodes) -> list[ChunkResult]:
         parts = _split(episodes, EVALUATION_EPISODES_PER_CHUNK)
-        return [evaluation_result(part, chunk.episodes) for part, (_, chunk) in zip(parts, work, strict=True)]
+        return [
+            evaluation_result(part, chunk.episodes, chunk.first) for part, (_, chunk) in zip(parts, work, strict=True)
+        ]
 
     def gradient_arguments(work: Sequence[tuple[Centre, GradientChunk]]) -> tuple[Any, ...]:
         _, chunks = _around_one(work)
@@ -144,6 +146,12 @@ def kinds_of(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], Kin
         GradientChunk: Kind(Compilable(gradient_sums, compile_gradient_sum), gradient_arguments, gradient_results),
         PolicyChunk: Kind(functions.policies, partial(_policy_arguments, spec, backend.made), _policy_results),
     }
+
+
+def _wanted(chunk: EvaluationChunk) -> Any:
+    """Which of a chunk's episodes are wanted."""
+    slot_E = np.arange(EVALUATION_EPISODES_PER_CHUNK)
+    return (slot_E >= chunk.first) & (slot_E < chunk.first + chunk.episodes)
 
 
 def _policy_arguments(

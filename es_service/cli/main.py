@@ -166,6 +166,9 @@ app.add_typer(bench, name="bench")
 
 @app.command()
 def doctor(
+    task: Annotated[
+        str | None, typer.Argument(metavar="[TASK]", help="Check this task instead: does it repeat, how fast is it?")
+    ] = None,
     cluster: Annotated[
         str | None,
         typer.Option("--cluster", metavar="ADDRESS", help="Check this Ray cluster instead: HOST:PORT, or auto."),
@@ -175,9 +178,15 @@ def doctor(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that this machine, or a cluster, can run searches, and show what their results depend on."""
+    """Check that this machine, a cluster or a task can run searches, and show what their results depend on."""
     from es_service.cli.doctor import examine
     from es_service.cli.doctor_cluster import examine_cluster
+    from es_service.cli.doctor_task import examine_task
+
+    if task is not None:
+        if cluster is not None or shared is not None:
+            raise ConfigError("--cluster and --shared are no checks of a task; leave them or the task out")
+        raise typer.Exit(0 if examine_task(task, as_json=as_json) else 1)
 
     if cluster is None and shared is not None:
         raise ConfigError("--shared is for a cluster; give --cluster, too")

@@ -58,6 +58,11 @@ class TaskConfig(Section):
         "the last observation. A name: this key of the last step's info. module:function: a function of the episode. "
         "null: that of the task.",
     )
+    time_limit_s: Positive | None = Field(
+        None,
+        description="Longest time in seconds of a chunk of episodes, for tasks of Python objects, or of a call of a "
+        "function, which is then invalid. null: chunks have a deadline that follows their usual time, and calls none.",
+    )
     options: Options = Field(
         default_factory=dict, description="Settings of the task, such as `start`, which the task declares."
     )
@@ -235,6 +240,7 @@ def worker_spec(
         environment=settings.environment,
         environment_options=dict(settings.options),
         descriptor=settings.descriptor,
+        time_limit_s=settings.time_limit_s,
         descriptor_size=0 if settings.descriptor is None else len(task.descriptor_names),
         policy=policy_spec(config, task),
         episode_steps=settings.episode_steps,

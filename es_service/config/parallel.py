@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from es_service.config.model import RunConfig
 from es_service.config.search import PopulationConfig
+from es_service.config.tasks import ROLLOUTS
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK
 from es_service.protocol.policies import chunks_of
 
@@ -14,13 +15,21 @@ ANY_NUMBER = 2**20
 def chunks_of_phases(config: RunConfig) -> dict[str, int]:
     """Number of chunks of each phase of a generation, all of which can be computed at the same time."""
     search, sizes, several = config.search, config.compute, config.search.populations()
+    together = _episodes_together(config)
     if not isinstance(search, PopulationConfig):
-        return {"rollout": chunks_of(search.policies(), search.evaluation_episodes)}
+        policies, episodes = search.policies(), search.evaluation_episodes
+        return {"rollout": chunks_of(policies, episodes) if together is None else -(-policies * episodes // together)}
     return {
         "rollout": several * (search.pairs // sizes.chunk_pairs),
         "gradient": several * -(-search.pairs // sizes.gradient_block_pairs),
-        "evaluation": several * -(-search.evaluation_episodes // EVALUATION_EPISODES_PER_CHUNK),
+        "evaluation": several * -(-search.evaluation_episodes // (together or EVALUATION_EPISODES_PER_CHUNK)),
     }
+
+
+def _episodes_together(config: RunConfig) -> int | None:
+    """Most episodes that are sent to a worker together; None: those of whole chunks."""
+    task, rollout = config.resolved_with, ROLLOUTS.get(config.compute.rollout)
+    return None if task is None or rollout is None else rollout.episodes_together(task)
 
 
 def chunks_at_once(config: RunConfig) -> int:

@@ -182,6 +182,9 @@ def task_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     if (chosen := values.get("task.descriptor")) is not None and task.kind == "jax":
         why = f" for {task.name}, whose descriptor is its own"
         problems.append(not_allowed("task.descriptor", chosen, "null", why=why))
+    if (limit := values.get("task.time_limit_s")) is not None and task.kind == "jax":
+        why = f" for {task.name}, whose steps take equal times"
+        problems.append(not_allowed("task.time_limit_s", limit, "null", why=why))
     return problems
 
 

@@ -12,6 +12,7 @@ import math
 from es_service.dispatch.events import Compiled
 from es_service.dispatch.scheduler_changes import put_worker
 from es_service.dispatch.scheduler_state import SchedulerState, Worker, usual_chunk_s
+from es_service.protocol.messages import GradientChunk
 
 RECENT_DURATIONS = 31
 """Number of durations per kind of work item from which the running median is computed."""
@@ -29,6 +30,8 @@ def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worke
     limit, limit_s = "min_deadline_s", max(limits.min_deadline_s, limits.deadline_factor * item.size * (usual_s or 0.0))
     if usual_s is None and limit_s < limits.first_deadline_s:
         limit, limit_s = "first_deadline_s", limits.first_deadline_s
+    if limits.chunk_limit_s is not None and item.kind != GradientChunk.__name__:
+        limit, limit_s = "chunk_limit_s", item.size * limits.chunk_limit_s
     usual_item_s = math.inf if usual_s is None else item.size * usual_s
     late_s = now + max(limits.late_factor * usual_item_s, usual_item_s + limits.late_by_s)
     return worker._replace(started_s=now, deadline_s=now + limit_s, limit=limit, late_s=late_s)

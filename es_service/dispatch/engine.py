@@ -11,6 +11,7 @@ import logging
 import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Generic, Protocol, Self, TypeVar
 
 from es_service.dispatch import events
@@ -31,6 +32,7 @@ from es_service.errors import EvaluationError, Interrupted
 from es_service.logs import logger
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import ChunkResult, Work, WorkItemId
+from es_service.protocol.pieces import pieces_of, whole
 
 _LOG = logger(__name__)
 _RARE = (events.WorkerUp, events.WorkerLost, events.Compiled, events.Failure, events.StopWorker)
@@ -211,13 +213,16 @@ class Engine(Generic[AnyTransport]):
             # may get one. Only one work item is charged for that, since all other workers are then asked first.
             self._handle(message)
         self._phase += 1
-        parts = self._parts(work)
+        most = self._state.limits.episodes_together
+        pieces = [[one] if most is None else pieces_of(one, most) for one in work]
+        parts = self._parts([piece for of_chunk in pieces for piece in of_chunk])
         self._waits.begin((item_id.kind for item_id, _ in parts), time.monotonic())
         self._work, self._results = dict(parts), {}
         self._step(events.Submit(tuple(events.WorkItem(item_id, item_id.kind, item_id.chunks) for item_id, _ in parts)))
         while pending(self._state):
             self._serve()
-        return [result for item_id, _ in parts for result in self._results.pop(item_id)]
+        results = (result for item_id, _ in parts for result in self._results.pop(item_id))
+        return [whole(one, list(islice(results, len(own)))) for one, own in zip(work, pieces, strict=True)]
 
     def close(self) -> None:
         """Kill all workers and wait until they have ended; in a cluster that was joined they end shortly afterwards."""

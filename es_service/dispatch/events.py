@@ -50,6 +50,10 @@ class Limits:
     """Lower bound of the limit for later items."""
     deadline_factor: float = 5.0
     """Later items may take max(min_deadline_s, deadline_factor x size x median of recent durations of their kind)."""
+    chunk_limit_s: float | None = None
+    """Longest time for a chunk of episodes, in the place of the limits for first and later items; None: these."""
+    episodes_together: int | None = None
+    """Most episodes of an evaluation or policy chunk that are sent together; None: whole chunks."""
     max_failures_in_a_row: int = 3
     """Number of consecutive exceptions after which a worker is killed and replaced."""
     restart_backoff_s: float = 1.0

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import socket
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from typing import IO
 
@@ -177,7 +178,7 @@ class ChildProcesses:
     def close(self) -> None:
         """Kill all children and wait until they have ended."""
         for worker in self._workers.values():
-            worker.child.process.kill()  # kill all before waiting, since each takes some time to free its memory
+            _kill(worker.child)  # kill all before waiting, since each takes some time to free its memory
         for worker in list(self._workers):
             self.kill(worker)
 
@@ -271,13 +272,21 @@ class ChildProcesses:
 
 def _end(child: _Child) -> tuple[str, str]:
     """Kill a child; returns how it ended and its last output."""
-    child.process.kill()
+    _kill(child)
     code = child.process.wait()
     child.control.close()
     child.log.seek(max(0, child.log.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
     last_words = child.log.read(LAST_WORDS_BYTES).decode(errors="replace").strip()
     child.log.close()
     return f"signal {-code}" if code < 0 else f"exit code {code}", last_words
+
+
+def _kill(child: _Child) -> None:
+    """Kill a child and the processes that code of the user has started in it, which are in its session."""
+    if child.process.returncode is None:  # it has not been waited for, so that the number is still its own
+        with suppress(ProcessLookupError):
+            os.killpg(child.process.pid, signal.SIGKILL)
+    child.process.kill()
 
 
 def _start_child(spec: bytes, undo: ExitStack) -> _Child:

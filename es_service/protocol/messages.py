@@ -119,6 +119,8 @@ class WorkerSpec:
     """What computes episodes and gradients: a name in `workers.rollouts.BACKENDS`."""
     descriptor: DescriptorChoice | None = None
     """Descriptor that the config chooses; None: that of the task."""
+    time_limit_s: float | None = None
+    """Longest time of a call of a function, if the task is one; None: it has none."""
     descriptor_size: int = 0
     """How many numbers that descriptor has; 0 if it is the task's."""
     outputs: tuple[str, ...] = ()
@@ -185,7 +187,9 @@ class EvaluationChunk:
     ask: int = 0
     """As for training. Each centre that is evaluated in a generation has resets of its own."""
     episodes: int = EVALUATION_EPISODES_PER_CHUNK
-    """Number of episodes that are wanted, the first of the chunk's 16. The shape that is compiled has all of them."""
+    """Number of episodes that are wanted among the chunk's 16. The shape that is compiled has all of them."""
+    first: int = 0
+    """The first of them, if the chunk is a piece of one (`protocol.pieces`)."""
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,9 @@ class PolicyChunk:
     """Index of the policies' ask among those of its generation that are for policies."""
     part: int = 0
     """Number of the chunk among those of the policies that it is sent with."""
+    first: int = 0
+    count: int = POLICY_SLOTS
+    """The first of its slots that is wanted, and how many are, if the chunk is a piece of one (`protocol.pieces`)."""
 
 
 def chunks_of(policies: int, episodes: int) -> int:
@@ -70,6 +73,6 @@ def chunks_of(policies: int, episodes: int) -> int:
 
 def slots(policies: Policies, chunk: PolicyChunk) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """(index of the policy [L], number of the episode [L]) of each slot of a chunk."""
-    count, first = len(policies.parameters_N_D), chunk.part * POLICY_SLOTS
-    slot_L = np.arange(first, min(first + POLICY_SLOTS, count * policies.episodes))
+    count, first = len(policies.parameters_N_D), chunk.part * POLICY_SLOTS + chunk.first
+    slot_L = np.arange(first, min(first + min(chunk.count, POLICY_SLOTS - chunk.first), count * policies.episodes))
     return slot_L % count, slot_L // count

@@ -60,6 +60,13 @@ class Rollout(Protocol):
         """Limits as `chunk_pairs`, for a task."""
         return self.chunk_pairs
 
+    def episodes_together(self, task: TaskSpec) -> int | None:
+        """Most episodes of an evaluation, or of policies, that are sent to a worker as one piece; None: whole chunks.
+
+        Only where an episode's bits do not depend on the others of its chunk.
+        """
+        return None
+
     def why_not_here(self) -> str:
         """Reason why it cannot run on this machine; empty if it can."""
         return ""

@@ -24,7 +24,7 @@ from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.parts import moments_from_arrays
 from es_service.protocol.machine import platform_info
-from es_service.protocol.messages import FloatArray, Moments, WorkerSpec
+from es_service.protocol.messages import FloatArray, Moments, TaskSpec, WorkerSpec
 from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
@@ -39,6 +39,8 @@ from workers.policies.policy import initial_parameters
 from workers.rollouts import BACKENDS
 
 _LOG = logger(__name__)
+CALLS_S = 60.0
+"""Seconds in which the process of a function can be replaced, beside the time of its calls."""
 LIMIT_NAMES = {
     "start_deadline_s": "half of compute.no_worker_timeout_s",
     "compile_deadline_s": "compute.compile_timeout_s",
@@ -46,6 +48,7 @@ LIMIT_NAMES = {
     "min_deadline_s": "at least compute.chunk_timeout_s",
     "place_timeout_s": "compute.place_timeout_s",
     "no_worker_timeout_s": "compute.no_worker_timeout_s",
+    "chunk_limit_s": "task.time_limit_s",
 }
 """Config keys that set the engine's time limits, as its messages name them."""
 
@@ -187,7 +190,8 @@ def _naming_the_run(folder: Path) -> Iterator[None]:
 
 def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
     """The engine's number of workers and time limits."""
-    compute = config.compute
+    compute, task = config.compute, task_of(config)
+    rollout = BACKENDS[compute.rollout]
     return Limits(
         workers=worker_count(config, most),
         max_attempts=compute.max_attempts,
@@ -198,8 +202,19 @@ def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
         place_timeout_s=math.inf if compute.place_timeout_s is None else compute.place_timeout_s,
         no_worker_timeout_s=compute.no_worker_timeout_s,
         names=LIMIT_NAMES,
-        late_factor=Limits.late_factor if BACKENDS[compute.rollout].copies_late_items else math.inf,
+        late_factor=Limits.late_factor if rollout.copies_late_items else math.inf,
+        chunk_limit_s=chunk_limit_s(config, task),
+        episodes_together=rollout.episodes_together(task),
     )
+
+
+def chunk_limit_s(config: RunConfig, task: TaskSpec) -> float | None:
+    """Longest time of a chunk where the config has one: that of its environments, which step side by side, or enough
+    for the calls of a function, which end by themselves when they take too long."""
+    limit_s = config.task.time_limit_s
+    if limit_s is None or task.kind != "function":
+        return limit_s
+    return 2 * config.compute.chunk_pairs * config.task.episodes_per_member * limit_s + CALLS_S
 
 
 def make_engine(

@@ -130,6 +130,8 @@ NOT_MEASURED = {
     "search.init_from": "names a folder, of which the functions of a search know nothing",
     "search.candidate_choice": "chooses among the elites of that folder, which `test_polish.py` checks",
     "search.max_invalid_fraction": "stops a run, which `test_es.py` and `test_policies.py` check",
+    "task.descriptor": "is for tasks of Python objects; `test_gymnasium.py` has it",
+    "task.time_limit_s": "is for tasks of Python objects and functions; `test_host.py` and `test_functions.py` have it",
     "policy.memory": "needs XLA; `test_policy_kinds.py` has it",
     "compute.rollout": "the other one is XLA",
     "compute.rollout_block_pairs": "only XLA uses it",

@@ -56,7 +56,7 @@ def slow(parameters):
     """It hangs, or ends its process, once: where a file says so, and the first parameter is positive."""
     fault = Path(os.environ["HOST_FAULT"])
     kind = fault.read_text() if fault.exists() else ""
-    if kind and parameters[0] > 0.0:
+    if kind and parameters[0] > 0.05:  # a member and no centre
         fault.unlink(missing_ok=True)
         if kind == "exit":
             os._exit(3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import time
 from pathlib import Path
 
@@ -83,7 +84,9 @@ class Slow(Drift):
             fault.unlink()  # only one worker finds it
         except FileNotFoundError:
             kind = ""
-        if kind == "hang":
+        if kind.startswith("hang"):
+            sleeper = subprocess.Popen(["sleep", "1000"])  # a process of the simulator's own
+            Path(os.environ["HOST_FAULT"] + "_process").write_text(str(sleeper.pid))
             time.sleep(1000.0)
         elif kind == "exit":
             os._exit(7)
@@ -99,3 +102,14 @@ class Fragile(Drift):
         if self.steps == 4:
             raise ValueError("the fifth step cannot be done")
         return super().step(action)
+
+
+class Forgetful(Drift):
+    """A drift whose seed is not all that it depends on: it goes on with the random numbers of the episode before."""
+
+    def reset(self, seed):
+        before = getattr(self, "random", None)
+        seen, info = super().reset(seed)
+        if before is not None:
+            self.random = before
+        return seen, info

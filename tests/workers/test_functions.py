@@ -8,11 +8,13 @@ import yaml
 
 from es_service import api, load_config
 from es_service.config.model import policy_spec
+from es_service.config.parallel import chunks_of_phases
 from es_service.config.tasks import TASKS, task_of
 from es_service.errors import ConfigError
 from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
 from es_service.protocol.noise import evaluation_reset_keys
-from tests.helpers import centre, spec
+from es_service.runs.session import dispatch_limits
+from tests.helpers import centre, spec, workers_in_this_process
 from tests.workers import functions
 from tests.workers.test_host import NO_JAX
 from workers.environments import TaskError, describe_environment
@@ -40,6 +42,13 @@ def no_jax(tmp_path, monkeypatch):
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(NO_JAX)
     monkeypatch.syspath_prepend(tmp_path / "site")
+
+
+@pytest.fixture
+def one_process():
+    """The run of a test starts no process, while those of other tests do."""
+    with workers_in_this_process():
+        yield
 
 
 def test_a_function_says_what_it_is():
@@ -89,7 +98,7 @@ def test_map_elites_fills_a_map_of_descriptors(tmp_path, no_jax):
 
 
 @pytest.mark.parametrize("search", [{"algorithm": "nsr_es", "pairs": 8}, {"algorithm": "ars", "pairs": 8}, MAP_ELITES])
-@pytest.mark.usefixtures("workers_here")
+@pytest.mark.usefixtures("one_process")
 def test_other_methods_move_a_noisy_function_of_any_number_of_parameters(search, tmp_path):
     config = config_of(NOISY, search | {"evaluation_episodes": 4})
     run = api.run(config, tmp_path / "run").run
@@ -97,7 +106,7 @@ def test_other_methods_move_a_noisy_function_of_any_number_of_parameters(search,
     assert list(run.parameters("best")) == ["x0", "x1", "x2", "x3"]
 
 
-@pytest.mark.usefixtures("workers_here")
+@pytest.mark.usefixtures("one_process")
 def test_calls_that_fail_are_invalid_and_named_with_their_parameters(tmp_path, capfd):
     search = MAP_ELITES | {"max_invalid_fraction": 1.0, "evaluation_episodes": 1, "iso_sigma": 1.0}
     run = api.run(config_of(FRAGILE, search), tmp_path / "run").run
@@ -107,6 +116,32 @@ def test_calls_that_fail_are_invalid_and_named_with_their_parameters(tmp_path, c
     for why in ("ValueError: this quarter is forbidden", "the fitness nan and", "returned the fitness 'many'; it must"):
         (line, *_) = [one for one in told.splitlines() if why in one]
         assert line.startswith(f"{FRAGILE} failed with x = "), line
+
+
+@pytest.mark.parametrize("kind", ["hang", "exit"])
+def test_a_call_that_hangs_or_ends_its_process_is_invalid_and_costs_no_worker(kind, tmp_path, monkeypatch, no_jax):
+    """In a process of its own, which begins anew, if calls have a limit of time."""
+    monkeypatch.setenv("HOST_FAULT", str(tmp_path / "fault"))
+    (tmp_path / "fault").write_text(kind)
+    config = config_of(f"function:{MODULE}:slow", ES | {"evaluation_episodes": 1}, generations=2)
+    config["task"]["time_limit_s"] = 1.0
+    run = api.run(config, tmp_path / "run").run
+    assert run.history[["lost_workers", "retries"]].to_numpy().sum() == 0
+    assert run.history.invalid_members.sum() == 1
+    calm = api.run(config, tmp_path / "calm").run
+    assert calm.history.invalid_members.sum() == 0
+    assert calm.history.best_fitness.iloc[0] == run.history.best_fitness.iloc[0]
+
+
+def test_calls_are_sent_one_by_one_and_the_limit_of_time_is_that_of_calls():
+    config = load_config(config_of(HILL, MAP_ELITES))
+    assert chunks_of_phases(config) == {"rollout": 40}
+    assert dispatch_limits(config).episodes_together == 1
+    assert chunks_of_phases(load_config(config_of(NOISY)))["evaluation"] == 30
+    limited = load_config(config_of(HILL), ["task.time_limit_s=5"])
+    assert dispatch_limits(limited).chunk_limit_s == 2 * 5.0 + 60.0
+    with pytest.raises(ConfigError, match=r"task.time_limit_s: 5 is not allowed for point_maze"):
+        load_config({**config_of(HILL), "task": {"environment": "point_maze", "time_limit_s": 5}, "map": {}})
 
 
 def test_a_seed_belongs_to_the_episode_and_both_of_a_pair_share_it():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -201,14 +202,21 @@ def test_outputs_of_steps_are_what_happened_in_training_and_in_evaluations(episo
         make_worker(drift(outputs=("nothing",)))([(centre_of(worker_spec), EvaluationChunk(1, 0))])
 
 
+def has_ended(process):
+    """Whether a process is gone, or has ended and is not waited for."""
+    try:
+        return Path("/proc", process, "stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
 @pytest.mark.usefixtures("no_jax")
 @pytest.mark.parametrize("fault", ["", "exit", "it raises this once", pytest.param("hang", marks=pytest.mark.slow)])
 def test_workers_a_resume_and_faults_change_no_bit(fault, tmp_path, monkeypatch):
     monkeypatch.setenv("HOST_FAULT", str(tmp_path / "fault"))
     slow = f"python:{MODULE}:Slow"
-    config = config_of(slow, ES | {"pairs": 24}, chunk_timeout_s=1.0, first_chunk_timeout_s=2.0) | {
-        "map": {"cells": [16]}
-    }
+    config = config_of(slow, ES | {"pairs": 24})
+    config["map"] = {"cells": [16]}
     undisturbed = api.run(config | {"compute": {"workers": 1}}, tmp_path / "one").run.digest()
     if not fault:
         three = api.run(config | {"compute": {"workers": 3}}, tmp_path / "three").run
@@ -217,11 +225,16 @@ def test_workers_a_resume_and_faults_change_no_bit(fault, tmp_path, monkeypatch)
         assert api.resume(tmp_path / "two", ["budget.generations=4"]).run.digest() == undisturbed
         return
     (tmp_path / "fault").write_text(fault)
+    if fault == "hang":
+        config["task"]["time_limit_s"] = 1.0
     notices: list[str] = []
     run = api.run(config, tmp_path / "faulty", on_notice=notices.append).run
     lost, retries = run.history[["lost_workers", "retries"]].sum()
     assert retries > 0
     assert (lost, len(notices)) == (0, 0) if fault == "it raises this once" else (1, 1), notices
+    if fault == "hang":
+        assert "within 1 s of computing (task.time_limit_s)" in notices[0]
+        assert has_ended((tmp_path / "fault_process").read_text()), "what it has started ends with it"
     assert run.digest() == undisturbed
 
 

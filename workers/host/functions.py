@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from es_service.protocol.messages import FloatArray, WorkerSpec
 from es_service.protocol.raised import raised
 from workers.environments.function_task import FunctionTask
+from workers.host.caller import CallFailedError
 from workers.host.seeds import seed_of
 from workers.rollouts.backend import Episodes
 
@@ -20,6 +22,7 @@ POINTS = 2
 
 def run_calls(
     task: FunctionTask,
+    called: Callable[[FloatArray, int], tuple[float, Any]],
     spec: WorkerSpec,
     parameters_L_D: FloatArray,
     reset_keys_L_4: NDArray[np.uint32],
@@ -29,6 +32,9 @@ def run_calls(
 ) -> Episodes:
     """One call for each lane that runs, in their order; see `workers.host.episodes.run_episodes`.
 
+    Args:
+        called: calls the task, here or in another process.
+
     A call whose fitness or descriptor is not finite, or that raises, makes the episode invalid, and says so on stderr.
     """
     lanes = len(reset_keys_L_4)
@@ -36,7 +42,9 @@ def run_calls(
     descriptor_L_B = np.zeros((lanes, task.descriptor_size), np.float32)
     for lane in range(lanes):
         if runs_L is None or runs_L[lane]:
-            fitness_L[lane], descriptor_L_B[lane] = _called(task, parameters_L_D[lane], seed_of(reset_keys_L_4[lane]))
+            fitness_L[lane], descriptor_L_B[lane] = _called(
+                task, called, parameters_L_D[lane], seed_of(reset_keys_L_4[lane])
+            )
     sums_L_O = np.zeros((lanes, 1 if training else 0), np.float32)
     points = 0 if training else POINTS
     return Episodes(
@@ -53,14 +61,18 @@ def run_calls(
     )
 
 
-def _called(task: FunctionTask, parameters_D: FloatArray, seed: int) -> tuple[float, Any]:
+def _called(
+    task: FunctionTask, called: Callable[[FloatArray, int], tuple[float, Any]], parameters_D: FloatArray, seed: int
+) -> tuple[float, Any]:
     """(fitness, descriptor) of a call; NaN if it fails."""
     try:
         with np.errstate(over="ignore"):  # beyond float32 is infinite, and invalid
-            fitness, descriptor_B = task(parameters_D, seed)
+            fitness, descriptor_B = called(parameters_D, seed)
             if np.isfinite(np.float32(fitness)) and np.isfinite(descriptor_B).all():
                 return fitness, descriptor_B
         why = f"the fitness {fitness:g} and the descriptor {descriptor_B.tolist()} are not finite numbers"
+    except CallFailedError as error:
+        why = str(error)
     except (Exception, SystemExit) as error:  # the user's code can raise anything
         why = raised(error, task.name).message
     named = ", ".join(f"{name} = {value!r}" for name, value in task.parameters.named(parameters_D).items())

@@ -20,6 +20,7 @@ from es_service.protocol.policies import POLICY_SLOTS
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from workers.compilable import Compilable
 from workers.environments import is_function_task, make_function_task, make_host_task
+from workers.host.caller import Caller
 from workers.host.episodes import Lanes, Watched, known_from_the_start, run_episodes
 from workers.host.functions import run_calls
 from workers.host.noise import gradient_summer, members
@@ -44,6 +45,10 @@ class Host(RolloutBackend):
     def pair_limits(self, task: TaskSpec) -> tuple[int, int]:
         """One pair of calls, which may take long, or as many environments as an evaluation has."""
         return (1, 1) if task.kind == "function" else self.chunk_pairs
+
+    def episodes_together(self, task: TaskSpec) -> int | None:
+        """One call of a function, which may take long."""
+        return 1 if task.kind == "function" else None
 
     def chunk_functions(self, spec: WorkerSpec) -> ChunkFunctions:
         """Functions that share the environments of a worker."""
@@ -120,11 +125,15 @@ class Runner(Protocol):
 def make_runner(spec: WorkerSpec) -> Runner:
     """The runner of a worker, with its environments or its function."""
     if is_function_task(spec.environment):
-        function = make_function_task(spec.environment, spec.environment_options)
+        given = spec.environment, spec.environment_options
+        function = make_function_task(*given)
+        called = function if spec.time_limit_s is None else Caller(*given, spec.time_limit_s)
 
         def call(parameters_L_D, mean, std, reset_keys_L_4, action_keys_L_4=None, *, runs_L=None, watched=None):
             training = action_keys_L_4 is not None
-            episodes = run_calls(function, spec, parameters_L_D, reset_keys_L_4, training=training, runs_L=runs_L)
+            episodes = run_calls(
+                function, called, spec, parameters_L_D, reset_keys_L_4, training=training, runs_L=runs_L
+            )
             if watched is not None:
                 watched.descriptors.extend([episodes.descriptor[watched.lane]] * 2)
                 watched.returns.extend([0.0, episodes.returns[watched.lane]])

@@ -1,0 +1,45 @@
+"""`doctor TASK` tells a task that repeats itself from one that does not, and says how fast it is."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from es_service.cli.doctor_task import _findings, examine_task
+from es_service.errors import ConfigError
+
+MODULE = "tests.workers.host_tasks"
+
+
+def findings(name):
+    return list(_findings(name))
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [(f"python:{MODULE}:Drift", "steps"), ("function:tests.workers.functions:hill", "calls")],
+)
+def test_a_task_that_repeats_is_said_to(name, unit, monkeypatch):
+    monkeypatch.setattr("es_service.cli.doctor_task.SECONDS", 0.01)
+    (_, what), _, (level, repeats), (_, speed) = findings(name)
+    assert what.startswith(f"{name}: A ")
+    assert level == "ok"
+    assert repeats.startswith("it repeats bit for bit")
+    assert "in another process" in repeats
+    assert re.match(rf"[\d,]+ {unit}/s on one core", speed)
+
+
+def test_a_task_that_does_not_repeat_is_told_from_one_that_does(monkeypatch, capsys):
+    monkeypatch.setattr("es_service.cli.doctor_task.SECONDS", 0.01)
+    *_, (level, repeats), _ = findings(f"python:{MODULE}:Forgetful")
+    assert level == "note"
+    assert "it returns other numbers after another episode, so" in repeats
+    assert not examine_task(f"python:{MODULE}:Fragile", as_json=True)
+    assert "the fifth step cannot be done" in capsys.readouterr().out
+
+
+def test_tasks_in_jax_repeat_and_what_is_no_task_is_named():
+    assert findings("point_maze")[-1][1].startswith("its steps are pure functions")
+    with pytest.raises(ConfigError, match=r"point_mase is not a known task; .*did you mean point_maze\?"):
+        findings("point_mase")

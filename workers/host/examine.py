@@ -1,0 +1,129 @@
+"""Step a task of Python objects with random actions, or call a function, to see whether it repeats itself and how fast.
+
+    python -m workers.host.examine NAME SETTINGS SECONDS     # what `workers.describe` takes, and how long to measure
+
+Prints one line of JSON: {"problem": text}, or the fields of `Examined`. `es-service doctor TASK` runs it in two
+processes and compares their hashes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import resource
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from es_service.protocol.messages import TaskSpec
+from es_service.protocol.noise import Domain, normal_integers, stream_keys
+from es_service.protocol.raised import raised
+from workers.describe import described
+from workers.environments import TaskError, make_function_task, make_host_task
+from workers.environments.host_task import HostEnvironment
+
+STEPS = 200
+"""Most steps of an episode that is compared."""
+BESIDE = 3
+"""Further objects that step beside one."""
+SEED, OTHER_SEED = 1, 2
+ALONE = "alone"
+"""Name of the first episode among the hashes; the others are to equal it."""
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What was found of a task."""
+
+    hashes: dict[str, str]
+    """What was done -> hash of all that the object returned: ALONE in a new object, and then the same once more after
+    another episode, and beside other objects."""
+    steps_per_second: float
+    """Steps of one core, or calls of a function."""
+    peak_mib: int
+    """Most memory of the process, in MiB."""
+
+
+def examine(task: TaskSpec, seconds: float) -> Examined:
+    """Examine a task that is described as `task`; at least one step is measured.
+
+    Raises whatever the code of the task raises.
+    """
+    options = {name: option.default for name, option in task.options.items()}
+    if task.parameters is not None:
+        function = make_function_task(task.name, options)
+        start_D = task.parameters.first(0, 0)
+
+        def call(seed: int) -> str:
+            return _hash([function(start_D, seed)])
+
+        hashes = {ALONE: call(SEED), "after another call": (call(OTHER_SEED), call(SEED))[1]}
+        return _measured(hashes, lambda: (call(SEED), 1)[1], seconds)
+    made, key = make_host_task(task.name, options), stream_keys(0, Domain.ACTION_NOISE, 0, 0)
+    coordinates = np.arange(STEPS * task.action_size, dtype=np.uint32)
+    action_T_A = np.clip(normal_integers(np, key, coordinates) / 32.0, -1.0, 1.0).astype(np.float32)
+    actions_T = made.actions(action_T_A.reshape(STEPS, task.action_size))
+
+    def episodes(environments: list[HostEnvironment], seeds: list[int]) -> tuple[str, int]:
+        """(hash of the first episode, steps of all) of episodes that step side by side."""
+        first_L = [one.reset(seed) for one, seed in zip(environments, seeds, strict=True)]
+        said: list[Any] = [first_L[0]]
+        steps, running = 0, list(range(len(environments)))
+        for action in actions_T[: min(STEPS, task.episode_steps)]:
+            done = set()
+            for lane in running:
+                found = environments[lane].step(action)
+                steps += 1
+                if lane == 0:
+                    said.append((*found, environments[0].descriptor()))
+                if found[2]:
+                    done.add(lane)
+            running = [lane for lane in running if lane not in done]
+            if not running:
+                break
+        return _hash(said), steps
+
+    one = HostEnvironment(made)
+    hashes = {ALONE: episodes([one], [SEED])[0]}
+    episodes([one], [OTHER_SEED])
+    hashes["after another episode"] = episodes([one], [SEED])[0]
+    several = [HostEnvironment(made) for _ in range(1 + BESIDE)]
+    hashes["beside other objects"] = episodes(several, [SEED, *range(OTHER_SEED, OTHER_SEED + BESIDE)])[0]
+    return _measured(hashes, lambda: episodes([one], [SEED])[1], seconds)
+
+
+def _measured(hashes: dict[str, str], work: Callable[[], int], seconds: float) -> Examined:
+    steps, started = 0, time.perf_counter()
+    while not steps or time.perf_counter() - started < seconds:
+        steps += work()
+    rate = steps / (time.perf_counter() - started)
+    return Examined(hashes, round(rate, 1), round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+
+
+def _hash(said: list[Any]) -> str:
+    """Hash of observations, rewards, ends and descriptors, bit for bit."""
+    found = hashlib.sha256()
+    for one in said:
+        for part in one if isinstance(one, tuple) else (one,):
+            found.update(np.asarray(part).tobytes())
+    return found.hexdigest()
+
+
+def main(name: str, settings: str, seconds: str) -> None:
+    """Print what was found of a task, or the problem with it, as JSON."""
+    try:
+        task = described(name, json.loads(settings))
+        answer: dict[str, Any] = asdict(examine(task, float(seconds)))
+    except TaskError as error:
+        answer = {"problem": str(error)}
+    except Exception as error:  # the user's code can raise anything
+        answer = {"problem": raised(error, name).message}
+    print(f"\n{json.dumps(answer)}")  # on a line of its own, whatever the user's code prints
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
