@@ -267,7 +267,7 @@ def test_a_task_says_what_it_is():
         (["compute.rollout=xla"], "xla cannot run .*: it computes tasks in JAX, and not tasks of Python objects"),
         (
             ["task.environment=point_maze", "compute.rollout=host"],
-            "it computes tasks of Python objects, and not tasks in",
+            "it computes tasks of Python objects and functions of parameters, and not tasks in",
         ),
         (["compute.engine=ray", "compute.worker_resources.gpu=1"], "host runs only on CPUs"),
         (["task.options.wind=-1"], "must be a number, at least 0"),
