@@ -39,7 +39,7 @@ LONGEST_S = 10.0
 """Seconds of the processor, since others may be busy on it; a read that waits ends at the time limit of tests."""
 RIGHT, PARTLY, OTHER = "right", "partly right", "another answer"
 OLDER = "right but for the recent generations"
-RECENT = ("weight of fitness", "not known")
+RECENT = ("weight of fitness", "centres ", "faults handled", "not known")
 """Lines of `status` about the recent generations, whose damage hides nothing else of a run."""
 CERTIFIED = "certified"
 """The line about certified policies, of which the run has none."""
@@ -190,20 +190,20 @@ def judged(name: str, answer: Any, right: Any) -> str:
     if answer == right:
         return RIGHT
     known = {"status": status_without_recent, "status --json": json_without_recent}.get(name)
-    return OLDER if known and known(answer) == (known(right)[0], True) else OTHER
+    return OLDER if known and known(literal_eval(answer)) == (known(literal_eval(right))[0], True) else OTHER
 
 
 def status_without_recent(answer: str) -> tuple[object, bool]:
     """What `status` says of all but the recent generations, and whether it says that these, or certified policies, are
     not known."""
-    lines = literal_eval(answer).splitlines()
+    lines = answer.splitlines()
     unknown = any(line.startswith("not known") or line.split()[:3] == [CERTIFIED, "not", "known:"] for line in lines)
     return [line for line in lines if not line.startswith((*RECENT, CERTIFIED))], unknown
 
 
 def json_without_recent(answer: str) -> tuple[object, bool]:
     """The same of `status --json`."""
-    [data] = json.loads(literal_eval(answer))
+    [data] = json.loads(answer)
     objectives = data.pop("objectives")
     return data, objectives["problem"] is not None and objectives["newest"] is objectives["recent"] is None
 

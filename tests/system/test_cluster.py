@@ -326,7 +326,7 @@ def test_a_node_with_other_code_is_told_of_once_and_left_out(tmp_path):
     config, run = tmp_path / "config.yaml", tmp_path / "run"
     compute = CONFIG["compute"] | {"dispatch_log": True, "worker_resources": {"cpu": 1}, "workers": 4}
     config.write_text(yaml.safe_dump(CONFIG | {"compute": compute}))
-    ours, other = ROOT / "workers" / "policy.py", tmp_path / "policy.py"
+    ours, other = ROOT / "workers" / "measure.py", tmp_path / "measure.py"
     other.write_text(f"{ours.read_text()}# a comment\n")
     with Cluster(tmp_path) as hosts:
         hosts.start("stale", 2, setup=f"mount --bind {other} {ours}", PYTHONDONTWRITEBYTECODE="1")
@@ -335,7 +335,7 @@ def test_a_node_with_other_code_is_told_of_once_and_left_out(tmp_path):
         code, printed = hosts.run("head", *command, tmp_path / "alone", timeout=90.0)
         assert code == 1
         assert "stale has other code" in printed
-        assert "workers/policy.py" in printed
+        assert "workers/measure.py" in printed
         assert "Traceback" not in printed
         print(f"every node refuses: the run ends after {time.monotonic() - started:.1f} s")
         hosts.start("good", 2)

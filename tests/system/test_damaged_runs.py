@@ -10,6 +10,7 @@ import pytest
 
 from es_service import api
 from tests.es_service.mutations import damage_bytes, damage_rows
+from tests.es_service.test_store_fuzz import json_without_recent, status_without_recent
 from tests.system.command_line import command, digest
 from tests.system.session import SMALL
 
@@ -21,6 +22,9 @@ READS = (
     ("export", "--to", "npz"),
     ("report", "--replay", "none"),
 )
+WITHOUT_RECENT = {("status",): status_without_recent, ("status", "--json"): json_without_recent}
+"""What a command says of all but recent generations and certified policies, and whether it says that these are not
+known."""
 
 
 def printed(folder, words):
@@ -52,7 +56,10 @@ def examine(example, number):
     shutil.copytree(original, folder)
     print(number, rng.choice((damage_bytes, damage_rows))(folder / "run.db", rng))
     for words in READS:
-        assert printed(folder, words) in (None, expected[words]), words
+        found = printed(folder, words)
+        if found not in (None, expected[words]):
+            of = WITHOUT_RECENT[words]
+            assert of(found) == (of(expected[words])[0], True), words
     if printed(folder, ("resume",)) is not None:
         assert digest(folder) == expected["digest",].strip()
 

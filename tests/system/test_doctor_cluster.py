@@ -99,7 +99,7 @@ def test_a_cluster_with_a_token_has_no_finding_until_one_of_its_hosts_has_faults
 
         edited = {
             Path(machine.__file__): (f'VERSION = "{machine.VERSION}"', 'VERSION = "0.1.0"'),
-            ROOT / "workers/policy.py": ("", "# edited\n"),
+            ROOT / "workers/measure.py": ("", "# edited\n"),
             Path(ray.__file__).with_name("_version.py"): (ray.__version__, "2.0.0"),
         }
         mounts = [f"mount -t tmpfs tmpfs {shared}", f"ip address add {PUBLIC}/8 dev eth0"]
@@ -120,7 +120,7 @@ def test_a_cluster_with_a_token_has_no_finding_until_one_of_its_hosts_has_faults
         assert found.keys() == {
             "Ray listens on a public address",
             versions,
-            "other code than here in es_service/protocol/machine.py, workers/policy.py",
+            "other code than here in es_service/protocol/machine.py, workers/measure.py",
             f"{shared} is not shared (No such file or directory)",
             NOT_ENCRYPTED,
         }
