@@ -159,6 +159,7 @@ NOVELTY, COMMON = "es_service/search/novelty.py", "es_service/search/algorithms/
 NSRA, STARTS = "es_service/search/algorithms/nsra_es.py", "es_service/search/algorithms/starts.py"
 MAP_ELITES, BASE = "es_service/search/algorithms/map_elites.py", "es_service/search/algorithms/base.py"
 RECIPES = "es_service/protocol/recipes.py"
+KEPT_PARENTS = "es_service/protocol/kept_parents.py"
 ADAM, SHAPING = "es_service/search/steps/adam.py", "es_service/search/shaping.py"
 BEHAVIOUR_MAP, PARTS = "es_service/search/maps/behaviour_map.py", "es_service/loop/parts.py"
 GENERATION, TREE = "es_service/loop/generation.py", "es_service/protocol/gradient_tree.py"
@@ -455,6 +456,28 @@ CASES = [
             "Domain.PARAMETER_NOISE, generation, np.arange(search.batch)",
         ),
         ("has a line for each parameter", RECIPES, "noise[..., -1:]", "noise[..., 1:]"),
+    ),
+    *cases(
+        "a worker's parents of policies",
+        "tests/laws/test_recipes.py",
+        (
+            "are made with their own parents exchanged",
+            RECIPES,
+            "Origin(recipes.rule, recipes.names[x], recipes.names[y], key_4.copy())",
+            "Origin(recipes.rule, recipes.names[y], recipes.names[x], key_4.copy())",
+        ),
+        (
+            "are forgotten while they are needed",
+            KEPT_PARENTS,
+            "if self._bytes <= self._most_bytes or name in wanted:",
+            "if self._bytes <= self._most_bytes:",
+        ),
+        (
+            "are made before what they are made of",
+            KEPT_PARENTS,
+            "return dict(reversed(steps.items()))",
+            "return steps",
+        ),
     ),
     *cases(
         "an elite's fitness",

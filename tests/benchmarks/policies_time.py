@@ -1,10 +1,12 @@
 """What does a generation of policies cost the driver? MAP-Elites on PointMaze with made-up episodes, by item.
 
     python -m tests.benchmarks.policies_time                # a minute, one core
+    python -m tests.benchmarks.policies_time --bytes --task ant_trap --hidden 256 256 --batch 256
 
 Milliseconds of the processor in the driver's process, all its threads together, so other programs disturb them little;
 medians over the generations after the first 50, in which the map fills. Messages to workers and rollouts are left out.
-The digest at the end of a line shows whether two versions have computed the same.
+The digest at the end of a line shows whether two versions have computed the same. With `--bytes`, the numbers are
+instead the kilobytes that two workers, which take turns, are sent in a generation: the median after the first 50.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -26,8 +28,10 @@ from es_service.config.tasks import task_of
 from es_service.loop import driver
 from es_service.loop.history import evaluated_columns, history_columns
 from es_service.protocol.evaluator import DispatchCounts
-from es_service.protocol.messages import EpisodesResult
+from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
+from es_service.protocol.messages import EpisodesResult, Work
 from es_service.protocol.policies import PolicyChunk, slots
+from es_service.protocol.wire import framed
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
 from es_service.store.digest import checked_parts, digest_of
@@ -43,10 +47,15 @@ class Inventing:
 
     counts = DispatchCounts()
 
-    def __init__(self) -> None:
+    def __init__(self, *, counting: bool) -> None:
         self._rng = np.random.default_rng(0)
+        self._workers = [KeptParents(2**28, int) for _ in range(2)] if counting else []
+        self.sent_bytes: list[int] = []
 
     def evaluate(self, work):
+        if self._workers and work:
+            parts = [work[number :: len(self._workers)] for number in range(len(self._workers))]
+            self.sent_bytes.append(sum(map(_bytes_of, parts, self._workers)))
         return [self._answer(*one) for one in work]
 
     def _answer(self, subject, chunk):
@@ -55,6 +64,14 @@ class Inventing:
         place = self._rng.uniform(-1.0, 1.0, (slots_L, 2)).astype(np.float32)
         trace = np.zeros((*([slots_L] if isinstance(chunk, PolicyChunk) else []), 64, 2), np.float32)
         return EpisodesResult(fitness, fitness, place, np.full(slots_L, 200, np.int32), place, None, trace)
+
+
+def _bytes_of(work: Sequence[Work], kept: KeptParents[int]) -> int:
+    """Bytes of a work item's messages to a worker, as the engine inline sends them."""
+    parents = [framed(("parents", {name: given})) for name, given in parents_to_send(work, kept).items()]
+    subjects = {id(subject): framed(("subject", 0, as_sent(subject))) for subject, _ in work}
+    chunks = framed(("chunks", 0, 1, [(number, chunk) for number, (_, chunk) in enumerate(work)]))
+    return sum(map(len, [*parents, *subjects.values(), chunks]))
 
 
 def timed(function: Callable[..., Any], spent: dict[str, float], name: str) -> Callable[..., Any]:
@@ -69,12 +86,12 @@ def timed(function: Callable[..., Any], spent: dict[str, float], name: str) -> C
     return run
 
 
-def measure(batch: int, generations: int, place: Path) -> dict[str, Any]:
-    """Milliseconds of each item in a generation."""
+def measure(batch: int, generations: int, place: Path, given: argparse.Namespace) -> dict[str, Any]:
+    """Milliseconds of each item in a generation, or what is sent."""
     config = api.load_config(
         {
-            "task": {"environment": "point_maze"},
-            "policy": {"hidden": [64, 64]},
+            "task": {"environment": given.task},
+            "policy": {"hidden": given.hidden},
             "search": {"algorithm": "map_elites", "batch": batch},
             "budget": {"generations": FILLING + generations},
         }
@@ -94,16 +111,20 @@ def measure(batch: int, generations: int, place: Path) -> dict[str, Any]:
         rows.append(dict(spent))
         spent.clear()
 
+    evaluator = Inventing(counting=given.bytes)
     kept = {name: getattr(driver, name) for name in ITEMS[:-1]}
     try:
         for name, function in kept.items():
             setattr(driver, name, timed(function, spent, name))
         with RunStore.create(place, config.resolved_yaml(), meta) as store:
             store.commit = timed(store.commit, spent, "commit")
-            driver.run(search, Inventing(), store, None, note)
+            driver.run(search, evaluator, store, None, note)
     finally:
         for name, function in kept.items():
             setattr(driver, name, function)
+    if given.bytes:
+        sent = round(float(np.median(evaluator.sent_bytes[1 + FILLING :])) / 1e3, 1)
+        return {"batch": batch, "kB": sent, "digest": digest_of(checked_parts(place)[0])[:12]}
     ms = {name: [1e3 * row[name] for row in rows[FILLING:]] for name in ITEMS}
     ms["record"] = [both - stored for both, stored in zip(ms["record"], ms["commit"], strict=True)]
     found = {name: round(float(np.median(values)), 2) for name, values in ms.items()}
@@ -115,10 +136,13 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--batch", nargs="+", type=int, default=[64, 256, 1024])
     parser.add_argument("--generations", type=int, default=150)
+    parser.add_argument("--bytes", action="store_true")
+    parser.add_argument("--task", default="point_maze")
+    parser.add_argument("--hidden", nargs="*", type=int, default=[64, 64])
     arguments = parser.parse_args()
     for batch in arguments.batch:
         with tempfile.TemporaryDirectory() as folder:
-            print(json.dumps(measure(batch, arguments.generations, Path(folder) / "run")), flush=True)
+            print(json.dumps(measure(batch, arguments.generations, Path(folder) / "run", arguments)), flush=True)
 
 
 if __name__ == "__main__":
