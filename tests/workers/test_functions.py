@@ -75,7 +75,8 @@ def test_what_a_search_moves_is_half_ranges_and_the_start_is_where_it_begins():
 
 
 def test_an_es_climbs_a_hill_and_every_worker_says_the_same(tmp_path, no_jax):
-    run = api.run(config_of(HILL, generations=60), tmp_path / "one").run
+    with workers_in_this_process():
+        run = api.run(config_of(HILL, generations=60), tmp_path / "one").run
     assert run.history.best_fitness.iloc[0] == pytest.approx(10.0 - 100 * 0.7**2 - 0.25)
     assert run.history.best_fitness.iloc[-1] > 9.9
     assert run.history.env_steps.iloc[-1] == 1 + 60 * (16 + 1)
@@ -88,7 +89,8 @@ def test_an_es_climbs_a_hill_and_every_worker_says_the_same(tmp_path, no_jax):
 
 def test_map_elites_fills_a_map_of_descriptors(tmp_path, no_jax):
     config = config_of(HILL, MAP_ELITES, generations=8)
-    run = api.run(config, tmp_path / "one").run
+    with workers_in_this_process():
+        run = api.run(config, tmp_path / "one").run
     assert len(run.map) > 8
     row = run.map.iloc[0]
     values = run.parameters((int(row.cell_wide), int(row.cell_high)))
@@ -119,12 +121,13 @@ def test_calls_that_fail_are_invalid_and_named_with_their_parameters(tmp_path, c
 
 
 @pytest.mark.parametrize("kind", ["hang", "exit"])
-def test_a_call_that_hangs_or_ends_its_process_is_invalid_and_costs_no_worker(kind, tmp_path, monkeypatch, no_jax):
+@pytest.mark.usefixtures("one_process")
+def test_a_call_that_hangs_or_ends_its_process_is_invalid_and_costs_no_worker(kind, tmp_path, monkeypatch):
     """In a process of its own, which begins anew, if calls have a limit of time."""
     monkeypatch.setenv("HOST_FAULT", str(tmp_path / "fault"))
     (tmp_path / "fault").write_text(kind)
     config = config_of(f"function:{MODULE}:slow", ES | {"evaluation_episodes": 1}, generations=2)
-    config["task"]["time_limit_s"] = 1.0
+    config["task"]["time_limit_s"] = {"hang": 1.0, "exit": 5.0}[kind]  # another one has another process, too
     run = api.run(config, tmp_path / "run").run
     assert run.history[["lost_workers", "retries"]].to_numpy().sum() == 0
     assert run.history.invalid_members.sum() == 1

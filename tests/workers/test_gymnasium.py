@@ -15,8 +15,7 @@ from es_service.protocol.noise import evaluation_reset_keys
 from es_service.protocol.sources import own_path, user_sources
 from es_service.runs.moment import Policy
 from es_service.runs.replay import record
-from tests.helpers import centre, random_parameters, spec
-from tests.workers.test_host import NO_JAX
+from tests.helpers import centre, random_parameters, spec, workers_in_this_process
 from workers.environments import TaskError, describe_environment
 from workers.worker import make_worker
 
@@ -43,6 +42,13 @@ def config_of(environment, **task):
         "budget": {"generations": 2},
         "compute": {"engine": "inline", "workers": 1},
     }
+
+
+@pytest.fixture
+def one_process():
+    """The run of a test starts no process."""
+    with workers_in_this_process():
+        yield
 
 
 @pytest.mark.parametrize("name", CLASSIC)
@@ -90,14 +96,11 @@ def test_episodes_are_those_of_a_loop_by_hand(name):
         ([1, 0], ("observation_1", "observation_0"), ((-2.0, 2.0),) * 2),
         ("place", ("place_0", "place_1"), ((-1e30, 1e30),) * 2),
         (f"{MODULE}:turning", ("rewards", "places"), ((-60.0, 0.0), (-60.0, 60.0))),
-        (None, ("length",), ((0.0, 25.0),)),
+        pytest.param(None, ("length",), ((0.0, 25.0),), marks=pytest.mark.long),
     ],
 )
-def test_a_config_chooses_the_descriptor(descriptor, names, bounds, tmp_path, monkeypatch):
+def test_a_config_chooses_the_descriptor(descriptor, names, bounds, tmp_path, one_process):
     """A key of info that the reset lacks is known from the first step on, in traces and replays, too."""
-    (tmp_path / "site").mkdir()
-    (tmp_path / "site" / "sitecustomize.py").write_text(NO_JAX)
-    monkeypatch.syspath_prepend(tmp_path / "site")
     config = config_of(REACH, descriptor=descriptor)
     config["map"] = {"cells": [5] * len(names)} | ({"bounds": [[-2, 2], [-2, 2]]} if descriptor == "place" else {})
     task = task_of(load_config(config))
@@ -121,6 +124,7 @@ def test_a_config_chooses_the_descriptor(descriptor, names, bounds, tmp_path, mo
             load_config(config | {"map": {}})
 
 
+@pytest.mark.usefixtures("one_process")
 def test_options_are_arguments_of_make_and_constants_of_the_run(tmp_path):
     config = config_of(REACH, options={"reach": 0.5, "limit": 7})
     task = task_of(load_config(config))
@@ -129,7 +133,7 @@ def test_options_are_arguments_of_make_and_constants_of_the_run(tmp_path):
     assert run.config["task"]["options"] == {"reach": 0.5, "limit": 7}
     assert run.history.env_steps.iloc[-1] == 7 * (3 * 3 + 2 * 32), "the environment truncates after the limit"
     resumed = api.resume(tmp_path / "run", ["budget.generations=3"]).run
-    whole = api.run(config | {"budget": {"generations": 3}, "compute": {"workers": 2}}, tmp_path / "whole").run
+    whole = api.run(config | {"budget": {"generations": 3}}, tmp_path / "whole").run
     assert resumed.digest() == whole.digest()
     with pytest.raises(ConfigError, match=r"cannot be made with the options .*unexpected keyword argument 'reech'"):
         load_config(config_of(REACH, options={"reech": 0.5}))

@@ -18,7 +18,7 @@ from es_service.protocol.outputs import AT_THE_END, OF_STEPS
 from es_service.protocol.policies import Policies, PolicyChunk
 from es_service.runs.replay import record
 from es_service.runs.session import dispatch_limits
-from tests.helpers import centre, random_parameters, spec
+from tests.helpers import centre, random_parameters, spec, workers_in_this_process
 from tests.workers import host_tasks
 from workers.environments import TaskError, describe_environment, make_host_task
 from workers.host.episodes import Lanes
@@ -60,21 +60,22 @@ def no_jax(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path / "site")
 
 
-@pytest.mark.parametrize("search", [ES, MAP_ELITES], ids=lambda search: search["algorithm"])
-def test_a_run_and_its_replays_are_those_of_xla(search, tmp_path, request):
+@pytest.mark.parametrize("search", [ES, pytest.param(MAP_ELITES, marks=pytest.mark.long)], ids=["es", "map_elites"])
+def test_a_run_and_its_replays_are_those_of_simd(search, tmp_path, request):
     """PointMaze from its corner, whose reset draws nothing."""
-    of_xla = config_of("point_maze", search, rollout="xla")
-    of_xla["task"]["options"] = {"start": "corner"}
-    of_xla["compute"]["workers"] = 1
+    of_simd = config_of("point_maze", search, rollout="simd")
+    of_simd["task"]["options"] = {"start": "corner"}
     if search is ES:
-        of_xla["compute"]["chunk_pairs"] = 8
-    xla = api.run(of_xla, tmp_path / "xla").run
+        of_simd["compute"]["chunk_pairs"] = 8
+    of_simd["compute"]["workers"] = 1
+    with workers_in_this_process():
+        simd = api.run(of_simd, tmp_path / "simd").run
     request.getfixturevalue("no_jax")
     run = api.run(config_of(MAZE, search), tmp_path / "host").run
     assert run.config["compute"]["rollout"] == "host"
     for column in ("best_fitness", "env_steps", "coverage", "goal_distance_min", "population_return_median"):
-        np.testing.assert_allclose(run.history[column], xla.history[column], rtol=2e-3, err_msg=column)
-    np.testing.assert_allclose(run.policy("best").parameters_D, xla.policy("best").parameters_D, atol=1e-3)
+        np.testing.assert_allclose(run.history[column], simd.history[column], rtol=2e-3, err_msg=column)
+    np.testing.assert_allclose(run.policy("best").parameters_D, simd.policy("best").parameters_D, atol=1e-3)
     cells = list(run.map[["cell_x", "cell_y"]].head(2).itertuples(index=False, name=None))
     replays, recordings = record(run, best=True, cells=cells)
     assert [one.is_the_stored for one in replays] == [True] * (1 + len(cells))
@@ -211,7 +212,15 @@ def has_ended(process):
 
 
 @pytest.mark.usefixtures("no_jax")
-@pytest.mark.parametrize("fault", ["", "exit", "it raises this once", pytest.param("hang", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "",
+        "hang",
+        pytest.param("exit", marks=pytest.mark.long),
+        pytest.param("it raises this once", marks=pytest.mark.long),
+    ],
+)
 def test_workers_a_resume_and_faults_change_no_bit(fault, tmp_path, monkeypatch):
     monkeypatch.setenv("HOST_FAULT", str(tmp_path / "fault"))
     slow = f"python:{MODULE}:Slow"
