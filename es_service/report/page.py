@@ -83,7 +83,7 @@ def document(title: str, sections: list[Markup], scripts: Mapping[str, Any], lib
         tag("style", Markup(asset("page.css"))),
     )
     data = [data_script(f"data-{name}", value) for name, value in scripts.items()]
-    code = [tag("script", Markup(text)) for text in (*(libraries or []), asset("page.js"))]
+    code = [tag("script", Markup(text)) for text in (asset("page.js"), *(libraries or []))]
     body = tag("body", maps.empty_pattern(), tag("header", tag("h1", title)), tag("main", *sections), *data, *code)
     return f"<!DOCTYPE html>\n{tag('html', head, body, lang='en')}\n"
 

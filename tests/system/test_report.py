@@ -149,7 +149,6 @@ def replayed(folder, settings, task, *options, **environment):
     return folder / "report.html"
 
 
-@pytest.mark.long
 def test_a_point_is_replayed_in_the_plane(page, tmp_path):
     page.open(replayed(tmp_path / "run", {"map.enabled": False, "search.algorithm": "es"}, SHIPPED["point_maze"]))
     assert page.text("#step").startswith("step 0 of 40; return so far 0")
