@@ -358,8 +358,8 @@ CASES = [
         (
             "is that of the results",
             ENGINE,
-            "[result for item_id, _ in parts for result in self._results.pop(item_id)]",
-            "[result for results in self._results.values() for result in results]",
+            "(result for item_id, _ in parts for result in self._results.pop(item_id))",
+            "(result for results in self._results.values() for result in results)",
         ),
     ),
     *cases(
@@ -544,7 +544,7 @@ CASES = [
             "host = episodes.map(np.array)",
             "host = episodes.map(np.asarray)",
         ),
-        ("traces", RESULTS, "np.asarray(episodes.trace_T_B)[0].copy()", "np.asarray(episodes.trace_T_B)[0]"),
+        ("traces", RESULTS, "np.asarray(episodes.trace_T_B)[first].copy()", "np.asarray(episodes.trace_T_B)[first]"),
     ),
 ]
 

@@ -10,6 +10,7 @@ from es_service import api
 from es_service.api import load_config
 from es_service.cli.commands import error_message
 from es_service.config.compute import ComputeConfig
+from es_service.config.model import TaskConfig
 from es_service.config.parallel import chunks_at_once, chunks_of_phases, parallel_sentence
 from es_service.dispatch.events import Compiled, Result, StopWorker, Submit, Tick, WorkerLost, WorkerUp, WorkItem
 from es_service.dispatch.scheduler import step
@@ -64,8 +65,9 @@ def test_messages_of_deadlines_name_the_keys_that_set_them():
 
 def test_keys_that_messages_name_exist():
     for name in LIMIT_NAMES.values():
-        (item_id,) = re.findall(r"compute\.(\w+)", name)
-        assert item_id in ComputeConfig.model_fields
+        (section, key), *others = re.findall(r"(compute|task)\.(\w+)", name)
+        assert not others
+        assert key in {"compute": ComputeConfig, "task": TaskConfig}[section].model_fields
 
 
 def test_a_run_that_has_lost_its_start_does_not_start_anywhere_else(tmp_path):

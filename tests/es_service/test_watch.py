@@ -19,12 +19,14 @@ from es_service.errors import StoreError
 from es_service.report.data import read_run
 from es_service.report.page import run_sections
 from es_service.report.write import python_call
+from es_service.store import connection, upkeep, writer
 from es_service.store.codec import text_sha256
 from es_service.watch import channels
 from es_service.watch.pages import draw_run
 from es_service.watch.runs import Reading, Runs
 from es_service.watch.server import Site
 from tests.es_service.test_report_page import Elements
+from tests.helpers import workers_in_this_process
 from tests.run_examples import write_run
 from tests.system.session import SMALL
 from workers.environments import SHIPPED
@@ -407,3 +409,30 @@ def test_a_run_with_forged_data_hides_no_other(tmp_path):
     assert f'run="{tmp_path.name}/b",task="point_maze"' in get(app, "/metrics")[2]
     key = key_of(tmp_path, f"{tmp_path.name}/a")
     assert "cannot be drawn" in sections(app, f"/events/run/{key}")["sections"]["live"]["html"]
+
+
+def test_on_a_shared_file_system_the_copy_is_watched_while_a_driver_writes(tmp_path, monkeypatch):
+    for module in (writer, connection):
+        monkeypatch.setattr(module, "is_network_filesystem", lambda path: True)
+    monkeypatch.setattr(upkeep, "NETWORK_COPY_INTERVAL_S", 0.0)
+    monkeypatch.setattr(upkeep, "COPY_TIME_FRACTION", np.inf)
+    read, opened, seen = [], connection.connected_to, []
+    monkeypatch.setattr(connection, "connected_to", lambda file: (read.append(file.name), opened(file))[1])
+
+    def watch(row):
+        if row["generation"] < 1:
+            return
+        read.clear()
+        [one] = Runs([tmp_path]).summaries()
+        reading = Reading(one.found)
+        assert reading.update()
+        assert reading.data is not None
+        assert not reading.data.problems
+        assert one.problem == ""
+        assert set(read) == {"run.db.copy"}
+        seen.append((row["generation"], int(reading.data.history["generation"][-1])))
+
+    with workers_in_this_process():
+        api.run(MAPPED, tmp_path / "run", on_generation=watch)
+    assert [generation for generation, _ in seen] == [1, 2, 3, 4, 5, 6]
+    assert all(generation - 1 <= shown <= generation for generation, shown in seen)
