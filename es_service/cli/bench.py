@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from es_service.cli.options import ConfigArgument, SetOption, overrides
+from es_service.config.caller import CALLER
 from es_service.config.problems import one_of
 from es_service.errors import ConfigError
 
@@ -45,8 +46,9 @@ def rollouts(
     rollouts = rollout.split(",") if rollout else []
     if policies is None:
         raise ConfigError(f"--policy {policy}: must be on or off")
-    if not set(rollouts) <= set(measured.ROLLOUTS):
-        raise ConfigError(f"--rollout {rollout}: must be {one_of(measured.ROLLOUTS)}, or several separated by commas")
+    able = [name for name, one in measured.ROLLOUTS.items() if one.task_kinds != (CALLER,)]  # others compute nothing
+    if not set(rollouts) <= set(able):
+        raise ConfigError(f"--rollout {rollout}: must be {one_of(able)}, or several separated by commas")
     if odd := [number for number in batch or () if number % 2]:
         raise ConfigError(f"--batch {odd[0]}: must be even, so that it consists of whole pairs")
     rows = measured.bench_rollouts(

@@ -102,7 +102,7 @@ def test_an_environment_depends_neither_on_the_others_nor_on_threads_nor_on_the_
     module._kernels.cache_clear()
 
 
-@pytest.mark.parametrize("task", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("task", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.long)])
 def test_steps_are_those_of_the_task(task):
     """The functions that xla and simd compile for runs, in JAX."""
     envs, functions = TaskVectorEnv(task, 3), environment_of(task)

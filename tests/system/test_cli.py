@@ -56,7 +56,7 @@ def test_bench_rollouts_prints_a_row_per_policy_batch_and_rollout(one_core):
         (("--batch", 7), "must be even"),
         (("--policy", "maybe"), "--policy maybe: must be on or off"),
         (("--task", "ant_maz"), "did you mean ant_maze?"),
-        (("--rollout", "gpu"), "--rollout gpu: must be xla or simd, or several"),
+        (("--rollout", "gpu"), "--rollout gpu: must be host, xla or simd, or several"),
     ):
         code, printed = es("bench", "rollouts", *wrong)
         assert code == 2

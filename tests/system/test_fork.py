@@ -103,6 +103,16 @@ def test_a_state_that_does_not_fit_is_refused(parent, override, change):
     assert error_message(caught.value).endswith(f": es-service run CONFIG --set search.init_from={parent.folder}:best")
 
 
+class Told(tasks.Tasks):
+    """Tasks of which PointMaze is told to be another one."""
+
+    def __init__(self, point_maze):
+        self.point_maze = point_maze
+
+    def chosen(self, name, options, descriptor):
+        return self.point_maze if name == "point_maze" else super().chosen(name, options, descriptor)
+
+
 def test_another_descriptor_is_refused(tmp_path, monkeypatch):
     """One of as many dimensions: a novelty archive of both would mean nothing."""
     bounds = SHIPPED["point_maze"].descriptor_bounds
@@ -114,9 +124,9 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
         },
     )  # fmt: skip
     for module in (checked_config, tasks):
-        monkeypatch.setattr(module, "TASKS", {"point_maze": told})
+        monkeypatch.setattr(module, "TASKS", Told(told))
     monkeypatch.setattr(
-        api, "work", lambda *_: api.Outcome(api.open_run(tmp_path / "run"), "")
+        api, "work", lambda *_, **__: api.Outcome(api.open_run(tmp_path / "run"), "")
     )  # as workers know of no such option
     api.run(SMALL, tmp_path / "run")
     assert (
@@ -126,7 +136,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
         with pytest.raises(ConfigError, match=rf"task\.options\.descriptor: place -> {other}\n[^$]*search\.init_from"):
             lineage.fork_config(tmp_path / "run", [f"task.options.descriptor={other}"])
     for module in (checked_config, tasks):
-        monkeypatch.setattr(module, "TASKS", {"point_maze": replace(told, descriptors={"place": (("a", "b"), bounds)})})
+        monkeypatch.setattr(module, "TASKS", Told(replace(told, descriptors={"place": (("a", "b"), bounds)})))
     with pytest.raises(ConfigError, match=r"the descriptor of point_maze: \[x, y\] -> \[a, b\]\n.*search\.init_from"):
         lineage.fork_config(tmp_path / "run")
 
@@ -135,7 +145,7 @@ def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkey
     """A user's own, edited: the same parameters would mean another network."""
     other = replace(SHIPPED["point_maze"], action_size=3)
     for module in (checked_config, tasks):
-        monkeypatch.setattr(module, "TASKS", {"point_maze": other})
+        monkeypatch.setattr(module, "TASKS", Told(other))
     with pytest.raises(ConfigError, match=r"point_maze has changed since the run was created \(action_size: 2 -> 3\)"):
         api.resume(parent.folder, ["budget.generations=7"])
     with pytest.raises(ConfigError, match=r"the network's layers: \[2, 8, 2\] -> \[2, 8, 3\]\n.*search\.init_from"):
@@ -151,7 +161,7 @@ def test_a_task_whose_sizes_have_changed_is_refused_by_resume_too(parent, monkey
 )
 def test_a_task_with_other_columns_is_no_other_version(parent, monkeypatch, change, told):
     for module in (checked_config, tasks):
-        monkeypatch.setattr(module, "TASKS", {"point_maze": replace(SHIPPED["point_maze"], **change)})
+        monkeypatch.setattr(module, "TASKS", Told(replace(SHIPPED["point_maze"], **change)))
     with pytest.raises(ConfigError, match=rf"the task point_maze has changed since the run was created \({told}\)"):
         api.resume(parent.folder, ["budget.generations=7"])
 
