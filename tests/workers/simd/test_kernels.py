@@ -200,11 +200,11 @@ def test_digests_tell_functions_apart_and_know_them_again() -> None:
     assert len(others | set(same)) == 8
 
 
-def test_facts_say_what_compiling_took() -> None:
-    first = compile_kernel(swing, jax.ShapeDtypeStruct((5,), jnp.float32)).facts
+def test_facts_say_what_compiling_took(tmp_path) -> None:
+    first = compile_kernel(swing, jax.ShapeDtypeStruct((5,), jnp.float32), folder=tmp_path).facts
     assert not first.cached
     assert first.computed > 0
     assert first.code_bytes > 0
-    again: Kernel = compile_kernel(swing, jax.ShapeDtypeStruct((5,), jnp.float32))
+    again: Kernel = compile_kernel(swing, jax.ShapeDtypeStruct((5,), jnp.float32), folder=tmp_path)
     assert again.facts.cached
     assert again.facts.code_bytes == first.code_bytes
