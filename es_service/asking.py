@@ -91,14 +91,17 @@ class Asked:
 class AskTell:
     """A run whose episodes the caller computes; `ask_tell` makes one. To be used from one thread."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, dimensions: int) -> None:
+        """`dimensions`: those of the descriptor."""
         self.folder = folder
         self.outcome: Outcome | None = None
         """How the run ended; None while it goes on."""
         self._from_run: Queue[Asked | Outcome | BaseException] = Queue()
         self._to_run: Queue[Told | None] = Queue()
         self._asked: Asked | None = None
-        self._dimensions = 0
+        self._error: BaseException | None = None
+        """What has ended the run before its budget was spent; raised again by every later call."""
+        self._dimensions = dimensions
 
     @property
     def run(self) -> Run:
@@ -160,12 +163,18 @@ class AskTell:
 
     def _receive(self) -> None:
         """Wait until the run asks, or ends."""
+        if self._error is not None:
+            raise self._error
         match self._from_run.get():
             case Asked() as asked:
                 self._asked = asked
             case Outcome() as outcome:
                 self.outcome = outcome
+            case _Closed():
+                self._error = EvaluationError("the block of ask_tell was left; make the same call again to go on")
+                raise self._error
             case BaseException() as error:
+                self._error = error
                 raise error
 
 
@@ -233,8 +242,7 @@ def ask_tell(
             value=wanted.task.environment,
             allowed=CALLER,
         )
-    search = AskTell(folder)
-    search._dimensions = len(task_of(wanted).descriptor_names)
+    search = AskTell(folder, len(task_of(wanted).descriptor_names))
 
     @contextmanager
     def caller(spec: WorkerSpec) -> Iterator[Any]:
@@ -252,6 +260,7 @@ def ask_tell(
     try:
         yield search
     finally:
+        search._asked = None
         search._to_run.put(None)
         thread.join()
 

@@ -44,12 +44,17 @@ SIGMA = 0.02
 
 def examine(*, as_json: bool = False) -> bool:
     """Print every finding, at once or as JSON at the end, and return whether no check failed."""
+    checks = (_software, _ray, _machine, _vectors, _disk, _noise, _rollout)
+    return print_findings((one for check in checks for one in _guarded(check)), as_json=as_json)
+
+
+def print_findings(findings: Iterator[Finding], *, as_json: bool) -> bool:
+    """Print each finding when it is there, or all as JSON at the end; return whether no check failed."""
     found: list[Finding] = []
-    for check in (_software, _ray, _machine, _vectors, _disk, _noise, _rollout):
-        for level, text in _guarded(check):
-            found.append((level, text))
-            if not as_json:
-                print_finding(level, text)
+    for level, text in findings:
+        found.append((level, text))
+        if not as_json:
+            print_finding(level, text)
     if as_json:
         print_json([{"level": level, "text": text} for level, text in found])
     return all(level != "FAIL" for level, _ in found)

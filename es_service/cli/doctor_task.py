@@ -8,15 +8,13 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from es_service.cli.data import print_json
-from es_service.cli.options import print_finding
+from es_service.cli.doctor import Finding, print_findings
 from es_service.config.problems import did_you_mean, one_of
 from es_service.config.tasks import TASKS
 from es_service.errors import ConfigError
 from es_service.protocol.messages import UNBOUNDED, TaskSpec
 from es_service.protocol.process_environment import child_environment
 
-Finding = tuple[str, str]
 """Level ("ok", "note" or "FAIL") and text of one finding."""
 ALONE = "alone"
 SECONDS = 1.0
@@ -30,14 +28,7 @@ def examine_task(name: str, *, as_json: bool = False) -> bool:
 
     Raises ConfigError if there is no such task, or it cannot be used.
     """
-    found: list[Finding] = []
-    for level, text in _findings(name):
-        found.append((level, text))
-        if not as_json:
-            print_finding(level, text)
-    if as_json:
-        print_json([{"level": level, "text": text} for level, text in found])
-    return all(level != "FAIL" for level, _ in found)
+    return print_findings(_findings(name), as_json=as_json)
 
 
 def _findings(name: str) -> Iterator[Finding]:

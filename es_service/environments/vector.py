@@ -20,6 +20,10 @@ from workers.lanes import Lanes, LanesState, Seen
 Returned = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
 
+State = tuple[LanesState, NDArray[np.bool_], NDArray[np.float32]]
+"""State of the task, which episodes are over [N], and the last observations [N, O]."""
+
+
 class TaskVectorEnv(VectorEnv[Any, Any, Any]):
     """Environments of a task side by side.
 
@@ -140,14 +144,15 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         info |= self._masked(shown, np.arange(self.num_envs))
         return self._observation_N_O.copy(), reward_N, terminated_N, truncated_N, info
 
-    def get_state(self) -> tuple[LanesState, NDArray[np.bool_]]:
+    def get_state(self) -> State:
         """State of all environments, from which `set_state` of as many of the same task goes on, bit for bit."""
-        return self._lanes.state(), self._is_over_N.copy()
+        return self._lanes.state(), self._is_over_N.copy(), self._observation_N_O.copy()
 
-    def set_state(self, state: tuple[LanesState, NDArray[np.bool_]]) -> None:
+    def set_state(self, state: State) -> None:
         """Go on from what `get_state` has returned; the next step is that of those environments."""
-        lanes, is_over_N = state
+        lanes, is_over_N, observation_N_O = state
         self._lanes.set_state(lanes)
+        self._observation_N_O[:] = observation_N_O
         self._is_over_N = is_over_N.copy()
         self._is_seeded_N[:] = True
 

@@ -157,6 +157,11 @@ def test_what_is_no_task_of_the_caller_is_refused_and_so_is_telling_after_the_en
             search.tell(*told_of(asked))
         with pytest.raises(EvaluationError, match="the run has ended, so nothing is asked"):
             search.tell([0.0])
+    with ask_tell(config_of("es"), tmp_path / "left") as search:
+        search.ask()
+    for _ in range(2):
+        with pytest.raises(EvaluationError, match="the block of ask_tell was left"):
+            search.ask()
 
 
 def test_readers_know_the_run_and_whoever_would_compute_episodes_says_whose_they_are(tmp_path):

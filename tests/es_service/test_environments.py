@@ -127,6 +127,10 @@ def test_the_state_goes_on_in_other_environments():
     others.set_state(envs.get_state())
     for one in actions[10:]:
         same(envs.step(one), others.step(one))
+    last = TaskVectorEnv(POLE, 20, max_episode_steps=9)
+    last.set_state(envs.get_state())
+    some = np.arange(20) == 3
+    same(*(one.reset(options={"reset_mask": some.copy()}) for one in (envs, last)))
     with pytest.raises(ValueError, match=r"state has words of shape \(20, 5\), but 3 environments of "):
         TaskVectorEnv(POLE, 3).set_state(envs.get_state())
     single, other = TaskEnv("point_maze"), TaskEnv("point_maze")
