@@ -9,6 +9,7 @@ import base64
 import contextlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -32,6 +33,10 @@ def needed() -> str:
     return found
 
 
+class PageLeftError(Exception):
+    """The page was left while one of its scripts was asked for a value."""
+
+
 class Page:
     """A page that is open in the browser."""
 
@@ -50,7 +55,7 @@ class Page:
             self.send(f"{domain}.enable")
 
     def send(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Result of a command of the protocol."""
+        """Result of a command of the protocol; raises `PageLeftError` if the page gave way to another before it answered."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
         os.write(
@@ -59,6 +64,8 @@ class Page:
         while True:
             answer = self._receive()
             if answer.get("id") == self._number:
+                if re.search("navigated|context", answer.get("error", {}).get("message", "")):
+                    raise PageLeftError
                 assert "error" not in answer, (method, answer["error"])
                 return answer["result"]
 
@@ -110,11 +117,14 @@ class Page:
         return answer["result"].get("value")
 
     def until(self, script: str) -> None:
-        """Wait until an expression is true."""
+        """Wait until an expression is true, in this page or in the one that takes its place."""
         end = time.monotonic() + PATIENCE_S
-        while not self.value(script):
-            assert time.monotonic() < end, f"this did not become true: {script}"
+        while time.monotonic() < end:
+            with contextlib.suppress(PageLeftError):
+                if self.value(script):
+                    return
             time.sleep(0.05)
+        raise AssertionError(f"this did not become true: {script}")
 
     def place(self, selector: str, x: float = 0.5, y: float = 0.5) -> tuple[float, float]:
         """Pixels of a place in an element, as shares of its width and height, after scrolling to it."""
