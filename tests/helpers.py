@@ -16,6 +16,7 @@ import pytest
 
 from es_service.dispatch.events import Limits
 from es_service.errors import Interrupted
+from es_service.loop.history import NO_INTEGER
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import Centre, Chunk, ChunkResult, PolicySpec, Work, WorkerSpec
 from workers.recording import record
@@ -131,7 +132,7 @@ def workers_in_this_process() -> Iterator[None]:
 def rows_of(table: Mapping[str, np.ndarray]) -> list[dict]:
     """The rows of a table; None for no value."""
     columns = {
-        name: [None if value != value else value for value in np.ma.asarray(values).tolist()]
+        name: [None if value in (None, NO_INTEGER) or value != value else value for value in values.tolist()]
         for name, values in table.items()
     }
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]

@@ -15,7 +15,8 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from es_service.protocol.kept_parents import LackingError
-from es_service.protocol.messages import Subject, WorkerSpec, forget_oldest
+from es_service.protocol.kept_subjects import KeptSubjects
+from es_service.protocol.messages import Subject, WorkerSpec
 from es_service.protocol.parent import end_with
 from es_service.protocol.raised import RaisedError, raised
 from es_service.protocol.sources import why_refused
@@ -95,13 +96,13 @@ def _serve(parent: socket.socket, run_chunks: Compilable | RaisedError, spec: Wo
         parent.sendall(framed(("broken", run_chunks)))
         return
     parent.sendall(framed(("up",)))
-    subjects: dict[int, Subject] = {}
+    subjects: KeptSubjects[Subject] = KeptSubjects(attrgetter("nbytes"))
     parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
     compiled: set[str] = set()
     while True:
         match receive(parent):
             case ("subject", number, subject):
-                subjects[number] = subject
+                subjects.add(number, subject)
             case ("parents", given):
                 parents.receive(given)
             case ("chunks", item, attempt, chunks):
@@ -117,7 +118,7 @@ def _serve(parent: socket.socket, run_chunks: Compilable | RaisedError, spec: Wo
                 except BaseException as error:  # also sys.exit in an environment
                     answer = ("failure", item, attempt, raised(error, spec.environment))
                 parent.sendall(framed(answer))
-                forget_oldest(subjects, attrgetter("nbytes"))
+                subjects.forget_oldest()
 
 
 if __name__ == "__main__":

@@ -26,7 +26,8 @@ from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
 from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
-from es_service.protocol.messages import Subject, Work, WorkerSpec, forget_oldest
+from es_service.protocol.kept_subjects import KeptSubjects
+from es_service.protocol.messages import Subject, Work, WorkerSpec
 from es_service.protocol.parent import start_child
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.raised import RaisedError, raised
@@ -78,8 +79,8 @@ class _Worker:
     channel: Channel
     parents: KeptParents[int]
     """Sizes of the parents of policies that it keeps."""
-    subjects: dict[int, int] = field(default_factory=dict)
-    """Numbers of the subjects that it has, in the order in which they were sent, and their bytes."""
+    subjects: KeptSubjects[int] = field(default_factory=lambda: KeptSubjects(int))
+    """Bytes of the subjects that it has, by their numbers."""
     unanswered: dict[tuple[Hashable, int], Sequence[Work]] = field(default_factory=dict)
     """Work items that it was sent and has not answered, by id and attempt."""
 
@@ -94,7 +95,7 @@ class ChildProcesses:
         self._by_descriptor: dict[int, int] = {}
         self._poll = select.poll()
         self._ready: deque[Message] = deque()
-        self._subjects: dict[int, tuple[Subject, int, bytes]] = {}
+        self._subjects: KeptSubjects[tuple[Subject, int, bytes]] = KeptSubjects(lambda entry: entry[0].nbytes)
         """By `id`, which the subject in the entry keeps from being reused."""
         self._next_subject = 0
 
@@ -137,13 +138,13 @@ class ChildProcesses:
         for subject, chunk in work:
             number, frame = self._framed_subject(subject)
             if number not in to.subjects:
-                to.subjects[number] = subject.nbytes
+                to.subjects.add(number, subject.nbytes)
                 frames.append(frame)
             numbered.append((number, chunk))
         for name, given in parents_to_send(work, to.parents).items():
             frames.append(framed(("parents", {name: given})))
-        forget_oldest(to.subjects, int)
-        forget_oldest(self._subjects, lambda entry: entry[0].nbytes)
+        to.subjects.forget_oldest()
+        self._subjects.forget_oldest()
         to.unanswered[item_id, attempt] = work
         to.channel.send(*frames, framed(("chunks", item_id, attempt, numbered)))
         self._watch(to.channel)
@@ -186,7 +187,8 @@ class ChildProcesses:
         """Number and message of a subject. One that was forgotten meanwhile gets another number."""
         if (known := self._subjects.get(id(subject))) is None:
             frame = framed(("subject", self._next_subject, as_sent(subject)))
-            known = self._subjects[id(subject)] = subject, self._next_subject, frame
+            known = subject, self._next_subject, frame
+            self._subjects.add(id(subject), known)
             self._next_subject += 1
         return known[1:]
 

@@ -11,7 +11,8 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
-from es_service.protocol.messages import KEPT_BYTES, FloatArray, Subject, Work, forget_oldest
+from es_service.protocol.kept_subjects import KEPT_BYTES, KeptSubjects
+from es_service.protocol.messages import FloatArray, Subject, Work
 from es_service.protocol.recipes import Origin
 
 IN_CALL_BYTES = 64 * 2**10
@@ -102,7 +103,7 @@ class Arguments:
 
     def __init__(self, ray: ModuleType) -> None:
         self._ray = ray
-        self._subjects: dict[int, tuple[Subject, Any]] = {}
+        self._subjects: KeptSubjects[tuple[Subject, Any]] = KeptSubjects(lambda entry: entry[0].nbytes)
         """By `id`, which the subject in the entry keeps from being reused."""
         self._parents: KeptParents[_Stored] = KeptParents(KEPT_BYTES, attrgetter("nbytes"))
         """Large parents that are stored."""
@@ -150,6 +151,6 @@ class Arguments:
         if (known := self._subjects.get(id(subject))) is None:
             pickled = pickle.dumps(as_sent(subject), pickle.HIGHEST_PROTOCOL)
             known = subject, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
-            self._subjects[id(subject)] = known
-            forget_oldest(self._subjects, lambda entry: entry[0].nbytes)
+            self._subjects.add(id(subject), known)
+            self._subjects.forget_oldest()
         return known[1]

@@ -65,7 +65,7 @@ from es_service.loop.state import RunState
 from es_service.protocol.evaluator import DispatchCounts, Evaluator
 from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, TaskSpec
 from es_service.search.algorithms.base import Ask, SearchState
-from es_service.search.maps.behaviour_map import Elite
+from es_service.search.maps.behaviour_map import EMPTY, Elite
 from es_service.search.maps.geometry import reachable_cells
 from es_service.search.novelty import novelty
 from es_service.search.observation_statistics import merge_moments
@@ -254,6 +254,7 @@ def record(
     config, generation, learned = search.config, proposal.generation, updated.search
     evaluated, told, results = updated.evaluated, updated.told, updated.evaluated.evaluation
     episodes = sum(one.fitness.size for one in evaluations.populations) * config.task.episodes_per_member
+    cell_N = None if learned.map is None else learned.map.cells_with(generation, evaluated.index_N)
     state = RunState(
         generation=generation,
         search=replace(learned, elites={}),
@@ -262,9 +263,9 @@ def record(
         env_steps=before.env_steps + int(evaluated.env_steps_N.sum()),
         episodes=before.episodes + episodes + results.fitness.size,
         wall_clock_s=clock.total(),
-        elites=entered(learned, told, evaluated.points, results.trace_T_B),
+        elites=entered(learned, cell_N, evaluated.points, results.trace_T_B),
     )
-    table = evaluated_table(evaluated, search.task, learned.map, generation, proposal.start_cells, updated.novelty_N)
+    table = evaluated_table(evaluated, search.task, cell_N, proposal.start_cells, updated.novelty_N)
     at = fittest(told)  # the history's row is about this one
     shown = int(evaluated.index_N[at])
     row: HistoryRow = {
@@ -279,8 +280,7 @@ def record(
             learned.map,
             config.map.qd_offset,
             reachable,
-            generation=generation,
-            centre=shown,
+            cell=None if cell_N is None or cell_N[at] == EMPTY else int(cell_N[at]),
             start_cell=proposal.start_cells.get(shown),
         ),
         "update_norm": or_none(evaluated.update_norm_N[at]),

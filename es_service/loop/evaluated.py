@@ -17,7 +17,7 @@ from es_service.loop.policies import PolicyWork, no_statistics, policy_work
 from es_service.protocol.episodes import each, joined
 from es_service.protocol.messages import Centre, EpisodesResult, Moments, TaskSpec
 from es_service.search.algorithms.base import Ask, CentreEvaluations, PolicyAsk, SearchState
-from es_service.search.maps.behaviour_map import EMPTY, BehaviourMap
+from es_service.search.maps.behaviour_map import EMPTY
 
 
 @dataclass(frozen=True)
@@ -243,19 +243,22 @@ def told_of(evaluated: Evaluated, generation: int) -> CentreEvaluations:
 def evaluated_table(
     evaluated: Evaluated,
     task: TaskSpec,
-    map_: BehaviourMap | None,
-    generation: int,
+    cell_N: NDArray[np.int64] | None,
     start_cells: Mapping[int, int],
     novelty_N: NDArray[np.float64],
 ) -> Table:
-    """The rows of a generation in the table of evaluated centres; see `history.evaluated_columns`."""
+    """The rows of a generation in the table of evaluated centres; see `history.evaluated_columns`.
+
+    Args:
+        cell_N: cells of which they are the elites, EMPTY for the others; None without a map.
+    """
     index_N, episodes = evaluated.index_N, evaluated.evaluation
     cells = {}
-    if map_ is not None:
+    if cell_N is not None:
         start_N = np.full(index_N.shape, EMPTY)
         for index, cell in start_cells.items():
             start_N[index_N == index] = cell
-        cells = {"start_cell": with_gaps(start_N), "cell": with_gaps(map_.cells_with(generation, index_N))}
+        cells = {"start_cell": with_gaps(start_N), "cell": with_gaps(cell_N)}
     return {
         "centre": index_N,
         "fitness_weight": evaluated.fitness_weight_N,

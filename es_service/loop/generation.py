@@ -13,6 +13,7 @@ from itertools import islice
 from typing import Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from es_service.config.model import RunConfig
 from es_service.errors import EvaluationError
@@ -221,7 +222,7 @@ def fittest(told: CentreEvaluations) -> int:
 
 def entered(
     state: SearchState,
-    told: CentreEvaluations,
+    cell_N: NDArray[np.int64] | None,
     points: Callable[[Sequence[int]], Sequence[Centre]],
     trace_N_T_B: FloatArray | None,
 ) -> dict[int, Elite]:
@@ -231,13 +232,13 @@ def entered(
     The map decides this and not `CentreState.cell`, which a search of the user need not set.
 
     Args:
-        points: function from indices in `told` to what was evaluated.
+        cell_N: cells of which those just evaluated are the elites, EMPTY for the others; None without a map.
+        points: function from indices in `cell_N` to what was evaluated.
     """
-    if state.map is None:
+    if state.map is None or cell_N is None:
         return {}
     filled = set(state.map.cell_N.tolist()) if state.elites else set()
     found = {cell: elite for cell, elite in state.elites.items() if cell in filled}
-    cell_N = state.map.cells_with(told.generation, told.centre_N)
     rows = np.flatnonzero(cell_N != EMPTY).tolist()
     for row, point in zip(rows, points(rows), strict=True):
         assert trace_N_T_B is not None, "an evaluation has a trace"

@@ -27,7 +27,9 @@ def each(change: Callable[..., np.ndarray], *results: EpisodesResult) -> Episode
 def joined(results: Sequence[EpisodesResult], count: int | None = None) -> EpisodesResult:
     """Results along the first axis, one after another, of which the first `count` are kept; without moments."""
     found = each(lambda *arrays: np.concatenate(arrays)[:count], *results)
-    names, rows = results[0].of_steps, int(found.steps.sum(dtype=np.int64))
+    if not (names := results[0].of_steps):
+        return found
+    rows = int(found.steps.sum(dtype=np.int64))
     return replace(
         found, of_steps={name: np.concatenate([one.of_steps[name] for one in results])[:rows] for name in names}
     )

@@ -7,7 +7,7 @@ imports neither.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -217,10 +217,6 @@ Subject = Centre | Policies
 """What the episodes of a chunk run: the centre of training, evaluation and gradient chunks, or policies."""
 Work = tuple[Subject, Chunk]
 """A chunk with the subject that it belongs to."""
-KEPT_CENTRES = 64
-"""Most subjects that a worker keeps after each work item, so that they need not be sent to it again."""
-KEPT_BYTES = 32 * 2**20
-"""Most bytes of parameters that it keeps."""
 
 
 def around(subject: Subject, chunks: Iterable[Chunk]) -> list[Work]:
@@ -232,21 +228,6 @@ def chunk_name(chunk: Chunk) -> str:
     """Name of a chunk in messages, such as `TrainingChunk 3 of generation 5`."""
     population = f" of population {chunk.ask}" if chunk.ask else ""
     return f"{type(chunk).__name__} {chunk.chunk_id}{population} of generation {chunk.generation}"
-
-
-def forget_oldest(kept: dict[int, Any], size_of: Callable[[Any], int]) -> None:
-    """Remove the oldest entries, in order of insertion, so that at most KEPT_CENTRES and KEPT_BYTES remain, or one.
-
-    A worker and its sender both do so after each work item, so that the sender knows which subjects the worker has.
-
-    Args:
-        size_of: bytes of an entry.
-    """
-    total = sum(map(size_of, kept.values()))
-    for number in list(kept)[:-1]:
-        if len(kept) <= KEPT_CENTRES and total <= KEPT_BYTES:
-            return
-        total -= size_of(kept.pop(number))
 
 
 class WorkItemId(NamedTuple):

@@ -177,7 +177,7 @@ def stored_value(column: Column, value: Any) -> int | float | None:
         integer = operator.index(value)
     except TypeError as error:
         raise StoreError(f"history column {column.name} is {column.type} and cannot hold {value!r}") from error
-    if not -(2**63) <= integer < 2**63:
+    if not -(2**63) < integer < 2**63:
         raise StoreError(f"history column {column.name} cannot hold {value!r}: it does not fit into 64 bits")
     return integer
 
@@ -197,7 +197,8 @@ def row_bytes(row: Row) -> bytes:
     return b"".join(parts)
 
 
-def column_bytes(columns: Sequence[Column]) -> bytes:
+@lru_cache
+def column_bytes(columns: tuple[Column, ...]) -> bytes:
     """Bytes of the names and types of columns, which are hashed before the values."""
     return json.dumps([[column.name, column.type] for column in columns], separators=(",", ":")).encode()
 
@@ -209,7 +210,7 @@ def row_sha256(columns: bytes, row: Row, evaluations: bytes, state: str) -> str:
 
 
 def history_row(
-    columns: Sequence[Column],
+    columns: tuple[Column, ...],
     generation: int,
     history: Mapping[str, int | float | None],
     evaluations: bytes,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
-from es_service.loop.history import Column, Table
+from es_service.loop.history import NO_INTEGER, Column, Table
 from es_service.store.codec import INTEGER, REAL, Row, stored_value
 
 _MARKED = np.dtype([("mark", "S1"), ("bits", "<i8")])
@@ -39,26 +39,24 @@ def table_bytes(columns: Sequence[Column], table: Table) -> bytes:
     if missing := {column.name for column in columns} - table.keys():
         raise StoreError(f"a table has the columns {sorted(table)}; it lacks {sorted(missing)}")
     rows = len(table[columns[0].name])
-    value_N_C = np.zeros((rows, len(columns)), _MARKED)
-    is_byte_N_C_9 = np.ones((rows, len(columns), _MARKED.itemsize), bool)
+    bits_C_N = np.empty((len(columns), rows), "<i8")
+    float_C_N = bits_C_N.view("<f8")
     for at, column in enumerate(columns):
-        value_N, is_missing_N = _column(column, table[column.name], rows)
-        bits_N = value_N.astype("<i8" if column.type == "INTEGER" else "<f8").view("<i8")
-        value_N_C["bits"][:, at] = bits_N
-        value_N_C["mark"][:, at] = np.where(is_missing_N, b"N", b"I" if column.type == "INTEGER" else b"R")
-        is_byte_N_C_9[is_missing_N, at, 1:] = False
+        value_N = np.asarray(table[column.name])
+        if value_N.shape != (rows,):
+            raise StoreError(f"column {column.name} has the shape {value_N.shape}, and others have {rows} rows")
+        if value_N.dtype.kind not in ("iu" if column.type == "INTEGER" else "iuf"):
+            raise StoreError(f"column {column.name} is {column.type} and cannot hold {value_N.dtype}")
+        (bits_C_N if column.type == "INTEGER" else float_C_N)[at] = value_N
+    is_real_C = np.array([column.type == "REAL" for column in columns])
+    float_C_N[is_real_C] += 0.0  # -0.0 becomes 0.0
+    is_missing_C_N = np.where(is_real_C[:, None], np.isnan(float_C_N), bits_C_N == NO_INTEGER)
+    value_N_C = np.empty((rows, len(columns)), _MARKED)
+    value_N_C["bits"] = bits_C_N.T
+    value_N_C["mark"] = np.where(is_missing_C_N, b"N", np.where(is_real_C, b"R", b"I")[:, None]).T
+    is_byte_N_C_9 = np.ones((rows, len(columns), _MARKED.itemsize), bool)
+    is_byte_N_C_9[..., 1:] = ~is_missing_C_N.T[..., None]
     return value_N_C.view(np.uint8).reshape(is_byte_N_C_9.shape)[is_byte_N_C_9].tobytes()
-
-
-def _column(column: Column, values: NDArray[Any], rows: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """(values, whether each is missing) of a column of a table."""
-    value_N = np.ma.getdata(values)
-    if value_N.shape != (rows,):
-        raise StoreError(f"column {column.name} has the shape {value_N.shape}, and others have {rows} rows")
-    if value_N.dtype.kind not in ("iu" if column.type == "INTEGER" else "iuf"):
-        raise StoreError(f"column {column.name} is {column.type} and cannot hold {value_N.dtype}")
-    is_missing_N = np.ma.getmaskarray(values) | (value_N != value_N)
-    return (value_N if column.type == "INTEGER" else value_N.astype(np.float64) + 0.0), is_missing_N
 
 
 def as_table(columns: Sequence[Column], rows: Sequence[Mapping[str, int | float | None]]) -> dict[str, NDArray[Any]]:
@@ -74,8 +72,8 @@ def as_table(columns: Sequence[Column], rows: Sequence[Mapping[str, int | float 
     table: dict[str, NDArray[Any]] = {}
     for column in columns if rows else ():
         values = [stored_value(column, row[column.name]) for row in rows]
-        filled = np.array([0 if value is None else value for value in values], "f8" if column.type == "REAL" else "i8")
-        table[column.name] = np.ma.MaskedArray(filled, [value is None for value in values])
+        kind, none = ("f8", np.nan) if column.type == "REAL" else ("i8", NO_INTEGER)
+        table[column.name] = np.array([none if value is None else value for value in values], kind)
     return table
 
 

@@ -12,6 +12,7 @@ import tempfile
 import threading
 import time
 from contextlib import ExitStack
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,9 @@ from es_service.dispatch.engine import Answer
 from es_service.dispatch.events import Limits, Placed, WorkerLost, WorkerUp
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol import messages
-from es_service.protocol.messages import KEPT_CENTRES, TrainingChunk, Work, around, forget_oldest
+from es_service.protocol import kept_subjects
+from es_service.protocol.kept_subjects import KEPT_SUBJECTS, KeptSubjects
+from es_service.protocol.messages import TrainingChunk, Work, around
 from es_service.protocol.raised import RaisedError
 from es_service.protocol.wire import framed, receive
 from tests.helpers import SPEC, centre, random_parameters, spec
@@ -66,16 +68,17 @@ class Receiver:
     """A worker's side of a socket, as in workers/process.py: the centres that it keeps, and what it was sent."""
 
     def __init__(self, end: socket.socket) -> None:
-        self.end, self.centres, self.received = end, {}, 0
+        self.end, self.received = end, 0
+        self.centres = KeptSubjects(attrgetter("nbytes"))
 
     def item(self) -> list[tuple[float, int]]:
         """(first parameter of the centre, id) of each chunk of the next work item."""
         while (said := receive(self.end))[0] == "subject":
             _, number, point = said
-            self.centres[number] = point
+            self.centres.add(number, point)
             self.received += 1
         found = [(float(self.centres[number].parameters_D[0]), chunk.chunk_id) for number, chunk in said[3]]
-        forget_oldest(self.centres, lambda point: point.nbytes)
+        self.centres.forget_oldest()
         return found
 
 
@@ -94,7 +97,7 @@ def test_a_centre_is_sent_once_while_it_is_among_the_newest_and_again_when_it_wa
         ([0], 1),
         ([0, 1, 0], 2),
         ([2, 1], 3),
-        (range(3, KEPT_CENTRES), 64),
+        (range(3, KEPT_SUBJECTS), 64),
         ([0], 64),  # still there
         ([64], 65),
         ([1], 65),
@@ -104,14 +107,14 @@ def test_a_centre_is_sent_once_while_it_is_among_the_newest_and_again_when_it_wa
         transport.send(0, "key", 1, work_of(*numbers))
         assert worker.item() == [(number, position) for position, number in enumerate(numbers)]
         assert worker.received == received
-        assert len(worker.centres) <= KEPT_CENTRES
+        assert len(worker.centres) <= KEPT_SUBJECTS
     transport.send(1, "key", 1, work_of(99, 98))  # what one worker has, another may not have
     assert second.item() == [(99, 0), (98, 1)]
     assert second.received == 2
 
 
 def test_of_large_centres_a_worker_keeps_as_many_as_fit_and_always_one(transport, monkeypatch):
-    monkeypatch.setattr(messages, "KEPT_BYTES", 400)
+    monkeypatch.setattr(kept_subjects, "KEPT_BYTES", 400)
     transport, (end, _) = transport
     worker, sizes = Receiver(end), {0: 50, 1: 50, 2: 25, 3: 101}
     points = {number: centre(np.full(size, number, np.float32)) for number, size in sizes.items()}

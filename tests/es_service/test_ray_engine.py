@@ -19,7 +19,8 @@ from es_service.dispatch.ray_calls import IN_CALL_BYTES
 from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE, Claim, Growth, Membership, emptiest, look
 from es_service.errors import EvaluationError, Interrupted
-from es_service.protocol.messages import KEPT_CENTRES, EvaluationChunk, TrainingChunk, around
+from es_service.protocol.kept_subjects import KEPT_SUBJECTS
+from es_service.protocol.messages import EvaluationChunk, TrainingChunk, around
 from es_service.protocol.sources import OtherCodeError
 from tests.helpers import SPEC, centre, random_parameters
 
@@ -504,7 +505,7 @@ def test_a_chunk_that_kills_its_workers_is_found_out_after_as_many_as_it_has_att
 @pytest.mark.parametrize("size", [1, IN_CALL_BYTES // 4])
 def test_a_call_has_each_of_its_centres_once_and_a_large_one_is_stored_once_while_it_is_new(size):
     ray = PretendedRay()
-    points = [centre(np.full(size, number)) for number in range(KEPT_CENTRES + 2)]
+    points = [centre(np.full(size, number)) for number in range(KEPT_SUBJECTS + 2)]
 
     def evaluate(*numbers: int) -> int:
         """Evaluates chunks of these centres; returns how many values were stored for that."""
@@ -522,9 +523,9 @@ def test_a_call_has_each_of_its_centres_once_and_a_large_one_is_stored_once_whil
 
     with ray_engine(ray, Limits(2, item_s=60.0)) as engine:
         found = [evaluate(0) for _ in range(3)]  # so that it is known how long a chunk takes
-        found += [evaluate(0, 1, 1, 0), evaluate(*range(KEPT_CENTRES)), evaluate(0, 1), evaluate(KEPT_CENTRES)]
+        found += [evaluate(0, 1, 1, 0), evaluate(*range(KEPT_SUBJECTS)), evaluate(0, 1), evaluate(KEPT_SUBJECTS)]
         found += [evaluate(1, 2), evaluate(0)]  # the oldest was forgotten
         evaluate(1, 2, 3, 2)
         assert max(len(centres) for _, *centres in ray.calls) > 1
-    large = [1, 0, 0, 1, KEPT_CENTRES - 2, 0, 1, 0, 1]
+    large = [1, 0, 0, 1, KEPT_SUBJECTS - 2, 0, 1, 0, 1]
     assert found == ([0] * 9 if size == 1 else large)

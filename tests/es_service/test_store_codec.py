@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from es_service.errors import StoreError
-from es_service.loop.history import Column
+from es_service.loop.history import NO_INTEGER, Column
 from es_service.store.codec import (
     changed_sum,
     decode_part,
@@ -105,7 +105,7 @@ def test_a_table_has_the_bytes_of_its_rows():
     columns = [Column("i", "INTEGER", True, ""), Column("x", "REAL", True, ""), Column("y", "REAL", True, "")]
     numbers, floats = np.array([3, -1, 2**62]), np.array([np.nan, -0.0, np.inf])
     small = np.array([0.1, np.nan, -0.0], np.float32)
-    table = {"i": np.ma.MaskedArray(numbers, [False, True, False]), "x": floats, "y": small, "z": floats}
+    table = {"i": np.where([False, True, False], NO_INTEGER, numbers), "x": floats, "y": small, "z": floats}
     rows = [
         {"i": 3, "x": math.nan, "y": float(small[0])},
         {"i": None, "x": 0.0, "y": None},

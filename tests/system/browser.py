@@ -55,7 +55,7 @@ class Page:
             self.send(f"{domain}.enable")
 
     def send(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Result of a command of the protocol; raises `PageLeftError` if the page gave way to another before it answered."""
+        """Result of a command of the protocol. Raises PageLeftError if the page gave way to another meanwhile."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
         os.write(
