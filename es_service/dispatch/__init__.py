@@ -1,1 +1,1 @@
-"""Sending work items to workers and receiving their results: the scheduler, a pure state machine, and the engines."""
+"""Sending work items to workers and receiving their results: the scheduler, a state machine without I/O and clock, and the engines."""

@@ -1,4 +1,4 @@
-"""Assignment of work items to workers. `scheduler.step` uses it.
+"""Assignment of work items to workers. `scheduler.handle` uses it.
 
 Idle workers are served first, those that answered their last item in time before others, then workers that can take
 another item behind the one they run. A work item that failed on a worker is not assigned to that worker again while
@@ -13,23 +13,24 @@ from es_service.dispatch.scheduler_changes import put_worker, take_item
 from es_service.dispatch.scheduler_state import SchedulerState, Slot, Waiting
 
 
-def assign(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
-    """Assign queued items to workers that can take more, idle workers first; this changes the containers of `s`."""
-    retries = s.retries
+def assign(s: SchedulerState, out: list[Command], now: float) -> None:
+    """Assign queued items to workers that can take more, idle workers first."""
     for load in range(s.limits.in_flight):
-        for slots, _, _, worker in s.free:  # as they are before this round
-            if slots > load or not s.places:
+        passed = 0
+        while s.places and passed < len(s.free):
+            slots, _, _, worker = s.free[passed]
+            if slots > load:
                 break
             waiting = _next_for(s, worker) if slots == load else None
             if waiting is None:
+                passed += 1
                 continue
-            take_item(s, waiting, worker)
-            retries += waiting.item.size if waiting.last_holder is not None else 0
+            take_item(s, waiting, worker)  # the worker leaves its place in `free`, and the next one moves up
+            s.retries += waiting.item.size if waiting.last_holder is not None else 0
             slot, record = Slot(waiting.item, waiting.faults + 1), s.up[worker]
             record = record._replace(slots=(*record.slots, slot))
             put_worker(s, s.up, worker, begin_first_slot(s, record, now) if load == 0 else record)
             out.append(Assign(worker, waiting.item.id, slot.attempt))
-    return s if retries == s.retries else s._replace(retries=retries)
 
 
 def _next_for(s: SchedulerState, worker: int) -> Waiting | None:

@@ -1,4 +1,4 @@
-"""How long a worker may take for a work item, and what is said of one that takes longer. `scheduler.step` uses it.
+"""How long a worker may take for a work item, and what is said of one that takes longer. `scheduler.handle` uses it.
 
 The time of a work item counts from when its worker begins it. A worker first compiles for the first item of a kind,
 which has a limit of its own, and the time of that item counts from the end of compiling, so that its duration is known
@@ -38,7 +38,7 @@ def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worke
 
 
 def note_compiled(s: SchedulerState, event: Compiled, now: float) -> None:
-    """Remember that a worker has compiled for a kind; this changes the containers of `s`.
+    """Remember that a worker has compiled for a kind.
 
     If it did so for its first slot, the time of that item counts from the end of compiling, as the worker measured it,
     since the message may have been read later.

@@ -16,14 +16,14 @@ from typing import Generic, Protocol, Self, TypeVar
 
 from es_service.dispatch import events
 from es_service.dispatch.dispatch_log import Log, no_log
-from es_service.dispatch.scheduler import step
+from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import (
     initial_state,
     is_waiting,
     loss_text,
     next_deadline,
+    note_last_words,
     pending,
-    told_last_words,
     usual_chunk_s,
     workers_with_place,
 )
@@ -274,7 +274,7 @@ class Engine(Generic[AnyTransport]):
     def _step(self, event: events.Event) -> bool:
         """Pass an event to the scheduler and carry out its commands; returns whether it accepted a result."""
         is_late = isinstance(event, events.Tick) and is_waiting(self._state)
-        self._state, commands = step(self._state, event, time.monotonic())
+        commands = handle(self._state, event, time.monotonic())
         if commands or not isinstance(event, events.Tick):
             self._tell(event)
         accepted = False
@@ -286,7 +286,7 @@ class Engine(Generic[AnyTransport]):
                 case events.StartWorker(worker):
                     self.transport.start(worker)
                 case events.StopWorker(worker, _):
-                    self._state = told_last_words(self._state, worker, self.transport.kill(worker))
+                    note_last_words(self._state, worker, self.transport.kill(worker))
                 case events.Assign(worker, item_id, attempt):
                     self.transport.send(worker, item_id, attempt, self._work[item_id])
         if self._state.failed is not None:

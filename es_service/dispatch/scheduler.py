@@ -1,8 +1,8 @@
-"""The scheduler: a pure state machine that replaces lost workers, repeats lost work, and decides when the run fails.
+"""The scheduler: a state machine that replaces lost workers, repeats lost work, and decides when the run fails.
 
-It stands between the driver's work items and the engines that own the workers. `step(state, event, now)` returns the
-next state and the commands that the engine must carry out, in order. It uses no I/O, clock, random numbers or threads:
-the same arguments give the same result, and a returned state never changes, so a simulation can try every interleaving.
+It stands between the driver's work items and the engines that own the workers. `handle(state, event, now)` changes the
+state and returns the commands that the engine must carry out, in order. It uses no I/O, clock, random numbers or
+threads: the same arguments give the same result, so a simulation can try every interleaving.
 
 An engine starts with `initial_state(limits)` of scheduler_state.py and a `Tick`, passes on every message of its workers
 as an event, and sends a `Tick` whenever the time `next_deadline(state)` has come. It must pass on all waiting messages
@@ -23,10 +23,9 @@ Rules:
 assignment.py decides which worker gets which item, and deadlines.py how long it may take. stragglers.py decides which
 items are sent a second time. scheduler_changes.py keeps the containers of the state consistent.
 
-Cost: a step copies the containers of the state, whose copies are cheap (cheap_copies.py), and looks only at the workers
-and items that its event concerns and at those that it stops or assigns. An event takes 20 to 29 microseconds with 10 to
-10,000 workers and items (tests/benchmarks/dispatch_scale.py). Only `SetWorkers`, a failure of the run, and events
-before a first worker is up look at all workers. A free worker passes over items that failed on it.
+Cost: an event looks only at the workers and items that it concerns and at those that it stops or assigns
+(tests/benchmarks/dispatch_scale.py). Only `SetWorkers`, a failure of the run, and events before a first worker is up
+look at all workers. A free worker passes over items that failed on it.
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ import math
 from collections.abc import Hashable
 
 from es_service.dispatch.assignment import assign
-from es_service.dispatch.cheap_copies import Sorted, Table
 from es_service.dispatch.deadlines import add_duration, begin_first_slot, missed_deadline, note_compiled, plain
 from es_service.dispatch.events import (
     Command,
@@ -70,29 +68,27 @@ from es_service.dispatch.scheduler_state import (
     late_workers,
     loss_text,
     next_deadline,
-    with_own_containers,
     without,
 )
 from es_service.dispatch.stragglers import note_late_workers, send_copies
 
 
-def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerState, list[Command]]:
-    """The next state, and the commands that the engine must carry out.
+def handle(s: SchedulerState, event: Event, now: float) -> list[Command]:
+    """Change the state as an event demands; returns the commands that the engine must carry out.
 
     Args:
         now: time in seconds of a monotonic clock with any origin.
 
     Raises:
-        ValueError: a submitted id has not been delivered yet, or `SetWorkers` asks for less than 1 worker.
+        ValueError: a submitted id has not been delivered yet, or `SetWorkers` asks for less than 1 worker;
+            the state is then of no use.
     """
-    if state.failed is not None or (isinstance(event, Tick) and now < next_deadline(state)):
-        return state, []
-    # Only the containers of `s` are changed in place, since no other state has them before this step returns.
-    s = with_own_containers(state)
     out: list[Command] = []
+    if s.failed is not None or (isinstance(event, Tick) and now < next_deadline(s)):
+        return out
     match event:
         case Result(worker, item_id, attempt):
-            s = _result(s, out, worker, item_id, attempt, now)
+            _result(s, out, worker, item_id, attempt, now)
         case Submit(items):
             append_items(s, items)
         case Placed(worker):
@@ -102,47 +98,46 @@ def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerStat
         case WorkerUp(worker):
             if pop_worker(s, s.starting, worker) is not None:
                 put_worker(s, s.up, worker, Worker(s.next_rank))
-                s = s._replace(start_failures=0, next_rank=s.next_rank + 1)
+                s.start_failures = 0
+                s.next_rank += 1
         case WorkerLost(worker, reason, bystander, refused):
             fault = not refused and worker not in s.draining
-            s = _lose(s, out, worker, reason, now, fault=fault, charge=not bystander)
+            _lose(s, out, worker, reason, now, fault=fault, charge=not bystander)
         case Compiled():
             note_compiled(s, event, now)
         case Failure():
-            s = _failure(s, out, event, now)
+            _failure(s, out, event, now)
         case Tick(silent):
             note_late_workers(s, now)
-            s = _expire(s, out, now, silent)
+            _expire(s, out, now, silent)
         case Drain(worker):
-            s = _drain(s, out, worker)
+            _drain(s, out, worker)
         case SetWorkers(wanted):
             if wanted < 1:
                 raise ValueError(f"SetWorkers({wanted}): the number of workers must be at least 1")
-            s = s._replace(wanted=wanted)
+            s.wanted = wanted
             for worker in by_progress(s)[wanted:]:
-                s = _drain(s, out, worker)
+                _drain(s, out, worker)
     if s.failed is None:
-        s = _start_workers(s, out, now)
-        s = assign(s, out, now)
+        _start_workers(s, out, now)
+        assign(s, out, now)
         if isinstance(event, Tick):
-            s = send_copies(s, out, now)
+            send_copies(s, out, now)
         if is_down(s) != (s.down_since_s is not None):
-            s = s._replace(down_since_s=now if s.down_since_s is None else None)
-    return s, out
+            s.down_since_s = now if s.down_since_s is None else None
+    return out
 
 
-def _result(
-    s: SchedulerState, out: list[Command], worker: int, item_id: Hashable, attempt: int, now: float
-) -> SchedulerState:
+def _result(s: SchedulerState, out: list[Command], worker: int, item_id: Hashable, attempt: int, now: float) -> None:
     record = s.up.get(worker) or s.draining.get(worker)
     if record is None:
-        return s._replace(duplicates=s.duplicates + 1)
+        s.duplicates += 1
+        return
     if delivered := drop_item(s, item_id):
         out.append(Deliver(item_id))
-        if s.losses_in_a_row:
-            s = s._replace(losses_in_a_row=0)
+        s.losses_in_a_row = 0
     else:
-        s = s._replace(duplicates=s.duplicates + 1)
+        s.duplicates += 1
     index = find_slot(record, item_id, attempt)
     if index is not None:
         item = record.slots[index].item
@@ -154,15 +149,15 @@ def _result(
                 add_duration(s, item.kind, (now - record.started_s) / item.size)
         record = record._replace(slots=without(record.slots, index), pace=pace, failures_in_a_row=0)
         _close_slot(s, out, worker, record, index, now)
-    return s
 
 
-def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) -> SchedulerState:
+def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) -> None:
     worker, item_id = event.worker, event.item_id
     record = s.up.get(worker) or s.draining.get(worker)
     index = find_slot(record, item_id, event.attempt) if record is not None else None
     if record is None or index is None:
-        return s._replace(duplicates=s.duplicates + 1)
+        s.duplicates += 1
+        return
     slots, failures = without(record.slots, index), record.failures_in_a_row + 1
     record = record._replace(slots=slots, failures_in_a_row=failures)
     _close_slot(s, out, worker, record, index, now)
@@ -171,11 +166,12 @@ def _failure(s: SchedulerState, out: list[Command], event: Failure, now: float) 
         reason = because(what, event.message)
         out.append(StopWorker(worker, reason))
         # The item that it has just begun is not charged.
-        s = _lose(s, out, worker, reason, now, charge=False)
+        _lose(s, out, worker, reason, now, charge=False)
     if not holds(s, worker, item_id):
-        return s._replace(duplicates=s.duplicates + 1)
+        s.duplicates += 1
+        return
     return_item(s, worker, item_id)
-    return _charge(s, out, item_id, f"it raised an exception on worker {worker}", event.message)
+    _charge(s, out, item_id, f"it raised an exception on worker {worker}", event.message)
 
 
 def _close_slot(s: SchedulerState, out: list[Command], worker: int, record: Worker, index: int, now: float) -> None:
@@ -200,7 +196,7 @@ def _lose(
     *,
     fault: bool = True,
     charge: bool = True,
-) -> SchedulerState:
+) -> None:
     """Forget a worker, put its items back at the front of the queue and plan its replacement.
 
     An unknown worker changes nothing.
@@ -212,47 +208,49 @@ def _lose(
     starting = pop_worker(s, s.starting, worker) is not None
     record = pop_worker(s, s.up, worker) or pop_worker(s, s.draining, worker)
     if not starting and record is None:
-        return s
+        return
     slots = record.slots if record is not None else ()
     running = slots[0].item.id if slots and holds(s, worker, slots[0].item.id) else None
     for slot in reversed(slots):
         if holds(s, worker, slot.item.id):
             return_item(s, worker, slot.item.id)
     if not fault:
-        return s
-    s = s._replace(lost_workers=s.lost_workers + 1, last_lost=worker, last_loss=reason, last_words="")
+        return
+    s.lost_workers += 1
+    s.last_lost, s.last_loss, s.last_words = worker, reason, ""
     if s.up or s.draining:
-        s = s._replace(start_failures=0)
+        s.start_failures = 0
     elif starting and worker >= s.tried:
-        s = s._replace(start_failures=s.start_failures + 1, tried=s.next_worker)
+        s.start_failures += 1
+        s.tried = s.next_worker
     if now >= s.start_at_s:  # else this replacement waits together with an earlier one
         doublings = min(s.losses_in_a_row - 1, 30)
         wait_s = min(s.limits.max_backoff_s, s.limits.restart_backoff_s * 2**doublings) if doublings >= 0 else 0.0
-        s = s._replace(losses_in_a_row=s.losses_in_a_row + 1, start_at_s=now + wait_s)
+        s.losses_in_a_row += 1
+        s.start_at_s = now + wait_s
     if starting and s.start_failures >= s.limits.max_start_failures and not s.up and not s.draining:
-        return _fail(s, out, loss_text(s, f"no worker started in {s.start_failures} consecutive attempts; last loss: "))
-    if running is not None and charge:
-        return _charge(s, out, running, f"worker {worker} was lost while running it", reason)
-    return s
+        _fail(s, out, loss_text(s, f"no worker started in {s.start_failures} consecutive attempts; last loss: "))
+    elif running is not None and charge:
+        _charge(s, out, running, f"worker {worker} was lost while running it", reason)
 
 
-def _charge(s: SchedulerState, out: list[Command], item_id: Hashable, what: str, reason: str) -> SchedulerState:
+def _charge(s: SchedulerState, out: list[Command], item_id: Hashable, what: str, reason: str) -> None:
     """Add a fault to a work item; if it now has `max_attempts` faults, the run fails, and says what happened last."""
     waiting = s.items[item_id] = s.items[item_id]._replace(faults=s.items[item_id].faults + 1)
-    if waiting.faults < s.limits.max_attempts:
-        return s
-    what = f"work item {item_id} failed in {waiting.faults} attempts; the last time {what}"
-    return _fail(s, out, because(what, reason))
+    if waiting.faults >= s.limits.max_attempts:
+        what = f"work item {item_id} failed in {waiting.faults} attempts; the last time {what}"
+        _fail(s, out, because(what, reason))
 
 
-def _fail(s: SchedulerState, out: list[Command], message: str) -> SchedulerState:
+def _fail(s: SchedulerState, out: list[Command], message: str) -> None:
     out.append(Fail(message))
     out.extend(StopWorker(worker, "the run failed") for worker in sorted([*s.starting, *s.up, *s.draining]))
-    s = s._replace(starting=Table(), up=Table(), draining=Table(), deadlines=Sorted(), free=Sorted(), places=Sorted())
-    return s._replace(failed=message)
+    for container in (s.starting, s.up, s.draining, s.deadlines, s.free, s.places):
+        container.clear()
+    s.failed = message
 
 
-def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int, ...]) -> SchedulerState:
+def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int, ...]) -> None:
     """Stop every worker whose deadline has passed; the run fails if no worker was up for too long."""
     for worker in late_workers(s, now):
         if s.failed is None:
@@ -260,30 +258,28 @@ def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int
             out.append(StopWorker(worker, reason))
             is_silent = worker in silent
             has_no_place = is_silent and worker in s.starting
-            s = _lose(s, out, worker, reason, now, fault=not has_no_place, charge=not is_silent)
+            _lose(s, out, worker, reason, now, fault=not has_no_place, charge=not is_silent)
     name, limit_s = down_limit(s)
     if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + limit_s:
         for_s = f"for {plain(limit_s)} s ({s.limits.name_of(name)})"
         text = f"was up {for_s} while {len(s.items)} work items waited" if s.next_rank else f"got a place {for_s}"
-        return _fail(s, out, loss_text(s, f"no worker {text}; last loss: "))
-    return s
+        _fail(s, out, loss_text(s, f"no worker {text}; last loss: "))
 
 
-def _drain(s: SchedulerState, out: list[Command], worker: int) -> SchedulerState:
+def _drain(s: SchedulerState, out: list[Command], worker: int) -> None:
     record = pop_worker(s, s.up, worker)
     if record is not None and record.slots:
         put_worker(s, s.draining, worker, record._replace(rank=s.next_rank))
-        return s._replace(next_rank=s.next_rank + 1)
-    if record is not None or pop_worker(s, s.starting, worker) is not None:
+        s.next_rank += 1
+    elif record is not None or pop_worker(s, s.starting, worker) is not None:
         out.append(StopWorker(worker, "drained"))
-    return s
 
 
-def _start_workers(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
+def _start_workers(s: SchedulerState, out: list[Command], now: float) -> None:
     missing = s.wanted - len(s.starting) - len(s.up)
     if missing <= 0 or now < s.start_at_s:
-        return s
+        return
     for worker in range(s.next_worker, s.next_worker + missing):
         put_worker(s, s.starting, worker, Worker(worker, deadline_s=now + s.limits.start_deadline_s))
         out.append(StartWorker(worker))
-    return s._replace(next_worker=s.next_worker + missing)
+    s.next_worker += missing

@@ -1,7 +1,7 @@
-"""Changes to the containers of a state that `scheduler.step` builds.
+"""Changes to the containers of the scheduler's state.
 
 Each function keeps the containers consistent: what it changes in one of them it also changes in the others that depend
-on it. `s` is the state that is being built, whose containers no other state has.
+on it.
 """
 
 from __future__ import annotations
@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Iterable
 
-from es_service.dispatch.cheap_copies import Table
 from es_service.dispatch.events import WorkItem
 from es_service.dispatch.scheduler_state import IN_TIME, SchedulerState, Waiting, Worker, next_time
 
 
-def put_worker(s: SchedulerState, group: Table[int, Worker], worker: int, record: Worker) -> None:
+def put_worker(s: SchedulerState, group: dict[int, Worker], worker: int, record: Worker) -> None:
     """Store a worker in one of the three groups of `s`; `deadlines`, `free`, `in_time` and `late` change with it."""
     old = group.get(worker)
     group[worker] = record
@@ -30,23 +29,22 @@ def put_worker(s: SchedulerState, group: Table[int, Worker], worker: int, record
         if len(record.slots) < s.limits.in_flight:
             s.free.add((len(record.slots), record.pace, record.rank, worker))
     was_in_time = old is not None and old.pace == IN_TIME
-    if group is s.up and was_in_time != (record.pace == IN_TIME):
-        (s.in_time.remove if was_in_time else s.in_time.add)((worker,))
+    if group is s.up:
+        s.in_time += (record.pace == IN_TIME) - was_in_time
     if record.pace != IN_TIME or (old is not None and not was_in_time):
         for slot in record.slots:
             _update_late(s, slot.item.id)
 
 
-def pop_worker(s: SchedulerState, group: Table[int, Worker], worker: int) -> Worker | None:
+def pop_worker(s: SchedulerState, group: dict[int, Worker], worker: int) -> Worker | None:
     """Remove a worker from one of the three groups of `s` and return it; None if the group does not have it."""
-    old = group.pop(worker)
+    old = group.pop(worker, None)
     if old is not None:
         if (at_s := next_time(old)) < math.inf:
             s.deadlines.remove((at_s, worker))
         if group is s.up:
             _forget_free(s, worker, old)
-            if old.pace == IN_TIME:
-                s.in_time.remove((worker,))
+            s.in_time -= old.pace == IN_TIME
     return old
 
 
@@ -61,14 +59,11 @@ def append_items(s: SchedulerState, items: Iterable[WorkItem]) -> None:
     Raises:
         ValueError: one has been submitted before and not delivered yet.
     """
-    last = s.places.last()
-    places = []
-    for place, item in enumerate(items, 0 if last is None else last[0] + 1):
+    for place, item in enumerate(items, s.places[-1][0] + 1 if s.places else 0):
         if item.id in s.items:
             raise ValueError(f"work item {item.id} was submitted again before it was delivered")
         s.items[item.id] = Waiting(item, place=place)
-        places.append((place, item.id))
-    s.places.extend(places)
+        s.places.add((place, item.id))
 
 
 def take_item(s: SchedulerState, waiting: Waiting, worker: int) -> None:
@@ -90,8 +85,7 @@ def return_item(s: SchedulerState, worker: int, item_id: Hashable) -> None:
         other = waiting.second if waiting.holder == worker else waiting.holder
         s.items[item_id] = waiting._replace(holder=other, second=None, last_holder=worker)
     else:
-        first = s.places.first()
-        place = 0 if first is None else first[0] - 1
+        place = s.places[0][0] - 1 if s.places else 0
         s.items[item_id] = waiting._replace(place=place, holder=None, last_holder=worker)
         s.places.add((place, item_id))
     _update_late(s, item_id)
@@ -99,7 +93,7 @@ def return_item(s: SchedulerState, worker: int, item_id: Hashable) -> None:
 
 def drop_item(s: SchedulerState, item_id: Hashable) -> bool:
     """Forget a work item, wherever it is; returns whether there was one."""
-    waiting = s.items.pop(item_id)
+    waiting = s.items.pop(item_id, None)
     if waiting is not None:
         _leave_queue(s, waiting)
         if waiting.late is not None:
@@ -126,8 +120,7 @@ def _update_late(s: SchedulerState, item_id: Hashable) -> None:
         record = s.up.get(waiting.holder) or s.draining.get(waiting.holder)
         belongs = record is not None and record.pace != IN_TIME
     if belongs and waiting.late is None:
-        last = s.late.last()
-        place = 0 if last is None else last[0] + 1
+        place = s.late[-1][0] + 1 if s.late else 0
         s.late.add((place, item_id))
         s.items[item_id] = waiting._replace(late=place)
     elif not belongs and waiting.late is not None:

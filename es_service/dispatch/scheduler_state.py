@@ -1,6 +1,6 @@
 """State of the scheduler, and functions of the state alone.
 
-It is the data of `scheduler.step`. The records are immutable and shared between states.
+It is the data of `scheduler.handle`, which changes it. The records in its containers are immutable.
 """
 
 from __future__ import annotations
@@ -8,9 +8,12 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Hashable
+from dataclasses import dataclass, field
+from itertools import takewhile
 from typing import NamedTuple
 
-from es_service.dispatch.cheap_copies import Sorted, Table
+from sortedcontainers import SortedList
+
 from es_service.dispatch.events import Limits, WorkItem, because, with_last_words
 
 IN_TIME, LATE, NEW = range(3)
@@ -68,31 +71,32 @@ class Worker(NamedTuple):
     """Whether it is starting and has reported its place."""
 
 
-class SchedulerState(NamedTuple):
-    """Complete state of the scheduler. Its containers must not be changed; times are in seconds, as `now` of `step`."""
+@dataclass(slots=True)
+class SchedulerState:
+    """Complete state of the scheduler, which only `scheduler.handle` changes; times are in seconds, as its `now`."""
 
     limits: Limits
     wanted: int
     """Number of workers that should run."""
-    starting: Table[int, Worker]
+    starting: dict[int, Worker] = field(default_factory=dict)
     """Workers that have not come up yet."""
-    up: Table[int, Worker]
+    up: dict[int, Worker] = field(default_factory=dict)
     """Workers that can be assigned work items."""
-    draining: Table[int, Worker]
+    draining: dict[int, Worker] = field(default_factory=dict)
     """Workers that finish their work items and get no others."""
-    deadlines: Sorted[tuple[float, int]]
+    deadlines: SortedList = field(default_factory=SortedList)
     """(next time at which it is late or must be stopped, worker) of every worker of these three groups that has one."""
-    free: Sorted[tuple[int, int, int, int]]
+    free: SortedList = field(default_factory=SortedList)
     """(number of its slots, pace, rank, worker) of every worker that can be assigned another work item."""
-    in_time: Sorted[tuple[int]]
-    """Every worker that is up and IN_TIME."""
-    items: Table[Hashable, Waiting]
+    in_time: int = 0
+    """Number of workers that are up and IN_TIME."""
+    items: dict[Hashable, Waiting] = field(default_factory=dict)
     """Work items that have not been delivered, by id."""
-    places: Sorted[tuple[int, Hashable]]
+    places: SortedList = field(default_factory=SortedList)
     """(place, id) of every work item in the queue."""
-    late: Sorted[tuple[int, Hashable]]
+    late: SortedList = field(default_factory=SortedList)
     """(place, id) of every work item that may be sent a second time, see stragglers.py."""
-    durations_s: dict[str, tuple[float, ...]]
+    durations_s: dict[str, tuple[float, ...]] = field(default_factory=dict)
     """Kind -> recent durations of one chunk, without compiling."""
     next_worker: int = 0
     """Id of the next worker to start."""
@@ -132,37 +136,8 @@ class SchedulerState(NamedTuple):
 
 
 def initial_state(limits: Limits) -> SchedulerState:
-    """State without work items and workers; the first step starts the workers, whatever its event is."""
-    return SchedulerState(
-        limits,
-        limits.workers,
-        starting=Table(),
-        up=Table(),
-        draining=Table(),
-        deadlines=Sorted(),
-        free=Sorted(),
-        in_time=Sorted(),
-        items=Table(),
-        places=Sorted(),
-        late=Sorted(),
-        durations_s={},
-    )
-
-
-def with_own_containers(state: SchedulerState) -> SchedulerState:
-    """An equal state whose containers may be changed, since no other state has them."""
-    return state._replace(
-        starting=state.starting.copy(),
-        up=state.up.copy(),
-        draining=state.draining.copy(),
-        deadlines=state.deadlines.copy(),
-        free=state.free.copy(),
-        in_time=state.in_time.copy(),
-        items=state.items.copy(),
-        places=state.places.copy(),
-        late=state.late.copy(),
-        durations_s=state.durations_s.copy(),
-    )
+    """State without work items and workers; the first event starts the workers, whichever it is."""
+    return SchedulerState(limits, limits.workers)
 
 
 def pending(state: SchedulerState) -> int:
@@ -185,7 +160,7 @@ def is_down(state: SchedulerState) -> bool:
         return False
     if state.next_rank:
         return bool(state.items)
-    return not any(state.starting[worker].placed for worker in state.starting)
+    return not any(record.placed for record in state.starting.values())
 
 
 def is_waiting(state: SchedulerState) -> bool:
@@ -201,7 +176,7 @@ def down_limit(state: SchedulerState) -> tuple[str, float]:
 
 def workers_with_place(state: SchedulerState) -> int:
     """Number of workers that can be assigned work items, now or when they have come up."""
-    return len(state.up) + sum(state.starting[worker].placed for worker in state.starting)
+    return len(state.up) + sum(record.placed for record in state.starting.values())
 
 
 def by_progress(state: SchedulerState) -> list[int]:
@@ -215,8 +190,7 @@ def next_deadline(state: SchedulerState) -> float:
         return math.inf
     if state.late and has_idle_worker_for_copies(state):
         return -math.inf
-    first = state.deadlines.first()
-    at_s = first[0] if first is not None else math.inf
+    at_s = state.deadlines[0][0] if state.deadlines else math.inf
     if len(state.starting) + len(state.up) < state.wanted:
         at_s = min(at_s, state.start_at_s)
     if state.down_since_s is not None:
@@ -234,7 +208,7 @@ def has_idle_worker_for_copies(state: SchedulerState) -> bool:
     """Whether the queue is empty, and an idle worker can take an item of another one, as stragglers.py explains."""
     if not state.late or state.places or state.limits.late_factor == math.inf:
         return False
-    slots, pace, *_ = state.free.first() or (1, NEW)
+    slots, pace, *_ = state.free[0] if state.free else (1, NEW)
     if slots or pace == IN_TIME or state.in_time:
         return not slots and pace == IN_TIME
     return pace == LATE or _first_late_pace(state) == LATE
@@ -242,9 +216,7 @@ def has_idle_worker_for_copies(state: SchedulerState) -> bool:
 
 def _first_late_pace(state: SchedulerState) -> int:
     """Pace of the worker that has the first item in `late`."""
-    first = state.late.first()
-    assert first is not None
-    holder = state.items[first[1]].holder
+    holder = state.items[state.late[0][1]].holder
     assert holder is not None
     return (state.up.get(holder) or state.draining[holder]).pace
 
@@ -252,9 +224,7 @@ def _first_late_pace(state: SchedulerState) -> int:
 def late_workers(state: SchedulerState, now: float) -> list[int]:
     """Workers whose deadline has passed: first those that start, then those that are up, then those that drain."""
     late = []
-    for deadline_s, worker in state.deadlines:
-        if now < deadline_s:
-            break
+    for _, worker in takewhile(lambda entry: entry[0] <= now, state.deadlines):
         position = next(
             (number, group[worker].rank)
             for number, group in enumerate((state.starting, state.up, state.draining))
@@ -264,13 +234,12 @@ def late_workers(state: SchedulerState, now: float) -> list[int]:
     return [worker for _, worker in sorted(late)]
 
 
-def told_last_words(state: SchedulerState, worker: int, last_words: str) -> SchedulerState:
-    """State with the last output of a stopped worker's process, also in the message of `Fail` if its loss made the run
+def note_last_words(state: SchedulerState, worker: int, last_words: str) -> None:
+    """Remember the last output of a stopped worker's process, also in the message of `Fail` if its loss made the run
     fail."""
-    if worker != state.last_lost:
-        return state
-    failed = None if state.failed is None else with_last_words(state.failed, last_words)
-    return state._replace(last_words=last_words, failed=failed)
+    if worker == state.last_lost:
+        state.last_words = last_words
+        state.failed = None if state.failed is None else with_last_words(state.failed, last_words)
 
 
 def loss_text(state: SchedulerState, what: str = "") -> str:

@@ -14,7 +14,7 @@ from itertools import count
 
 from es_service.dispatch import events
 from es_service.dispatch.engine import item_sizes
-from es_service.dispatch.scheduler import step
+from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import SchedulerState, initial_state, next_deadline, pending, usual_chunk_s
 
 ROUNDS = 4
@@ -96,11 +96,12 @@ def predict(
         start_deadline_s=NEVER_S,
         late_factor=late_factor,
     )
-    state, _ = step(initial_state(limits), events.Tick(), 0.0)
+    state = initial_state(limits)
+    handle(state, events.Tick(), 0.0)
     for worker in range(actors):
-        state, _ = step(state, events.WorkerUp(worker), 0.0)
+        handle(state, events.WorkerUp(worker), 0.0)
         for phase in phases:
-            state, _ = step(state, events.Compiled(worker, phase.kind, 0.0), 0.0)
+            handle(state, events.Compiled(worker, phase.kind, 0.0), 0.0)
 
     def seconds_of(worker: int, kind: str, chunks: int) -> float:
         return costs.chunk_s[kind] * longest_part(chunks) * slowness(worker)
@@ -159,7 +160,7 @@ class _Cluster:
     def _step(self, event: events.Event) -> None:
         """Pass an event to the scheduler and send the work items that it assigns."""
         began = self._clock()
-        self._state, commands = step(self._state, event, self.now)
+        commands = handle(self._state, event, self.now)
         self.now += self._clock() - began
         for command in commands:
             if isinstance(command, events.Assign):

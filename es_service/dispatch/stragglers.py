@@ -18,6 +18,7 @@ takes its workers for slow nor sends copies of items that are answered already.
 from __future__ import annotations
 
 import math
+from itertools import takewhile
 
 from es_service.dispatch.deadlines import begin_first_slot
 from es_service.dispatch.events import Assign, Command
@@ -26,27 +27,20 @@ from es_service.dispatch.scheduler_state import LATE, SchedulerState, Slot, has_
 
 
 def note_late_workers(s: SchedulerState, now: float) -> None:
-    """Mark the workers that have become late with their first slot; this changes the containers of `s`."""
-    for at_s, worker in s.deadlines:  # as they are before this
-        if now < at_s:
-            break
+    """Mark the workers that have become late with their first slot."""
+    for _, worker in list(takewhile(lambda entry: entry[0] <= now, s.deadlines)):
         group = s.up if worker in s.up else s.draining
         record = group.get(worker)
         if record is not None and record.late_s <= now:
             put_worker(s, group, worker, record._replace(late_s=-math.inf, pace=LATE))
 
 
-def send_copies(s: SchedulerState, out: list[Command], now: float) -> SchedulerState:
-    """Send items of late workers to idle ones, as long as there are both; this changes the containers of `s`."""
-    copies = s.copies
+def send_copies(s: SchedulerState, out: list[Command], now: float) -> None:
+    """Send items of late workers to idle ones, as long as there are both."""
     while has_idle_worker_for_copies(s):
-        first, idle = s.late.first(), s.free.first()
-        assert first is not None
-        assert idle is not None
-        waiting, worker = s.items[first[1]], idle[-1]
+        waiting, worker = s.items[s.late[0][1]], s.free[0][-1]
         copy_item(s, waiting.item.id, worker)
         slot = Slot(waiting.item, waiting.faults + 1)
         put_worker(s, s.up, worker, begin_first_slot(s, s.up[worker]._replace(slots=(slot,)), now))
         out.append(Assign(worker, waiting.item.id, slot.attempt, copy=True))
-        copies += waiting.item.size
-    return s if copies == s.copies else s._replace(copies=copies)
+        s.copies += waiting.item.size

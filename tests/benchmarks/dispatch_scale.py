@@ -21,7 +21,7 @@ import numpy as np
 
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Assign, Compiled, Limits, Result, Submit, Tick, WorkerUp, WorkItem
-from es_service.dispatch.scheduler import step
+from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import initial_state, next_deadline, pending
 from es_service.protocol.messages import NO_CENTRE, GradientResult, TrainingChunk, Work, WorkItemId, around
 
@@ -52,6 +52,9 @@ class AnswersAtOnce:
     def silent(self) -> tuple[int, ...]:
         return ()
 
+    def shortage(self) -> str:
+        return ""
+
     def receive(self, timeout_s: float) -> Message | None:
         return self._inbox.popleft() if self._inbox else None
 
@@ -78,16 +81,17 @@ def engine_seconds(items: int, workers: int) -> list[float]:
 
 def scheduler_seconds(items: int, workers: int) -> tuple[float, float]:
     """Seconds of the scheduler alone: for an item that is submitted, and for one that is answered."""
-    state, _ = step(initial_state(limits_of(workers)), Tick(), 0.0)
+    state = initial_state(limits_of(workers))
+    handle(state, Tick(), 0.0)
     for worker in range(workers):
         for event in (WorkerUp(worker), Compiled(worker, "TrainingChunk", 0.0)):
-            state, _ = step(state, event, 0.0)
+            handle(state, event, 0.0)
     submit, answer = [], []
     for generation in range(GENERATIONS):
         ids = [WorkItemId(generation, index, "TrainingChunk", generation, 0, index, 1) for index in range(items)]
         event = Submit(tuple(WorkItem(item_id, item_id.kind) for item_id in ids))
         started = time.perf_counter()
-        state, commands = step(state, event, started)
+        commands = handle(state, event, started)
         submit.append((time.perf_counter() - started) / items)
         waiting, seconds = deque(commands), 0.0
         while waiting:
@@ -96,7 +100,7 @@ def scheduler_seconds(items: int, workers: int) -> tuple[float, float]:
                 event = Result(command.worker, command.item_id, command.attempt)
                 started = time.perf_counter()
                 next_deadline(state)  # the engine asks before each wait
-                state, more = step(state, event, started)
+                more = handle(state, event, started)
                 seconds += time.perf_counter() - started
                 waiting.extend(more)
         answer.append(seconds / items)

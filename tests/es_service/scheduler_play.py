@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import replace
 
 from es_service.dispatch.events import Command, Compiled, Event, Limits, StartWorker, Submit, Tick, WorkerUp, WorkItem
-from es_service.dispatch.scheduler import step
+from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import IN_TIME, SchedulerState, initial_state, next_time
 
+CONTAINERS = "starting", "up", "draining", "deadlines", "free", "items", "places", "late", "durations_s"
 LIMITS = Limits(
     workers=2,
     in_flight=2,
@@ -25,6 +27,17 @@ LIMITS = Limits(
     max_start_failures=3,
     no_worker_timeout_s=30.0,
 )
+
+
+def copied(state: SchedulerState) -> SchedulerState:
+    """An equal state that has nothing in common with it that can change."""
+    return replace(state, **{name: copy(getattr(state, name)) for name in CONTAINERS})
+
+
+def step(state: SchedulerState, event: Event, now: float) -> tuple[SchedulerState, list[Command]]:
+    """`handle` for a copy of the state: (the state after the event, the commands)."""
+    after = copied(state)
+    return after, handle(after, event, now)
 
 
 def play(state: SchedulerState, *events: tuple[float, Event]) -> tuple[SchedulerState, list[Command]]:
@@ -67,7 +80,7 @@ def check_consistency(state: SchedulerState) -> None:
     ]
     assert list(state.free) == sorted(entry for entry in loads if entry[0] < state.limits.in_flight)
     if state.failed is None:
-        assert list(state.in_time) == sorted((worker,) for worker in state.up if state.up[worker].pace == IN_TIME)
+        assert state.in_time == sum(record.pace == IN_TIME for record in state.up.values())
     waiting = [(item_id, state.items[item_id]) for item_id in state.items]
     assert all((record.place is None) != (record.holder is None) for _, record in waiting)
     assert all(record.second is None or record.second != record.holder is not None for _, record in waiting)

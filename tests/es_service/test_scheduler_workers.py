@@ -21,9 +21,8 @@ from es_service.dispatch.events import (
     WorkerLost,
     WorkerUp,
 )
-from es_service.dispatch.scheduler import step
 from es_service.dispatch.scheduler_state import initial_state, is_waiting, next_deadline
-from tests.es_service.scheduler_play import LIMITS, items, play, ready
+from tests.es_service.scheduler_play import LIMITS, items, play, ready, step
 
 
 def test_a_worker_that_keeps_raising_is_quarantined_without_blaming_its_next_task():

@@ -13,7 +13,7 @@ from es_service.config.compute import ComputeConfig
 from es_service.config.model import TaskConfig
 from es_service.config.parallel import chunks_at_once, chunks_of_phases, parallel_sentence
 from es_service.dispatch.events import Compiled, Result, StopWorker, Submit, Tick, WorkerLost, WorkerUp, WorkItem
-from es_service.dispatch.scheduler import step
+from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import initial_state
 from es_service.errors import ConfigError, StoreError
 from es_service.runs import session
@@ -38,8 +38,7 @@ def messages_after(*events) -> list[str]:
     """Why workers are stopped, and the run, over all events; (seconds, event)."""
     state, said = initial_state(dispatch_limits(load_config(CONFIG))), []
     for now, event in events:
-        state, commands = step(state, event, now)
-        said += [command.reason for command in commands if isinstance(command, StopWorker)]
+        said += [command.reason for command in handle(state, event, now) if isinstance(command, StopWorker)]
     return [*said, state.failed or ""]
 
 

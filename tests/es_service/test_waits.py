@@ -7,7 +7,7 @@ import logging
 from es_service import api
 from es_service.dispatch import waits
 from es_service.dispatch.events import Compiled, Limits, Placed, Result, Submit, Tick, WorkerUp, WorkItem
-from es_service.dispatch.scheduler import step
+from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import initial_state
 from es_service.dispatch.waits import NOTICE_S, SILENCE_S, Waits
 from es_service.protocol.messages import Chunk
@@ -28,7 +28,7 @@ def test_a_wait_is_told_when_it_begins_and_when_it_ends():
     def at(now: float, *events) -> list[tuple[str, str]]:
         nonlocal state
         for event in events:
-            state, _ = step(state, event, now)
+            handle(state, event, now)
         told.clear()
         what.look(state, now, lambda: "it is full")
         return list(told)
