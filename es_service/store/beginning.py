@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from es_service.store.codec import (
     Part,
+    column_bytes,
     decode_part,
     encode_part,
     history_row,
@@ -64,7 +65,7 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
         row = (part, newest, in_force[part][1], payload)
         connection.execute("INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)", row)
     names = [column.name for column in meta.columns]
-    insert = history_insert(meta.columns)
+    insert, heading = history_insert(meta.columns), column_bytes(meta.columns)
     centre_names = [column.name for column in meta.evaluation_columns]
     evaluations = iter(beginning.evaluations)
     for generation, given in enumerate(beginning.history):
@@ -73,7 +74,7 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
         values = {name: given.get(name) for name in names}
         rows = [{name: centre.get(name) for name in centre_names} for centre in next(evaluations, ())]
         centres = table_bytes(meta.evaluation_columns, as_table(meta.evaluation_columns, rows))
-        connection.execute(insert, history_row(meta.columns, generation, values, centres, state))
+        connection.execute(insert, history_row(meta.columns, heading, generation, values, centres, state))
     for generation, platform in beginning.platforms:
         text = json.dumps(platform, sort_keys=True)
         row = (generation, text, text_sha256(f"platform {generation}", text))

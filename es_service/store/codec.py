@@ -197,8 +197,7 @@ def row_bytes(row: Row) -> bytes:
     return b"".join(parts)
 
 
-@lru_cache
-def column_bytes(columns: tuple[Column, ...]) -> bytes:
+def column_bytes(columns: Sequence[Column]) -> bytes:
     """Bytes of the names and types of columns, which are hashed before the values."""
     return json.dumps([[column.name, column.type] for column in columns], separators=(",", ":")).encode()
 
@@ -210,7 +209,8 @@ def row_sha256(columns: bytes, row: Row, evaluations: bytes, state: str) -> str:
 
 
 def history_row(
-    columns: tuple[Column, ...],
+    columns: Sequence[Column],
+    heading: bytes,
     generation: int,
     history: Mapping[str, int | float | None],
     evaluations: bytes,
@@ -219,11 +219,14 @@ def history_row(
     """A history row as it is stored, with the evaluated centres (`table_bytes`), the `state_sha256` of its generation
     and its own SHA-256 at the end.
 
+    Args:
+        heading: the columns as `column_bytes`.
+
     Raises:
         StoreError: as in `row_values`.
     """
     values = row_values(columns, generation, history)
-    return (*values, evaluations, state, row_sha256(column_bytes(columns), values, evaluations, state))
+    return (*values, evaluations, state, row_sha256(heading, values, evaluations, state))
 
 
 def row_dict(columns: Sequence[Column], row: Row) -> dict[str, int | float]:

@@ -132,7 +132,7 @@ def _history(connection: Connection, meta: RunMeta, until: int) -> tuple[str, st
     of_centre = [column for column in all_of_centre if column.deterministic]
     total = hashlib.sha256(json.dumps([[column.name, column.type] for column in columns]).encode() + b"\n")
     query = history_select(columns) + " WHERE history.generation <= ? ORDER BY history.generation"
-    centres = hashlib.sha256(column_bytes(tuple(of_centre)) + b"\n")
+    centres = hashlib.sha256(column_bytes(of_centre) + b"\n")
     for *values, evaluations, _, _ in connection.execute(query, (until,)):
         total.update(row_bytes(tuple(values)))
         if len(of_centre) < len(all_of_centre):

@@ -26,6 +26,7 @@ from es_service.store.codec import (
     GONE,
     Part,
     changed_sum,
+    column_bytes,
     decode_part,
     encode_change,
     history_row,
@@ -88,6 +89,7 @@ class RunStore:
         self._doubled = [part for part, rows in self._kept.items() if len(rows) > 1]
         self._state_sum = 0 if self.generation is None else state_sum(rows_in_force(self._kept, self.generation))
         self._insert_history = history_insert(self.meta.columns)
+        self._heading = column_bytes(self.meta.columns)
         try:
             with self._explaining(f"opening {DATABASE}"):
                 self.start = load_start(self._connection)
@@ -213,7 +215,9 @@ class RunStore:
         old = {part: max(self._kept[part].items()) for part in new if part in self._kept}
         total = changed_sum(self._state_sum, old, new)
         centres = table_bytes(self.meta.evaluation_columns, evaluations)
-        history_values = history_row(self.meta.columns, generation, history, centres, state_sha256(total))
+        history_values = history_row(
+            self.meta.columns, self._heading, generation, history, centres, state_sha256(total)
+        )
         # The rows that remain make up the states of the newest generation, of the one before it, and of those to keep.
         outdated = outdated_rows(self._kept, self._doubled, self.keep_every, self._earlier)
         self._hook("before_begin")
