@@ -77,7 +77,7 @@ def test_many_are_as_many_single_ones_in_each_mode(task, mode):
     assert ((1, 0) in ends) == (task == POLE)
 
 
-@pytest.mark.parametrize("task", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("task", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.long)])
 def test_an_environment_depends_neither_on_the_others_nor_on_threads_nor_on_the_width_of_vectors(task, monkeypatch):
     steps, lane = 12, 3
 

@@ -33,7 +33,7 @@ def assert_same(results, others) -> None:
     np.testing.assert_equal([asdict(result) for result in results], [asdict(other) for other in others])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_killed_children_change_no_result_and_leave_nothing_behind():
     """Eight in a row, by turns between two calls and in the middle of one."""
     before = footprint()

@@ -92,7 +92,12 @@ def places(folder, text):
 @pytest.mark.parametrize(
     ("setting", "first", "frames"),
     [
-        ("task.options.way=constructor", "ValueError: no such way :smile:", ["my_task.py, __init__"]),
+        pytest.param(
+            "task.options.way=constructor",
+            "ValueError: no such way :smile:",
+            ["my_task.py, __init__"],
+            marks=pytest.mark.long,
+        ),
         ("task.options.way=step", "TypeError: dot_general requires", ["my_task.py, step", "my_task.py, helper"]),
         ("search.algorithm=my_search:telling", "AttributeError: 'SearchState'", ["my_search.py, tell"]),
     ],
@@ -130,7 +135,10 @@ def test_so_does_an_error_before_the_run(folder, monkeypatch, setting, said, fra
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", ["task.options.way=step", "search.algorithm=my_search:telling"])
+@pytest.mark.parametrize(
+    "setting",
+    [pytest.param("task.options.way=step", marks=pytest.mark.long), "search.algorithm=my_search:telling"],
+)
 def test_the_frames_of_the_program_are_in_the_debug_log(folder, tmp_path, setting):
     settings = ("--set", setting, "--set", "compute.dispatch_log=true", "--log-level", "debug")
     words = [PROGRAM, "run", "c.yaml", *settings, "--out", tmp_path / "run"]

@@ -71,7 +71,7 @@ def test_every_package_is_installed():
     assert len(packages) == len(set(packages))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_whoever_has_no_clone_runs_a_shipped_config_from_another_folder(tmp_path):
     """In a fresh installation of the package beside the dependencies at hand."""
     source, place, elsewhere = tmp_path / "source", tmp_path / "installed", tmp_path / "elsewhere"

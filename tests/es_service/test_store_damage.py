@@ -496,7 +496,7 @@ def test_a_bit_flipped_anywhere_never_gives_another_run(tmp_path, run_with_copy)
     content = (run_with_copy / "run.db").read_bytes()
     # Half of them where the file is not empty: there are more zeros than data in so short a run.
     filled = [position for position in range(size) if content[position]]
-    positions = [rng.randrange(size) for _ in range(60)] + rng.sample(filled, 120) + rng.sample(range(100), 40)
+    positions = [rng.randrange(size) for _ in range(30)] + rng.sample(filled, 60) + rng.sample(range(100), 20)
     outcomes = []
     for number, position in enumerate(positions):
         bit = rng.randrange(8)

@@ -60,6 +60,7 @@ def actions(count: int, steps: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1, 1, (steps, count, 8)).astype(np.float32)
 
 
+@pytest.mark.long
 def test_without_a_wall_in_reach_a_substep_is_brax_s_bit_for_bit():
     both = whole(start(16)), whole(start(16))
     for action in actions(16, 300):
@@ -80,7 +81,10 @@ def test_a_control_step_is_ten_of_brax_s():
         np.testing.assert_allclose(state.qd, full.qd, atol=2e-6 * np.abs(full.qd).max())
 
 
-@pytest.mark.parametrize("make_training_rollout", [xla.make_training_rollout, simd.make_training_rollout])
+@pytest.mark.parametrize(
+    "make_training_rollout",
+    [pytest.param(xla.make_training_rollout, marks=pytest.mark.long), simd.make_training_rollout],
+)
 def test_a_compiled_episode_is_brax_s_after_one_step(make_training_rollout):
     """The whole rollout, policy and all, beside Brax's own reset and ten of its substeps, far from any wall."""
     shape = PolicySpec((29, 16, 8))

@@ -22,7 +22,7 @@ TURN = 10
 """Steps after which a motor may turn round."""
 
 
-@pytest.fixture(scope="module", params=list(WALLS))
+@pytest.fixture(scope="module", params=["ant_trap", pytest.param("ant_maze", marks=pytest.mark.long)])
 def watched(request):
     """(task, its walls, a watch over ants that are pushed while every motor is turned fully to and fro).
 

@@ -196,12 +196,13 @@ def test_methods_that_do_not_fit_what_is_declared_are_named(monkeypatch, name, v
 
 def test_the_driver_asks_a_process_and_gets_the_same_answer():
     assert TASKS["brax:inverted_pendulum"] == brax_task.describe("inverted_pendulum")
-    assert TASKS[EXAMPLE] == user_task.describe(EXAMPLE)
+    assert TASKS[POINT] == user_task.describe(POINT)
     assert TASKS.get("no_such_task") is None
     with pytest.raises(ConfigError, match=r"brax:nope is not in the installed Brax"):
         TASKS.get("brax:nope")
 
 
+@pytest.mark.long
 def test_a_worker_runs_the_example():
     task = user_task.describe(EXAMPLE)
     shape = PolicySpec((task.observation_size, 8, task.action_size))

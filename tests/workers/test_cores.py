@@ -91,7 +91,7 @@ def test_child_processes_with_xla_give_the_results_of_one_core(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("how", "code"), [("lose", 1), ("end", -signal.SIGKILL)])
+@pytest.mark.parametrize(("how", "code"), [pytest.param("lose", 1, marks=pytest.mark.long), ("end", -signal.SIGKILL)])
 def test_a_worker_and_its_child_processes_end_together(tmp_path, how, code):
     done = child_program(tmp_path, how)
     assert done.returncode == code, done.stderr.decode()

@@ -94,7 +94,7 @@ def test_episodes_are_those_of_a_loop_by_hand(name):
     ("descriptor", "names", "bounds"),
     [
         ([1, 0], ("observation_1", "observation_0"), ((-2.0, 2.0),) * 2),
-        ("place", ("place_0", "place_1"), ((-1e30, 1e30),) * 2),
+        pytest.param("place", ("place_0", "place_1"), ((-1e30, 1e30),) * 2, marks=pytest.mark.long),
         (f"{MODULE}:turning", ("rewards", "places"), ((-60.0, 0.0), (-60.0, 60.0))),
         pytest.param(None, ("length",), ((0.0, 25.0),), marks=pytest.mark.long),
     ],

@@ -82,7 +82,7 @@ def test_a_lane_with_weights_of_its_own_has_the_bits_of_a_centre_at_every_width(
         jax.tree.map(np.testing.assert_array_equal, found[0], other)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_policies_of_an_ant_whose_inputs_that_are_always_zero_are_left_out_have_the_bits_of_a_centre():
     worker_spec = dataclasses.replace(task_spec("ant_trap"), episode_steps=5)
     environment, shape = make_environment("ant_trap", {}), worker_spec.policy

@@ -70,7 +70,7 @@ def test_a_recording_ends_with_its_episode(monkeypatch, rollout):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ant_maze", "ant_trap"])
+@pytest.mark.parametrize("name", [pytest.param("ant_maze", marks=pytest.mark.long), "ant_trap"])
 def test_the_poses_of_an_ant_are_those_of_its_links(name):
     spec = spec_of(name, "simd", 30)
     size = SHIPPED[name].observation_size

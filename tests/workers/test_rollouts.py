@@ -34,7 +34,9 @@ def numpy_is_registered(tmp_path, monkeypatch):
     monkeypatch.setitem(BACKENDS, "numpy", NumPy())
 
 
-@pytest.mark.parametrize("search", [ES, MAP_ELITES], ids=lambda search: search["algorithm"])
+@pytest.mark.parametrize(
+    "search", [pytest.param(ES, marks=pytest.mark.long), MAP_ELITES], ids=lambda search: search["algorithm"]
+)
 def test_a_run_and_its_replays_with_another_rollout_are_those_of_xla(search, tmp_path, request):
     xla = api.run(CONFIG | {"search": search, "compute": {"workers": 1, "rollout": "xla"}}, tmp_path / "xla").run
     request.getfixturevalue("numpy_is_registered")

@@ -29,7 +29,7 @@ def entries(folder) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in folder.glob("*/*-cache")}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_has_the_same_bits_with_an_empty_cache_a_full_one_a_damaged_one_and_none(folder, tmp_path, monkeypatch):
     def digest(name: str) -> str:
         return api.run(CONFIG, tmp_path / name).run.digest()
