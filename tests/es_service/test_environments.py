@@ -157,6 +157,7 @@ def test_each_shipped_task_is_registered_with_its_length_and_passes_gymnasium_s_
         check_env(gymnasium.make(id_of(task)).unwrapped, skip_render_check=True)
 
 
+@pytest.mark.slow
 def test_a_caller_s_mode_of_jax_changes_no_bit():
     program = """
 import hashlib, jax

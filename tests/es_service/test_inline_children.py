@@ -63,6 +63,7 @@ def test_killed_children_change_no_result_and_leave_nothing_behind():
     engine.close()  # again: nothing happens
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(60)
 def test_a_child_stopped_in_mid_message_blocks_nobody():
     """Its socket holds a fraction of a 5 MB centre. The deadline passes, it is replaced, the result is right."""
@@ -116,6 +117,7 @@ def test_an_engine_whose_log_cannot_be_written_leaves_no_child_behind():
     assert footprint() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
     """One chunk and more threads than it may have attempts: it is sent to each of them when their child is gone, and

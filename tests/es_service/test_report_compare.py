@@ -179,6 +179,7 @@ def test_a_run_without_generations_is_refused(runs, tmp_path):
         comparison_page([runs[0], read_run(tmp_path / "run")])
 
 
+@pytest.mark.slow
 def test_figures_are_written_as_svg_and_png(folders, runs, tmp_path):
     one = write_figures(runs[:1], tmp_path / "one")
     names = {"best_fitness", "goal_distance", "coverage", "qd_score", "behaviour_map", "trajectory", "centres"}

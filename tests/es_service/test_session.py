@@ -95,6 +95,7 @@ def test_no_more_workers_start_than_have_work(monkeypatch):
     assert worker_count(own) == 40
 
 
+@pytest.mark.slow
 def test_a_note_says_how_many_workers_start_where_not_all_have_work(tmp_path):
     notices: list[str] = []
     few = {"search.pairs": 16, "search.evaluation_episodes": 20, "compute.max_workers_per_core": 4}

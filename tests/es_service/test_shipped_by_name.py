@@ -42,6 +42,7 @@ def test_a_missing_file_with_a_similar_name_names_the_shipped_config(tmp_path, m
         load_config("another")
 
 
+@pytest.mark.slow
 def test_a_run_s_own_folder_has_no_colon_in_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name = default_folder(load_config("brax_ant_es")).as_posix()

@@ -490,6 +490,7 @@ def run_with_copy(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_bit_flipped_anywhere_never_gives_another_run(tmp_path, run_with_copy):
     rng = random.Random(0)
     size = (run_with_copy / "run.db").stat().st_size

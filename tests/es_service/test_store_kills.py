@@ -55,6 +55,7 @@ KILLS = [
 ]
 
 
+@pytest.mark.slow
 def test_a_killed_writer_loses_the_generation_in_flight_and_nothing_else(tmp_path):
     jobs = [("hook", f"{hook}-{count}", hook, count) for hook, count, _ in KILLS]
     checkpoints = [
@@ -76,6 +77,7 @@ def test_a_killed_writer_loses_the_generation_in_flight_and_nothing_else(tmp_pat
         assert digest(tmp_path / name) == expected_digest
 
 
+@pytest.mark.slow
 def test_a_creation_killed_at_any_file_operation_can_be_continued_or_repeated(tmp_path):
     names = [f"{kind}-{count}" for kind in ("new", "existing") for count in range(1, 30)]
     for name in names:
@@ -105,6 +107,7 @@ def test_a_creation_killed_at_any_file_operation_can_be_continued_or_repeated(tm
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
 
 
+@pytest.mark.slow
 def test_a_repair_killed_at_any_file_operation_can_be_done_again(tmp_path, monkeypatch):
     # The file itself holds the empty run, all generations are in the log beside it, and one of them is damaged there:
     # taken apart, the two would be an empty run, or the log would be replayed into the copy.

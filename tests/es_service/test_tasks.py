@@ -85,6 +85,7 @@ def test_an_attribute_that_the_constructor_changes_is_refused_and_not_ignored():
         make_environment(f"{HERE}:Longer", {"steps": 20})
 
 
+@pytest.mark.slow
 def test_a_current_folder_with_modules_of_our_names_is_nobody_s_business(tmp_path, monkeypatch):
     """Neither where a task is described, nor where rollouts are measured, nor where they are run."""
     for name in ("workers", "es_service", "jax"):

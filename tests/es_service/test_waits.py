@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 
+import pytest
+
 from es_service import api
 from es_service.dispatch import waits
 from es_service.dispatch.events import Compiled, Limits, Placed, Result, Submit, Tick, WorkerUp, WorkItem
@@ -79,6 +81,7 @@ def test_every_kind_of_chunk_has_words():
     assert {kind.__name__ for kind in Chunk.__args__} == set(compiling.CONTENTS)
 
 
+@pytest.mark.slow
 def test_a_run_says_that_its_workers_compile(tmp_path, monkeypatch, caplog):
     """To its caller, in the log, and in `status`; a second run knows that they have compiled before."""
     monkeypatch.setattr(waits, "SILENCE_S", 0.0)

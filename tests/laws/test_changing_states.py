@@ -300,6 +300,7 @@ def same(now, then):
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(courses, seeds, st.integers(0, 10**6))
 def test_damage_of_the_newest_generation_falls_back_to_the_one_before(tmp_path_factory, course, seed, chosen):

@@ -233,6 +233,7 @@ def test_every_constant_is_measured_or_there_is_a_reason():
     assert known == OTHER.keys() | NOT_MEASURED.keys()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", OURS)
 def test_the_table_says_which_keys_have_an_effect(method):
     settings = OURS[method].settings

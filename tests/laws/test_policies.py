@@ -242,6 +242,7 @@ def whole(tmp_path_factory):
         return api.run(GIVEN, tmp_path_factory.mktemp("whole") / "run").run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compute", [{"workers": 3}, {"workers": 2, "inline_workers": "threads"}], ids=str)
 def test_runs_with_policies_have_the_same_bits_on_any_workers_and_when_resumed(whole, tmp_path, compute):
     other = api.load_config(GIVEN | {"compute": GIVEN["compute"] | compute, "budget": {"generations": 2}})

@@ -47,6 +47,7 @@ def certified(folder, search, **sections) -> Certified:
     return certify_run(folder)[0]
 
 
+@pytest.mark.slow
 def test_a_policy_that_chooses_an_action_balances_a_pole(tmp_path):
     found = certified(
         tmp_path / "run",

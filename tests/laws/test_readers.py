@@ -159,6 +159,7 @@ def test_fresh_episodes_of_each_policy(run):
     assert json.loads(es("evaluate", run.folder, "--cell", one, "--episodes", 2, "--json")) == [by_name[one]]
 
 
+@pytest.mark.slow
 def test_every_export_has_all_of_it(run, tmp_path):
     from ribs.archives import GridArchive  # noqa: F401 (its pickle needs it)
 

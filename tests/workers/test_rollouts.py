@@ -34,6 +34,7 @@ def numpy_is_registered(tmp_path, monkeypatch):
     monkeypatch.setitem(BACKENDS, "numpy", NumPy())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "search", [pytest.param(ES, marks=pytest.mark.long), MAP_ELITES], ids=lambda search: search["algorithm"]
 )

@@ -29,6 +29,7 @@ def least_distance(walls, foot, knee, points=2001):
     return best
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("walls", [ant_maze.WALLS, ant_trap.WALLS], ids=["maze", "trap"])
 def test_distance_is_the_least_to_any_wall(walls):
     rng = np.random.default_rng(0)

@@ -51,6 +51,7 @@ def test_only_the_episodes_that_are_wanted_are_run() -> None:
         kernel.run(*given, wanted_L[1:])
 
 
+@pytest.mark.slow
 def test_memory_is_protected_without_assertions_too() -> None:
     """`python -O` removes assertions: arrays must stay alive during a call, and wrong ones must still be refused."""
     program = """
