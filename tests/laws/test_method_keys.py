@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
+import sys
 from functools import cache, reduce
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +16,7 @@ from es_service.config.model import policy_spec, worker_spec
 from es_service.config.tasks import TASKS
 from es_service.loop import driver
 from es_service.loop.history import history_columns
+from es_service.search import algorithms
 from es_service.search.algorithms import ALGORITHMS, OURS
 from es_service.search.observation_statistics import no_observations
 from es_service.store.digest import arrays_sha256
@@ -241,3 +245,14 @@ def test_the_table_says_which_keys_have_an_effect(method):
     measured = {key: is_used for key, is_used in declared.items() if is_used or not key.startswith("search.")}
     found = {key: has_effect(method, key, as_given if measured[key] else as_it_cannot_be) for key in measured}
     assert found == measured
+
+
+def test_a_shipped_method_is_one_file_that_nothing_else_names(tmp_path, monkeypatch):
+    text = Path(importlib.import_module("es_service.search.algorithms.es").__file__).read_text()
+    (tmp_path / "hill.py").write_text(text.replace("EsSettings", "HillSettings").replace("def es(", "def hill("))
+    monkeypatch.setattr(algorithms, "__path__", [*algorithms.__path__, str(tmp_path)])
+    monkeypatch.delitem(sys.modules, "es_service.search.algorithms.hill", raising=False)
+    found = {one.name: one for one in algorithms._shipped()}
+    assert found.keys() == {*OURS, "hill"}
+    mapping = {"task": {"environment": "point_maze"}, "search": {"algorithm": "hill"}, "budget": {"generations": 1}}
+    assert load_config(mapping, **KNOWN | {"algorithms": found}).search.algorithm == "hill"

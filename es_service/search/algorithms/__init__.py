@@ -8,24 +8,32 @@ new centre is (`step`), and tells it the evaluations of the new centres and of t
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 from collections.abc import Iterator, Mapping
 
-from es_service.search.algorithms.ars import ars
-from es_service.search.algorithms.es import es
-from es_service.search.algorithms.jedi import jedi
-from es_service.search.algorithms.map_elites import map_elites
-from es_service.search.algorithms.me_es import me_es
-from es_service.search.algorithms.memes import memes
+from es_service.config.search import PopulationConfig
 from es_service.search.algorithms.method import Method
-from es_service.search.algorithms.ns_es import ns_es
-from es_service.search.algorithms.nsr_es import nsr_es
-from es_service.search.algorithms.nsra_es import nsra_es
 from es_service.search.algorithms.own import own_method
-from es_service.search.algorithms.polish import polish
 
-OURS: dict[str, Method] = {
-    one.name: one for one in (es, ns_es, nsr_es, nsra_es, me_es, memes, map_elites, ars, polish, jedi)
-}
+
+def _shipped() -> Iterator[Method]:
+    """The method of each file of this folder that has one, under the name of the file."""
+    for file in pkgutil.iter_modules(__path__):
+        found = getattr(importlib.import_module(f"{__name__}.{file.name}"), file.name, None)
+        if isinstance(found, Method):
+            yield found
+
+
+def _by_simplicity(method: Method) -> tuple[int, str]:
+    """Number of keys that other gradient methods lack, or have with another default; and the name."""
+    common, settings = PopulationConfig.model_fields, method.settings
+    fields = settings.model_fields.items()
+    own = [name for name, key in fields if name not in common or key.default != common[name].default]
+    return len(own) + len(settings.presets), method.name
+
+
+OURS: dict[str, Method] = {one.name: one for one in sorted(_shipped(), key=_by_simplicity)}
 """The shipped methods, the simplest first: a config that no search uses may leave `search.algorithm` out."""
 
 
