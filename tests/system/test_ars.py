@@ -39,6 +39,7 @@ def undisturbed(tmp_path_factory):
         return api.run(config_of(), tmp_path_factory.mktemp("ars") / "run").run
 
 
+@pytest.mark.long
 def test_xla_computes_a_linear_policy_too(tmp_path, undisturbed):
     one, two = (api.run(config_of(rollout="xla", workers=n), tmp_path / str(n)).run for n in (1, 2))
     assert digest_parts(one.folder) == digest_parts(two.folder) != digest_parts(undisturbed.folder)

@@ -42,7 +42,7 @@ def one_core():
     os.sched_setaffinity(0, before)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_bench_rollouts_prints_a_row_per_policy_batch_and_rollout(one_core):
     words = ("bench", "rollouts", "--task", "point_maze", "--batch", 8, "--seconds", 0, "--json")
     code, printed = es(*words, COLUMNS="80")

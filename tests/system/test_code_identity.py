@@ -164,6 +164,7 @@ def test_a_task_that_is_edited_between_two_runs_of_one_process_is_new_in_the_sec
     assert hashes(resumed)["my_task.py"] == hashes(second)["my_task.py"]
 
 
+@pytest.mark.long
 def test_a_search_that_is_edited_between_two_runs_of_one_process_is_new_in_the_second(own):
     """It, or a module that it imports."""
     folder, _ = own

@@ -100,6 +100,7 @@ def test_a_first_chunk_that_computes_for_too_long_is_said_to_compute(run, engine
     assert "within 1 s of computing (compute.first_chunk_timeout_s)" in str(caught.value)
 
 
+@pytest.mark.long
 def test_a_first_chunk_may_take_longer_than_later_ones(tmp_path, run):
     """The gradient of a run has no step, and so nothing to wait for."""
     found = run("inline", compute_s=6.0, first_chunk_timeout_s=60.0, chunk_timeout_s=5.0)

@@ -317,7 +317,7 @@ def test_an_example_has_no_more_in_it_than_any_user_has(name):
     assert "from es_service import" in text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_pyribs_fills_its_archive_and_gets_behind_the_walls():
     """The deceptive optimum, under the upper wall, is -126.4."""
     archive = importlib.import_module("tests.examples.pyribs_scheduler").search(120)

@@ -105,7 +105,7 @@ def test_half_a_virtual_environment_is_not_taken_for_a_whole_one(project):
         assert not (project / ".venv").exists()
 
 
-@pytest.mark.parametrize("installer", ["pip", "uv"])
+@pytest.mark.parametrize("installer", [pytest.param("pip", marks=pytest.mark.long), "uv"])
 def test_a_command_says_what_it_installs_and_how_long_it_takes_and_an_interruption_leaves_nothing_half(
     project, installer, request, monkeypatch
 ):

@@ -46,6 +46,7 @@ def test_a_user_s_task(tmp_path, run):
     assert digest(tmp_path / "resumed") == digest(tmp_path / "ray")
 
 
+@pytest.mark.long
 def test_one_of_brax_s(tmp_path, run):
     """Begun by a worker process, and gone on with in this one, which computes the whole, too."""
     task, inline = "brax:inverted_pendulum", ["compute.engine=inline", "compute.workers=1"]

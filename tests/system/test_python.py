@@ -120,6 +120,7 @@ def test_a_notebook_shows_the_progress_unless_it_is_told_each_generation_or_not_
         manager.shutdown_kernel(now=True)
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:jupyter_client")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_the_example_of_a_notebook_shows_what_it_has_stored(tmp_path, monkeypatch):

@@ -203,6 +203,7 @@ def test_without_ray_the_error_says_what_does_without(monkeypatch):
     assert error_message(error.value).endswith(" resume RUN --engine inline --set compute.workers=auto")
 
 
+@pytest.mark.long
 def test_it_works_in_a_thread_where_signals_cannot_be_set(tmp_path, reference):
     thread = threading.Thread(target=run, args=(tmp_path / "run",), kwargs={"workers": 2})
     thread.start()

@@ -48,7 +48,7 @@ def one_ray():
     disconnect(started, forget=True)
 
 
-@pytest.mark.parametrize("rollout", ["simd", "xla"])
+@pytest.mark.parametrize("rollout", ["simd", pytest.param("xla", marks=pytest.mark.long)])
 def test_an_actor_with_two_cores_gives_the_same_bits_and_is_replaced_as_a_whole(tmp_path, monkeypatch, rollout):
     """It is killed in mid-generation. With simd its cores are threads, with xla child processes, which end with it."""
     straight = tmp_path / "straight"

@@ -42,8 +42,15 @@ def reference(tmp_path_factory):
     return digest_parts(folder)
 
 
-@pytest.mark.parametrize("kind", ["processes", "threads"])
-@pytest.mark.parametrize("workers", [2, 3])
+@pytest.mark.parametrize(
+    ("workers", "kind"),
+    [
+        (2, "threads"),
+        (3, "processes"),
+        pytest.param(2, "processes", marks=pytest.mark.long),
+        pytest.param(3, "threads", marks=pytest.mark.long),
+    ],
+)
 def test_number_and_kind_of_workers(tmp_path, reference, workers, kind):
     seen = []
     run(tmp_path / "run", lambda row: seen.append(len(children())), workers=workers, inline_workers=kind)
@@ -116,7 +123,7 @@ def test_a_run_goes_on_without_a_worker_that_hangs(tmp_path, reference):
     assert children() == []
 
 
-@pytest.mark.parametrize("rollout", ["simd", "xla"])
+@pytest.mark.parametrize("rollout", ["simd", pytest.param("xla", marks=pytest.mark.long)])
 def test_run_from_a_process_that_already_used_jax(tmp_path, reference, rollout):
     """The caller's JAX has other threads, 64-bit types and flags; rollouts never see them."""
     expected = reference
