@@ -348,8 +348,8 @@ CASES = [
         (
             "puts them last",
             CHANGES,
-            "first = s.places.first()\n        place = 0 if first is None else first[0] - 1",
-            "first = s.places.last()\n        place = 0 if first is None else first[0] + 1",
+            "s.places[0][0] - 1 if s.places else 0",
+            "s.places[-1][0] + 1 if s.places else 0",
         ),
     ),
     *cases(
