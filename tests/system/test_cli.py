@@ -64,6 +64,7 @@ def test_bench_rollouts_prints_a_row_per_policy_batch_and_rollout(one_core):
 
 
 @pytest.mark.alone
+@pytest.mark.long
 def test_bench_scaling_predicts_a_row_per_number_of_workers():
     config = ("point_maze_es", "--set", "search.pairs=512")
     code, printed = es("bench", "scaling", *config, "--workers", "1,4,128", "--cores-per-node", 32, "--json")
