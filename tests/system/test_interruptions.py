@@ -19,7 +19,9 @@ ENDLESS = ["--set", "budget.generations=100000"]  # a fast machine finishes the 
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [pytest.param(signal.SIGINT, 130, marks=pytest.mark.long), (signal.SIGTERM, 143)]
+)
 def test_signals_stop_promptly_and_resume_equals_uninterrupted(config, tmp_path, number, code):
     folder = tmp_path / "run"
     long = ["--set", "budget.generations=400"]

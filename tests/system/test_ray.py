@@ -106,7 +106,7 @@ def test_lost_and_hanging_workers_change_nothing(tmp_path, reference, monkeypatc
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("cores", [1, 2])
+@pytest.mark.parametrize("cores", [pytest.param(1, marks=pytest.mark.long), 2])
 def test_a_run_goes_on_without_an_actor_that_hangs(tmp_path, reference, monkeypatch, cores):
     """The other one computes what it has, long before the deadline; a copy is no retry."""
     stopped, send, begun = [], Actors.send, time.monotonic()
