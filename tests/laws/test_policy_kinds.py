@@ -7,10 +7,13 @@ import shutil
 import numpy as np
 import pytest
 
-from es_service import api
+from es_service import api, evaluator
+from es_service.config.model import policy_spec
+from es_service.config.tasks import TASKS
 from es_service.runs.certification import certify_run
 from es_service.runs.certified import Certified
 from es_service.runs.export import export
+from es_service.runs.moment import Policy
 from es_service.runs.replay import record
 from es_service.runs.verification import verify
 from es_service.store.digest import digest_parts
@@ -93,3 +96,21 @@ def test_a_run_with_each_kind_of_policy_is_resumed_verified_replayed_exported_an
         assert not np.array_equal(policy.start()(observations[1]), second), "it remembers the first observation"
     else:
         assert np.array_equal(policy(observations), np.stack([first, second]))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_evaluator_runs_each_kind_of_policy_as_it_is_called(kind):
+    config = api.load_config(config_of(kind))
+    shape = policy_spec(config, TASKS["point_maze"])
+    policies = np.random.default_rng(0).normal(size=(3, shape.parameters)).astype(np.float32)
+    with evaluator(config, transitions=True) as evaluate:
+        found, again = (evaluate(policies, episodes=2, seed=5) for _ in range(2))
+    steps = found.transitions
+    assert steps is not None
+    assert steps.action.tobytes() == again.transitions.action.tobytes()
+    assert steps.steps.min() > 1
+    zero, one, called = np.zeros(2, np.float32), np.ones(2, np.float32), np.empty_like(steps.action)
+    for policy, episode in np.ndindex(3, 2):
+        rows, act = steps.rows(policy, episode), Policy(shape, policies[policy], zero, one, None).start()
+        called[rows] = [act(seen) for seen in steps.observation[rows]]
+    np.testing.assert_allclose(steps.action, called, atol=1e-5, err_msg="an evaluation draws no action")
