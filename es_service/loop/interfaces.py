@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+
 from es_service.config.model import RunConfig
 from es_service.loop.history import HistoryRow, Table
 from es_service.loop.parts import Arrays, Changes
@@ -28,7 +30,7 @@ class Stored(Protocol):
 class Store(Protocol):
     """What the loop needs from a run store during a run."""
 
-    def part(self, name: str) -> Arrays: ...
+    def part(self, name: str) -> Mapping[str, np.ndarray]: ...
     def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> None: ...
 
 

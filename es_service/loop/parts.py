@@ -230,14 +230,17 @@ def map_from_parts(parts: Parts) -> BehaviourMap | None:
     )
 
 
+_OF_ELITES = tuple(Elite.__dataclass_fields__)
+
+
 def elite_to_arrays(elite: Elite) -> Arrays:
     """Arrays of an elite."""
-    return {name: getattr(elite, name) for name in Elite.__dataclass_fields__}
+    return {name: getattr(elite, name) for name in _OF_ELITES}
 
 
 def elite_from_arrays(arrays: Mapping[str, np.ndarray]) -> Elite:
     """Inverse of `elite_to_arrays`."""
-    return Elite(**{name: arrays[name] for name in Elite.__dataclass_fields__})
+    return Elite(*[arrays[name] for name in _OF_ELITES])
 
 
 def best_to_arrays(best: Best) -> Arrays:

@@ -27,6 +27,7 @@ TOGETHER = 8
 """Policies that are made together. Those of a small network stay in the cache of a core."""
 LARGEST_NOISE = 8.0
 """Bound of the magnitude of a normal variate of `protocol.noise`."""
+LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
 class IsoLine(NamedTuple):
@@ -128,7 +129,7 @@ class Recipes:
         iso, line = (LARGEST_NOISE * sigma for sigma in self.rule)
         largest = float(np.max([_facts(parent_D).largest for parent_D in self.parents]))
         # No difference of parents may overflow either. NaN is not less than anything.
-        if not (1.0 + 2.0 * max(1.0, line)) * largest + iso < float(np.finfo(np.float32).max):
+        if not (1.0 + 2.0 * max(1.0, line)) * largest + iso < LARGEST_FLOAT:
             return f"make policies that may not be finite, of parents with values up to {largest:g}"
         return ""
 
@@ -209,11 +210,11 @@ _KNOWN: dict[int, _Facts] = {}
 
 
 def _facts(parameters_D: FloatArray) -> _Facts:
-    if not isinstance(parameters_D, np.ndarray):
-        raise TypeError(f"a parent is {type(parameters_D).__name__}; must be a float32 array [D]")
     number = id(parameters_D)
     if (known := _KNOWN.get(number)) is not None and known.of() is parameters_D:
         return known
+    if not isinstance(parameters_D, np.ndarray):
+        raise TypeError(f"a parent is {type(parameters_D).__name__}; must be a float32 array [D]")
     values = np.ascontiguousarray(parameters_D)
     name = hashlib.sha256(values.data).digest()[:NAME_BYTES]
     largest = float(np.abs(values).max(initial=0.0))

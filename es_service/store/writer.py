@@ -161,19 +161,15 @@ class RunStore:
         names = sorted(rows_in_force(self._kept, self.generation)) if self.generation is not None else []
         return {name: self._part(name) for name in names if without is None or not name.startswith(without)}
 
-    def part(self, name: str) -> dict[str, NDArray[Any]]:
+    def part(self, name: str) -> Part:
         """One part of the newest generation's state: name -> read-only array. Parts read lately are kept in memory.
 
         Raises:
             KeyError: there is no such part.
             StoreError: the part has been damaged since the run was opened.
         """
-        at = max(self._kept[name])
-        if (kept := self._recent.get(name, at)) is not None:
-            return kept
-        arrays = self._part(name)
-        self._recent.add(name, at, arrays)
-        return arrays
+        kept = self._recent.get(name)
+        return self._recent.add(name, self._part(name)) if kept is None else kept
 
     def _part(self, name: str) -> dict[str, NDArray[Any]]:
         """As `part`, from the database."""
@@ -240,6 +236,7 @@ class RunStore:
                 del self._kept[part]
         for part, (at, sha256) in new.items():
             self._kept.setdefault(part, {})[at] = sha256
+            self._recent.forget(part)
         self._doubled = [part for part in new if len(self._kept[part]) > 1]
         self._hook("after_commit")
         _LOG.debug("stored generation %d: %d parts", generation, len(payloads))
