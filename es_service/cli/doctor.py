@@ -20,6 +20,7 @@ from es_service.cli.data import print_json
 from es_service.cli.options import print_finding
 from es_service.config.model import worker_spec
 from es_service.config.tasks import TASKS
+from es_service.dispatch.cluster_findings import Finding, cluster_findings
 from es_service.dispatch.cores import cores
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
@@ -34,8 +35,6 @@ from workers.policies.policy import initial_parameters
 from workers.simd.backend.target import NoVectorsError, host_target
 from workers.simd.episodes.kernel import compile_kernel
 
-Finding = tuple[str, str]
-"""Level ("ok", "note" or "FAIL") and text of one finding."""
 MIN_FREE_BYTES = 1 << 30
 MIN_MEMORY_BYTES = 2 << 30
 SIGMA = 0.02
@@ -46,6 +45,11 @@ def examine(*, as_json: bool = False) -> bool:
     """Print every finding, at once or as JSON at the end, and return whether no check failed."""
     checks = (_software, _ray, _machine, _vectors, _disk, _noise, _rollout)
     return print_findings((one for check in checks for one in _guarded(check)), as_json=as_json)
+
+
+def examine_cluster(address: str, *, as_json: bool = False) -> bool:
+    """The same for a Ray cluster."""
+    return print_findings(iter(cluster_findings(address)), as_json=as_json)
 
 
 def print_findings(findings: Iterator[Finding], *, as_json: bool) -> bool:

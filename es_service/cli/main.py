@@ -173,24 +173,17 @@ def doctor(
         str | None,
         typer.Option("--cluster", metavar="ADDRESS", help="Check this Ray cluster instead: HOST:PORT, or auto."),
     ] = None,
-    shared: Annotated[
-        Path | None, typer.Option("--shared", help="With --cluster: a folder that all nodes should share.")
-    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check that this machine, a cluster or a task can run searches, and show what their results depend on."""
-    from es_service.cli.doctor import examine
-    from es_service.cli.doctor_cluster import examine_cluster
+    from es_service.cli.doctor import examine, examine_cluster
     from es_service.cli.doctor_task import examine_task
 
     if task is not None:
-        if cluster is not None or shared is not None:
-            raise ConfigError("--cluster and --shared are no checks of a task; leave them or the task out")
+        if cluster is not None:
+            raise ConfigError("--cluster is no check of a task; leave it or the task out")
         raise typer.Exit(0 if examine_task(task, as_json=as_json) else 1)
-
-    if cluster is None and shared is not None:
-        raise ConfigError("--shared is for a cluster; give --cluster, too")
-    passed = examine(as_json=as_json) if cluster is None else examine_cluster(cluster, shared, as_json=as_json)
+    passed = examine(as_json=as_json) if cluster is None else examine_cluster(cluster, as_json=as_json)
     raise typer.Exit(0 if passed else 1)
 
 

@@ -1,161 +1,168 @@
-"""What is wrong with a Ray cluster, judged from its facts."""
+"""What is wrong with a Ray cluster: do its nodes answer with the software of this host, and does it ask for a token?
+
+A task on each node tells of its software (`node_probe`). The head and the dashboard are called without a token.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import Literal
+import contextlib
+import http.client
+from collections.abc import Iterator, Mapping
+from types import ModuleType
+from typing import Any
 
-from es_service.dispatch.cluster_facts import ClusterFacts, NodeFacts
+from es_service.dispatch import node_probe
+from es_service.dispatch.ray_cluster import connect, disconnect, require_node
+from es_service.dispatch.ray_faults import error_text
+from es_service.dispatch.ray_head import HEAD_CALL, grpc_module, status_code, uses_tls
+from es_service.errors import EvaluationError
 from es_service.protocol.sources import in_words, other_files
 
+NODE_S = 60.0
+"""Longest wait for the answers of all nodes, in seconds; a node first starts a process for the task."""
+HTTP_S = 5.0
+"""Longest wait for an answer of the dashboard, in seconds."""
 SAME = "install the same on every node, as constraints.txt names it"
+Finding = tuple[str, str]
+"""Level ("ok", "note" or "FAIL") and text: what is wrong; what may happen because of it; what to do about it."""
+Software = Mapping[str, Any]
+"""What `node_probe.software` returns."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One thing that was checked, with what is wrong or worth knowing."""
+def cluster_findings(address: str) -> list[Finding]:
+    """Join a cluster and check it; each check is either "ok" or says what is wrong.
 
-    level: Literal["ok", "note", "FAIL"]
-    what: str
-    where: str = ""
-    """The nodes, by name; empty if it is about all of them."""
-    meaning: str = ""
-    """What may happen because of it; empty for "ok"."""
-    way_out: str = ""
-    """What to do about it; empty for "ok"."""
+    Args:
+        address: "HOST:PORT", or "auto" for the cluster on this machine.
 
-    @property
-    def text(self) -> str:
-        """The finding in one line."""
-        place = f"{self.where}: " if self.where else ""
-        return place + "; ".join(filter(None, (self.what, self.meaning, self.way_out)))
-
-
-def findings(facts: ClusterFacts) -> list[Finding]:
-    """What was checked, security first: for each check either "ok" or what is wrong, then what is worth knowing. Nodes
-    with the same problem are in one finding."""
-    nodes, here = facts.nodes, facts.driver.versions
-    called = Counter(name.rpartition(" ")[0] for node in nodes for name in node.called)
-    servers = ", ".join(f"{count} {name}{'s' * (count > 1)}" for name, count in called.items())
-    ours = ", ".join(f"{name} {here[name]}" for name in ("ray", "python", "es-service") if name in here)
-    checks = [
-        (f"none of these servers of Ray answers without a token: {servers}", _all(_open, nodes)),
-        ("Ray listens on no public address of these nodes", _all(_public, nodes)),
-        (f"these nodes have {ours} and the packages of this host", _all(_versions, nodes, facts.driver)),
-        ("these nodes have the code of this host", _all(_code, nodes, facts.driver)),
-    ]
-    if facts.shared:
-        checks.append((f"these nodes share {facts.shared} with this host", _all(_disk, nodes, facts.shared)))
-    total = len(nodes) + len(facts.silent)
-    names = ", ".join(node.name for node in nodes)
-    found = [Finding("ok", f"{len(nodes)} of {total} nodes answer: {names}")] if nodes else []
-    for sound, problems in checks if nodes else ():
-        found += _merged(problems) or [Finding("ok", sound)]
-    silent = _merged(_silence(name, why) for name, why in facts.silent.items())
-    return [*found, *silent, *_merged(_all(_processor, nodes, facts.driver)), *_wire(facts)]
+    Raises:
+        EvaluationError: the connection failed, or a package is missing.
+    """
+    grpc = grpc_module()  # `connect` works without it, but may wait for a minute
+    try:
+        require_node(address)
+        ray = connect(address, gpus=False, cpus=1)
+    except EvaluationError as error:  # its ways out are those of a run
+        raise EvaluationError(" ".join(error.sentence.split()), field="cluster", value=address) from error
+    try:
+        answers, silent = _ask(ray)
+        head, dashboard = ray.get_runtime_context().gcs_address, _dashboard(ray)
+    finally:
+        disconnect(ray)
+    is_open = {f"head {head}": status_code(grpc, head, HEAD_CALL) is None}
+    if dashboard:
+        is_open[f"dashboard {dashboard}"] = answers_anyone(dashboard)
+    of_access = access_findings(is_open, len(answers) + len(silent), encrypted=uses_tls())
+    return [*node_findings(answers, silent, node_probe.software()), *of_access]
 
 
-def _all(check: Callable[..., Iterator[Finding]], nodes: Iterable[NodeFacts], *arguments: object) -> list[Finding]:
-    return [found for node in nodes for found in check(node, *arguments)]
+def node_findings(answers: Mapping[str, Software], silent: Mapping[str, str], here: Software) -> Iterator[Finding]:
+    """Findings about the nodes; those with the same problem are in one.
+
+    Args:
+        answers: name of each node that answered -> its software.
+        silent: name of each other node -> why it did not.
+        here: the software of this host.
+    """
+    if answers:
+        yield "ok", f"{len(answers)} of {len(answers) + len(silent)} nodes answer: {', '.join(answers)}"
+    where: dict[Finding, list[str]] = {}
+    for node, why in silent.items():
+        what = f"the node does not answer a task ({why}); workers there would not start either"
+        logs = "read Ray's logs on it, in /tmp/ray/session_latest/logs, or remove it from the cluster"
+        where.setdefault(("FAIL", f"{what}; {logs}"), []).append(node)
+    for node, theirs in answers.items():
+        for one in _differences(theirs, here):
+            where.setdefault(one, []).append(node)
+    if not any(level == "FAIL" for level, _ in where):
+        ours = ", ".join(f"{name} {here['versions'][name]}" for name in ("ray", "python", "es-service"))
+        yield "ok", f"these nodes have {ours}, and the packages and the code of this host"
+    for (level, text), nodes in where.items():
+        yield level, f"{', '.join(nodes)}: {text}"
 
 
-def _merged(found: Iterable[Finding]) -> list[Finding]:
-    """Findings that are equal but for the nodes as one each."""
-    merged: dict[Finding, list[str]] = {}
-    for one in found:
-        merged.setdefault(replace(one, where=""), []).append(one.where)
-    return [replace(one, where=", ".join(where)) for one, where in merged.items()]
+def access_findings(is_open: Mapping[str, bool], nodes: int, *, encrypted: bool) -> Iterator[Finding]:
+    """Findings about who can use a cluster.
+
+    Args:
+        is_open: server of Ray -> whether it answers without a token.
+        nodes: number of its nodes.
+        encrypted: whether Ray's processes use TLS.
+    """
+    if servers := ", ".join(name for name, is_one in is_open.items() if is_one):
+        meaning = "whoever can reach these ports can run programs on every node"
+        way_out = "start Ray again on every node, with RAY_AUTH_MODE=token and the same RAY_AUTH_TOKEN"
+        yield "FAIL", f"{servers}: Ray answers without a token; {meaning}; {way_out}"
+    else:
+        yield "ok", f"none of these servers of Ray answers without a token: {', '.join(is_open)}"
+    if encrypted:
+        yield "ok", "Ray's processes use TLS"
+    elif nodes > 1:
+        meaning = "whoever can read the traffic of this network can read the token and use it"
+        way_out = "use a private network, or TLS (docker/README.md, Tokens)"
+        yield "note", f"messages between nodes are not encrypted; {meaning}; {way_out}"
 
 
-def _open(node: NodeFacts) -> Iterator[Finding]:
-    if node.open_ports:
-        yield Finding(
-            "FAIL",
-            "Ray answers without a token",
-            f"{node.name} ({', '.join(node.open_ports)})",
-            "whoever can reach these ports can run programs there",
-            "start Ray again on every node, with RAY_AUTH_MODE=token and the same RAY_AUTH_TOKEN",
-        )
+def answers_anyone(server: str) -> bool:
+    """Whether an HTTP server, HOST:PORT, answers a request without a token, be it that it does not know the path."""
+    connection = http.client.HTTPConnection(server, timeout=HTTP_S)
+    try:
+        connection.request("GET", "/api/version")  # its page needs no token
+        return connection.getresponse().status not in (http.client.UNAUTHORIZED, http.client.FORBIDDEN)
+    except (OSError, http.client.HTTPException):  # nothing answers there
+        return False
+    finally:
+        connection.close()
 
 
-def _public(node: NodeFacts) -> Iterator[Finding]:
-    if node.public:
-        yield Finding(
-            "FAIL",
-            "Ray listens on a public address",
-            f"{node.name} ({', '.join(node.public)})",
-            "unless a firewall prevents it, anyone can try to connect, and whoever reads the traffic sees the token",
-            "close these ports in a firewall, or use machines that have only private addresses",
-        )
+def _differences(theirs: Software, here: Software) -> Iterator[Finding]:
+    """What is wrong with the software of a node."""
+    versions, ours = theirs["versions"], here["versions"]
+    names = sorted(ours.keys() & versions.keys() - {"cpu"})
+    if other := [f"{name} {versions[name]} (here {ours[name]})" for name in names if versions[name] != ours[name]]:
+        meaning = "a run may fail there, and its digest is marked mixed"
+        yield "FAIL", f"other versions: {', '.join(other)}; {meaning}; {SAME}"
+    if theirs["problem"]:
+        yield "FAIL", f"es-service cannot be used ({theirs['problem']}); workers there do not start; {SAME}"
+    elif files := other_files(here["sources"], theirs["sources"]):
+        meaning = "this node computes nothing for a driver on this host"
+        yield "FAIL", f"other code than here in {in_words(files)}; {meaning}; give every node the same files"
+    if (cpu := versions.get("cpu")) != ours.get("cpu") and cpu and ours.get("cpu"):
+        meaning = "the digest of a run on both is marked mixed, and with xla its last bits may differ"
+        way_out = "use nodes of one kind for a run that must repeat bit for bit"
+        yield "note", f"its processor is {cpu}, here {ours['cpu']}; {meaning}; {way_out}"
 
 
-def _silence(name: str, why: str) -> Finding:
-    return Finding(
-        "FAIL",
-        f"the node does not answer a task ({why})",
-        name,
-        "workers there would not start either",
-        "read Ray's logs on it, in /tmp/ray/session_latest/logs, or remove it from the cluster",
-    )
+def _ask(ray: ModuleType) -> tuple[dict[str, Software], dict[str, str]]:
+    """Name of each node -> its software, or why it gave no answer."""
+    affinity = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
+    ray.cloudpickle.register_pickle_by_value(node_probe)
+    try:
+        probe = ray.remote(num_cpus=0, max_retries=0)(node_probe.software)
+        asked = {
+            probe.options(scheduling_strategy=affinity(node["NodeID"], soft=False)).remote(): (
+                f"{node['NodeManagerHostname']} {node['NodeManagerAddress']}"
+            )
+            for node in ray.nodes()
+            if node["Alive"]
+        }
+    finally:
+        ray.cloudpickle.unregister_pickle_by_value(node_probe)
+    ready, late = ray.wait(list(asked), num_returns=len(asked), timeout=NODE_S)
+    answers, silent = {}, {asked[ref]: f"nothing within {NODE_S:g} s" for ref in late}
+    for ref in ready:
+        try:
+            answers[asked[ref]] = ray.get(ref)
+        except ray.exceptions.RayError as error:
+            silent[asked[ref]] = error_text(error).strip().rpartition("\n")[2]
+    return dict(sorted(answers.items())), dict(sorted(silent.items()))
 
 
-def _versions(node: NodeFacts, driver: NodeFacts) -> Iterator[Finding]:
-    names = sorted(driver.versions.keys() & node.versions.keys() - {"cpu"})
-    pairs = [(name, node.versions[name], driver.versions[name]) for name in names]
-    if other := [f"{name} {theirs} (here {ours})" for name, theirs, ours in pairs if theirs != ours]:
-        yield Finding(
-            "FAIL",
-            f"other versions: {', '.join(other)}",
-            node.name,
-            "a run may fail there, and its digest is marked mixed",
-            SAME,
-        )
+def _dashboard(ray: ModuleType) -> str | None:
+    """HOST:PORT of the dashboard; None if there is none.
 
-
-def _code(node: NodeFacts, driver: NodeFacts) -> Iterator[Finding]:
-    if node.problem:
-        yield Finding(
-            "FAIL", f"es-service cannot be used ({node.problem})", node.name, "workers there do not start", SAME
-        )
-    elif files := other_files(driver.sources, node.sources):
-        yield Finding(
-            "FAIL",
-            f"other code than here in {in_words(files)}",
-            node.name,
-            "this node computes nothing for a driver on this host",
-            "give every node the same files",
-        )
-
-
-def _processor(node: NodeFacts, driver: NodeFacts) -> Iterator[Finding]:
-    if (cpu := node.versions.get("cpu")) != (ours := driver.versions.get("cpu")) and cpu and ours:
-        yield Finding(
-            "note",
-            f"its processor is {cpu}, here {ours}",
-            node.name,
-            "the digest of a run on both is marked mixed, and with xla its last bits may differ",
-            "use nodes of one kind for a run that must repeat bit for bit",
-        )
-
-
-def _disk(node: NodeFacts, shared: str) -> Iterator[Finding]:
-    if node.not_shared:
-        yield Finding(
-            "FAIL",
-            f"{shared} is not shared ({node.not_shared})",
-            node.name,
-            "what this host writes there is not on that node, and a run that continues there does not find its folder",
-            "mount the same disk at the same path, readable by the user of Ray",
-        )
-
-
-def _wire(facts: ClusterFacts) -> Iterator[Finding]:
-    if len(facts.nodes) > 1 and not facts.encrypted:
-        yield Finding(
-            "note",
-            "messages between nodes are not encrypted",
-            meaning="whoever can read the traffic of this network can read the token and use it",
-            way_out="use a private network, or TLS (docker/README.md, Tokens)",
-        )
+    Ray has no public function for this. If a version of Ray lacks this one, the dashboard is not checked.
+    """
+    with contextlib.suppress(AttributeError):
+        return ray._private.worker.get_dashboard_url() or None
+    return None

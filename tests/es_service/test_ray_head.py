@@ -1,4 +1,4 @@
-"""What is learnt by calling the ports of a cluster, here of servers that answer as Ray does."""
+"""What is learnt by calling the head of a cluster, here servers that answer as Ray does."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from es_service.dispatch import ray_head
-from es_service.dispatch.ray_head import HEAD_CALL, require_head
-from es_service.dispatch.ray_ports import NODE_CALL, open_ports
+from es_service.dispatch.ray_head import HEAD_CALL, grpc_module, require_head, status_code
 from es_service.errors import EvaluationError
 
 
@@ -39,8 +38,9 @@ def head(request, monkeypatch):
     server.stop(None).wait()
 
 
-def test_a_port_that_needs_a_token_is_not_open(head):
-    assert open_ports([(head, HEAD_CALL), (head, NODE_CALL)]) == [False, False]
+def test_a_head_that_needs_a_token_answers_nobody_without_one(head):
+    assert status_code(grpc_module(), head, HEAD_CALL) is not None
+    assert status_code(grpc_module(), head, HEAD_CALL, "right") is None
 
 
 def test_what_is_wrong_with_the_token_is_said_before_a_cluster_is_joined(head, monkeypatch, tmp_path):
@@ -82,7 +82,7 @@ def test_a_token_that_the_cluster_does_not_ask_for_is_refused(head, monkeypatch)
 
 
 def test_a_server_that_is_no_head_is_named(head, monkeypatch):
-    monkeypatch.setattr(ray_head, "HEAD_CALL", NODE_CALL)
+    monkeypatch.setattr(ray_head, "HEAD_CALL", "/ray.rpc.NodeManagerService/GetSystemConfig")
     with pytest.raises(
         EvaluationError, match=f"at {head}: the server there does not answer as the head .*UNIMPLEMENTED"
     ):
