@@ -178,6 +178,8 @@ NETWORK = "workers/simd/episodes/network.py"
 OF_NOVELTY, OF_NOVELTY_SEARCH = "tests/es_service/test_novelty.py", "tests/laws/test_novelty_search.py"
 OF_ME_ES, OF_RULES = "tests/laws/test_me_es.py", "tests/laws/test_update_rules.py"
 OF_MAP_ELITES = "tests/laws/test_map_elites.py"
+KEPT, MEASURED = "es_service/search/maps/kept.py", "es_service/search/algorithms/measured.py"
+OF_MEASURED = "tests/laws/test_measured_elites.py"
 OF_MAPS = "tests/es_service/test_maps.py tests/es_service/test_changed_elites.py"
 OF_ROLLOUT = "tests/workers/test_rollout.py"
 OF_SCHEDULER = "tests/es_service/test_scheduler.py tests/es_service/test_scheduler_workers.py"
@@ -456,6 +458,38 @@ CASES = [
             "Domain.PARAMETER_NOISE, generation, np.arange(search.batch)",
         ),
         ("has a line for each parameter", RECIPES, "noise[..., -1:]", "noise[..., 1:]"),
+    ),
+    *cases(
+        "a policy that is measured again",
+        f"tests/es_service/test_kept.py {OF_MEASURED}",
+        ("counts its new sample as much as all before", KEPT, "fitness_was_R) / (count_R + 1)", "fitness_was_R) / 2"),
+        (
+            "falls behind younger ones that are as fit",
+            KEPT,
+            "both.serial_K, -both.fitness_K",
+            "-both.serial_K, -both.fitness_K",
+        ),
+        ("is drawn whatever its rank", KEPT, "np.exp(-rank_K)", "np.ones(kept.size)"),
+        ("stays if its sample is invalid", MEASURED, "stays_K[rows_R[~is_valid_R]] = False", "pass"),
+        ("stays in its cell", MEASURED, "comes_K[rows_R[is_valid_R]] = True", "pass"),
+        (
+            "keeps only its first sample of the median",
+            MEASURED,
+            '[-MOST_SAMPLES:].copy(), "descriptor_S_B"',
+            '[:1].copy(), "descriptor_S_B"',
+        ),
+        ("gives no score to its elite", MEASURED, "score_K[at] = score", "pass"),
+    ),
+    *cases(
+        "corrected values",
+        OF_MEASURED,
+        ("count no steps", "es_service/loop/driver.py", " + correction.env_steps", ""),
+        (
+            "have the stored places",
+            "es_service/loop/correction.py",
+            "doubles(results.descriptor).mean(axis=1)[valid_N]",
+            "map_.descriptor_N_B[first : first + len(cells)][valid_N]",
+        ),
     ),
     *cases(
         "a worker's parents of policies",

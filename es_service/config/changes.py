@@ -35,6 +35,8 @@ STATE_KEYS = (
     "policy.bias",
     "search.algorithm",
     "search.centres",
+    "search.elites.kind",
+    "search.elites.estimate",
     "map.enabled",
     "map.kind",
     "map.bounds",

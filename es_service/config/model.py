@@ -139,6 +139,13 @@ class MapConfig(Section):
         description="Fitness that counts as 0 in the QD-score. auto: the lowest reward of the task, times the steps of "
         "an episode with fitness sum; 0 if the task specifies no lowest reward."
     )
+    correct_every: Count | None = Field(
+        None,
+        description="All elites are evaluated in new episodes after each generation whose number is a multiple of "
+        "this, for the corrected columns of the history. These episodes count as environment steps; the search learns "
+        "nothing from them. null: never, and no such columns.",
+    )
+    correct_episodes: Count = Field(32, description="Episodes of each elite there.")
 
 
 class BudgetConfig(Section):

@@ -157,6 +157,102 @@ class NearnessObjective(ObjectivePart):
     weight: Fraction = Field(0.5, description="Of kind nearness: weight of nearness beside fitness.")
 
 
+Again = Annotated[float, Field(ge=0, lt=1), "a number from 0 to below 1"] | Literal["all"]
+
+
+class Once(Section):
+    """Elites are measured once, and keep what that said."""
+
+    kind: Literal["once"] = "once"
+
+
+class Measured(Section):
+    """Elites that are measured again: a cell keeps several policies, each where all of its samples say.
+
+    The defaults of a kind are those of the method that it is named after.
+    """
+
+    depth: Count = Field(
+        8,
+        description="Policies that a cell keeps; the fittest is its elite. Kind once has no such keys.",
+    )
+    again: Again = Field(
+        0.25,
+        description="Share of a generation's episodes that measure kept policies again; all: every kept policy once in "
+        "each generation, besides the other episodes.",
+    )
+    draw: Literal["exponential", "linear", "harmonic", "uniform"] = Field(
+        "exponential",
+        description="How these policies are drawn, by their rank in their cell, 0 for the fittest: in proportion to "
+        "exp(-rank), to the deepest rank + 1 - rank, to 1 / (rank + 1), or all alike.",
+    )
+    estimate: Literal["mean", "median"] = Field(
+        "mean", description="What of its samples says the fitness and the descriptor of a policy."
+    )
+
+
+class MeasuredNewcomers(Measured):
+    """The same for a search whose newcomers may be measured several times before they are compared."""
+
+    first_samples: Count = Field(2, description="Episodes, or means of evaluation episodes, of each new policy.")
+    replaces: Literal["worst", "any"] = Field(
+        "worst",
+        description="What a new policy replaces in a full cell. worst: the least fit, if that is less fit. any: a "
+        "random one, whatever its fitness; parents are then drawn from all policies of a cell, in proportion to their "
+        "fitness above the lowest.",
+    )
+
+
+class Extract(MeasuredNewcomers):
+    """Extract-ME: Flageat et al. 2025 (arXiv:2502.06585)."""
+
+    kind: Literal["eme"] = "eme"
+
+
+class ArchiveSampling(MeasuredNewcomers):
+    """Archive-Sampling: Flageat and Cully 2023 (arXiv:2302.00463)."""
+
+    kind: Literal["archive_sampling"] = "archive_sampling"
+    depth: Count = 2
+    again: Again = "all"
+    first_samples: Count = 1
+
+
+class ExplicitSampling(MeasuredNewcomers):
+    """MAP-Elites-Sampling, explicit averaging: Flageat and Cully 2023 (arXiv:2302.00463)."""
+
+    kind: Literal["me_sampling"] = "me_sampling"
+    depth: Count = 1
+    again: Again = 0.0
+    first_samples: Count = 32
+
+
+class DeepGrid(MeasuredNewcomers):
+    """Deep-Grid: Flageat and Cully 2020."""
+
+    kind: Literal["deep_grid"] = "deep_grid"
+    depth: Count = 32
+    again: Again = 0.0
+    first_samples: Count = 1
+    replaces: Literal["worst", "any"] = "any"
+
+
+class ExtractCentres(Measured):
+    """The container of Extract-ME for centres, each of which is measured once, by its evaluation episodes."""
+
+    kind: Literal["eme"] = "eme"
+
+
+class ArchiveSamplingCentres(Measured):
+    """That of Archive-Sampling, likewise."""
+
+    kind: Literal["archive_sampling"] = "archive_sampling"
+    depth: Count = 2
+    again: Again = "all"
+
+
+Elites = Once | Extract | ArchiveSampling | ExplicitSampling | DeepGrid
+ElitesOfCentres = Once | ExtractCentres | ArchiveSamplingCentres
 Step = AdamStep | AdamWStep | PlainStep | ClipUpStep
 Shaping = Ranks | Signs | Returns | TopPairs
 Objective = (

@@ -26,6 +26,7 @@ from es_service.loop.checks import (
     require_weights,
 )
 from es_service.loop.clock import Clock
+from es_service.loop.correction import Correction, correct
 from es_service.loop.evaluated import (
     Evaluations,
     Proposal,
@@ -137,8 +138,10 @@ def _generation(
     clock.lap("seconds_driver")
     evaluations = evaluate(search, evaluator, proposal, clock)
     updated = update(search, evaluator, proposal, evaluations, clock)
+    correction = correct(search, evaluator, store, state, updated)
+    clock.lap("seconds_evaluation")
     faults = fault_columns(evaluator.counts, since=since)
-    return record(search, store, state, proposal, evaluations, updated, reachable, faults, clock)
+    return record(search, store, state, proposal, evaluations, updated, correction, reachable, faults, clock)
 
 
 def propose(search: Search, store: Store, state: RunState) -> Proposal:
@@ -246,6 +249,7 @@ def record(
     proposal: Proposal,
     evaluations: Evaluations,
     updated: Update,
+    correction: Correction,
     reachable: Reachable,
     faults: HistoryRow,
     clock: Clock,
@@ -260,8 +264,8 @@ def record(
         search=replace(learned, elites={}),
         observations=merge_moments(before.observations, evaluations.observed),
         best=better(before.best, told, evaluated.point),
-        env_steps=before.env_steps + int(evaluated.env_steps_N.sum()),
-        episodes=before.episodes + episodes + results.fitness.size,
+        env_steps=before.env_steps + int(evaluated.env_steps_N.sum()) + correction.env_steps,
+        episodes=before.episodes + episodes + results.fitness.size + correction.episodes,
         wall_clock_s=clock.total(),
         elites=entered(learned, cell_N, evaluated.points, results.trace_T_B),
     )
@@ -283,6 +287,7 @@ def record(
             cell=None if cell_N is None or cell_N[at] == EMPTY else int(cell_N[at]),
             start_cell=proposal.start_cells.get(shown),
         ),
+        **correction.columns,
         "update_norm": or_none(evaluated.update_norm_N[at]),
         "parameter_norm": norm(evaluated.point(at).parameters_D),
         **population_columns(evaluations.members),

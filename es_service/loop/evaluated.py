@@ -237,6 +237,7 @@ def told_of(evaluated: Evaluated, generation: int) -> CentreEvaluations:
         evaluated.population_max_N,
         episodes.fitness.shape[1],
         episodes,
+        evaluated.points,
     )
 
 

@@ -79,6 +79,13 @@ _MAP = (
     Column("map_fitness_max", "REAL", True, "highest fitness of an elite, as it was when it entered"),
     Column("qd_score", "REAL", True, "sum over elites of fitness less map.qd_offset"),
 )
+_CORRECTED = (
+    Column("corrected_coverage", "REAL", True, "coverage of the elites' means over map.correct_episodes new episodes"),
+    Column("corrected_qd_score", "REAL", True, "QD-score of the same map; none where a generation does not correct"),
+    Column("corrected_fitness_max", "REAL", True, "highest fitness in the same map"),
+)
+CORRECTED = tuple(column.name for column in _CORRECTED)
+"""Names of these columns, which a run has if `map.correct_every` is set."""
 _EPISODES = (
     Column("fitness_first", "REAL", False, "fitness of its first evaluation episode, which a replay shows"),
     Column("reset_seed", "INTEGER", False, "seed in the addresses of the resets of its evaluation episodes"),
@@ -113,8 +120,12 @@ _SEARCH_AND_TIMES = (
 )
 
 
-def history_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
-    """All columns of a run, with those of its descriptor's dimensions, of its goal and of its map, if it has these."""
+def history_columns(task: TaskSpec, has_map: bool, corrects: bool = False) -> tuple[Column, ...]:
+    """All columns of a run, with those of its descriptor's dimensions, of its goal and of its map, if it has these.
+
+    Args:
+        corrects: whether `map.correct_every` is set.
+    """
     descriptor = tuple(
         column
         for name in task.descriptor_names
@@ -123,7 +134,9 @@ def history_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:
             Column(f"centre_{name}_std", "REAL", True, f"standard deviation of {name} over the same episodes"),
         )
     )
-    return (*_FITNESS, *descriptor, *(_GOAL if task.has_goal else ()), *(_MAP if has_map else ()), *_SEARCH_AND_TIMES)
+    goal, of_map = _GOAL if task.has_goal else (), _MAP if has_map else ()
+    corrected = _CORRECTED if has_map and corrects else ()
+    return (*_FITNESS, *descriptor, *goal, *of_map, *corrected, *_SEARCH_AND_TIMES)
 
 
 def evaluated_columns(task: TaskSpec, has_map: bool) -> tuple[Column, ...]:

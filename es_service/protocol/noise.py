@@ -50,6 +50,8 @@ class Domain(IntEnum):
     """Resets of episodes that only report the value of what was chosen."""
     ENVIRONMENT_RESET = 9
     """Resets of our tasks as environments of other libraries."""
+    CORRECTION_RESET = 10
+    """Resets of episodes that say what the elites of a map are worth, from which the search learns nothing."""
 
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)

@@ -163,8 +163,9 @@ def remember(recipes: Recipes, policy_N_D: Sequence[FloatArray]) -> None:
         policy_N_D: what `recipes.made` has given.
     """
     for (x, y), key_4, parameters_D in zip(recipes.parent_N_2.tolist(), recipes.key_N_4, policy_N_D, strict=True):
-        origin = Origin(recipes.rule, recipes.names[x], recipes.names[y], key_4.copy())
-        _ORIGINS[name_of(parameters_D)] = origin
+        origin, name = Origin(recipes.rule, recipes.names[x], recipes.names[y], key_4.copy()), name_of(parameters_D)
+        if name not in (origin.x, origin.y):  # a policy as it is says nothing of how it was made
+            _ORIGINS[name] = origin
     while len(_ORIGINS) > MOST_ORIGINS:
         del _ORIGINS[next(iter(_ORIGINS))]
 
@@ -185,6 +186,12 @@ def recipes_of(rule: IsoLine, parents: Sequence[FloatArray], parent_N_2: NDArray
         TypeError: a parent is no array.
     """
     return Recipes(rule, tuple(map(name_of, parents)), tuple(parents), parent_N_2, key_N_4)
+
+
+def unvaried(policies: Sequence[FloatArray]) -> Recipes:
+    """Recipes of policies as they are, [D] each, for those that workers may know already as parents of others."""
+    itself_N_2 = np.repeat(np.arange(len(policies))[:, None], 2, axis=1)
+    return recipes_of(IsoLine(0.0, 0.0), policies, itself_N_2, np.zeros((len(policies), KEY_WORDS), np.uint32))
 
 
 def name_of(parameters_D: FloatArray) -> bytes:

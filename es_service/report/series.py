@@ -27,7 +27,7 @@ PHASES = {
 }
 """History columns that divide a generation's time -> labels."""
 
-Group = Literal["last", "mean"]
+Group = Literal["last", "mean", "held"]
 """What a point shows of a group of generations: "last" for values so far, "mean" for values of one generation."""
 
 
@@ -65,11 +65,13 @@ class _Spec(NamedTuple):
 _SPECS = (
     _Spec(
         "Fitness",
-        "Mean over the evaluation episodes of a centre; of the population, single training episodes with noise.",
+        "Mean over the evaluation episodes of a centre; of the population, single training episodes with noise. "
+        "Corrected: in the new episodes of map.correct_every.",
         (
             ("best centre so far", "best_fitness", "last"),
             ("centre", "centre_fitness_mean", "mean"),
             ("population, median", "population_fitness_median", "mean"),
+            ("best elite, corrected", "corrected_fitness_max", "held"),
         ),
         ("population, quartiles", "population_fitness_q25", "population_fitness_q75"),
     ),
@@ -80,11 +82,20 @@ _SPECS = (
     ),
     _Spec(
         "Coverage of the behaviour map",
-        "Filled cells as a share of all cells, and of those that can be reached where the task knows its walls.",
-        (("of all cells", "coverage", "last"), ("of reachable cells", "coverage_reachable", "last")),
+        "Filled cells as a share of all cells, and of those that can be reached where the task knows its walls. "
+        "Corrected: where the elites are by the means of new episodes.",
+        (
+            ("of all cells", "coverage", "last"),
+            ("of reachable cells", "coverage_reachable", "last"),
+            ("of all cells, corrected", "corrected_coverage", "held"),
+        ),
         percent=True,
     ),
-    _Spec("QD-score", "Sum over all elites of fitness less map.qd_offset.", (("QD-score", "qd_score", "last"),)),
+    _Spec(
+        "QD-score",
+        "Sum over all elites of fitness less map.qd_offset. Corrected: of their means in new episodes.",
+        (("QD-score", "qd_score", "last"), ("corrected", "corrected_qd_score", "held")),
+    ),
     _Spec(
         "Novelty of the centre",
         "Mean distance of its descriptor to the nearest centres evaluated before.",
@@ -181,14 +192,16 @@ def groups(generations: int, most: int = MOST_POINTS) -> NDArray[np.int64]:
 
 
 def thinned(values_G: NDArray[np.float64], ends_K: NDArray[np.int64], group: Group) -> NDArray[np.float64]:
-    """One value for each group, [K]: the last or the mean of its finite values; NaN for a group without any."""
+    """One value for each group, [K]: the last or the mean of its finite values; NaN for a group without any. held: the
+    last finite value up to the end of the group, for values that only some generations have."""
     starts_K = np.concatenate([[0], ends_K[:-1]])
     if not ends_K.size:
         return np.zeros(0)
     finite_G = np.isfinite(values_G)
-    if group == "last":
+    if group != "mean":
         last_G = np.maximum.accumulate(np.where(finite_G, np.arange(values_G.size), -1))[ends_K - 1]
-        return np.where(last_G >= starts_K, values_G[np.maximum(last_G, 0)], np.nan)
+        first_K = 0 if group == "held" else starts_K
+        return np.where(last_G >= first_K, values_G[np.maximum(last_G, 0)], np.nan)
     with np.errstate(invalid="ignore"):
         sums_K = np.add.reduceat(np.where(finite_G, values_G, 0.0), starts_K)
         return sums_K / np.where(counts := np.add.reduceat(finite_G.astype(float), starts_K), counts, np.nan)

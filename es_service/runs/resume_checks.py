@@ -61,7 +61,8 @@ def require_resumable(store: RunStore, config: RunConfig, *, strict: bool) -> No
 
 def columns(config: RunConfig, task: TaskSpec) -> tuple[tuple[Column, ...], tuple[Column, ...]]:
     """The columns of a run's history, and those of its evaluated centres."""
-    return history_columns(task, config.map.enabled), evaluated_columns(task, config.map.enabled)
+    corrects = config.map.correct_every is not None
+    return history_columns(task, config.map.enabled, corrects), evaluated_columns(task, config.map.enabled)
 
 
 def _budget_of_a_fork(config: RunConfig, standing: Standing) -> dict[str, Any]:

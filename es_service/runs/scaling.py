@@ -330,7 +330,7 @@ def _driver_cost(config: RunConfig, answers: Mapping[str, ChunkResult]) -> float
         config=config.model_dump(mode="json"),
         constants=config.constants(),
         task=asdict(task),
-        columns=history_columns(task, config.map.enabled),
+        columns=history_columns(task, config.map.enabled, config.map.correct_every is not None),
         evaluation_columns=evaluated_columns(task, config.map.enabled),
     )
     replay: Evaluator = _Replay(answers, random, bounds_B_2)

@@ -123,6 +123,8 @@ def test_values_that_are_missing_leave_gaps_and_count_for_nothing():
     values_G, ends_K = np.array([np.nan, 1.0, np.nan, np.nan, 4.0, np.nan]), np.array([2, 4, 6])
     np.testing.assert_array_equal(series.thinned(values_G, ends_K, "mean"), [1.0, np.nan, 4.0])
     np.testing.assert_array_equal(series.thinned(values_G, ends_K, "last"), [1.0, np.nan, 4.0])
+    np.testing.assert_array_equal(series.thinned(values_G, ends_K, "held"), [1.0, 1.0, 4.0])
+    np.testing.assert_array_equal(series.thinned(values_G[2:], np.array([1, 4]), "held"), [np.nan, 4.0])
     assert series.thinned(np.zeros(0), np.zeros(0, int), "last").size == 0
 
 

@@ -48,6 +48,11 @@ CHANGES = {
         "policy": {"memory": 3},
         "compute": {"inline_workers": "processes"},
     },
+    "map_elites, elites measured again": {
+        "search": {"algorithm": "map_elites", "elites": {"kind": "eme", "depth": 2, "estimate": "median"}},
+        "map": {"correct_every": 2, "correct_episodes": 3},
+    },
+    "memes, elites measured again": {"search": {"algorithm": "memes", "elites": {"kind": "eme"}}},
 }
 """Name -> settings of a run that are none of a method's own."""
 KILLS = ("before_begin", "mid_transaction", "before_commit", "after_commit")

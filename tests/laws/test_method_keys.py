@@ -35,6 +35,8 @@ COMMON = {
     "search.evaluation_episodes": 3,
     "novelty.neighbours": 3,
     "map.cells": [9, 8],
+    "map.correct_every": 3,
+    "map.correct_episodes": 2,
     "budget.generations": 5,
 }
 WITH_POPULATIONS = {
@@ -110,6 +112,7 @@ OTHER = {
     "search.stagnation_generations": 1,
     "search.parent_statistics": "elite",
     "search.batch": 32,
+    "search.elites.kind": "archive_sampling",
     "search.iso_sigma": 0.3,
     "search.line_sigma": 0.3,
     "search.evaluation_episodes": 4,
@@ -122,6 +125,8 @@ OTHER = {
     "map.bounds": [[-2, 1], [-1, 1]],
     "map.cells": [7, 7],
     "map.qd_offset": -3.0,
+    "map.correct_every": 2,
+    "map.correct_episodes": 3,
     "compute.chunk_pairs": 32,
     "compute.gradient_block_pairs": 32,
     "seed": 1,
@@ -196,7 +201,7 @@ def digest(config):
     for parts in store.after:
         for name in sorted(parts):
             total.update(f"{name} {arrays_sha256(parts[name])}\n".encode())
-    columns = [one.name for one in history_columns(TASK, config.map.enabled) if one.deterministic]
+    columns = [one.name for one in history_columns(TASK, config.map.enabled, True) if one.deterministic]
     for row, evaluated in zip(store.rows, store.evaluated, strict=True):
         total.update(repr([row.get(column) for column in columns]).encode())
         total.update(repr([sorted(one.items()) for one in evaluated]).encode())

@@ -43,7 +43,15 @@ SETTINGS = {
 }
 """Settings of a method; others have those of populations."""
 POLISHED = {**OF_POPULATIONS, "screened": 3, "candidates": 2, "round_generations": 2}
-METHODS = [*ALGORITHMS, "tests.laws.test_policies:mixed"]
+MEASURED_AGAIN = "map_elites, elites measured again"
+VARIANTS = {
+    MEASURED_AGAIN: (
+        "map_elites",
+        {"search": {"elites": {"kind": "eme", "depth": 2}}, "map": {"correct_every": 2, "correct_episodes": 2}},
+    )
+}
+"""Name -> method and settings of its runs besides those of the method."""
+METHODS = [*ALGORITHMS, "tests.laws.test_policies:mixed", *VARIANTS]
 
 
 @cache
@@ -56,11 +64,12 @@ def parent():
 
 
 def config_of(method, **more):
+    method, changes = VARIANTS.get(method, (method, {}))
     settings = SETTINGS.get(method, OF_POPULATIONS)
     if ALGORITHMS[method].settings.needs_start:
         settings = POLISHED | {"init_from": parent()}
-    search = {**CONFIG["search"], "algorithm": method, **settings}
-    return CONFIG | {"search": search} | more
+    search = {**CONFIG["search"], "algorithm": method, **settings, **changes.get("search", {})}
+    return CONFIG | {"search": search, "map": CONFIG["map"] | changes.get("map", {})} | more
 
 
 @pytest.fixture(scope="module", params=METHODS)

@@ -23,7 +23,17 @@ from es_service.protocol.kept_parents import (
 from es_service.protocol.messages import Policies, around
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.policies import POLICY_SLOTS, PolicyChunk
-from es_service.protocol.recipes import IsoLine, Origin, Recipes, name_of, origin_of, recipes_of, remember, variation
+from es_service.protocol.recipes import (
+    IsoLine,
+    Origin,
+    Recipes,
+    name_of,
+    origin_of,
+    recipes_of,
+    remember,
+    unvaried,
+    variation,
+)
 from es_service.search.algorithms.base import PolicyAsk
 from tests.laws.me_es_runs import SHAPE, config_of, run_in_memory
 from tests.laws.test_policies import only
@@ -221,6 +231,17 @@ def test_a_policy_has_the_origin_of_which_it_was_made():
     assert isinstance(origin, Origin)
     known = dict(zip(asked.names, asked.parents, strict=True))
     assert bits(origin.recipes(known).made()[0]) == bits(asked.made()[3])
+
+
+def test_a_policy_as_it_is_has_its_own_bits_and_no_origin():
+    """An origin that names the policy itself would never end."""
+    policies = [np.random.default_rng(seed).normal(size=2000).astype(np.float32) for seed in range(3)]
+    recipes = unvaried(policies)
+    made_N_D = recipes.made()
+    np.testing.assert_array_equal(made_N_D, policies)
+    assert recipes.names == tuple(map(name_of, made_N_D))
+    remember(recipes, list(made_N_D))
+    assert all(origin_of(name) is None for name in recipes.names)
 
 
 def test_a_worker_whose_cores_are_processes_gives_them_the_policies():

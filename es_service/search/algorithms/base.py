@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from es_service.config.parts import Objective
 from es_service.protocol.episodes import one_of
-from es_service.protocol.messages import EpisodesResult, FloatArray
+from es_service.protocol.messages import Centre, EpisodesResult, FloatArray
 from es_service.protocol.recipes import Recipes
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.search.novelty import NoveltyArchive, sound_archive
@@ -194,6 +194,8 @@ class CentreEvaluations(Sequence[CentreEvaluation]):
     episodes: int = 1
     results: EpisodesResult | None = None
     """Results of each episode, [N, E]."""
+    points: Callable[[Sequence[int]], Sequence[Centre]] | None = None
+    """Function from indices on axis N to what was evaluated: parameters and observation statistics."""
 
     def __len__(self) -> int:
         return len(self.centre_N)

@@ -41,9 +41,13 @@ CENTRE_CHOICE = 0
 """Last id of the random streams of Domain.SELECTION that choose the centre to update."""
 
 AdaptWeight = Callable[[FitnessWeight, Sequence[CentreEvaluation]], FitnessWeight]
+Offer = Callable[[SearchState, Sequence[CentreEvaluation]], SearchState]
+"""(state, evaluations of a generation) -> state with them in the novelty archive and in the behaviour map."""
 
 
-def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight | None = None) -> Algorithm:
+def novelty_search(
+    config: RunConfig, fitness_weight: float, adapt: AdaptWeight | None = None, offer: Offer | None = None
+) -> Algorithm:
     """An algorithm of the family of Conti et al. 2018: ES on the utility (1 - w) * shaped novelty + w * shaped fitness.
 
     A generation updates one centre, or all, as the keys of `CentresSettings` say; without these, one by novelty.
@@ -51,6 +55,7 @@ def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight 
     Args:
         fitness_weight: initial value of w.
         adapt: (weight, evaluations of a generation after 0) -> new weight; None for a constant w.
+        offer: what becomes of evaluated centres; None: `archived_and_mapped`.
     """
     search = settings_of(config, PopulationConfig)
     updates_all = isinstance(search, CentresSettings) and search.update == "all"
@@ -71,7 +76,7 @@ def novelty_search(config: RunConfig, fitness_weight: float, adapt: AdaptWeight 
         weight = state.weight
         if adapt is not None and evaluations[0].generation > 0:
             weight = adapt(weight, evaluations)
-        return replace(archived_and_mapped(state, evaluations), weight=weight)
+        return replace((offer or archived_and_mapped)(state, evaluations), weight=weight)
 
     return Algorithm(ask, tell, weights, step, fitness_weight)
 

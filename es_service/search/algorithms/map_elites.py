@@ -26,15 +26,27 @@ from pydantic import Field
 
 from es_service.config.fields import Count, NotNegative
 from es_service.config.model import RunConfig
+from es_service.config.parts import Elites, MeasuredNewcomers, Once
 from es_service.config.presets import same
 from es_service.config.search import SearchConfig
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.protocol.recipes import IsoLine, recipes_of
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, PolicyAsk, SearchState, in_columns
-from es_service.search.algorithms.common import archived_and_mapped
+from es_service.search.algorithms.common import archived, archived_and_mapped
+from es_service.search.algorithms.measured import (
+    LAYER_CHOICE,
+    asked_again,
+    drawn_rows,
+    kept_of,
+    own_of,
+    parameters_of,
+    shares,
+    told_of_samples,
+)
 from es_service.search.algorithms.method import method
-from es_service.search.algorithms.settings import settings_of
+from es_service.search.algorithms.settings import ELITES, settings_of
 from es_service.search.maps.batches import insert_each
+from es_service.search.maps.kept import KeptPolicies
 
 PARENT_CHOICE = 3
 """Last id of the random stream of Domain.SELECTION that draws the parents."""
@@ -44,7 +56,11 @@ class MapElitesSettings(SearchConfig):
     """Policies and their variation. The map begins with 32 random policies unless the config has another number, which
     is our own choice: the store keeps all of them, and for an ant each takes a megabyte."""
 
-    batch: Count = Field(256, description="Number of policies that a generation makes and evaluates.")
+    batch: Count = Field(
+        256,
+        description="Number of policies that a generation makes and evaluates; with other search.elites than once, the "
+        "number of its samples.",
+    )
     iso_sigma: NotNegative = Field(
         0.005, description="Standard deviation of the noise in each parameter, in parameter units."
     )
@@ -53,6 +69,8 @@ class MapElitesSettings(SearchConfig):
         description="Standard deviation of the step along the line through both parents, as a share of the distance "
         "between them.",
     )
+
+    elites: Elites = Field(Once(), discriminator="kind", description=ELITES)
 
     presets = (
         same("policy.observation_normalization", False, "QDax; nothing could gather the statistics"),
@@ -74,6 +92,8 @@ class MapElitesSettings(SearchConfig):
 def map_elites(config: RunConfig) -> Algorithm:
     """MAP-Elites: mutations of the map's elites, each evaluated as it is and offered to the map."""
     search = settings_of(config, MapElitesSettings)
+    if isinstance(search.elites, MeasuredNewcomers):
+        return _with_measured_elites(config, search, search.elites)
 
     def parents(state: SearchState, generation: int) -> list[int]:
         has_elites = state.map is not None and state.map.size
@@ -100,6 +120,69 @@ def map_elites(config: RunConfig) -> Algorithm:
         return replace(state, map=map_)
 
     return Algorithm(ask, tell, parents=parents)
+
+
+def _with_measured_elites(config: RunConfig, search: MapElitesSettings, elites: MeasuredNewcomers) -> Algorithm:
+    """MAP-Elites whose generation has `batch` samples: of new policies, and of kept ones that are measured again.
+
+    Everything that it needs of the kept policies is in its own state, so it names no parents.
+    """
+
+    def of_generation(state: SearchState, generation: int) -> tuple[KeptPolicies, int, NDArray[np.int64]]:
+        kept = kept_of(state)
+        count, again = shares(elites, search.batch, kept.size)
+        return kept, count, drawn_rows(config, elites, kept, generation, again)
+
+    def ask(state: SearchState, generation: int) -> tuple[PolicyAsk, ...]:
+        kept, count, rows = of_generation(state, generation)
+        if kept.size:
+            serial_N_2 = kept.serial_K[parent_rows(config, elites, kept, state, generation)[:count]]
+            drawn, index_N_2 = np.unique(serial_N_2, return_inverse=True)
+            parents = parameters_of(state, drawn.tolist())
+        else:
+            drawn, index_N_2 = np.unique(parent_cells(config, state, generation)[:count], return_inverse=True)
+            parents = [state.centres[index].centre_D for index in drawn.tolist()]
+        key_N_4 = stream_keys(config.seed, Domain.VARIATION, generation, np.arange(count))
+        # Sample s of policy n has number s * count + n, and resets of its own.
+        samples, rule = (elites.first_samples, 1), IsoLine(search.iso_sigma, search.line_sigma)
+        recipes = recipes_of(rule, parents, np.tile(index_N_2.reshape(-1, 2), samples), np.tile(key_N_4, samples))
+        return (PolicyAsk(recipes), *asked_again(state, kept, rows))
+
+    def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
+        told = in_columns(evaluations)
+        if told.generation == 0:
+            for evaluation in told:
+                state = archived(state, evaluation)
+            return told_of_samples(config, elites, state, told, np.arange(len(told))[:, None])
+        _, count, rows = of_generation(state, told.generation)
+        index_S_N = np.arange(elites.first_samples * count).reshape(-1, count)
+        return told_of_samples(config, elites, state, told, index_S_N.T, rows, np.arange(index_S_N.size, len(told)))
+
+    return Algorithm(ask, tell, own=own_of(config, elites), counts_samples=True)
+
+
+def parent_rows(
+    config: RunConfig, elites: MeasuredNewcomers, kept: KeptPolicies, state: SearchState, generation: int
+) -> NDArray[np.int64]:
+    """Indices on axis K of the two parents of each policy, [N, 2].
+
+    Their cells are drawn as by `parent_cells`. A parent is the fittest policy of its cell or, with `replaces: any`, one
+    that is drawn in proportion to its fitness above the lowest of the cell; if all are equal, any.
+    """
+    cell_N_2 = parent_cells(config, state, generation)
+    first_N_2 = np.searchsorted(kept.cell_K, cell_N_2)
+    if elites.replaces == "worst":
+        return first_N_2
+    last_N_2 = np.searchsorted(kept.cell_K, cell_N_2, side="right") - 1
+    of_cell_K = np.searchsorted(kept.cell_K, kept.cell_K, side="right") - 1  # the least fit one of the same cell
+    share_K = kept.fitness_K - kept.fitness_K[of_cell_K]
+    share_K[share_K[np.searchsorted(kept.cell_K, kept.cell_K)] == 0.0] = 1.0  # of the fittest: all are equal
+    until_K = np.add.accumulate(share_K)
+    before_N_2 = np.append(0.0, until_K)[first_N_2]
+    key = stream_keys(config.seed, Domain.SELECTION, generation, LAYER_CHOICE)
+    drawn_N_2 = uniforms(key, np.arange(cell_N_2.size, dtype=np.uint32)).reshape(-1, 2).astype(np.float64)
+    wanted_N_2 = before_N_2 + drawn_N_2 * (until_K[last_N_2] - before_N_2)
+    return np.clip(np.searchsorted(until_K, wanted_N_2, side="right"), first_N_2, last_N_2)
 
 
 def parent_cells(config: RunConfig, state: SearchState, generation: int) -> NDArray[np.int64]:

@@ -43,6 +43,7 @@ from es_service.config.presets import PresetRow
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.search.algorithms.base import Algorithm, Ask, SearchState, from_elite
 from es_service.search.algorithms.common import novelty_search, population
+from es_service.search.algorithms.measured import measuring, offering
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import EmittersSettings, settings_of
 from es_service.search.algorithms.starts import (
@@ -96,7 +97,8 @@ class MeEsSettings(EmittersSettings):
 def me_es(config: RunConfig) -> Algorithm:
     """MAP-Elites with ES: blocks of exploring or exploiting generations that start from elites of the behaviour map."""
     search = settings_of(config, MeEsSettings)
-    shared = novelty_search(config, fitness_weight=weight_of_fitness(block_objective(search, config.seed, 1)))
+    first = block_objective(search, config.seed, 1)
+    shared = novelty_search(config, fitness_weight=weight_of_fitness(first), offer=offering(config))
 
     def objectives(state: SearchState, generation: int) -> list[Objective]:
         return [block_objective(search, config.seed, generation, emitter) for emitter in range(len(state.centres))]
@@ -129,7 +131,7 @@ def me_es(config: RunConfig) -> Algorithm:
 
     restart = counting(partial(from_elite, own_statistics=search.parent_statistics == "elite"))
     own = counted_starts(config) if search.cell_sampling == "least_tried" else {}
-    return replace(shared, ask=ask, start_cells=start_cells, restart=restart, own=own)
+    return measuring(config, replace(shared, ask=ask, start_cells=start_cells, restart=restart, own=own))
 
 
 def block_objective(search: MeEsSettings, seed: int, generation: int, emitter: int = 0) -> Objective:

@@ -38,6 +38,7 @@ from es_service.search.algorithms.base import (
     read_only,
 )
 from es_service.search.algorithms.common import novelty_search, population
+from es_service.search.algorithms.measured import measuring, offering
 from es_service.search.algorithms.method import method
 from es_service.search.algorithms.settings import EmittersSettings, settings_of
 from es_service.search.algorithms.starts import TRIED, Starts, counted_starts, counting, drawn_cell, start_shares
@@ -87,7 +88,8 @@ class MemesSettings(EmittersSettings):
 def memes(config: RunConfig) -> Algorithm:
     """MAP-Elites with many ES: each explores or exploits, until its centres no longer enter the map."""
     search = settings_of(config, MemesSettings)
-    shared = novelty_search(config, fitness_weight=weight_of_fitness(emitter_objective(search, 0)))
+    first = emitter_objective(search, 0)
+    shared = novelty_search(config, fitness_weight=weight_of_fitness(first), offer=offering(config))
 
     def start_cells(state: SearchState, generation: int) -> dict[int, int]:
         if state.map is None or not state.map.size:
@@ -130,7 +132,7 @@ def memes(config: RunConfig) -> Algorithm:
         own[AGE] = np.zeros(search.emitters, np.int64)
     if search.starts == "least_tried":
         own |= counted_starts(config)
-    return replace(shared, start_cells=start_cells, restart=restart, ask=ask, tell=tell, own=own)
+    return measuring(config, replace(shared, start_cells=start_cells, restart=restart, ask=ask, tell=tell, own=own))
 
 
 def emitter_objective(search: MemesSettings, emitter: int) -> Objective:

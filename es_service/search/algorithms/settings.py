@@ -8,11 +8,19 @@ from pydantic import Field
 
 from es_service.config.fields import Count
 from es_service.config.model import RunConfig
-from es_service.config.parts import Objectives, outputs_of
+from es_service.config.parts import ElitesOfCentres, Objectives, Once, outputs_of
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.errors import ConfigError
 
 Settings = TypeVar("Settings", bound=SearchConfig)
+ELITES = (
+    "How the elites of the map are measured. once: when they enter it, and never again. The other kinds keep several "
+    "policies in each cell and measure some of them again in each generation, so that what was luck falls, moves to "
+    "another cell or leaves. eme: Extract-ME. archive_sampling: all of them, in every generation. Of map_elites only: "
+    "me_sampling, which measures new policies many times and none again; deep_grid, which measures each once and "
+    "replaces any."
+)
+"""Description of `search.elites`."""
 
 
 def settings_of(config: RunConfig, kind: type[Settings]) -> Settings:
@@ -98,6 +106,8 @@ class EmittersSettings(PopulationConfig):
         "which the elite at its start was evaluated. With elite, all elites descend from the first centre and keep its "
         "statistics, so observations are not normalised unless the run started from a policy of another run.",
     )
+
+    elites: ElitesOfCentres = Field(Once(), discriminator="kind", description=ELITES)
 
     only_centres = "search.emitters"
 
