@@ -219,6 +219,8 @@ Work = tuple[Subject, Chunk]
 """A chunk with the subject that it belongs to."""
 KEPT_CENTRES = 64
 """Most subjects that a worker keeps after each work item, so that they need not be sent to it again."""
+FAILURES_TOLD = 16
+"""Most failed episodes that the result of a chunk names."""
 KEPT_BYTES = 32 * 2**20
 """Most bytes of parameters that it keeps."""
 
@@ -318,6 +320,9 @@ class EpisodesResult:
 
     observation [K, O]: what the policy sees, neither normalised nor clipped; action [K, A]: what the task gets, with
     its noise; reward, done: those of the step, float32 and bool; step_descriptor [K, B]: descriptor after it."""
+    failures: tuple[str, ...] = ()
+    """Invalid episodes of which the rollout knows why they are invalid, each as a text that names the member, its seed,
+    its parameters and the reason; at most FAILURES_TOLD of a chunk."""
 
 
 @dataclass(frozen=True)
