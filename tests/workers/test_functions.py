@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import re
+from io import StringIO
 
 import numpy as np
 import pytest
 import yaml
+from rich.console import Console
 
 from es_service import api, load_config
+from es_service.cli.tables.status import print_status
 from es_service.config.model import policy_spec
 from es_service.config.parallel import chunks_of_phases
 from es_service.config.tasks import TASKS, task_of
 from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
 from es_service.protocol.noise import evaluation_reset_keys
+from es_service.report.write import write_report
+from es_service.runs.export import arrays, tables
 from es_service.runs.session import dispatch_limits
 from tests.helpers import centre, spec, workers_in_this_process
 from tests.workers import functions
@@ -99,6 +104,31 @@ def test_map_elites_fills_a_map_of_descriptors(tmp_path, no_jax):
     assert (values["width"], values["height"]) == pytest.approx((row.wide, row.high), rel=1e-5)
     assert functions.hill(list(values.values()))[0] == pytest.approx(row.fitness, rel=1e-5)
     assert api.run(config | {"compute": {"workers": 3}}, tmp_path / "three").run.digest() == run.digest()
+
+
+@pytest.mark.usefixtures("one_process")
+def test_status_report_and_exports_have_the_names_of_parameters(tmp_path):
+    run = api.run(config_of(HILL, MAP_ELITES, generations=4), tmp_path / "run").run
+    best = run.parameters("best")
+    console = Console(file=StringIO(), width=200)
+    print_status(console, run)
+    shown = ", ".join(f"{name} = {value:.6g}" for name, value in best.items())
+    assert f"best parameters    {shown}\n" in console.file.getvalue()
+    page = write_report(run.folder, tmp_path / "report.html", best=False)[0].read_text()
+    assert "Parameters of the best centre" in page
+    assert re.search(rf"height</th><td>{best['height']:.9g}</td><td>0 to 1</td><td>0.9</td>", page)
+    table = dict(tables(run))["parameters"].set_index("which")
+    assert table.loc["best"].to_dict() == best
+    assert list(table.columns) == ["width", "height", "rest"]
+    cells = [",".join(map(str, one)) for one in run.map[["cell_wide", "cell_high"]].to_numpy().tolist()]
+    assert sorted(set(table.index) - {"best", "centre"}) == sorted(cells)
+    np.testing.assert_allclose(table.loc[cells, ["width", "height"]], run.map[["wide", "high"]], rtol=1e-5)
+    found = arrays(run)
+    assert found["parameter_names"].tolist() == list(best)
+    np.testing.assert_array_equal(found["values"], table.loc[cells])
+    np.testing.assert_array_equal(found["best_values"], list(best.values()))
+    policies = api.run(config_of(HILL), tmp_path / "es").run
+    assert dict(tables(policies))["parameters"]["which"].tolist()[:2] == ["best", "centre"]
 
 
 @pytest.mark.parametrize("search", [{"algorithm": "nsr_es", "pairs": 8}, {"algorithm": "ars", "pairs": 8}, MAP_ELITES])
