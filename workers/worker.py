@@ -6,6 +6,7 @@ A worker has no state that a restart would lose: every result is a pure function
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import accumulate
 from typing import Any, NamedTuple, TypeVar
@@ -15,9 +16,11 @@ import numpy as np
 from es_service.protocol.gradient_tree import with_neighbours_added
 from es_service.protocol.messages import (
     EVALUATION_EPISODES_PER_CHUNK,
+    FAILURES_TOLD,
     Centre,
     Chunk,
     ChunkResult,
+    EpisodesResult,
     EvaluationChunk,
     FloatArray,
     GradientChunk,
@@ -36,7 +39,7 @@ from es_service.protocol.recipes import Recipes
 from workers.compilable import Compilable
 from workers.results import evaluation_result, policies_result, training_result
 from workers.rollouts import BACKENDS
-from workers.rollouts.backend import Episodes, RolloutBackend
+from workers.rollouts.backend import Episodes, RolloutBackend, lane_of
 
 AnyChunk = TypeVar("AnyChunk", TrainingChunk, EvaluationChunk, GradientChunk)
 POLICY_CHUNKS_TOGETHER = 8
@@ -76,7 +79,10 @@ def make_worker(spec: WorkerSpec) -> Compilable:
             return function(kinds[type(work[0][1])], work)
         except BaseException as error:
             if len(work) == 1:
-                error.add_note(f"raised in {chunk_name(work[0][1])}")
+                lane, place = lane_of(error), chunk_name(work[0][1])
+                error.add_note(
+                    f"raised in {place if lane is None else f'{lane_name(spec, work[0], lane)}, in {place}'}"
+                )
                 raise
         return [result for one in work for result in named(function, [one])]  # to find the one that raises
 
@@ -105,7 +111,8 @@ def kinds_of(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], Kin
 
     def training_results(work: Sequence[tuple[Centre, TrainingChunk]], episodes: Episodes) -> list[ChunkResult]:
         shift_O = work[0][0].observation_mean_O
-        return [training_result(part, shift_O) for part in _split(episodes, spec.chunk_pairs)]
+        parts = zip(work, _split(episodes, spec.chunk_pairs), strict=True)
+        return [_with_failures(spec, one, part, training_result(part, shift_O)) for one, part in parts]
 
     def evaluation_arguments(work: Sequence[tuple[Centre, EvaluationChunk]]) -> tuple[Any, ...]:
         centre, chunks = _around_one(work)
@@ -121,7 +128,8 @@ def kinds_of(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], Kin
     def evaluation_results(work: Sequence[tuple[Centre, EvaluationChunk]], episodes: Episodes) -> list[ChunkResult]:
         parts = _split(episodes, EVALUATION_EPISODES_PER_CHUNK)
         return [
-            evaluation_result(part, chunk.episodes, chunk.first) for part, (_, chunk) in zip(parts, work, strict=True)
+            _with_failures(spec, one, part, evaluation_result(part, one[1].episodes, one[1].first))
+            for part, one in zip(parts, work, strict=True)
         ]
 
     def gradient_arguments(work: Sequence[tuple[Centre, GradientChunk]]) -> tuple[Any, ...]:
@@ -144,7 +152,9 @@ def kinds_of(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], Kin
         TrainingChunk: Kind(functions.training, training_arguments, training_results),
         EvaluationChunk: Kind(functions.evaluation, evaluation_arguments, evaluation_results),
         GradientChunk: Kind(Compilable(gradient_sums, compile_gradient_sum), gradient_arguments, gradient_results),
-        PolicyChunk: Kind(functions.policies, partial(_policy_arguments, spec, backend.made), _policy_results),
+        PolicyChunk: Kind(
+            functions.policies, partial(_policy_arguments, spec, backend.made), partial(_policy_results, spec)
+        ),
     }
 
 
@@ -185,15 +195,43 @@ def _statistics(policies: Policies, given_N_O: FloatArray | None, value: float, 
     return np.full((len(policies.parameters_N_D), inputs), value, np.float32)
 
 
-def _policy_results(work: Sequence[tuple[Policies, PolicyChunk]], episodes: Episodes) -> list[ChunkResult]:
+def _policy_results(
+    spec: WorkerSpec, work: Sequence[tuple[Policies, PolicyChunk]], episodes: Episodes
+) -> list[ChunkResult]:
     results, start = [], 0
     for one, chunk in work:
         _, episode_L = slots(one, chunk)
         of_chunk = slice(start, start + len(episode_L))
         part = episodes.map(lambda array, of=of_chunk: array[of])
-        results.append(policies_result(part, episode_L == 0 if one.traces else None))
+        result = policies_result(part, episode_L == 0 if one.traces else None)
+        results.append(_with_failures(spec, (one, chunk), part, result))
         start += len(episode_L)
     return results
+
+
+def lane_name(spec: WorkerSpec, work: Work, lane: int) -> str:
+    """Who runs in a lane of a chunk, such as `member + of pair 12`.
+
+    Args:
+        lane: as in `FailedEpisode`.
+    """
+    subject, chunk = work
+    population = f" of population {chunk.ask}" if chunk.ask else ""
+    if isinstance(chunk, TrainingChunk):
+        return f"member {'+-'[lane % 2]} of pair {chunk.chunk_id * spec.chunk_pairs + lane // 2}{population}"
+    if isinstance(chunk, EvaluationChunk):
+        return f"evaluation episode {chunk.chunk_id * EVALUATION_EPISODES_PER_CHUNK + lane}{population}"
+    if isinstance(chunk, PolicyChunk) and isinstance(subject, Policies):
+        policy_L, episode_L = slots(subject, chunk)
+        asked = f" of ask {chunk.ask}" if chunk.ask else ""
+        return f"episode {episode_L[lane]} of policy {subject.first + policy_L[lane]}{asked}"
+    raise TypeError(f"{chunk_name(chunk)} has no episodes")
+
+
+def _with_failures(spec: WorkerSpec, work: Work, episodes: Episodes, result: EpisodesResult) -> EpisodesResult:
+    """The result of a chunk with the first of its failed episodes by name."""
+    told = episodes.failures[:FAILURES_TOLD]
+    return replace(result, failures=tuple(f"{lane_name(spec, work, lane)} {text}" for lane, text in told))
 
 
 def _groups(work: Sequence[Work], *, together: bool) -> list[list[Work]]:

@@ -164,6 +164,9 @@ class Engine(Generic[AnyTransport]):
         self._waits = Waits(on_wait, on_compile)
         self._state = initial_state(limits)
         self._phase = 0
+        self.describe: Callable[[Sequence[Work]], str] = lambda work: ""
+        """What an error says of a work item whose workers were lost, since these could not name it; a sentence
+        without a full stop, or nothing."""
         self._work: dict[Hashable, Sequence[Work]] = {}
         self._results: dict[Hashable, list[ChunkResult]] = {}
         try:
@@ -290,8 +293,24 @@ class Engine(Generic[AnyTransport]):
                 case events.Assign(worker, item_id, attempt):
                     self.transport.send(worker, item_id, attempt, self._work[item_id])
         if self._state.failed is not None:
-            raise EvaluationError(self._state.failed + (f". {self.transport.shortage()}." if is_late else ""))
+            raise EvaluationError(
+                self._state.failed + self._more(event) + (f". {self.transport.shortage()}." if is_late else "")
+            )
         return accepted
+
+    def _more(self, event: events.Event) -> str:
+        """What the error that ends the run says of the work item that was lost too often with `event`."""
+        most = self._state.limits.max_attempts
+        lost = [work for item, work in self._work.items() if self._faults(item) >= most]
+        if isinstance(event, events.Failure) or not lost:
+            return ""
+        text = self.describe(lost[0])
+        return f"\n{text}" if text else ""
+
+    def _faults(self, item_id: Hashable) -> int:
+        """Number of times that a work item was charged with a fault."""
+        waiting = self._state.items.get(item_id)
+        return 0 if waiting is None else waiting.faults
 
     def _tell(self, entry: events.Event | events.Command) -> None:
         """Write an event or a command to the dispatch log and to `logging`, there also a traceback at level DEBUG."""

@@ -121,10 +121,12 @@ def invalidate(
     valid = [valid_members(population) for population in populations]
     invalid, members = sum(int(np.count_nonzero(~one)) for one in valid), sum(one.size for one in valid)
     if invalid > max_invalid_fraction * members:
+        told = [text for population in populations for text in population.failures]
+        first = f" The first of which more is known: {told[0]}" if told else ""
         raise EvaluationError(
             f"generation {generation}: {invalid} of {members} members returned a fitness or descriptor that is "
             f"not finite, more than search.max_invalid_fraction ({max_invalid_fraction}) allows. Everything up to "
-            f"generation {generation - 1} is saved; a smaller search.sigma or learning rate may help.",
+            f"generation {generation - 1} is saved; a smaller search.sigma or learning rate may help.{first}",
             field="search.max_invalid_fraction",
             value=max_invalid_fraction,
         )
@@ -145,6 +147,12 @@ def require_some_finite(evaluations: Sequence[EpisodesResult], environment: str)
     }
     wrong = " and ".join(name for name, is_finite in finite.items() if not is_finite) or "fitness or descriptor"
     steps = min(int(evaluation.steps.min()) for evaluation in evaluations)
+    if told := [text for evaluation in evaluations for text in evaluation.failures]:
+        raise EvaluationError(
+            f"generation 0: each of the {count} episodes of the initial centres failed. The first: {told[0]}",
+            field="task.environment",
+            value=environment,
+        )
     raise EvaluationError(
         f"generation 0: the {wrong} is NaN or infinite in each of the {count} episodes of the initial centres; the "
         f"shortest episode has {steps} steps. The run cannot learn from this: look for a division by 0, a root or "

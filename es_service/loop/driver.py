@@ -81,6 +81,7 @@ def run(
     store: Store,
     state: RunState | None,
     report: Callable[[HistoryRow], object],
+    failed: Callable[[Sequence[str]], object] = lambda failures: None,
 ) -> tuple[RunState, str]:
     """Run generations until the budget is spent or `report` returns a `Stop`.
 
@@ -88,6 +89,8 @@ def run(
         state: the newest state in `store`, from which to continue; None to begin a run, with an empty store.
         report: called with each history row after it has been committed. A `Stop` that it returns ends the session, and
             any other value has no effect.
+        failed: called before that with texts that name the generation's failed episodes, if there are any of which
+            the rollouts know more.
 
     Returns:
         The last state and the reason for ending, in words.
@@ -100,7 +103,7 @@ def run(
     state, answer = state or initial_state(search), None
     reachable = None if state.search.map is None else reachable_cells(state.search.map.geometry, search.task)
     while (reason := answer.reason if isinstance(answer, Stop) else spent(search.config.budget, state)) is None:
-        state, row = _generation(search, evaluator, store, clock, state, reachable)
+        state, row = _generation(search, evaluator, store, clock, state, reachable, failed)
         answer = report(row)
     return state, reason
 
@@ -126,7 +129,13 @@ def spent(budget: BudgetConfig, state: RunState) -> str | None:
 
 
 def _generation(
-    search: Search, evaluator: Evaluator, store: Store, clock: Clock, state: RunState, reachable: Reachable
+    search: Search,
+    evaluator: Evaluator,
+    store: Store,
+    clock: Clock,
+    state: RunState,
+    reachable: Reachable,
+    failed: Callable[[Sequence[str]], object],
 ) -> tuple[RunState, HistoryRow]:
     """One generation: a pure function of (search, state, elites in the store) but for its timings.
 
@@ -141,6 +150,9 @@ def _generation(
     correction = correct(search, evaluator, store, state, updated)
     clock.lap("seconds_evaluation")
     faults = fault_columns(evaluator.counts, since=since)
+    results = [*evaluations.members, updated.evaluated.evaluation]  # policies are in both
+    if failures := list(dict.fromkeys(text for one in results for text in one.failures)):
+        failed(failures)
     return record(search, store, state, proposal, evaluations, updated, correction, reachable, faults, clock)
 
 

@@ -21,6 +21,7 @@ def each(change: Callable[..., np.ndarray], *results: EpisodesResult) -> Episode
         moments=None,
         trace_T_B=change(*traces) if len(traces) == len(results) else None,
         outputs={name: change(*(one.outputs[name] for one in results)) for name in results[0].outputs},
+        failures=tuple(text for one in results for text in one.failures),
     )
 
 
@@ -37,7 +38,7 @@ def joined(results: Sequence[EpisodesResult], count: int | None = None) -> Episo
 
 def one_of(results: EpisodesResult, index: int) -> EpisodesResult:
     """The results at an index of the first axis, such as those of one policy [E] from those of all [N, E]."""
-    found = each(lambda array: array[index], results)
+    found = replace(each(lambda array: array[index], results), failures=())  # they do not say which one is theirs
     if not results.of_steps:
         return found
     first, rows = (int(steps.sum(dtype=np.int64)) for steps in (results.steps[:index], results.steps[index]))

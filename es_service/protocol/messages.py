@@ -299,6 +299,9 @@ class EpisodesResult:
 
     observation [K, O]: what the policy sees, neither normalised nor clipped; action [K, A]: what the task gets, with
     its noise; reward, done: those of the step, float32 and bool; step_descriptor [K, B]: descriptor after it."""
+    failures: tuple[str, ...] = ()
+    """Invalid episodes of which the rollout knows why they are invalid, each as a text that names the member, its seed,
+    its parameters and the reason; at most FAILURES_TOLD of a chunk."""
 
 
 @dataclass(frozen=True)

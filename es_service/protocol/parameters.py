@@ -35,6 +35,16 @@ class ParameterSpec(NamedTuple):
         """Parameters of what a search moves, [D], by name."""
         return dict(zip(self.names, self.values(searched).tolist(), strict=True))
 
+    def text(self, searched: Any, most: int | None = None) -> str:
+        """Names and values of what a search moves, [D], such as `width = 0.3, height = 1.0`.
+
+        Args:
+            most: how many of them are shown; None for all.
+        """
+        named = [f"{name} = {value!r}" for name, value in self.named(searched).items()]
+        left = 0 if most is None else len(named) - most
+        return ", ".join(named[:most]) + (f" and {left} more" if left > 0 else "")
+
     def values(self, searched: Any) -> NDArray[np.float64]:
         """Parameters [..., D] of what a search moves: -1 and 1 stand for the bounds, at which is put what is beyond."""
         low_D, high_D, middle_D, half_D = self._scales()

@@ -44,7 +44,9 @@ def raised(error: BaseException, *names: str) -> RaisedError:
     if isinstance(error, RaisedError):
         return error
     whole = "".join(traceback.format_exception(error)).rstrip()
-    return RaisedError(users_error(error, *names) or (str(error) if _is_ours(error) else whole), whole)
+    return RaisedError(
+        users_error(error, *names) or ("\n".join([str(error), *_notes(error)]) if _is_ours(error) else whole), whole
+    )
 
 
 @contextmanager

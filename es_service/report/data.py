@@ -6,7 +6,7 @@ Axes: G generations, N evaluated centres, T points of a path, B descriptor dimen
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,9 @@ from es_service.store.sound import Arrays, Followed, SoundRun, read_sound
 Columns = Mapping[str, NDArray[np.float64]]
 """Column name -> its values; NaN stands for no value."""
 TRACE = "trace_T_B"
+POINT = "centre_D"
+MOST_PARAMETERS = 1000
+"""Most parameters of a function that a report shows."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,8 @@ class RunData:
     """The digest; empty if it cannot be computed, or while a driver is writing."""
     problems: tuple[str, ...]
     """What is damaged, one sentence each."""
+    best_parameters: Mapping[str, float] = field(default_factory=dict)
+    """Parameters of the best centre by name, if the task is a function of them."""
 
     @property
     def constants(self) -> Mapping[str, Any]:
@@ -127,11 +132,11 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
     problems = list(found.problems)
     run = Run(folder)
     run.__dict__["meta"] = found.meta  # it is cached there, and `run.db` itself may be damaged
-    best = found.parts.get(BEST)
+    best, task = found.parts.get(BEST), task_from_fields(found.meta.task)
     return RunData(
         folder=folder,
         meta=found.meta,
-        task=task_from_fields(found.meta.task),
+        task=task,
         history=_floats(found.history),
         centres=_floats(found.evaluations),
         map=_map(found, problems),
@@ -142,14 +147,21 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
         platforms=found.platforms,
         digest="",
         problems=tuple(problems),
+        best_parameters={} if best is None or POINT not in best else _named(task, best[POINT]),
     )
+
+
+def _named(task: TaskSpec, point_D: NDArray[Any]) -> dict[str, float]:
+    """Parameters of a function that is the task by name; empty for other tasks."""
+    return {} if task.parameters is None else task.parameters.named(point_D)
 
 
 def _kept(part: str, arrays: Arrays) -> Arrays | None:
     if part.startswith(ELITE_PREFIX):
         return {TRACE: arrays[TRACE]}
     if part == BEST:
-        return {name: arrays[name] for name in ("generation", "fitness")}
+        point = {POINT: arrays[POINT]} if arrays[POINT].size <= MOST_PARAMETERS else {}  # or it is a policy's
+        return {name: arrays[name] for name in ("generation", "fitness")} | point
     return arrays if part == GEOMETRY_PART or part.startswith(CELL_PREFIX) else None
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from importlib import resources
 from typing import Any
 
+from es_service.protocol.parameters import FREE
 from es_service.report import cloud as clouds
 from es_service.report import curves, facts, maps, series
 from es_service.report.colours import value_range
@@ -63,6 +64,8 @@ def run_sections(data: RunData, evaluate: Evaluate | None) -> tuple[dict[str, Ma
             "time": _time(data),
             "faults": _faults(data),
         }
+        if found := _parameters(data):
+            sections["parameters"] = found
     return sections, scripts
 
 
@@ -206,6 +209,19 @@ def _cloud(data: RunData, scripts: dict[str, Any]) -> Markup:
         ),
         id_="centres",
     )
+
+
+def _parameters(data: RunData) -> Markup:
+    """The parameters of the best centre, if the task is a function of them."""
+    spec = data.task.parameters
+    if spec is None or not data.best_parameters:
+        return Markup()
+    rows = []
+    for (name, value), (low, high), start in zip(data.best_parameters.items(), spec.bounds, spec.start, strict=True):
+        bounds = "none" if (low, high) == FREE else f"{low:g} to {high:g}"
+        rows.append((name, f"{value:.9g}", bounds, f"{start:g}"))
+    listed = table(rows, ("parameter", "value", "bounds", "start"), "numbers")
+    return section("Parameters of the best centre", listed, id_="parameters")
 
 
 def _time(data: RunData) -> Markup:

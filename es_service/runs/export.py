@@ -13,7 +13,8 @@ import numpy as np
 
 from es_service.config.problems import unknown_name
 from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
-from es_service.runs.moment import map_places
+from es_service.protocol.parameters import ParameterSpec
+from es_service.runs.moment import Moment, map_places
 from es_service.runs.trackers import TensorBoard, check_trackers, fill
 from es_service.runs.view import Run, is_no_elite
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
@@ -57,15 +58,20 @@ def export(run: Run, to: str, folder: Path) -> list[Path]:
 
 
 def tables(run: Run) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Names and content of history, evaluated centres, novelty archive and, where there are any, the map and the
-    certified policies; all but the last as of one generation. They come one by one, because the first two may be
-    large."""
-    moment = run.at(wanted=is_no_elite)
+    """Names and content of history, evaluated centres, novelty archive and, where there are any, the map, the
+    parameters of a function that is the task, and the certified policies; all but the last as of one generation. They
+    come one by one, because the first two may be large.
+
+    The parameters are those of the best centre, of the newest one (if the generation evaluated one) and of the elites:
+    `which` is best, centre or the place of a cell, such as 3,17; then each parameter in the units of the function."""
+    moment = run.at(wanted=is_no_elite) if run.parameter_spec is None else run.at()
     yield "history", run.history_until(moment.generation).reset_index()
     yield "evaluations", run.evaluations_until(moment.generation)
     yield "novelty", moment.novelty
     if run.constants["map.enabled"]:
         yield "map", moment.map
+    if run.parameter_spec is not None:
+        yield "parameters", _parameters(moment, run.parameter_spec, has_map=run.constants["map.enabled"])
     if not (certified := run.certified).empty:
         yield "certified", certified
 
@@ -79,7 +85,8 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
     [D], `best_mean` [O], `best_std` [O], `centre_parameters`, ...; for N elites `cell` [N, dimensions of the map],
     `fitness` [N], `descriptor` [N, B], `generation` [N], `samples` [N] (where they are counted), `parameters` [N, D],
     `mean` [N, O], `std` [N, O], `trace` [N, T, B]. A layer's weights [inputs, outputs] come before its biases, layer
-    after layer; those of a memory are of its gates and its candidate (`workers/policies/recurrent.py`).
+    after layer; those of a memory are of its gates and its candidate (`workers/policies/recurrent.py`). If the task is
+    a function, `parameter_names` [D], and in its units `best_values` [D], `centre_values` [D] and `values` [N, D].
     """
     moment = run.at()
     clip, spec = run.constants["policy.observation_clip"], run.policy_spec
@@ -102,6 +109,10 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
     if run.constants["map.enabled"]:
         map_, elites = moment.elites()
         found |= _map_arrays(run, map_, elites)
+    if (named := run.parameter_spec) is not None:
+        found["parameter_names"] = np.array(named.names)
+        of = [one.removesuffix("parameters") for one in found if one.endswith("parameters")]
+        found |= {f"{one}values": named.values(found[f"{one}parameters"]) for one in of}
     return found
 
 
@@ -179,6 +190,22 @@ def _map_arrays(run: Run, map_: BehaviourMap, elites: dict[int, Elite]) -> dict[
             for name, field in fields.items()
         },
     }
+
+
+def _parameters(moment: Moment, spec: ParameterSpec, *, has_map: bool) -> pd.DataFrame:
+    """The table of parameters; see `tables`."""
+    import pandas as pd
+
+    rows = {"best": moment.policy("best").parameters_D}
+    if moment.newest_centre is not None:
+        rows["centre"] = moment.policy("centre").parameters_D
+    if has_map:
+        map_, elites = moment.elites()
+        places = [",".join(map(str, place)) for place in map_places(map_).reshape(map_.size, -1).tolist()]
+        rows |= zip(places, (elite.centre_D for elite in elites.values()), strict=True)
+    table = pd.DataFrame(spec.values(np.stack(list(rows.values()))), columns=pd.Index(spec.names))
+    table.insert(0, "which", list(rows), allow_duplicates=True)
+    return table
 
 
 def _csv(run: Run, folder: Path) -> list[Path]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ from es_service.store.beginning import SEVERAL
 from es_service.store.codec import Part
 from es_service.store.writer import RunStore
 from workers.actor import WorkerActor
+from workers.host.described import described
 from workers.policies.policy import initial_parameters
 from workers.rollouts import BACKENDS
 
@@ -90,7 +92,7 @@ def work(
     """
     task = task_of(config)
     store.keep_every = config.store.keep_every
-    told = 0
+    told, said_failed = 0, False
 
     def tell(notice: str) -> None:
         _LOG.warning(notice)
@@ -149,6 +151,17 @@ def work(
         else caller(spec) as engine,
     ):
 
+        def tell_failed(failures: Sequence[str]) -> None:
+            nonlocal said_failed
+            for text in failures:
+                _LOG.warning("%s failed: %s", config.task.environment, text)
+            if not said_failed:
+                said_failed = True
+                on_notice(
+                    f"{config.task.environment} failed, which makes the member invalid: {failures[0]}. Later failures "
+                    "are in the log (--log-level warning)"
+                )
+
         def after_generation(row: Mapping[str, Any]) -> object:
             log(Committed(row["generation"]))
             tell_notices()
@@ -170,7 +183,7 @@ def work(
             tell(f"compute.workers: {count} workers start and not {compute.workers}, since {parallel_sentence(config)}")
         engine.wait_for_place()  # before the loop, whose time is that of the run and of its budget
         recorder = Recorder(store, engine, platform_info(), code, tell, strict=strict)
-        _, reason = driver.run(search, engine, recorder, state, after_generation)
+        _, reason = driver.run(search, engine, recorder, state, after_generation, tell_failed)
         _LOG.info("the session ends: %s", reason)
     return Outcome(open_run(store.folder), reason)
 
@@ -241,10 +254,11 @@ def make_engine(
     limits = dispatch_limits(config, most)
     if compute.engine == "inline":
         threads = compute.inline_workers == "threads"
-        return inline_engine(spec, limits, should_stop, threads=threads, log=log, on_compile=on_compile)
+        engine = inline_engine(spec, limits, should_stop, threads=threads, log=log, on_compile=on_compile)
+        return _describing(engine, config, spec)
     from es_service.dispatch.ray_engine import ray_engine
 
-    return ray_engine(
+    engine = ray_engine(
         spec,
         limits,
         should_stop,
@@ -259,6 +273,15 @@ def make_engine(
         on_compile=on_compile,
         on_refusal=on_refusal,
     )
+    return _describing(engine, config, spec)
+
+
+def _describing(engine: Engine[Any], config: RunConfig, spec: WorkerSpec) -> Engine[Any]:
+    """The engine, whose errors name the episodes of Python objects or the calls of a function that ended workers."""
+    task = task_of(config)
+    if task.kind in ("python", "function"):
+        engine.describe = partial(described, spec, task.parameters)
+    return engine
 
 
 def initial_centres(config: RunConfig, start: Part | None) -> tuple[list[FloatArray], Moments]:

@@ -242,12 +242,23 @@ class Run:
 
         Raises as `policy`, and NotInRunError if the task is no function.
         """
-        if (fields := self.meta.task.get("parameters")) is None:
+        if (spec := self.parameter_spec) is None:
             raise NotInRunError(
                 f"{self.folder} has policies: its task {self.meta.task['name']} is no function of parameters",
                 run=self.folder,
             )
-        return ParameterSpec.from_fields(*fields).named(self.policy(which).parameters_D)
+        return spec.named(self.policy(which).parameters_D)
+
+    @property
+    def parameter_spec(self) -> ParameterSpec | None:
+        """Names, bounds and start of the parameters of the function that is the run's task; None for other tasks."""
+        return parameter_spec(self.meta)
+
+
+def parameter_spec(meta: RunMeta) -> ParameterSpec | None:
+    """See `Run.parameter_spec`."""
+    fields = meta.task.get("parameters")
+    return None if fields is None else ParameterSpec.from_fields(*fields)
 
 
 def _frame(columns: Columns) -> pd.DataFrame:

@@ -52,6 +52,24 @@ def fragile(parameters):
 fragile.parameters = ("x", "y")
 
 
+def forgetful(parameters):
+    """It returns nothing."""
+    parameters.sum()
+
+
+forgetful.parameters = {f"x{index}": (0.0, 1.0) for index in range(20)}
+
+
+def deadly(parameters):
+    """It ends its process for one member of each pair."""
+    if parameters[0] > 0.0:
+        os._exit(3)
+    return float(parameters.sum())
+
+
+deadly.parameters = ("left", "right")
+
+
 def slow(parameters):
     """It hangs, or ends its process, once: where a file says so, and the first parameter is positive."""
     fault = Path(os.environ["HOST_FAULT"])

@@ -104,6 +104,31 @@ class Fragile(Drift):
         return super().step(action)
 
 
+class Undefined(Drift):
+    """A drift whose fifth reward is no number, where the place is below 0."""
+
+    def step(self, action):
+        seen, reward, *ends = super().step(action)
+        return seen, float("nan") if self.steps == 5 and self.place < 0.0 else reward, *ends
+
+
+class Deadly(Drift):
+    """A drift that ends its process in the fourth step."""
+
+    def step(self, action):
+        if self.steps == 3:
+            os._exit(9)
+        return super().step(action)
+
+
+class Wordless(Drift):
+    """A drift whose reward was forgotten."""
+
+    def step(self, action):
+        seen, _, *ends = super().step(action)
+        return seen, None if self.steps == 7 else 0.0, *ends
+
+
 class Forgetful(Drift):
     """A drift whose seed is not all that it depends on: it goes on with the random numbers of the episode before."""
 

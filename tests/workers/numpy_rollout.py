@@ -162,8 +162,8 @@ def episode(
 
 def stacked(episodes: Sequence[Episodes]) -> Episodes:
     """Episodes along a new first axis."""
-    arrays = (np.stack(arrays) for arrays in zip(*(one[:-2] for one in episodes), strict=True))
+    arrays = (np.stack(arrays) for arrays in zip(*(one[:-3] for one in episodes), strict=True))
     named = (
-        {name: np.stack([one[field][name] for one in episodes]) for name in episodes[0][field]} for field in (-2, -1)
+        {name: np.stack([one[field][name] for one in episodes]) for name in episodes[0][field]} for field in (-3, -2)
     )
-    return Episodes._make([*arrays, *named])
+    return Episodes._make([*arrays, *named, ()])

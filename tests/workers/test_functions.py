@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import re
+from io import StringIO
+
 import numpy as np
 import pytest
 import yaml
+from rich.console import Console
 
 from es_service import api, load_config
+from es_service.cli.tables.status import print_status
 from es_service.config.model import policy_spec
 from es_service.config.parallel import chunks_of_phases
 from es_service.config.tasks import TASKS, task_of
-from es_service.errors import ConfigError
+from es_service.errors import ConfigError, EvaluationError
 from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
 from es_service.protocol.noise import evaluation_reset_keys
+from es_service.report.write import write_report
+from es_service.runs.export import arrays, tables
 from es_service.runs.session import dispatch_limits
 from tests.helpers import centre, spec, workers_in_this_process
 from tests.workers import functions
@@ -99,6 +106,31 @@ def test_map_elites_fills_a_map_of_descriptors(tmp_path, no_jax):
     assert api.run(config | {"compute": {"workers": 3}}, tmp_path / "three").run.digest() == run.digest()
 
 
+@pytest.mark.usefixtures("one_process")
+def test_status_report_and_exports_have_the_names_of_parameters(tmp_path):
+    run = api.run(config_of(HILL, MAP_ELITES, generations=4), tmp_path / "run").run
+    best = run.parameters("best")
+    console = Console(file=StringIO(), width=200)
+    print_status(console, run)
+    shown = ", ".join(f"{name} = {value:.6g}" for name, value in best.items())
+    assert f"best parameters    {shown}\n" in console.file.getvalue()
+    page = write_report(run.folder, tmp_path / "report.html", best=False)[0].read_text()
+    assert "Parameters of the best centre" in page
+    assert re.search(rf"height</th><td>{best['height']:.9g}</td><td>0 to 1</td><td>0.9</td>", page)
+    table = dict(tables(run))["parameters"].set_index("which")
+    assert table.loc["best"].to_dict() == best
+    assert list(table.columns) == ["width", "height", "rest"]
+    cells = [",".join(map(str, one)) for one in run.map[["cell_wide", "cell_high"]].to_numpy().tolist()]
+    assert sorted(set(table.index) - {"best", "centre"}) == sorted(cells)
+    np.testing.assert_allclose(table.loc[cells, ["width", "height"]], run.map[["wide", "high"]], rtol=1e-5)
+    found = arrays(run)
+    assert found["parameter_names"].tolist() == list(best)
+    np.testing.assert_array_equal(found["values"], table.loc[cells])
+    np.testing.assert_array_equal(found["best_values"], list(best.values()))
+    policies = api.run(config_of(HILL), tmp_path / "es").run
+    assert dict(tables(policies))["parameters"]["which"].tolist()[:2] == ["best", "centre"]
+
+
 @pytest.mark.parametrize("search", [{"algorithm": "nsr_es", "pairs": 8}, {"algorithm": "ars", "pairs": 8}, MAP_ELITES])
 @pytest.mark.usefixtures("one_process")
 def test_other_methods_move_a_noisy_function_of_any_number_of_parameters(search, tmp_path):
@@ -109,15 +141,63 @@ def test_other_methods_move_a_noisy_function_of_any_number_of_parameters(search,
 
 
 @pytest.mark.usefixtures("one_process")
-def test_calls_that_fail_are_invalid_and_named_with_their_parameters(tmp_path, capfd):
+def test_calls_that_fail_are_invalid_and_named_with_their_parameters(tmp_path, capfd, caplog):
     search = MAP_ELITES | {"max_invalid_fraction": 1.0, "evaluation_episodes": 1, "iso_sigma": 1.0}
-    run = api.run(config_of(FRAGILE, search), tmp_path / "run").run
+    notices: list[str] = []
+    run = api.run(config_of(FRAGILE, search), tmp_path / "run", on_notice=notices.append).run
     assert (run.map[["x", "y"]] <= 0.0).all(axis=None)
     assert run.history.invalid_members.iloc[1:].min() > 0
     told = capfd.readouterr().err
     for why in ("ValueError: this quarter is forbidden", "the fitness nan and", "returned the fitness 'many'; it must"):
         (line, *_) = [one for one in told.splitlines() if why in one]
         assert line.startswith(f"{FRAGILE} failed with x = "), line
+    logged = [one for one in caplog.records if one.levelname == "WARNING" and " failed: " in one.getMessage()]
+    logged = [one for one in logged if one.generation > 0]  # the others are episodes of initial centres
+    named = [re.match(NAMED, one.getMessage()) for one in logged]
+    assert len(named) == run.history.invalid_members.sum()
+    for record, found in zip(logged, named, strict=True):
+        assert found is not None, record.getMessage()
+        x, y, seed = float(found["x"]), float(found["y"]), int(found["seed"])
+        policy = int(found["policy"])
+        assert seed == int(evaluation_reset_keys(0, record.generation, 0, policy=policy)[0]) >> 1
+        try:
+            assert not isinstance(functions.fragile((x, y)), float) or x > 0.0
+        except ValueError:
+            assert x > 0.0 < y
+    [notice] = notices
+    assert re.match(rf"{FRAGILE} failed, which makes the member invalid: evaluation episode \d+ with x = ", notice)
+
+
+NAMED = (
+    rf"{re.escape(FRAGILE)} failed: episode 0 of policy (?P<policy>\d+) with x = (?P<x>\S+), y = (?P<y>\S+) "
+    r"\(seed (?P<seed>\d+)\): (ValueError: this quarter is|the fitness nan and|.* returned the fitness 'many')"
+)
+
+
+@pytest.mark.usefixtures("one_process")
+def test_a_function_without_a_return_ends_the_run_with_a_sentence_that_says_so(tmp_path):
+    sentence = (
+        r"generation 0: each of the 30 episodes of the initial centres failed. The first: evaluation episode 0 with "
+        r"x0 = 0.5, .* and 8 more \(seed \d+\): .* returned the fitness None; it must be a number; is a `return` missing"  # noqa: E501
+    )
+    with pytest.raises(EvaluationError, match=sentence):
+        api.run(config_of(f"function:{MODULE}:forgetful"), tmp_path / "run")
+
+
+@pytest.mark.usefixtures("one_process")
+def test_too_many_failures_say_why(tmp_path):
+    config = config_of(FRAGILE, MAP_ELITES | {"max_invalid_fraction": 0.1, "iso_sigma": 9.0})
+    with pytest.raises(EvaluationError, match=r"more is known: (member . of pair|episode 0 of policy) .*x = .*: "):
+        api.run(config, tmp_path / "run", on_notice=[].append)
+
+
+def test_a_call_that_ends_its_worker_each_time_is_named_with_its_parameters(tmp_path):
+    config = config_of(f"function:{MODULE}:deadly", ES | {"evaluation_episodes": 1}, max_attempts=1)
+    with pytest.raises(EvaluationError, match=r"was lost while running it") as caught:
+        api.run(config, tmp_path / "run", on_notice=[].append)
+    first, second = re.findall(r"left = (\S+), right = (\S+) \(seed \d+\)", str(caught.value))
+    assert any(float(left) > 0.0 for left, _ in (first, second))
+    np.testing.assert_allclose(np.float64(first), -np.float64(second), rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["hang", "exit"])
@@ -128,7 +208,10 @@ def test_a_call_that_hangs_or_ends_its_process_is_invalid_and_costs_no_worker(ki
     (tmp_path / "fault").write_text(kind)
     config = config_of(f"function:{MODULE}:slow", ES | {"evaluation_episodes": 1}, generations=2)
     config["task"]["time_limit_s"] = {"hang": 1.0, "exit": 5.0}[kind]  # another one has another process, too
-    run = api.run(config, tmp_path / "run").run
+    notices: list[str] = []
+    run = api.run(config, tmp_path / "run", on_notice=notices.append).run
+    why = {"hang": r"no result within 1 s \(task.time_limit_s\)", "exit": "the call ended its process with exit code 3"}
+    assert re.search(rf"member [+-] of pair \d with x0 = .*, x2 = \S+ \(seed \d+\): {why[kind]}", *notices)
     assert run.history[["lost_workers", "retries"]].to_numpy().sum() == 0
     assert run.history.invalid_members.sum() == 1
     calm = api.run(config, tmp_path / "calm").run

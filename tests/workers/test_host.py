@@ -60,6 +60,13 @@ def no_jax(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path / "site")
 
 
+@pytest.fixture
+def one_process():
+    """The run of a test starts no process."""
+    with workers_in_this_process():
+        yield
+
+
 @pytest.mark.parametrize("search", [ES, pytest.param(MAP_ELITES, marks=pytest.mark.long)], ids=["es", "map_elites"])
 def test_a_run_and_its_replays_are_those_of_simd(search, tmp_path, request):
     """PointMaze from its corner, whose reset draws nothing."""
@@ -254,6 +261,40 @@ def test_what_cannot_be_computed_is_named_with_its_seed_so_that_it_can_be_run_al
     step, seed = re.findall(r"raised in step (\d+) of the episode whose reset has the seed (\d+)", str(caught.value))[0]
     assert int(step) == 5
     assert int(seed) == int(evaluation_reset_keys(0, 0, 0)[0]) >> 1
+    assert re.search(r"its policy has 41 parameters, \S+, .*\nraised in evaluation episode 0, in ", str(caught.value))
+
+
+@pytest.mark.usefixtures("one_process")
+def test_episodes_whose_rewards_are_no_numbers_are_named(tmp_path, caplog):
+    config = config_of(f"python:{MODULE}:Undefined", ES | {"max_invalid_fraction": 1.0}, workers=1)
+    config["map"] = {"cells": [16]}
+    notices: list[str] = []
+    run = api.run(config, tmp_path / "run", on_notice=notices.append).run
+    texts = [one.getMessage() for one in caplog.records if " failed: " in one.getMessage()]
+    of_members = [
+        one for one in texts if re.search(r"member [+-] of pair \d+ \(seed \d+\): the reward of step 5 is nan", one)
+    ]
+    assert 0 < len(of_members) <= run.history.invalid_members.sum()
+    assert len(notices) == 1
+    seeds = {int(seed) for seed in re.findall(r"\(seed (\d+)\)", "".join(of_members))}
+    keys = [stream_keys(0, Domain.TRAINING_RESET, generation, np.arange(16), 0, 0) for generation in range(1, 5)]
+    assert seeds <= {int(word) >> 1 for word in np.concatenate(keys)[:, 0]}
+
+
+def test_a_reward_that_is_none_is_named(tmp_path):
+    config = config_of(f"python:{MODULE}:Wordless", max_attempts=1, workers=1) | {"map": {"cells": [16]}}
+    with pytest.raises(EvaluationError, match=r"step returned the reward None; it must be a number\nraised in step 7 "):
+        api.run(config, tmp_path / "run")
+
+
+def test_environments_that_end_their_worker_each_time_are_named_with_their_seeds(tmp_path):
+    config = config_of(f"python:{MODULE}:Deadly", max_attempts=1, workers=1) | {"map": {"cells": [16]}}
+    with pytest.raises(
+        EvaluationError, match=r"The resets of its episodes have the seeds (\d+), (\d+), (\d+)"
+    ) as caught:
+        api.run(config, tmp_path / "run", on_notice=[].append)
+    seeds = re.findall(r"have the seeds (\d+), (\d+), (\d+)$", str(caught.value), re.MULTILINE)[0]
+    assert [int(seed) for seed in seeds] == [int(evaluation_reset_keys(0, 0, one)[0]) >> 1 for one in range(3)]
 
 
 def test_a_task_says_what_it_is():

@@ -68,8 +68,12 @@ class FunctionTask:
         if not self.has_descriptor:
             return _number(found, self.name), point_D[: self.descriptor_size].astype(np.float32)
         if not (isinstance(found, tuple | list) and len(found) == 2):
-            raise TaskError(f"{self.name} returned {found!r}; it must return (fitness, descriptor)")
-        descriptor_B = np.asarray(found[1], np.float32).reshape(-1)
+            forgotten = "; is a `return` missing?" if found is None else ""
+            raise TaskError(f"{self.name} returned {found!r}; it must return (fitness, descriptor){forgotten}")
+        try:
+            descriptor_B = np.asarray(found[1], np.float32).reshape(-1)
+        except (TypeError, ValueError):
+            raise TaskError(f"{self.name} returned the descriptor {found[1]!r}; it must be numbers") from None
         if descriptor_B.size != self.descriptor_size:
             raise TaskError(
                 f"{self.name} returned a descriptor of {descriptor_B.size} numbers, not {self.descriptor_size}"
@@ -146,7 +150,8 @@ def _number(value: Any, name: str) -> float:
     try:
         return float(value)
     except (TypeError, ValueError):
-        raise TaskError(f"{name} returned the fitness {value!r}; it must be a number") from None
+        forgotten = "; is a `return` missing?" if value is None else ""
+        raise TaskError(f"{name} returned the fitness {value!r}; it must be a number{forgotten}") from None
 
 
 def _descriptor(function: Any, parameters: ParameterSpec) -> tuple[Any, Any]:

@@ -89,13 +89,17 @@ class HostEnvironment:
     def step(self, action: Any) -> tuple[FloatArray, float, bool]:
         """Do one step: (observation [O], reward, whether the episode has ended)."""
         found = self._object.step(action)
-        if len(found) not in (3, 5):
+        if not isinstance(found, tuple | list) or len(found) not in (3, 5):
+            returned = f"{len(found)} values" if isinstance(found, tuple | list) else repr(found)
             raise TaskError(
-                f"{self._task.name}: step returned {len(found)} values; it must return (observation, reward, done), or "
+                f"{self._task.name}: step returned {returned}; it must return (observation, reward, done), or "
                 "(observation, reward, terminated, truncated, info)"
             )
         observation, reward, *ends = found
-        episode, reward = self._episode, float(reward)
+        try:
+            episode, reward = self._episode, float(reward)
+        except (TypeError, ValueError):
+            raise TaskError(f"{self._task.name}: step returned the reward {reward!r}; it must be a number") from None
         episode.observation_O, episode.steps = self._observed(observation), episode.steps + 1
         episode.info = ends[2] if len(ends) == 3 else {}
         episode.said |= episode.info

@@ -5,6 +5,7 @@ Axes: L lanes, O observation, A action, B descriptor, T points of a trace.
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,10 @@ from workers.environments.host_task import HostEnvironment, HostTask
 from workers.host.outputs import Outputs, Step
 from workers.host.policies import LanePolicies
 from workers.host.seeds import seed_of
-from workers.rollouts.backend import Episodes
+from workers.rollouts.backend import Episodes, FailedEpisode, raised_in_lane
+
+SHOWN = 4
+"""Parameters of a policy that a message shows."""
 
 
 class Watched(NamedTuple):
@@ -79,6 +83,7 @@ def run_episodes(
     sum_L_O, square_L_O = np.zeros((2, count, size if training else 0), np.float32)
     trace_L_T_B = np.zeros((count, 0 if training else points, task.descriptor_size), np.float32)
     outputs = Outputs(spec.outputs, spec, task, count)
+    bad_reward_L: dict[int, tuple[int, float]] = {}  # of each lane with one: its first reward that is not finite
 
     def watch(lane: int, environment: HostEnvironment) -> None:
         if watched is not None and watched.lane == lane:
@@ -112,6 +117,8 @@ def run_episodes(
                 observation_L_O[lane] = seen_O
                 reward_L[lane], steps_L[lane] = reward, step
                 returns_L[lane] += reward
+                if not isfinite(reward):
+                    bad_reward_L.setdefault(lane, (step, reward))
                 if task.goal_distance is not None:
                     distance = environment.goal_distance()
                     goal_distance_L_2[lane] = distance, np.fmin(goal_distance_L_2[lane, 1], distance)
@@ -127,12 +134,21 @@ def run_episodes(
             running = still
     except BaseException as error:
         place = f"step {step}" if step else "the reset"
-        error.add_note(f"raised in {place} of the episode whose reset has the seed {seed_of(reset_keys_L_4[lane])}")
+        seed, shown = seed_of(reset_keys_L_4[lane]), shown_parameters(policies.parameters_L_D[lane])
+        error.add_note(f"raised in {place} of the episode whose reset has the seed {seed}; its policy has {shown}")
+        raised_in_lane(error, lane)
         raise
     for trace_T_B in trace_L_T_B:
         known_from_the_start(trace_T_B)
     with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, which makes the episode invalid
         returns_L, reward_L = returns_L.astype(np.float32), reward_L.astype(np.float32)
+    failures = []
+    for lane in np.flatnonzero(steps_L > 0).tolist():
+        if why := _why_invalid(bad_reward_L.get(lane), returns_L[lane], descriptor_L_B[lane]):
+            shown = shown_parameters(policies.parameters_L_D[lane])
+            failures.append(
+                FailedEpisode(lane, f"(seed {seed_of(reset_keys_L_4[lane])}): {why}; its policy has {shown}")
+            )
     return Episodes(
         fitness=reward_L if spec.fitness == "final" else returns_L,
         returns=returns_L,
@@ -144,7 +160,31 @@ def run_episodes(
         trace_T_B=trace_L_T_B,
         outputs=outputs.at_the_end,
         of_steps=outputs.of_steps,
+        failures=tuple(failures),
     )
+
+
+def _why_invalid(bad_reward: tuple[int, float] | None, returns: np.float32, descriptor_B: FloatArray) -> str:
+    """Why an episode is invalid; empty if it is valid.
+
+    Args:
+        bad_reward: step and value of its first reward that is not finite; None if all are.
+    """
+    if bad_reward is not None:
+        return f"the reward of step {bad_reward[0]} is {bad_reward[1]:g}"
+    if not np.isfinite(returns):
+        return f"the sum of its rewards is {returns:g}, beyond what float32 holds"
+    if not np.isfinite(descriptor_B).all():
+        return f"its descriptor is {descriptor_B.tolist()}"
+    return ""
+
+
+def shown_parameters(parameters_D: FloatArray) -> str:
+    """The parameters of a policy in few words: the first ones, and how many there are."""
+    shown = ", ".join(f"{value:.6g}" for value in parameters_D[:SHOWN])
+    if len(parameters_D) <= SHOWN:
+        return f"the parameters {shown}"
+    return f"{len(parameters_D):,} parameters, {shown}, ..."
 
 
 def known_from_the_start(descriptor_T_B: FloatArray) -> None:

@@ -14,8 +14,12 @@ from es_service.protocol.raised import raised
 from workers.environments.function_task import FunctionTask
 from workers.host.caller import CallFailedError
 from workers.host.seeds import seed_of
-from workers.rollouts.backend import Episodes
+from workers.rollouts.backend import Episodes, FailedEpisode
 
+SHOWN = 12
+"""Most parameters that a failure names in the driver's log; the output of the worker has all of them."""
+LONGEST = 1000
+"""Longest reason of a failure there, in characters."""
 POINTS = 2
 """Points of a trace, of an episode with one step."""
 
@@ -37,14 +41,19 @@ def run_calls(
 
     A call whose fitness or descriptor is not finite, or that raises, makes the episode invalid, and says so on stderr.
     """
-    lanes = len(reset_keys_L_4)
+    lanes, failures = len(reset_keys_L_4), []
     fitness_L = np.zeros(lanes, np.float32)
     descriptor_L_B = np.zeros((lanes, task.descriptor_size), np.float32)
     for lane in range(lanes):
         if runs_L is None or runs_L[lane]:
-            fitness_L[lane], descriptor_L_B[lane] = _called(
-                task, called, parameters_L_D[lane], seed_of(reset_keys_L_4[lane])
-            )
+            seed = seed_of(reset_keys_L_4[lane])
+            fitness_L[lane], descriptor_L_B[lane], why = _called(task, called, parameters_L_D[lane], seed)
+            if why:
+                named = task.parameters.text(parameters_L_D[lane])
+                print(f"{task.name} failed with {named} (seed {seed}): {why}", file=sys.stderr, flush=True)
+                short = task.parameters.text(parameters_L_D[lane], SHOWN)
+                reason = "; ".join(line.strip() for line in why.splitlines())[:LONGEST]
+                failures.append(FailedEpisode(lane, f"with {short} (seed {seed}): {reason}"))
     sums_L_O = np.zeros((lanes, 1 if training else 0), np.float32)
     points = 0 if training else POINTS
     return Episodes(
@@ -58,26 +67,25 @@ def run_calls(
         trace_T_B=np.repeat(descriptor_L_B[:, None], points, axis=1),
         outputs={name: _output(name, fitness_L) for name in spec.outputs},
         of_steps={},
+        failures=tuple(failures),
     )
 
 
 def _called(
     task: FunctionTask, called: Callable[[FloatArray, int], tuple[float, Any]], parameters_D: FloatArray, seed: int
-) -> tuple[float, Any]:
-    """(fitness, descriptor) of a call; NaN if it fails."""
+) -> tuple[float, Any, str]:
+    """(fitness, descriptor, empty text) of a call; if it fails, NaN and the reason."""
     try:
         with np.errstate(over="ignore"):  # beyond float32 is infinite, and invalid
             fitness, descriptor_B = called(parameters_D, seed)
             if np.isfinite(np.float32(fitness)) and np.isfinite(descriptor_B).all():
-                return fitness, descriptor_B
+                return fitness, descriptor_B, ""
         why = f"the fitness {fitness:g} and the descriptor {descriptor_B.tolist()} are not finite numbers"
     except CallFailedError as error:
         why = str(error)
     except (Exception, SystemExit) as error:  # the user's code can raise anything
         why = raised(error, task.name).message
-    named = ", ".join(f"{name} = {value!r}" for name, value in task.parameters.named(parameters_D).items())
-    print(f"{task.name} failed with {named} (seed {seed}): {why}", file=sys.stderr, flush=True)
-    return np.nan, np.full(task.descriptor_size, np.nan, np.float32)
+    return np.nan, np.full(task.descriptor_size, np.nan, np.float32), why
 
 
 def _output(name: str, fitness_L: FloatArray) -> Any:

@@ -16,6 +16,18 @@ from es_service.protocol.recordings import Recordings, RecordRequest
 from es_service.protocol.rollouts import Rollout
 from workers.compilable import Compilable
 
+_LANE = "_es_service_lane"
+"""Attribute of an exception that was raised in an episode."""
+
+
+class FailedEpisode(NamedTuple):
+    """Why an episode is invalid, where the rollout knows it."""
+
+    lane: int
+    """Place of its policy in the chunk: of a training chunk 2 p + s for member s of pair p, of others the slot."""
+    text: str
+    """What comes after the name of the member: its seed and parameters, and the reason."""
+
 
 class Episodes(NamedTuple):
     """Results of an episode, or of a batch of episodes with the leading axes of the caller."""
@@ -43,11 +55,14 @@ class Episodes(NamedTuple):
     of_steps: dict[str, Any]
     """Outputs of each step that the run names, by name, [..., T, ...] (`protocol.outputs.OF_STEPS`). Rows from `steps`
     on may be anything."""
+    failures: tuple[FailedEpisode, ...] = ()
+    """Those of the invalid episodes of which the rollout knows more."""
 
     def map(self, function: Callable[[Any], Any]) -> Episodes:
         """The episodes with a function of each array in its place."""
-        named = ({name: function(array) for name, array in of.items()} for of in self[-2:])
-        return Episodes._make([*map(function, self[:-2]), *named])
+        *arrays, at_the_end, of_steps, failures = self
+        named = ({name: function(array) for name, array in of.items()} for of in (at_the_end, of_steps))
+        return Episodes._make([*map(function, arrays), *named, failures])
 
     def with_steps(self, of_steps: Mapping[str, Any]) -> Episodes:
         """The episodes with these values of all steps, in place of those after the newest."""
@@ -55,6 +70,16 @@ class Episodes(NamedTuple):
             outputs={name: array for name, array in self.outputs.items() if name not in of_steps},
             of_steps=dict(of_steps),
         )
+
+
+def raised_in_lane(error: BaseException, lane: int) -> None:
+    """Note at an exception in which lane of a chunk it was raised, for `lane_of`."""
+    setattr(error, _LANE, lane)
+
+
+def lane_of(error: BaseException) -> int | None:
+    """The lane of a chunk in which an exception was raised, as in `FailedEpisode`; None if it is not known."""
+    return getattr(error, _LANE, None)
 
 
 class ChunkFunctions(NamedTuple):

@@ -17,6 +17,8 @@ from es_service.runs.standing import Standing, doing, is_waiting, look, more, po
 from es_service.runs.view import Run
 
 FOLLOW_INTERVAL_S = 1.0
+SHOWN_PARAMETERS = 12
+"""Most parameters of a function that `status` shows; an export has all of them."""
 
 
 def print_status(console: Console, run: Run) -> None:
@@ -34,7 +36,7 @@ def print_status(console: Console, run: Run) -> None:
     fields["state"] = (
         state(standing) if standing.driver else f"{state(standing)}; continue with: {way_command(way_on(standing))}"
     )
-    _print_fields(console, fields | _progress(standing) | _certified(run))
+    _print_fields(console, fields | _progress(standing) | _parameters(standing) | _certified(run))
 
 
 def follow_status(console: Console, run: Run) -> None:
@@ -62,7 +64,7 @@ def print_summary(console: Console, run: Run, reason: str) -> None:
     sigma = next((key for key in ("search.sigma", "search.iso_sigma") if key in run.constants), None)
     doubled = {sigma: float(f"{run.constants[sigma] * 2:g}")} if sigma else {}
     print_line(console, f"\nDone: {reason}.")
-    _print_fields(console, _progress(standing) | _certified(run))
+    _print_fields(console, _progress(standing) | _parameters(standing) | _certified(run))
     print_line(console, f"\nThe run is in {folder}. Next:")
     for words in (
         ("status", folder),
@@ -101,6 +103,20 @@ def _progress(standing: Standing) -> dict[str, str]:
         "time": f"{last['wall_clock_s']:.1f}{of.get('wall_clock_s', '')} s, {rate:,.0f} steps/s overall",
         **_faults(recent, last["generation"]),
     }
+
+
+def _parameters(standing: Standing) -> dict[str, str]:
+    """The parameters of the best centre by name, if the task is a function."""
+    run = standing.run
+    if standing.row is None or run.parameter_spec is None:
+        return {}
+    try:
+        named = run.parameters("best")
+    except StoreError as error:
+        return {"best parameters": f"not known: {error.sentence}"}
+    shown = ", ".join(f"{name} = {value:.6g}" for name, value in list(named.items())[:SHOWN_PARAMETERS])
+    more = f" and {len(named) - SHOWN_PARAMETERS} more" if len(named) > SHOWN_PARAMETERS else ""
+    return {"best parameters": f"{shown}{more}"}
 
 
 def _objectives(recent: Recent) -> dict[str, str]:
