@@ -17,20 +17,29 @@ _FIRST = np.zeros(1, np.intp)
 
 
 class TaskEnv(gymnasium.Env[Any, Any]):
-    """One environment of a task, with the bits of an environment of `TaskVectorEnv` with the same seed.
+    """One environment of a task, with the bits of environment `index` of a `TaskVectorEnv` with the same seed.
 
     `info` has `descriptor` [B] (where the episode would end in the map), `success`, and `goal_distance` if the task has
     a goal. Actions outside of [-1, 1] are clipped. It has no limit of steps: `gymnasium.make` adds that of the task.
     """
 
     def __init__(
-        self, task: str, *, task_options: Mapping[str, OptionValue] | None = None, render_mode: None = None
+        self,
+        task: str,
+        *,
+        task_options: Mapping[str, OptionValue] | None = None,
+        render_mode: None = None,
+        index: int = 0,
     ) -> None:
-        """Arguments and errors are those of `TaskVectorEnv`."""
+        """Arguments and errors are those of `TaskVectorEnv`.
+
+        Args:
+            index: which environment of a `TaskVectorEnv` this one equals. It matters only for tasks that xla computes.
+        """
         if render_mode is not None:
             raise ValueError(f"render_mode = {render_mode!r}; must be None, since nothing is drawn")
         self.metadata = {"render_modes": []}
-        self._lanes = Lanes(task, task_options or {}, 1)
+        self._lanes = Lanes(task, task_options or {}, 1, first=index)
         self.task = self._lanes.task
         self.observation_space, self.action_space = observation_space(self.task), action_space(self.task)
         self._is_seeded = False
@@ -68,6 +77,10 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         """Go on from what `get_state` has returned."""
         self._lanes.set_state(state)
         self._is_seeded = True
+
+    def close(self) -> None:
+        """End the process of a task that xla computes."""
+        self._lanes.close()
 
     def _info(self, seen: Seen) -> dict[str, Any]:
         shown = {name: array[0] for name, array in info_of(self.task, seen).items()}

@@ -29,6 +29,9 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
 
     Environment i has the same bits whatever `num_envs` and `threads` are and on whatever processor: they depend on its
     seed, the number of its episodes since then, and its actions. `SyncVectorEnv` of as many `TaskEnv` gives the same.
+    What simd cannot compile of a task, its resets or its steps too, xla computes in blocks of 16 environments, in a
+    child process, and a warning says why. Then the bits also depend on i modulo 16 (`index` of a `TaskEnv`) and on the
+    kind of the processor.
 
     `info` has, for every environment, `descriptor` [N, B] (where the episode would end in the map), `success` [N], and
     `goal_distance` [N] if the task has a goal. Actions outside of [-1, 1] are clipped.
@@ -48,7 +51,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         """Compile the task's step, or take it from the cache.
 
         Args:
-            task: a shipped task (point_maze, ant_maze, ant_trap) or module:Class of a class in JAX.
+            task: a shipped task (point_maze, ant_maze, ant_trap), `brax:NAME`, or module:Class of a class in JAX.
             num_envs: number of environments.
             max_episode_steps: steps after which an episode is truncated; None: the task's own number.
             task_options: options of the task, such as {"start": "corner"}.
@@ -56,11 +59,11 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
                 observation, and `info["final_obs"]` and `info["final_info"]` what the episode ended with. NEXT_STEP:
                 the next step ignores its action and returns that observation. DISABLED: the caller resets, with
                 `reset(options={"reset_mask": ...})`.
-            threads: threads that step the environments; results do not depend on it.
+            threads: threads that step the environments, or processes where xla does; results do not depend on it.
             render_mode: only None, since nothing is drawn; `es-service replay` draws episodes of a run.
 
         Raises:
-            TaskError: there is no such task or option, or the task cannot be compiled.
+            TaskError: there is no such task or option, or the task cannot be computed.
             ValueError: another argument is wrong.
         """
         for name, value in (("num_envs", num_envs), ("threads", threads)):
@@ -157,7 +160,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         self._is_seeded_N[:] = True
 
     def close_extras(self, **_: Any) -> None:
-        """End the threads."""
+        """End the threads and processes."""
         self._lanes.close()
 
     def _begin(self, lane_M: NDArray[np.intp]) -> Seen:

@@ -23,8 +23,8 @@ from es_service.gymnasium import id_of
 from es_service.protocol.noise import Domain, stream_keys
 from tests.workers.simd.rollouts import targets
 from tests.workers.steps import environment_of
-from workers import lanes as module
 from workers.environments import SHIPPED, TaskError
+from workers.lanes import compiled
 from workers.simd.episodes import kernel
 
 POLE = "tests.examples.cart_pole:CartPole"
@@ -94,12 +94,12 @@ def test_an_environment_depends_neither_on_the_others_nor_on_threads_nor_on_the_
     expected = seen(TaskVectorEnv(task, 1, max_episode_steps=5), 0)
     for target in targets():
         monkeypatch.setattr(kernel, "host_target", lambda target=target: target)
-        module._kernels.cache_clear()
+        compiled.kernels.cache_clear()
         for count, threads in ((4, 1), (70, 1), (70, 3), (200, 2)):
             envs = TaskVectorEnv(task, count, max_episode_steps=5, threads=threads)
             assert seen(envs, lane) == expected
             envs.close()
-    module._kernels.cache_clear()
+    compiled.kernels.cache_clear()
 
 
 @pytest.mark.parametrize("task", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.long)])
@@ -202,7 +202,13 @@ OF_BOOLS = "0 true values; must have one value for each of the 2 environments, a
     ("call", "error", "sentence"),
     [
         (lambda: many("point_mase"), TaskError, "'point_mase' is not shipped; choose among point_maze, ant_maze"),
-        (lambda: many("brax:ant"), TaskError, "'brax:ant' is an environment of another library"),
+        (lambda: many("gymnasium:Ant-v5"), TaskError, "'gymnasium:Ant-v5' is a Python object, no task in JAX"),
+        (
+            lambda: many("function:tests.examples.beam:beam"),
+            TaskError,
+            "is a function of parameters, which has no step",
+        ),
+        (lambda: many("brax:aunt"), TaskError, "did you mean brax:ant"),
         (lambda: many(task_options={"begin": 1}), TaskError, "no option 'begin'; its options: start"),
         (lambda: many(count=0), ValueError, "num_envs = 0; must be at least 1"),
         (lambda: many(threads=0), ValueError, "threads = 0; must be at least 1"),
