@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from es_service.environments.drawing import FRAMES_PER_SECOND, MODES, Trails, require_mode
 from es_service.environments.spaces import action_space, info_of, observation_space, random_seed, seed_given
 from es_service.protocol.options import OptionValue
 from workers.lanes import Lanes, LanesState, Seen
@@ -46,7 +47,8 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         task_options: Mapping[str, OptionValue] | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         threads: int = 1,
-        render_mode: None = None,
+        copy: bool = True,
+        render_mode: str | None = None,
     ) -> None:
         """Compile the task's step, or take it from the cache.
 
@@ -60,7 +62,9 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
                 the next step ignores its action and returns that observation. DISABLED: the caller resets, with
                 `reset(options={"reset_mask": ...})`.
             threads: threads that step the environments, or processes where xla does; results do not depend on it.
-            render_mode: only None, since nothing is drawn; `es-service replay` draws episodes of a run.
+            copy: whether `reset` and `step` return new arrays of observations. If not, all of them return the same
+                array, whose content the next call replaces, and which must not be changed.
+            render_mode: None, or "rgb_array" for pictures from above; see `environments.drawing`.
 
         Raises:
             TaskError: there is no such task or option, or the task cannot be computed.
@@ -69,10 +73,14 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         for name, value in (("num_envs", num_envs), ("threads", threads)):
             if value < 1:
                 raise ValueError(f"{name} = {value!r}; must be at least 1")
-        if render_mode is not None:
-            raise ValueError(f"render_mode = {render_mode!r}; must be None, since nothing is drawn")
+        require_mode(render_mode)
+        self.render_mode, self._copies = render_mode, copy
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
+        self.metadata = {
+            "autoreset_mode": self.autoreset_mode,
+            "render_modes": list(MODES),
+            "render_fps": FRAMES_PER_SECOND,
+        }
         self._lanes = Lanes(task, task_options or {}, num_envs, threads)
         self.num_envs = num_envs
         self.task = self._lanes.task
@@ -83,6 +91,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         self._is_seeded_N = np.zeros(num_envs, bool)
         self._is_over_N = np.zeros(num_envs, bool)
         self._observation_N_O = np.zeros((num_envs, self.task.observation_size), np.float32)
+        self._trails = None if render_mode is None else Trails(self.task, num_envs)
 
     def reset(  # the base class takes only one number
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -105,7 +114,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
                 self._lanes.episode_N[lane] = -1
         self._is_seeded_N[lane_M] = True
         info = self._info(self._begin(lane_M), lane_M)
-        return self._observation_N_O.copy(), info
+        return self._returned(), info
 
     def step(self, actions: ArrayLike) -> Returned:
         """Step every environment with its action [N, A].
@@ -129,6 +138,8 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         terminated_N, truncated_N = seen.done, self._lanes.steps_N >= self.max_episode_steps
         reward_N = seen.reward.astype(np.float64)
         self._observation_N_O[:] = seen.observation
+        if self._trails is not None:
+            self._trails.move(np.arange(self.num_envs), seen.descriptor)
         info: dict[str, Any] = {}
         shown = {name: array.copy() for name, array in info_of(self.task, seen).items()}
         if self.autoreset_mode == AutoresetMode.NEXT_STEP and over_before_N.any():
@@ -145,7 +156,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
             self._put(shown, self._begin(lane_M), lane_M)
         self._is_over_N = terminated_N | truncated_N
         info |= self._masked(shown, np.arange(self.num_envs))
-        return self._observation_N_O.copy(), reward_N, terminated_N, truncated_N, info
+        return self._returned(), reward_N, terminated_N, truncated_N, info
 
     def get_state(self) -> State:
         """State of all environments, from which `set_state` of as many of the same task goes on, bit for bit."""
@@ -158,6 +169,18 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         self._observation_N_O[:] = observation_N_O
         self._is_over_N = is_over_N.copy()
         self._is_seeded_N[:] = True
+        if self._trails is not None:
+            self._trails.forget()
+
+    def frame(self, index: int) -> NDArray[np.uint8]:
+        """Picture of one environment, [256, 256, 3]. Raises ValueError if `render_mode` is None."""
+        if self._trails is None:
+            raise ValueError("render_mode = None; must be 'rgb_array' for pictures")
+        return self._trails.frame(index)
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Pictures of all environments, as Gymnasium's wrappers want them; None if `render_mode` is None."""
+        return None if self._trails is None else tuple(self._trails.frame(lane) for lane in range(self.num_envs))
 
     def close_extras(self, **_: Any) -> None:
         """End the threads and processes."""
@@ -168,7 +191,12 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         seen = self._lanes.reset(lane_M)
         self._observation_N_O[lane_M] = seen.observation
         self._is_over_N[lane_M] = False
+        if self._trails is not None:
+            self._trails.begin(lane_M, seen.descriptor)
         return seen
+
+    def _returned(self) -> NDArray[np.float32]:
+        return self._observation_N_O.copy() if self._copies else self._observation_N_O
 
     def _put(self, shown: dict[str, NDArray], seen: Seen, lane_M: NDArray[np.intp]) -> None:
         for name, array in info_of(self.task, seen).items():

@@ -17,6 +17,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
+from es_service.environments import drawing
 from es_service.environments.single import TaskEnv
 from es_service.environments.vector import TaskVectorEnv
 from es_service.gymnasium import id_of
@@ -212,7 +213,17 @@ OF_BOOLS = "0 true values; must have one value for each of the 2 environments, a
         (lambda: many(task_options={"begin": 1}), TaskError, "no option 'begin'; its options: start"),
         (lambda: many(count=0), ValueError, "num_envs = 0; must be at least 1"),
         (lambda: many(threads=0), ValueError, "threads = 0; must be at least 1"),
-        (lambda: many(render_mode="human"), ValueError, "must be None, since nothing is drawn"),
+        (
+            lambda: many(render_mode="human"),
+            ValueError,
+            "must be None or 'rgb_array'.* since MuJoCo's renderer needs Op",
+        ),
+        (
+            lambda: many(POLE, render_mode="rgb_array"),
+            ValueError,
+            r"\(place angle\); choose another one with task_opti",
+        ),
+        (lambda: many().frame(0), ValueError, "render_mode = None; must be 'rgb_array' for pictures"),
         (lambda: many().step(np.zeros((2, 2))), ValueError, "call reset before step"),
         (lambda: many().reset(seed=[1]), ValueError, "a list of 1; must have one for each of the 2"),
         (lambda: many().reset(seed=-1), ValueError, r"seed = -1; must be from 0 to 2\*\*63 - 1"),
@@ -224,6 +235,45 @@ OF_BOOLS = "0 true values; must have one value for each of the 2 environments, a
 def test_a_wrong_argument_is_an_error_that_says_what_is_allowed(call, error, sentence):
     with pytest.raises(error, match=sentence):
         call()
+
+
+def test_observations_are_new_arrays_unless_one_is_asked_for_that_is_reused():
+    for copy in (True, False):
+        envs = TaskVectorEnv("point_maze", 3, max_episode_steps=4, copy=copy)
+        first = envs.reset(seed=0)[0]
+        before = first.copy()
+        found = [envs.step(actions) for actions in actions_of(envs, 5)]
+        assert np.array_equal(first, before) == copy
+        assert (first is found[0][0]) == (not copy)
+        if copy:
+            expected = found
+    same([one[1:] for one in found], [one[1:] for one in expected])  # what an episode ended with is never reused
+    same(found[-1][0], expected[-1][0])
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_pictures_show_where_an_environment_is_and_the_way_of_its_episode(mode):
+    settings = {"render_mode": "rgb_array", "max_episode_steps": 9}
+    envs = TaskVectorEnv("point_maze", 2, autoreset_mode=mode, **settings)
+    single = partial(gymnasium.make, "es_service/PointMaze-v0", disable_env_checker=True, **settings)
+    theirs = SyncVectorEnv([single] * 2, autoreset_mode=mode)
+    envs.reset(seed=3)
+    theirs.reset(seed=3)
+    for number, actions in enumerate([np.full((2, 2), [1.0, 0.0])] * 14):
+        info = envs.step(actions)[-1]
+        theirs.step(actions)
+        same(envs.render(), theirs.render(), f"step {number}")
+        picture = envs.frame(1)
+        rows, columns = np.nonzero((picture == drawing.HERE).all(axis=-1))
+        place = (np.array([columns.mean(), 255 - rows.mean()]) + 0.5) / 256 * 2.12 - 1.06
+        np.testing.assert_allclose(place, info["descriptor"][1], atol=0.03)
+    ways = [(picture == drawing.WAY).all(axis=-1).sum() for picture in envs.render()]
+    assert all(0 < pixels < 100 for pixels in ways)  # that of the new episode only
+    walls = (picture == drawing.WALL).all(axis=-1)
+    assert walls[int((1.06 + 0.495) / 2.12 * 256), 150]  # the lower wall, from x = -0.5 to 1
+    assert not walls[int((1.06 + 0.495) / 2.12 * 256), 30]
+    envs.set_state(envs.get_state())
+    assert not (envs.frame(0) == drawing.HERE).all(axis=-1).any()
 
 
 def test_a_finished_episode_is_not_stepped_where_the_caller_resets():
