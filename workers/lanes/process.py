@@ -60,7 +60,7 @@ class BlockLanes:
         self._first, self._places = first, np.arange(first, first + lanes)
         blocks = -(-(first + lanes) // BLOCK)
         padding, _ = self._begin(np.zeros((BLOCK, KEY_WORDS), np.uint32))
-        self._arrays = [np.tile(array, (blocks, *[1] * (array.ndim - 1))) for array in map(np.asarray, padding)]
+        self._arrays = [np.concatenate([array] * blocks) for array in map(np.asarray, padding)]
         """Arrays of the carries, [16 * blocks, ...]; those of no lane are some reset."""
 
     def resets(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], Seen]:
