@@ -14,7 +14,9 @@ import jax
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.env_match import check_environments_match
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import vector
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from es_service.environments import drawing
@@ -155,7 +157,78 @@ def test_each_shipped_task_is_registered_with_its_length_and_passes_gymnasium_s_
             info = statistics.step(actions)[-1]
         assert (info["episode"]["l"] == 200).all()
         warnings.filterwarnings("ignore", ".*A Box observation space (minimum|maximum) value is")
-        check_env(gymnasium.make(id_of(task)).unwrapped, skip_render_check=True)
+        check_env(gymnasium.make(id_of(task), render_mode="rgb_array").unwrapped)
+
+
+class Lane(gymnasium.Env[Any, Any]):
+    """Environment 3 of seven, among others that get actions and seeds of their own."""
+
+    def __init__(self, task: str, limit: int) -> None:
+        self.envs = TaskVectorEnv(
+            task, 7, max_episode_steps=limit, autoreset_mode=AutoresetMode.DISABLED, render_mode="rgb_array"
+        )
+        self.observation_space, self.action_space = self.envs.single_observation_space, self.envs.single_action_space
+        self.render_mode, self.others = "rgb_array", np.random.default_rng(0)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.envs.reset(seed=[seed if lane == 3 else 100 + lane for lane in range(7)])
+        return observation[3], self._info(info)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        actions = self.others.uniform(-1, 1, self.envs.action_space.shape)
+        actions[3] = action
+        observation, reward, terminated, truncated, info = self.envs.step(actions)
+        others = (terminated | truncated) & (np.arange(7) != 3)
+        if others.any() and not (terminated | truncated)[3]:
+            self.envs.reset(options={"reset_mask": others})
+        return observation[3], float(reward[3]), bool(terminated[3]), bool(truncated[3]), self._info(info)
+
+    def render(self) -> Any:
+        return self.envs.frame(3)
+
+    def _info(self, info: dict[str, Any]) -> dict[str, Any]:
+        mine = {name: array[3] for name, array in info.items() if not name.startswith("_")}
+        return mine | {"success": bool(mine["success"])}
+
+
+def test_gymnasium_says_that_one_among_many_and_a_single_one_match():
+    settings = {"max_episode_steps": 20, "disable_env_checker": True, "render_mode": "rgb_array"}
+    single = gymnasium.make("es_service/PointMaze-v0", **settings)
+    check_environments_match(Lane("point_maze", 20), single, num_steps=70, seed=5)
+
+
+WRAPPERS: dict[str, Any] = {
+    "statistics": RecordEpisodeStatistics,
+    "observations": vector.NormalizeObservation,
+    "rewards": vector.NormalizeReward,
+    "clipped": vector.ClipAction,
+    "flat": vector.FlattenObservation,
+    "float64": partial(vector.DtypeObservation, dtype=np.float64),
+    "rescaled": partial(vector.RescaleAction, min_action=np.float32(-2.0), max_action=np.float32(2.0)),
+    "lists": vector.DictInfoToList,
+}
+
+
+OF_OBSERVATIONS = ("observations", "flat", "float64")
+"""Wrappers that Gymnasium has for other modes than SAME_STEP only."""
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "mode"),
+    [(name, AutoresetMode.NEXT_STEP) for name in WRAPPERS]
+    + [(name, AutoresetMode.SAME_STEP) for name in WRAPPERS if name not in OF_OBSERVATIONS],
+)
+def test_gymnasium_s_wrappers_do_to_them_what_they_do_to_single_ones(wrapper, mode):
+    single = partial(gymnasium.make, "es_service/Task-v0", max_episode_steps=30, task=POLE, disable_env_checker=True)
+    theirs = WRAPPERS[wrapper](SyncVectorEnv([single] * 3, autoreset_mode=mode))
+    ours = WRAPPERS[wrapper](TaskVectorEnv(POLE, 3, max_episode_steps=30, autoreset_mode=mode))
+    same(*(envs.reset(seed=2) for envs in (ours, theirs)))
+    for number, actions in enumerate(actions_of(ours, 60)):
+        found = [list(envs.step(actions)) for envs in (ours, theirs)]
+        if wrapper == "statistics":  # it measures time, too
+            for one in found:
+                one[4].get("episode", {}).pop("t", None)
+        same(*found, f"step {number}")
 
 
 @pytest.mark.slow
