@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from es_service.environments.drawing import FRAMES_PER_SECOND, MODES, Trails, require_mode
 from es_service.environments.spaces import action_space, info_of, observation_space, random_seed, seed_given
 from es_service.protocol.options import OptionValue
 from workers.lanes import Lanes, LanesState, Seen
@@ -17,22 +18,33 @@ _FIRST = np.zeros(1, np.intp)
 
 
 class TaskEnv(gymnasium.Env[Any, Any]):
-    """One environment of a task, with the bits of an environment of `TaskVectorEnv` with the same seed.
+    """One environment of a task, with the bits of environment `index` of a `TaskVectorEnv` with the same seed.
 
     `info` has `descriptor` [B] (where the episode would end in the map), `success`, and `goal_distance` if the task has
     a goal. Actions outside of [-1, 1] are clipped. It has no limit of steps: `gymnasium.make` adds that of the task.
     """
 
+    metadata = {"render_modes": list(MODES), "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012 - as Gymnasium's
+
     def __init__(
-        self, task: str, *, task_options: Mapping[str, OptionValue] | None = None, render_mode: None = None
+        self,
+        task: str,
+        *,
+        task_options: Mapping[str, OptionValue] | None = None,
+        render_mode: str | None = None,
+        index: int = 0,
     ) -> None:
-        """Arguments and errors are those of `TaskVectorEnv`."""
-        if render_mode is not None:
-            raise ValueError(f"render_mode = {render_mode!r}; must be None, since nothing is drawn")
-        self.metadata = {"render_modes": []}
-        self._lanes = Lanes(task, task_options or {}, 1)
+        """Arguments and errors are those of `TaskVectorEnv`.
+
+        Args:
+            index: which environment of a `TaskVectorEnv` this one equals. It matters only for tasks that xla computes.
+        """
+        require_mode(render_mode)
+        self.render_mode = render_mode
+        self._lanes = Lanes(task, task_options or {}, 1, first=index)
         self.task = self._lanes.task
         self.observation_space, self.action_space = observation_space(self.task), action_space(self.task)
+        self._trails = None if render_mode is None else Trails(self.task, 1)
         self._is_seeded = False
 
     def reset(
@@ -50,6 +62,8 @@ class TaskEnv(gymnasium.Env[Any, Any]):
             self._lanes.episode_N[0] = -1
             self._is_seeded = True
         seen = self._lanes.reset(_FIRST)
+        if self._trails is not None:
+            self._trails.begin(_FIRST, seen.descriptor)
         return seen.observation[0], self._info(seen)
 
     def step(self, action: ArrayLike) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
@@ -58,7 +72,13 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         if action_A.shape != self.action_space.shape:
             raise ValueError(f"action has the shape {action_A.shape}; must be {self.action_space.shape}")
         seen = self._lanes.step(action_A[None])
+        if self._trails is not None:
+            self._trails.move(_FIRST, seen.descriptor)
         return seen.observation[0], float(seen.reward[0]), bool(seen.done[0]), False, self._info(seen)
+
+    def render(self) -> NDArray[np.uint8] | None:  # the base class allows more kinds
+        """A picture from above, [256, 256, 3], if `render_mode` is "rgb_array"; see `environments.drawing`."""
+        return None if self._trails is None else self._trails.frame(0)
 
     def get_state(self) -> LanesState:
         """State of the environment, from which `set_state` of another one of the task goes on, bit for bit."""
@@ -67,7 +87,13 @@ class TaskEnv(gymnasium.Env[Any, Any]):
     def set_state(self, state: LanesState) -> None:
         """Go on from what `get_state` has returned."""
         self._lanes.set_state(state)
+        if self._trails is not None:
+            self._trails.forget()
         self._is_seeded = True
+
+    def close(self) -> None:
+        """End the process of a task that xla computes."""
+        self._lanes.close()
 
     def _info(self, seen: Seen) -> dict[str, Any]:
         shown = {name: array[0] for name, array in info_of(self.task, seen).items()}

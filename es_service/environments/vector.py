@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from es_service.environments.drawing import FRAMES_PER_SECOND, MODES, Trails, require_mode
 from es_service.environments.spaces import action_space, info_of, observation_space, random_seed, seed_given
 from es_service.protocol.options import OptionValue
 from workers.lanes import Lanes, LanesState, Seen
@@ -29,6 +30,9 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
 
     Environment i has the same bits whatever `num_envs` and `threads` are and on whatever processor: they depend on its
     seed, the number of its episodes since then, and its actions. `SyncVectorEnv` of as many `TaskEnv` gives the same.
+    What simd cannot compile of a task, its resets or its steps too, xla computes in blocks of 16 environments, in a
+    child process, and a warning says why. Then the bits also depend on i modulo 16 (`index` of a `TaskEnv`) and on the
+    kind of the processor.
 
     `info` has, for every environment, `descriptor` [N, B] (where the episode would end in the map), `success` [N], and
     `goal_distance` [N] if the task has a goal. Actions outside of [-1, 1] are clipped.
@@ -43,12 +47,13 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         task_options: Mapping[str, OptionValue] | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         threads: int = 1,
-        render_mode: None = None,
+        copy: bool = True,
+        render_mode: str | None = None,
     ) -> None:
         """Compile the task's step, or take it from the cache.
 
         Args:
-            task: a shipped task (point_maze, ant_maze, ant_trap) or module:Class of a class in JAX.
+            task: a shipped task (point_maze, ant_maze, ant_trap), `brax:NAME`, or module:Class of a class in JAX.
             num_envs: number of environments.
             max_episode_steps: steps after which an episode is truncated; None: the task's own number.
             task_options: options of the task, such as {"start": "corner"}.
@@ -56,20 +61,26 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
                 observation, and `info["final_obs"]` and `info["final_info"]` what the episode ended with. NEXT_STEP:
                 the next step ignores its action and returns that observation. DISABLED: the caller resets, with
                 `reset(options={"reset_mask": ...})`.
-            threads: threads that step the environments; results do not depend on it.
-            render_mode: only None, since nothing is drawn; `es-service replay` draws episodes of a run.
+            threads: threads that step the environments, or processes where xla does; results do not depend on it.
+            copy: whether `reset` and `step` return new arrays of observations. If not, all of them return the same
+                array, whose content the next call replaces, and which must not be changed.
+            render_mode: None, or "rgb_array" for pictures from above; see `environments.drawing`.
 
         Raises:
-            TaskError: there is no such task or option, or the task cannot be compiled.
+            TaskError: there is no such task or option, or the task cannot be computed.
             ValueError: another argument is wrong.
         """
         for name, value in (("num_envs", num_envs), ("threads", threads)):
             if value < 1:
                 raise ValueError(f"{name} = {value!r}; must be at least 1")
-        if render_mode is not None:
-            raise ValueError(f"render_mode = {render_mode!r}; must be None, since nothing is drawn")
+        require_mode(render_mode)
+        self.render_mode, self._copies = render_mode, copy
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
+        self.metadata = {
+            "autoreset_mode": self.autoreset_mode,
+            "render_modes": list(MODES),
+            "render_fps": FRAMES_PER_SECOND,
+        }
         self._lanes = Lanes(task, task_options or {}, num_envs, threads)
         self.num_envs = num_envs
         self.task = self._lanes.task
@@ -80,6 +91,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         self._is_seeded_N = np.zeros(num_envs, bool)
         self._is_over_N = np.zeros(num_envs, bool)
         self._observation_N_O = np.zeros((num_envs, self.task.observation_size), np.float32)
+        self._trails = None if render_mode is None else Trails(self.task, num_envs)
 
     def reset(  # the base class takes only one number
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -102,7 +114,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
                 self._lanes.episode_N[lane] = -1
         self._is_seeded_N[lane_M] = True
         info = self._info(self._begin(lane_M), lane_M)
-        return self._observation_N_O.copy(), info
+        return self._returned(), info
 
     def step(self, actions: ArrayLike) -> Returned:
         """Step every environment with its action [N, A].
@@ -126,6 +138,8 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         terminated_N, truncated_N = seen.done, self._lanes.steps_N >= self.max_episode_steps
         reward_N = seen.reward.astype(np.float64)
         self._observation_N_O[:] = seen.observation
+        if self._trails is not None:
+            self._trails.move(np.arange(self.num_envs), seen.descriptor)
         info: dict[str, Any] = {}
         shown = {name: array.copy() for name, array in info_of(self.task, seen).items()}
         if self.autoreset_mode == AutoresetMode.NEXT_STEP and over_before_N.any():
@@ -142,7 +156,7 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
             self._put(shown, self._begin(lane_M), lane_M)
         self._is_over_N = terminated_N | truncated_N
         info |= self._masked(shown, np.arange(self.num_envs))
-        return self._observation_N_O.copy(), reward_N, terminated_N, truncated_N, info
+        return self._returned(), reward_N, terminated_N, truncated_N, info
 
     def get_state(self) -> State:
         """State of all environments, from which `set_state` of as many of the same task goes on, bit for bit."""
@@ -155,9 +169,21 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         self._observation_N_O[:] = observation_N_O
         self._is_over_N = is_over_N.copy()
         self._is_seeded_N[:] = True
+        if self._trails is not None:
+            self._trails.forget()
+
+    def frame(self, index: int) -> NDArray[np.uint8]:
+        """Picture of one environment, [256, 256, 3]. Raises ValueError if `render_mode` is None."""
+        if self._trails is None:
+            raise ValueError("render_mode = None; must be 'rgb_array' for pictures")
+        return self._trails.frame(index)
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Pictures of all environments, as Gymnasium's wrappers want them; None if `render_mode` is None."""
+        return None if self._trails is None else tuple(self._trails.frame(lane) for lane in range(self.num_envs))
 
     def close_extras(self, **_: Any) -> None:
-        """End the threads."""
+        """End the threads and processes."""
         self._lanes.close()
 
     def _begin(self, lane_M: NDArray[np.intp]) -> Seen:
@@ -165,7 +191,12 @@ class TaskVectorEnv(VectorEnv[Any, Any, Any]):
         seen = self._lanes.reset(lane_M)
         self._observation_N_O[lane_M] = seen.observation
         self._is_over_N[lane_M] = False
+        if self._trails is not None:
+            self._trails.begin(lane_M, seen.descriptor)
         return seen
+
+    def _returned(self) -> NDArray[np.float32]:
+        return self._observation_N_O.copy() if self._copies else self._observation_N_O
 
     def _put(self, shown: dict[str, NDArray], seen: Seen, lane_M: NDArray[np.intp]) -> None:
         for name, array in info_of(self.task, seen).items():

@@ -1,4 +1,4 @@
-"""How fast are QDax, MuJoCo and evosax on the same cores, by turns with es-service?
+"""How fast are QDax, MuJoCo, gymnasium, EnvPool and evosax on the same cores, by turns with es-service?
 
     python -m tests.benchmarks.peers --build                # once: an environment for each of them, below runs/peers
     python -m tests.benchmarks.peers --rounds 5             # half an hour on two cores, on which nothing else computes
@@ -16,10 +16,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import pandas as pd
 
@@ -32,7 +34,8 @@ from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.protocol.machine import cpu_kind, platform_info
 from es_service.protocol.process_environment import same_imports
-from tests.benchmarks.peers_environments import NAMED, THEIRS, asked, build, python_of, their_versions
+from tests.benchmarks import vector_env
+from tests.benchmarks.peers_environments import NAMED, THEIRS, asked, build, python_of, their_versions, there_are
 from tests.benchmarks.rollouts_per_second import ANT_STEPS, config_of, measure
 from tests.helpers import centre
 from workers.environments.ant import STEP_S, SUBSTEPS
@@ -74,6 +77,13 @@ def _physics(integrator: str) -> Comparison:
     return Comparison(what, "mujoco", theirs, {"kind": "physics"}, "simulated_s_per_second")
 
 
+def _environments(what: str, program: str, theirs: Mapping[str, Any], threads: int) -> Comparison:
+    """AntTrap as a vector environment beside MuJoCo's ant."""
+    ours = {"kind": "environments", "count": 64, "threads": threads}
+    return Comparison(f"AntTrap's VectorEnv: {what}", program, theirs, ours, "env_steps_per_second")
+
+
+_ROLLOUT = {"kind": "mujoco ant", "integrator": "RK4", "cores": cores(), "batch": 64, "control_steps": 200}
 COMPARISONS = (
     _rollouts("ant_maze", "antmaze", ANT_STEPS, 256, (8, 32, 128)),
     _rollouts("ant_trap", "anttrap", ANT_STEPS, 256, (8, 32, 128)),
@@ -82,6 +92,10 @@ COMPARISONS = (
     _me_es(512, 50),
     _physics("RK4"),
     _physics("EULER"),
+    _environments("Ant-v5, sync", "mujoco", {"kind": "gymnasium steps", "mode": "sync", "count": 16}, 1),
+    _environments("Ant-v5, async", "mujoco", {"kind": "gymnasium steps", "mode": "async", "count": cores()}, cores()),
+    _environments("mujoco.rollout", "mujoco", _ROLLOUT, cores()),
+    _environments("EnvPool", "envpool", {"kind": "envpool steps", "cores": cores(), "count": 64}, cores()),
     Comparison(
         "point_maze: ES without episodes, 64 pairs",
         "evosax",
@@ -159,12 +173,26 @@ def our_search(algorithm: str, pairs: int, generations: int, whole: bool) -> dic
     }
 
 
-KINDS = {"rollouts": our_rollouts, "physics": our_physics, "search": our_search}
+def our_environments(count: int, threads: int, seconds: float) -> dict[str, Any]:
+    """Steps per second of AntTrap as a vector environment of Gymnasium, with random actions."""
+    with closing(gymnasium.make_vec(f"{vector_env.OURS}AntTrap-v0", num_envs=count, threads=threads)) as envs:
+        rate = vector_env.steps_per_second(envs, seconds)
+    return {
+        "env_steps_per_second": rate,
+        "physics_steps_per_second": rate * SUBSTEPS,
+        "simulated_s_per_second": rate * STEP_S,
+        "settings": f"{threads} threads, {count} environments",
+    }
+
+
+KINDS = {"rollouts": our_rollouts, "physics": our_physics, "search": our_search, "environments": our_environments}
 
 
 def take_turns(folder: Path, rounds: int, seconds: float, chosen: Sequence[Comparison], to: Path) -> list[dict]:
     """Rows of all measurements, written to a table after each."""
-    named = {name: their_versions(folder, name) for name in dict.fromkeys(one.program for one in chosen)}
+    programs = [name for name in dict.fromkeys(one.program for one in chosen) if there_are(folder, name)]
+    chosen = [one for one in chosen if one.program in programs]
+    named = {name: their_versions(folder, name) for name in programs}
     theirs = {name: ", ".join(f"{key} {found[key]}" for key in NAMED[name]) for name, found in named.items()}
     ours = f"{OURS} {platform_info()['es-service']}, jax {platform_info()['jax']}"
     rows: list[dict[str, Any]] = []

@@ -28,15 +28,23 @@ ENVIRONMENTS = {
         " jumanji==1.0.0 gym==0.26.2 dm_env==1.6 jaxopt==0.8.5",
         "jax==0.4.28 jaxlib==0.4.28 numpy==1.26.4 scipy==1.12.0",
     ),
-    "mujoco": ("mujoco==4.0.0 gymnasium==1.4.0 numpy==2.4.6",),
+    "mujoco": ("mujoco==4.0.0 gymnasium==1.4.0 numpy==2.4.6 imageio==2.38.1 packaging==26.3",),
     "evosax": ("evosax==0.3.2 jax==0.10.2 jaxlib==0.10.2 numpy==2.4.6",),
+    "envpool": ("envpool==1.2.5 gymnasium==1.4.0 numpy==2.4.6",),
 }
 """Folder of an environment -> packages of each call of pip, all calls but the first without dependencies.
 
 No resolver finds QDax's set in reasonable time: the last QDax that has these tasks needs packages older than those
 around them."""
-NAMED = {"qdax": ("qdax", "brax", "jax"), "mujoco": ("mujoco", "gymnasium"), "evosax": ("evosax", "jax")}
+NAMED = {
+    "qdax": ("qdax", "brax", "jax"),
+    "mujoco": ("mujoco", "gymnasium"),
+    "evosax": ("evosax", "jax"),
+    "envpool": ("envpool",),
+}
 """Packages whose versions a row gives."""
+OPTIONAL = ("envpool",)
+"""Programs that are left out where they cannot be installed: they have wheels for some machines only, and no source."""
 
 
 def python_of(folder: Path, name: str) -> Path:
@@ -79,6 +87,18 @@ def their_versions(folder: Path, name: str) -> dict[str, str]:
     return found
 
 
+def there_are(folder: Path, name: str) -> bool:
+    """Whether a program can be measured; says so if it is one that may be left out. See `their_versions`."""
+    try:
+        their_versions(folder, name)
+    except SystemExit as why:
+        if name not in OPTIONAL:
+            raise
+        print(f"{name} is left out: {str(why).splitlines()[0]}", flush=True)
+        return False
+    return True
+
+
 def build(folder: Path) -> None:
     """Make the environments that are not there or cannot be used."""
     for name, calls in ENVIRONMENTS.items():
@@ -88,6 +108,7 @@ def build(folder: Path) -> None:
             subprocess.run([sys.executable, "-m", "venv", "--clear", folder / name], check=True)
             pip = [python_of(folder, name), "-m", "pip", "install", "-qq"]
             for packages, alone in zip(calls, ([], *[["--no-deps"]] * 2), strict=False):
-                subprocess.run([*pip, *alone, *packages.split()], check=True)
-            their_versions(folder, name)
+                subprocess.run([*pip, *alone, *packages.split()], check=name not in OPTIONAL)
+            if not there_are(folder, name):
+                continue
         print(f"{folder / name} is ready", flush=True)

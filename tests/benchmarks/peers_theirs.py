@@ -21,6 +21,7 @@ NEEDED = {
     "qdax": ("qdax.tasks.brax_envs", "qdax.core.map_elites", "qdax.core.emitters.mees_emitter"),
     "mujoco": ("mujoco.rollout", "gymnasium"),
     "evosax": ("evosax.algorithms",),
+    "envpool": ("envpool", "gymnasium"),
 }
 """Modules without which an environment is not the one of its program."""
 FRAME_SKIP = 5
@@ -143,6 +144,46 @@ def mujoco_ant(integrator: str, cores: int, batch: int, control_steps: int, seco
     }
 
 
+ANT = "Ant-v5"
+ANT_STEP_S = 0.05
+"""Seconds of a control step of `Ant-v5`: five of 0.01 s."""
+
+
+def _steps(envs: Any, count: int, seconds: float) -> float:
+    """Steps a second of `count` environments side by side, which reset themselves, with random actions drawn before."""
+    import numpy as np
+
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, count, 8)).astype(np.float32)
+    envs.reset()
+
+    def call() -> None:
+        for one in actions:
+            envs.step(one)
+
+    return per_second(call, len(actions) * count, seconds)
+
+
+def gymnasium_steps(mode: str, count: int, seconds: float) -> dict[str, Any]:
+    """Steps per second of gymnasium's own ant in one of its vector environments: one process, or one for each ant."""
+    import gymnasium
+
+    envs = gymnasium.make_vec(ANT, num_envs=count, vectorization_mode=mode)
+    rate = _steps(envs, count, seconds)
+    envs.close()
+    settings = f"{ANT}, {mode}, {count} environments"
+    return {"env_steps_per_second": rate, "simulated_s_per_second": rate * ANT_STEP_S, "settings": settings}
+
+
+def envpool_steps(cores: int, count: int, seconds: float) -> dict[str, Any]:
+    """Steps per second of EnvPool's ant with a thread per core, through gymnasium's interface."""
+    import envpool
+
+    envs = envpool.make(ANT, env_type="gymnasium", num_envs=count, num_threads=cores)
+    rate = _steps(envs, count, seconds)
+    settings = f"{ANT}, {cores} threads, {count} environments"
+    return {"env_steps_per_second": rate, "simulated_s_per_second": rate * ANT_STEP_S, "settings": settings}
+
+
 def evosax_es(pairs: int, parameters: int, generations: int) -> dict[str, Any]:
     """Milliseconds per generation of OpenAI-ES's `ask` and `tell` in one compiled loop, for a fitness that costs
     nothing."""
@@ -169,6 +210,8 @@ KINDS: Mapping[str, Callable[..., dict[str, Any]]] = {
     "qdax rollouts": qdax_rollouts,
     "qdax me_es": qdax_me_es,
     "mujoco ant": mujoco_ant,
+    "gymnasium steps": gymnasium_steps,
+    "envpool steps": envpool_steps,
     "evosax es": evosax_es,
     "versions": versions,
 }

@@ -14,17 +14,20 @@ import jax
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.env_match import check_environments_match
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import vector
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
+from es_service.environments import drawing
 from es_service.environments.single import TaskEnv
 from es_service.environments.vector import TaskVectorEnv
 from es_service.gymnasium import id_of
 from es_service.protocol.noise import Domain, stream_keys
 from tests.workers.simd.rollouts import targets
 from tests.workers.steps import environment_of
-from workers import lanes as module
 from workers.environments import SHIPPED, TaskError
+from workers.lanes import compiled
 from workers.simd.episodes import kernel
 
 POLE = "tests.examples.cart_pole:CartPole"
@@ -94,12 +97,12 @@ def test_an_environment_depends_neither_on_the_others_nor_on_threads_nor_on_the_
     expected = seen(TaskVectorEnv(task, 1, max_episode_steps=5), 0)
     for target in targets():
         monkeypatch.setattr(kernel, "host_target", lambda target=target: target)
-        module._kernels.cache_clear()
+        compiled.kernels.cache_clear()
         for count, threads in ((4, 1), (70, 1), (70, 3), (200, 2)):
             envs = TaskVectorEnv(task, count, max_episode_steps=5, threads=threads)
             assert seen(envs, lane) == expected
             envs.close()
-    module._kernels.cache_clear()
+    compiled.kernels.cache_clear()
 
 
 @pytest.mark.parametrize("task", ["point_maze", pytest.param("ant_trap", marks=pytest.mark.long)])
@@ -154,7 +157,78 @@ def test_each_shipped_task_is_registered_with_its_length_and_passes_gymnasium_s_
             info = statistics.step(actions)[-1]
         assert (info["episode"]["l"] == 200).all()
         warnings.filterwarnings("ignore", ".*A Box observation space (minimum|maximum) value is")
-        check_env(gymnasium.make(id_of(task)).unwrapped, skip_render_check=True)
+        check_env(gymnasium.make(id_of(task), render_mode="rgb_array").unwrapped)
+
+
+class Lane(gymnasium.Env[Any, Any]):
+    """Environment 3 of seven, among others that get actions and seeds of their own."""
+
+    def __init__(self, task: str, limit: int) -> None:
+        self.envs = TaskVectorEnv(
+            task, 7, max_episode_steps=limit, autoreset_mode=AutoresetMode.DISABLED, render_mode="rgb_array"
+        )
+        self.observation_space, self.action_space = self.envs.single_observation_space, self.envs.single_action_space
+        self.render_mode, self.others = "rgb_array", np.random.default_rng(0)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.envs.reset(seed=[seed if lane == 3 else 100 + lane for lane in range(7)])
+        return observation[3], self._info(info)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        actions = self.others.uniform(-1, 1, self.envs.action_space.shape)
+        actions[3] = action
+        observation, reward, terminated, truncated, info = self.envs.step(actions)
+        others = (terminated | truncated) & (np.arange(7) != 3)
+        if others.any() and not (terminated | truncated)[3]:
+            self.envs.reset(options={"reset_mask": others})
+        return observation[3], float(reward[3]), bool(terminated[3]), bool(truncated[3]), self._info(info)
+
+    def render(self) -> Any:
+        return self.envs.frame(3)
+
+    def _info(self, info: dict[str, Any]) -> dict[str, Any]:
+        mine = {name: array[3] for name, array in info.items() if not name.startswith("_")}
+        return mine | {"success": bool(mine["success"])}
+
+
+def test_gymnasium_says_that_one_among_many_and_a_single_one_match():
+    settings = {"max_episode_steps": 20, "disable_env_checker": True, "render_mode": "rgb_array"}
+    single = gymnasium.make("es_service/PointMaze-v0", **settings)
+    check_environments_match(Lane("point_maze", 20), single, num_steps=70, seed=5)
+
+
+WRAPPERS: dict[str, Any] = {
+    "statistics": RecordEpisodeStatistics,
+    "observations": vector.NormalizeObservation,
+    "rewards": vector.NormalizeReward,
+    "clipped": vector.ClipAction,
+    "flat": vector.FlattenObservation,
+    "float64": partial(vector.DtypeObservation, dtype=np.float64),
+    "rescaled": partial(vector.RescaleAction, min_action=np.float32(-2.0), max_action=np.float32(2.0)),
+    "lists": vector.DictInfoToList,
+}
+
+
+OF_OBSERVATIONS = ("observations", "flat", "float64")
+"""Wrappers that Gymnasium has for other modes than SAME_STEP only."""
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "mode"),
+    [(name, AutoresetMode.NEXT_STEP) for name in WRAPPERS]
+    + [(name, AutoresetMode.SAME_STEP) for name in WRAPPERS if name not in OF_OBSERVATIONS],
+)
+def test_gymnasium_s_wrappers_do_to_them_what_they_do_to_single_ones(wrapper, mode):
+    single = partial(gymnasium.make, "es_service/Task-v0", max_episode_steps=30, task=POLE, disable_env_checker=True)
+    theirs = WRAPPERS[wrapper](SyncVectorEnv([single] * 3, autoreset_mode=mode))
+    ours = WRAPPERS[wrapper](TaskVectorEnv(POLE, 3, max_episode_steps=30, autoreset_mode=mode))
+    same(*(envs.reset(seed=2) for envs in (ours, theirs)))
+    for number, actions in enumerate(actions_of(ours, 60)):
+        found = [list(envs.step(actions)) for envs in (ours, theirs)]
+        if wrapper == "statistics":  # it measures time, too
+            for one in found:
+                one[4].get("episode", {}).pop("t", None)
+        same(*found, f"step {number}")
 
 
 @pytest.mark.slow
@@ -202,11 +276,27 @@ OF_BOOLS = "0 true values; must have one value for each of the 2 environments, a
     ("call", "error", "sentence"),
     [
         (lambda: many("point_mase"), TaskError, "'point_mase' is not shipped; choose among point_maze, ant_maze"),
-        (lambda: many("brax:ant"), TaskError, "'brax:ant' is an environment of another library"),
+        (lambda: many("gymnasium:Ant-v5"), TaskError, "'gymnasium:Ant-v5' is a Python object, no task in JAX"),
+        (
+            lambda: many("function:tests.examples.beam:beam"),
+            TaskError,
+            "is a function of parameters, which has no step",
+        ),
+        (lambda: many("brax:aunt"), TaskError, "did you mean brax:ant"),
         (lambda: many(task_options={"begin": 1}), TaskError, "no option 'begin'; its options: start"),
         (lambda: many(count=0), ValueError, "num_envs = 0; must be at least 1"),
         (lambda: many(threads=0), ValueError, "threads = 0; must be at least 1"),
-        (lambda: many(render_mode="human"), ValueError, "must be None, since nothing is drawn"),
+        (
+            lambda: many(render_mode="human"),
+            ValueError,
+            "must be None or 'rgb_array'.* since MuJoCo's renderer needs Op",
+        ),
+        (
+            lambda: many(POLE, render_mode="rgb_array"),
+            ValueError,
+            r"\(place angle\); choose another one with task_opti",
+        ),
+        (lambda: many().frame(0), ValueError, "render_mode = None; must be 'rgb_array' for pictures"),
         (lambda: many().step(np.zeros((2, 2))), ValueError, "call reset before step"),
         (lambda: many().reset(seed=[1]), ValueError, "a list of 1; must have one for each of the 2"),
         (lambda: many().reset(seed=-1), ValueError, r"seed = -1; must be from 0 to 2\*\*63 - 1"),
@@ -218,6 +308,45 @@ OF_BOOLS = "0 true values; must have one value for each of the 2 environments, a
 def test_a_wrong_argument_is_an_error_that_says_what_is_allowed(call, error, sentence):
     with pytest.raises(error, match=sentence):
         call()
+
+
+def test_observations_are_new_arrays_unless_one_is_asked_for_that_is_reused():
+    for copy in (True, False):
+        envs = TaskVectorEnv("point_maze", 3, max_episode_steps=4, copy=copy)
+        first = envs.reset(seed=0)[0]
+        before = first.copy()
+        found = [envs.step(actions) for actions in actions_of(envs, 5)]
+        assert np.array_equal(first, before) == copy
+        assert (first is found[0][0]) == (not copy)
+        if copy:
+            expected = found
+    same([one[1:] for one in found], [one[1:] for one in expected])  # what an episode ended with is never reused
+    same(found[-1][0], expected[-1][0])
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_pictures_show_where_an_environment_is_and_the_way_of_its_episode(mode):
+    settings = {"render_mode": "rgb_array", "max_episode_steps": 9}
+    envs = TaskVectorEnv("point_maze", 2, autoreset_mode=mode, **settings)
+    single = partial(gymnasium.make, "es_service/PointMaze-v0", disable_env_checker=True, **settings)
+    theirs = SyncVectorEnv([single] * 2, autoreset_mode=mode)
+    envs.reset(seed=3)
+    theirs.reset(seed=3)
+    for number, actions in enumerate([np.full((2, 2), [1.0, 0.0])] * 14):
+        info = envs.step(actions)[-1]
+        theirs.step(actions)
+        same(envs.render(), theirs.render(), f"step {number}")
+        picture = envs.frame(1)
+        rows, columns = np.nonzero((picture == drawing.HERE).all(axis=-1))
+        place = (np.array([columns.mean(), 255 - rows.mean()]) + 0.5) / 256 * 2.12 - 1.06
+        np.testing.assert_allclose(place, info["descriptor"][1], atol=0.03)
+    ways = [(picture == drawing.WAY).all(axis=-1).sum() for picture in envs.render()]
+    assert all(0 < pixels < 100 for pixels in ways)  # that of the new episode only
+    walls = (picture == drawing.WALL).all(axis=-1)
+    assert walls[int((1.06 + 0.495) / 2.12 * 256), 150]  # the lower wall, from x = -0.5 to 1
+    assert not walls[int((1.06 + 0.495) / 2.12 * 256), 30]
+    envs.set_state(envs.get_state())
+    assert not (envs.frame(0) == drawing.HERE).all(axis=-1).any()
 
 
 def test_a_finished_episode_is_not_stepped_where_the_caller_resets():

@@ -42,6 +42,7 @@ ENTRIES = {"es_service.__init__": "asking", "es_service.__main__": "cli"}
 JOINERS = {
     "es_service.asking",
     "es_service.gymnasium",
+    "es_service.environments.brax_env",
     "es_service.environments.single",
     "es_service.environments.spaces",
     "es_service.environments.vector",

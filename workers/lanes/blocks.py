@@ -1,0 +1,172 @@
+"""Lanes that xla computes, in child processes with the settings of workers, since simd cannot compile their task.
+
+XLA may give other bits for another shape, another number of threads, or another place in a batch. So lanes are computed
+in blocks of 16, padded, with one thread, and lane i is always in place i modulo 16 of its block: its bits depend on
+that and on its own state and action, and not on the number of lanes or processes. The settings are those of a process
+before it loads JAX, and the caller has loaded it in its own way.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import weakref
+from collections.abc import Mapping
+from contextlib import suppress
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.options import OptionValue
+from es_service.protocol.parent import bound, start_child
+from es_service.protocol.process_environment import child_environment
+from es_service.protocol.raised import RaisedError
+from es_service.protocol.wire import framed, receive
+from workers.environments import TaskError
+from workers.lanes.functions import Seen
+from workers.xla_cache import xla_cache_settings
+
+BLOCK = 16
+"""Lanes that xla computes together."""
+
+
+class LostProcessError(RuntimeError):
+    """The process that computes lanes has ended; the message says how."""
+
+
+class Blocks:
+    """Lanes in blocks, divided among child processes."""
+
+    def __init__(
+        self,
+        name: str,
+        options: Mapping[str, OptionValue],
+        lanes: int,
+        processes: int = 1,
+        *,
+        first: int = 0,
+    ) -> None:
+        """Start the processes, which compile the functions of the task or take them from the cache.
+
+        Args:
+            processes: most processes; each has whole blocks.
+            first: place in its block of the first lane.
+
+        Raises:
+            TaskError: the task cannot be computed.
+        """
+        blocks = -(-(first + lanes) // BLOCK)
+        share = -(-blocks // processes) * BLOCK
+        bounds = [0, *range(share - first, lanes, share), lanes]
+        self._bounds = np.array(bounds)
+        """Lanes of process p are those from bounds[p] to bounds[p + 1]."""
+        self._children: list[_Child] = []
+        try:
+            for start, end in pairwise(bounds):
+                self._children.append(_Child(name))
+                self._children[-1].ask((name, dict(options), end - start, first if start == 0 else 0))
+            for child in self._children:
+                child.answer()
+        except BaseException:
+            self.close()
+            raise
+
+    def begin(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> Seen:
+        """Reset some lanes; returns what is seen in these."""
+        return self.resets(lane_M, keys_M)[1]
+
+    def resets(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], Seen]:
+        """Reset some lanes, in increasing order; returns the words of their carries, and what is seen in them."""
+        return _joined(self._shared("resets", lane_M, keys_M))
+
+    def step(self, action_N_A: NDArray[np.float32]) -> Seen:
+        """Step all lanes."""
+        for child, start, end in zip(self._children, self._bounds[:-1], self._bounds[1:], strict=True):
+            child.ask(("step", action_N_A[start:end]))
+        return _joined([child.answer() for child in self._children])
+
+    def words(self) -> NDArray[np.uint32]:
+        """Words of the carries of all lanes, [N, words]."""
+        for child in self._children:
+            child.ask(("words",))
+        return _joined([child.answer() for child in self._children])
+
+    def put(self, lane_M: NDArray[np.intp], words_M: NDArray[np.uint32]) -> None:
+        """Set the carries of some lanes, in increasing order."""
+        self._shared("put", lane_M, words_M)
+
+    def close(self) -> None:
+        """End the processes."""
+        for child in self._children:
+            child.close()
+
+    def _shared(self, kind: str, lane_M: NDArray[np.intp], given_M: NDArray) -> list[Any]:
+        """Answers of the processes that have some of the lanes."""
+        cuts = np.searchsorted(lane_M, self._bounds)
+        asked = []
+        for child, start, low, high in zip(self._children, self._bounds[:-1], cuts[:-1], cuts[1:], strict=True):
+            if low < high:
+                child.ask((kind, lane_M[low:high] - start, given_M[low:high]))
+                asked.append(child)
+        return [child.answer() for child in asked]
+
+
+class _Child:
+    """A process of `workers.lanes.process`. It ends with this one, when it is closed, or when nobody refers to it."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._socket, theirs = socket.socketpair()
+        with theirs:
+            self._process = start_child(
+                lambda: subprocess.Popen(
+                    bound("workers.lanes.process", str(theirs.fileno())),
+                    pass_fds=[theirs.fileno()],
+                    stdin=subprocess.DEVNULL,
+                    env=child_environment() | xla_cache_settings(),
+                )
+            )
+        self._end = weakref.finalize(self, _ended, self._process, self._socket)
+
+    def ask(self, message: Any) -> None:
+        with suppress(OSError):  # it has ended, which `answer` finds
+            self._socket.sendall(framed(message))
+
+    def answer(self) -> Any:
+        """Raises TaskError with what the task's code raised, or LostProcessError."""
+        try:
+            answer = receive(self._socket)
+        except (EOFError, OSError):
+            self.close()
+            code = self._process.returncode
+            how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+            raise LostProcessError(
+                f"the process in which xla computes {self._name} has ended with {how}; make the environments anew"
+            ) from None
+        if isinstance(answer, RaisedError):
+            raise TaskError(answer.message)
+        return answer
+
+    def close(self) -> None:
+        self._end()
+
+
+def _ended(process: subprocess.Popen[bytes], end: socket.socket) -> None:
+    end.close()
+    with suppress(ProcessLookupError):
+        os.kill(process.pid, signal.SIGKILL)  # a process that was forked from this one may hold the socket open
+    process.wait()
+
+
+def _joined(answers: list[Any]) -> Any:
+    """Arrays [M, ...] of several processes as one each."""
+    if len(answers) == 1:
+        return answers[0]
+    if isinstance(answers[0], np.ndarray):
+        return np.concatenate(answers)
+    parts = [_joined(list(part)) for part in zip(*answers, strict=True)]
+    return Seen(*parts) if isinstance(answers[0], Seen) else tuple(parts)

@@ -1,0 +1,144 @@
+"""The process in which xla computes blocks of lanes for `workers.lanes.blocks`.
+
+python -m workers.lanes.process DESCRIPTOR     # of a socket; its parent sets the environment
+"""
+
+from __future__ import annotations
+
+import signal
+import socket
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.protocol.noise import KEY_WORDS
+from es_service.protocol.options import OptionValue
+from es_service.protocol.raised import raised
+from es_service.protocol.wire import framed, receive
+from workers.environments import make_environment
+from workers.lanes.blocks import BLOCK
+from workers.lanes.functions import Seen, lane_functions
+
+
+class BlockLanes:
+    """The lanes of this process, in blocks."""
+
+    def __init__(self, name: str, options: Mapping[str, OptionValue], lanes: int, first: int) -> None:
+        """Compile the reset. Arguments are those of `workers.lanes.blocks.Blocks`."""
+        begin, step = lane_functions(make_environment(name, options))
+        kinds: list[Any] = []
+        """Of each leaf of a carry, the kind of key of JAX that it is; None for other arrays."""
+
+        def carry(key: Any) -> Any:
+            carry, _ = begin(key)
+            kinds[:] = [jax.random.key_impl(leaf) if _is_key(leaf) else None for leaf in jax.tree.leaves(carry)]
+            return carry
+
+        tree = jax.tree.structure(jax.eval_shape(carry, jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)))
+
+        def arrays_of(carry: Any) -> list[Any]:
+            return [jax.random.key_data(leaf) if _is_key(leaf) else leaf for leaf in jax.tree.leaves(carry)]
+
+        def begun(key: Any) -> tuple[list[Any], Seen]:
+            carry, seen = begin(key)
+            return arrays_of(carry), seen
+
+        def stepped(arrays: Sequence[Any], action_A: Any) -> tuple[list[Any], Seen]:
+            leaves = [
+                array if kind is None else jax.random.wrap_key_data(array, impl=kind)
+                for array, kind in zip(arrays, kinds, strict=True)
+            ]
+            carry, seen = step(jax.tree.unflatten(tree, leaves), action_A)
+            return arrays_of(carry), seen
+
+        self._begin, self._step = jax.jit(jax.vmap(begun)), jax.jit(jax.vmap(stepped))
+        self._first, self._places = first, np.arange(first, first + lanes)
+        blocks = -(-(first + lanes) // BLOCK)
+        padding, _ = self._begin(np.zeros((BLOCK, KEY_WORDS), np.uint32))
+        self._arrays = [np.concatenate([array] * blocks) for array in map(np.asarray, padding)]
+        """Arrays of the carries, [16 * blocks, ...]; those of no lane are some reset."""
+
+    def resets(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], Seen]:
+        """See `Blocks.resets`."""
+        place_M, found = self._first + lane_M, []
+        for block in np.unique(place_M // BLOCK):
+            is_here_M = place_M // BLOCK == block
+            here = place_M[is_here_M] % BLOCK
+            keys = np.zeros((BLOCK, KEY_WORDS), np.uint32)
+            keys[here] = keys_M[is_here_M]
+            arrays, seen = self._begin(keys)
+            for kept, array in zip(self._arrays, arrays, strict=True):
+                kept[place_M[is_here_M]] = np.asarray(array)[here]
+            found.append([np.asarray(array)[here] for array in seen])
+        return self._words_of(place_M), Seen(*(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
+
+    def step(self, action_N_A: NDArray[np.float32]) -> Seen:
+        """See `Blocks.step`."""
+        actions = np.zeros((len(self._arrays[0]), action_N_A.shape[1]), np.float32)
+        actions[self._places] = action_N_A
+        found = []
+        for start in range(0, len(actions), BLOCK):
+            of = slice(start, start + BLOCK)
+            arrays, seen = self._step([array[of] for array in self._arrays], actions[of])
+            for kept, array in zip(self._arrays, arrays, strict=True):
+                kept[of] = array
+            found.append(seen)
+        return Seen(*(np.concatenate(arrays)[self._places] for arrays in zip(*found, strict=True)))
+
+    def words(self) -> NDArray[np.uint32]:
+        """See `Blocks.words`."""
+        return self._words_of(self._places)
+
+    def put(self, lane_M: NDArray[np.intp], words_M: NDArray[np.uint32]) -> None:
+        """See `Blocks.put`."""
+        end = 0
+        for kept in self._arrays:
+            start, end = end, end + _as_words(kept[:1]).shape[1]
+            words = np.ascontiguousarray(words_M[:, start:end])
+            of_size = words if kept.itemsize >= 4 else words.astype(f"u{kept.itemsize}")
+            kept[self._first + lane_M] = of_size.view(kept.dtype).reshape(len(lane_M), *kept.shape[1:])
+
+    def _words_of(self, place_M: NDArray[np.intp]) -> NDArray[np.uint32]:
+        return np.concatenate([_as_words(kept[place_M]) for kept in self._arrays], axis=1)
+
+
+def _as_words(array_M: NDArray) -> NDArray[np.uint32]:
+    """The bits of an array [M, ...] as words [M, words], one for each number of less than 32 bits, as in simd."""
+    rows = np.ascontiguousarray(array_M).reshape(len(array_M), -1)
+    return rows.view(np.uint32) if rows.itemsize >= 4 else rows.view(f"u{rows.itemsize}").astype(np.uint32)
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def main(descriptor: int) -> None:
+    """Answer until the parent closes its end: None when the lanes are there, and then what is asked for."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when this ends
+    with socket.socket(fileno=descriptor) as parent:
+        name, *given = receive(parent)
+        try:
+            lanes = BlockLanes(name, *given)
+        except BaseException as error:  # also sys.exit in the user's module
+            parent.sendall(framed(raised(error, name)))
+            return
+        parent.sendall(framed(None))
+        while True:
+            try:
+                kind, *given = receive(parent)
+            except EOFError:
+                return
+            try:
+                answer = getattr(lanes, kind)(*given)
+            except Exception as error:
+                answer = raised(error, name)
+            parent.sendall(framed(answer))
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))
