@@ -59,7 +59,9 @@ def correct(search: Search, evaluator: Evaluator, store: Store, before: RunState
     generation = updated.told.generation
     if generation % settings.correct_every or not map_.size:
         return Correction(dict.fromkeys(CORRECTED))
-    new = entered(updated.search, updated.told, updated.evaluated.points, updated.evaluated.evaluation.trace_T_B)
+    evaluated = updated.evaluated
+    cell_N = map_.cells_with(generation, evaluated.index_N)
+    new = entered(updated.search, cell_N, evaluated.points, evaluated.evaluation.trace_T_B)
     again, steps, episodes = empty_map(map_.geometry), 0, 0
     for ask, first in enumerate(range(0, map_.size, ELITES_AT_ONCE)):
         cells = map_.cell_N[first : first + ELITES_AT_ONCE].tolist()

@@ -217,6 +217,8 @@ Subject = Centre | Policies
 """What the episodes of a chunk run: the centre of training, evaluation and gradient chunks, or policies."""
 Work = tuple[Subject, Chunk]
 """A chunk with the subject that it belongs to."""
+FAILURES_TOLD = 16
+"""Most failed episodes that the result of a chunk names."""
 
 
 def around(subject: Subject, chunks: Iterable[Chunk]) -> list[Work]:
