@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from collections.abc import Iterator
-from typing import Any
 
 from es_service.cli.doctor import Finding, print_findings
 from es_service.config.problems import did_you_mean, one_of
 from es_service.config.tasks import TASKS
 from es_service.errors import ConfigError
 from es_service.protocol.messages import UNBOUNDED, TaskSpec
-from es_service.protocol.process_environment import child_environment
+from es_service.runs.repeating import compared, examined
 
-"""Level ("ok", "note" or "FAIL") and text of one finding."""
-ALONE = "alone"
 SECONDS = 1.0
 """Duration of the measurement."""
-LONGEST_S = 600.0
-"""Longest time of each of the two processes; functions may take long."""
 
 
 def examine_task(name: str, *, as_json: bool = False) -> bool:
@@ -49,21 +41,20 @@ def _findings(name: str) -> Iterator[Finding]:
     if task.kind == "jax":
         yield "ok", "its steps are pure functions that JAX traces, so they repeat; `bench rollouts` measures them"
         return
-    first, second = _examined(name), _examined(name)
+    first, second = (examined(name, {}, SECONDS) for _ in range(2))
     for answer in (first, second):
         if "problem" in answer:
             yield "FAIL", answer["problem"]
             return
-    same = {**first["hashes"], "in another process": second["hashes"][ALONE]}
-    if other := [where for where, one in same.items() if one != same[ALONE]]:
+    tried, other = compared(first, second)
+    if other:
         yield (
             "note",
             f"it does not repeat: with the same seed and actions it returns other numbers {' and '.join(other)}, so "
-            "neither does a run: other workers, a resume and `verify` find other numbers",
+            "neither does a run: other workers and a resume find other numbers, and `verify` says that it cannot judge",
         )
     else:
-        where = ", ".join(one for one in same if one != ALONE)
-        yield "ok", f"it repeats bit for bit with the same seed and actions: {where}"
+        yield "ok", f"it repeats bit for bit with the same seed and actions: {', '.join(tried)}"
     unit = "calls" if task.kind == "function" else "steps"
     rate, memory = max(one["steps_per_second"] for one in (first, second)), first["peak_mib"]
     yield "ok", f"{rate:,.0f} {unit}/s on one core without a policy; its process takes {memory:,} MiB"
@@ -77,18 +68,3 @@ def _what(task: TaskSpec) -> str:
         f"{task.name}: {task.summary or 'a task'}; {task.observation_size} numbers in an observation, "
         f"{task.action_size} {actions}, {task.episode_steps} steps"
     )
-
-
-def _examined(name: str) -> dict[str, Any]:
-    """What `workers.host.examine` finds in a process of its own."""
-    command = [sys.executable, "-m", "workers.host.examine", name, "{}", str(SECONDS)]
-    try:
-        process = subprocess.run(
-            command, env=child_environment(), capture_output=True, text=True, timeout=LONGEST_S, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return {"problem": f"it could not be examined within {LONGEST_S:g} s"}
-    lines = process.stdout.splitlines()
-    if process.returncode or not lines:
-        return {"problem": f"its process ended with exit code {process.returncode}:\n{process.stderr.strip()[-2000:]}"}
-    return json.loads(lines[-1])

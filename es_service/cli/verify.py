@@ -13,6 +13,8 @@ from es_service.cli.data import print_json
 from es_service.cli.options import JsonOption, LogLevelOption, RunArgument, print_error, print_note
 from es_service.errors import RunLockedError
 from es_service.runs.certification import recomputed as recomputed_certifications
+from es_service.runs.checked_config import changed_config
+from es_service.runs.repeating import why_not_repeatable
 from es_service.runs.verification import Recomputed
 from es_service.runs.verification import verify as recompute
 
@@ -26,8 +28,8 @@ def verify(
     as_json: JsonOption = False,
     log_level: LogLevelOption = None,
 ) -> None:
-    """Compute generations of a run again on this machine and compare every bit; exit code 1 if one differs, 3 if the
-    run is running."""
+    """Compute generations of a run again on this machine and compare every bit; exit code 1 if one differs, 3 if
+    this cannot be judged: the run is running, or its task does not repeat itself."""
     run = api.open_run(folder)
     try:
         recomputed = recompute(run, generations, workers)
@@ -47,12 +49,16 @@ def verify(
             what = f"differs: {', '.join(differences)}" if differences else "equal"
             since = f"; since it was made: {', '.join(changes)}" if changes else ""
             print_line(console, f"certification {one.number}, {one.name}: {what}{since}")
+    why = ""
+    if any(one.differences for one in found) or any(differences for _, differences in certified):
+        why = why_not_repeatable(run, changed_config(run.present_config, {}))
     equal = not any(one.differences for one in found) and not any(differences for _, differences in certified)
     if as_json:
         print_json(
             {
                 "digest": digest,
                 "equal": equal,
+                "does_not_repeat": why,
                 "recomputed": [asdict(one) for one in found],
                 "certified": [
                     {"certification": one.number, "policy": one.name, "differences": differences}
@@ -64,7 +70,13 @@ def verify(
         again = sum(one.last - one.first + 1 for one in found)
         print(f"{digest}  {'equal' if equal else 'different'}")
         print_note(f"{again:,} of {(run.generation or 0) + 1:,} generations were computed again")
-    raise typer.Exit(0 if equal else 1)
+        if why:
+            print_note(
+                f"{run.constants['task.environment']} does not repeat itself: with the same seed and actions it "
+                f"returns other numbers {why}. So the differences do not say that the run is wrong, and it cannot be "
+                "verified"
+            )
+    raise typer.Exit(0 if equal else 3 if why else 1)
 
 
 def _line(one: Recomputed) -> str:

@@ -83,6 +83,9 @@ class TaskSpec:
     """Parameters of a function that is the task; None for all other tasks."""
     deterministic: bool = False
     """Whether the task declares that equal parameters have equal results."""
+    does_not_repeat: str = ""
+    """Where a task of Python objects was found to return other numbers for the same seed and actions, in words, such as
+    `after another episode`; empty if it was not found to, or was not tried."""
 
 
 def with_options(task: TaskSpec, options: Mapping[str, OptionValue]) -> TaskSpec:

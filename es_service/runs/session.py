@@ -119,6 +119,12 @@ def work(
             on_compile(sentence)
 
     tell_notices()
+    if store.generation is None and task.does_not_repeat:
+        tell(
+            f"{task.name} does not repeat itself: with the same seed and actions it returns other numbers "
+            f"{task.does_not_repeat}. So neither does the run: with other workers or after a resume it has other "
+            "numbers, and `verify` cannot judge it. The run records this"
+        )
     state = driver.stored_state(store, task)
     if state is not None and (reason := driver.spent(config.budget, state)) is not None:
         return Outcome(open_run(store.folder), reason)  # no engine needs to start

@@ -60,6 +60,14 @@ def forgetful(parameters):
 forgetful.parameters = {f"x{index}": (0.0, 1.0) for index in range(20)}
 
 
+def restless(parameters):
+    """Its noise has no seed."""
+    return float(parameters.sum()) + np.random.default_rng().normal()
+
+
+restless.parameters = ("left", "right")
+
+
 def deadly(parameters):
     """It ends its process for one member of each pair."""
     if parameters[0] > 0.0:

@@ -75,9 +75,11 @@ class Drift:
 
 
 class Slow(Drift):
-    """A drift whose first step in a worker that finds a file with this process's kind of fault has that fault."""
+    """A drift whose first later step in a worker that finds a file with this process's kind of fault has that fault."""
 
     def step(self, action):
+        if self.steps < 12:  # whoever describes the task does fewer
+            return super().step(action)
         fault = Path(os.environ["HOST_FAULT"])
         try:
             kind = fault.read_text()
@@ -90,6 +92,12 @@ class Slow(Drift):
             time.sleep(1000.0)
         elif kind == "exit":
             os._exit(7)
+        elif kind == "leak":  # until the memory monitor of its node ends it
+            leaked = []
+            for _ in range(64):
+                leaked.append(bytearray(os.urandom(2**20) * 128))
+                time.sleep(0.05)
+            time.sleep(1000.0)
         elif kind:
             raise ValueError(kind)
         return super().step(action)

@@ -31,6 +31,8 @@ def print_status(console: Console, run: Run) -> None:
         "task": f"{constants['task.environment']}, {constants['task.episode_steps']} steps an episode",
         "search": ", ".join(filter(None, [*method, f"seed {constants['seed']}"])),
     }
+    if where := run.meta.task.get("does_not_repeat"):
+        fields["not repeatable"] = f"the task returns other numbers for the same seed {where}"
     if parent:
         fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
     fields["state"] = (

@@ -1,0 +1,64 @@
+"""Whether a task repeats itself: equal seeds and actions have equal results, bit for bit, wherever it runs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from es_service.config.model import RunConfig
+from es_service.config.tasks import task_of
+from es_service.protocol.process_environment import child_environment
+from es_service.runs.view import Run
+from workers.environments import settings_of_description
+
+ALONE = "alone"
+"""Name of the first episode among the hashes of `workers.host.examine`."""
+LONGEST_S = 600.0
+"""Longest time of each of the two processes; functions may take long."""
+
+
+def examined(name: str, settings: Mapping[str, Any], seconds: float) -> dict[str, Any]:
+    """What `workers.host.examine` finds of a task of Python objects or a function in a process of its own.
+
+    Args:
+        settings: see `settings_of_description`.
+        seconds: duration of its measurement.
+    """
+    command = [sys.executable, "-m", "workers.host.examine", name, json.dumps(settings), str(seconds)]
+    try:
+        process = subprocess.run(
+            command, env=child_environment(), capture_output=True, text=True, timeout=LONGEST_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return {"problem": f"it could not be examined within {LONGEST_S:g} s"}
+    lines = process.stdout.splitlines()
+    if process.returncode or not lines:
+        return {"problem": f"its process ended with exit code {process.returncode}:\n{process.stderr.strip()[-2000:]}"}
+    return json.loads(lines[-1])
+
+
+def compared(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    """(where a task was tried again, where it has not repeated itself) by what `examined` has found twice."""
+    same = {**first["hashes"], "in another process": second["hashes"][ALONE]}
+    tried = [one for one in same if one != ALONE]
+    return tried, [one for one in tried if same[one] != same[ALONE]]
+
+
+def why_not_repeatable(run: Run, config: RunConfig) -> str:
+    """Where the task of a run does not repeat itself, in words: as the run has recorded, or else as is found now.
+
+    Empty if it repeats itself, as far as can be found, and for tasks in JAX.
+    """
+    task = task_of(config)
+    if recorded := run.meta.task.get("does_not_repeat"):
+        return recorded
+    if task.kind not in ("python", "function"):
+        return ""
+    settings = settings_of_description(config.task.environment, config.task.options, config.task.descriptor)
+    found = [examined(config.task.environment, settings, 0.0) for _ in range(2)]
+    if any("problem" in one for one in found):
+        return ""
+    return " and ".join(compared(*found)[1])

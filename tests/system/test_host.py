@@ -1,0 +1,137 @@
+"""Tasks of Python objects: the driver is killed, workers are Ray's, and a simulator fails on a cluster of hosts."""
+
+from __future__ import annotations
+
+import re
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from es_service import api
+from es_service.store.digest import digest_parts
+from es_service.store.reader import read_generation
+from tests.helpers import workers_in_this_process
+from tests.system import cluster
+from tests.system.cluster import Cluster
+from tests.system.session import finish
+from tests.system.test_cluster import memory_in_use
+from tests.workers.test_host import has_ended
+
+PROGRAM = Path(sys.executable).parent / "es-service"
+MODULE = "tests.workers.host_tasks"
+HOST = {
+    "task": {"environment": f"python:{MODULE}:Drift"},
+    "policy": {"hidden": [4]},
+    "search": {"algorithm": "nsra_es", "pairs": 24, "evaluation_episodes": 4, "fitness_weight_patience": 2},
+    "map": {"cells": [8]},
+    "budget": {"generations": 6},
+    "compute": {"engine": "inline", "workers": 1},
+}
+"""Three training chunks a generation."""
+HOOKS = [  # as in test_kill: where a session is killed, at which passage of that point, and the newest generation then
+    ("opened", 1, None),
+    ("mid_transaction", 2, 0),
+    ("after_commit", 3, 3),
+    ("before_commit", 2, 4),
+]
+
+
+def with_compute(config: dict, **compute: object) -> dict:
+    return config | {"compute": config["compute"] | compute}
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """Digest of the run that nobody disturbs, whose environments are those of this process."""
+    folder = tmp_path_factory.mktemp("reference") / "run"
+    with workers_in_this_process():
+        api.run(api.load_config(HOST), folder)
+    return digest_parts(folder)
+
+
+def test_a_driver_killed_at_each_hook_in_turn_goes_on_to_the_same_bits(tmp_path, reference):
+    folder = tmp_path / "run"
+    for at, nth, newest in HOOKS:
+        config = None if folder.exists() else HOST
+        assert finish(folder, config=config, kill={"at": at, "nth": nth}) == -signal.SIGKILL
+        assert read_generation(folder) == newest
+    assert finish(folder) == 0
+    assert digest_parts(folder) == reference
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # Ray leaves files and processes to the garbage collector
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("workers", [1, 2, 3])
+def test_workers_of_ray_have_the_bits_of_this_process(workers, tmp_path, reference):
+    """One process for each core: an actor of several cores has a child for each."""
+    config = with_compute(HOST, engine="ray", workers=workers)
+    run = api.run(api.load_config(config), tmp_path / "run", on_notice=pytest.fail).run
+    assert run.history.workers.iloc[-1] == workers
+    assert digest_parts(run.folder) == reference
+
+
+FAULTS = {
+    "hang": r"lost a worker; .* within 4 s of computing \(task.time_limit_s\)",
+    "exit": "lost a worker; ",
+    "leak": "lost a worker; .*its node ran out of memory",
+    "it raises this once": "",
+}
+"""Fault of one step of one environment -> what the session prints about it."""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))
+@pytest.mark.parametrize("cores", [1, 2])
+def test_a_simulator_that_fails_once_on_a_cluster_of_hosts_changes_no_bit(tmp_path, cores):
+    """It hangs, ends its process, takes all the memory that it may have, and raises, one after another in one run."""
+    config = HOST | {"task": {"environment": f"python:{MODULE}:Slow", "time_limit_s": 4.0}, "map": {"cells": [16]}}
+    undisturbed = tmp_path / "undisturbed"
+    with workers_in_this_process(), pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOST_FAULT", str(tmp_path / "none"))
+        api.run(api.load_config(config), undisturbed)
+    file, run, fault = tmp_path / "config.yaml", tmp_path / "run", tmp_path / "fault"
+    file.write_text(yaml.safe_dump(with_compute(config, engine="ray")))
+    used, total = memory_in_use()
+    tight = {"RAY_memory_usage_threshold": f"{(used + 3 * 2**30) / total:.3f}"}
+    with Cluster(tmp_path) as hosts:
+        for node in ("a", "b"):
+            hosts.start(node, cores, HOST_FAULT=str(fault), **tight)
+
+        def session(generations, *command):
+            limits = ["--set", f"budget.generations={generations}", "--address", hosts.address]
+            code, printed = hosts.run("head", PROGRAM, *command, *limits, timeout=240.0, HOST_FAULT=str(fault))
+            assert code == 0, printed
+            return printed
+
+        for number, (kind, said) in enumerate(FAULTS.items()):
+            fault.write_text(kind)
+            printed = session(2 + number, *(("resume", run) if number else ("run", file, "--out", run)))
+            assert not fault.exists(), f"no environment has met the fault {kind}"
+            assert re.search(said, printed), printed
+            if kind == "hang":
+                assert has_ended(Path(f"{fault}_process").read_text()), "what it has started ends with it"
+        session(6, "resume", run)
+    assert digest_parts(run) == digest_parts(undisturbed)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))
+def test_a_simulator_that_always_fails_on_a_cluster_ends_with_its_seed(tmp_path):
+    config = with_compute(
+        HOST | {"task": {"environment": f"python:{MODULE}:Fragile"}, "map": {"cells": [16]}}, engine="ray"
+    )
+    file = tmp_path / "config.yaml"
+    file.write_text(yaml.safe_dump(config))
+    with Cluster(tmp_path) as hosts:
+        hosts.start("a", 2)
+        code, printed = hosts.run(
+            "head", PROGRAM, "run", file, "--out", tmp_path / "run", "--address", hosts.address, timeout=240.0
+        )
+    assert code == 1
+    assert "ValueError: the fifth step cannot be done" in printed
+    assert "of the episode whose reset has the seed" in printed
+    assert "raised in evaluation episode 0, in EvaluationChunk 0 of generation 0" in printed
