@@ -330,6 +330,24 @@ def test_without_noise_the_corrected_values_are_the_stored_ones(tmp_path, name):
 
 
 @pytest.mark.usefixtures("workers_here")
+def test_a_fork_may_change_the_container_but_not_what_it_is(tmp_path):
+    run = run_of(tmp_path, generations=4, correct=None)
+    assert run.parts()[1]["whole_kept"]["serial_K"].size > len(run.map)
+    further = ["budget.generations=6"]
+    flat = api.fork(run.folder, [*further, "search.elites.depth=1"], out=tmp_path / "flat").run
+    assert flat.parts()[1]["whole_kept"]["serial_K"].size == len(flat.map)
+    for change in ("kind=once", "estimate=median"):
+        with pytest.raises(ConfigError, match=r"its state does not fit these changes:\n  search\.elites\."):
+            api.fork(run.folder, [*further, f"search.elites.{change}"], out=tmp_path / "other")
+    shorter = api.fork(run.folder, [*further, "task.episode_steps=100"], out=tmp_path / "shorter").run
+    assert shorter.map["generation"].min() > 4
+    assert len(shorter.map) < len(run.map)
+    assert "corrected_coverage" not in run.history
+    corrected = api.fork(run.folder, [*further, "map.correct_every=6"], out=tmp_path / "corrected").run
+    assert corrected.history["corrected_coverage"].notna().tolist() == [False] * 6 + [True]
+
+
+@pytest.mark.usefixtures("workers_here")
 def test_corrected_values_agree_with_fresh_episodes_and_count_as_steps(tmp_path):
     from es_service.runs import evaluation
 
