@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from es_service import api
 from es_service.runs import evaluation
 from es_service.runs.certification import certify_run
 from es_service.runs.view import Run
+from tests.helpers import workers_in_this_process
 
 CONFIG = Path(__file__).parents[2] / "configs" / "point_maze_map_elites.yaml"
 KINDS = ("once", "eme", "archive_sampling", "me_sampling", "deep_grid")
@@ -62,6 +64,7 @@ def measured(kind: str, seed: int, steps: int, folder: Path, overrides: list[str
         "compute.inline_workers=threads",
         *overrides,
     ]
+    shutil.rmtree(folder, ignore_errors=True)  # of a measurement that was interrupted
     begun = time.monotonic()
     run = api.run(api.load_config(CONFIG, settings), folder).run
     seconds = time.monotonic() - begun
@@ -75,6 +78,7 @@ def measured(kind: str, seed: int, steps: int, folder: Path, overrides: list[str
         "seed": seed,
         "env_steps": int(last["env_steps"]),
         "generations": int(run.history.index[-1]),
+        "kept": len(run.parts()[1].get("whole_kept", {}).get("serial_K", run.map)),
         "samples": float(run.map["samples"].mean()) if "samples" in run.map else 1.0,
         **stored,
         **found,
@@ -103,12 +107,17 @@ def main() -> None:
             if any((row["kind"], row["seed"]) == (kind, seed) for row in rows):
                 continue
             name = "_".join([kind, str(seed), *asked.overrides]).replace("/", "_")
-            rows.append(measured(kind, seed, asked.steps, asked.out / name, asked.overrides))
+            with workers_in_this_process():  # the machine may be too busy to start others
+                rows.append(measured(kind, seed, asked.steps, asked.out / name, asked.overrides))
             with results.open("a") as file:
                 file.write(json.dumps(rows[-1]) + "\n")
+    if not rows:
+        return
     print(f"| kind | {' | '.join(SHOWN.values())} |\n| --- |{' --- |' * len(SHOWN)}")
     for kind in asked.kinds:
-        of_kind = [row for row in rows if row["kind"] == kind]
+        of_kind = [row for row in rows if row["kind"] == kind and first <= row["seed"] < end]
+        if not of_kind:
+            continue
         cells = [[row[name] for row in of_kind] for name in SHOWN]
         print(f"| {kind} | " + " | ".join(f"{np.median(c):.4g} ({min(c):.4g} to {max(c):.4g})" for c in cells) + " |")
 

@@ -212,11 +212,12 @@ def test_a_population_around_an_elite_gives_it_its_score():
         then, now = before["whole_kept"], after["whole_kept"]
         for index in range(config.search.emitters):
             cell = int(before[f"centre_{index}"]["cell"])
-            serial = then["serial_K"][then["cell_K"] == cell]
-            if cell < 0 or serial[0] not in now["serial_K"]:
+            if cell < 0:
                 continue
-            score = now["score_K"][now["serial_K"] == serial[0]]
-            scored += bool(score != then["score_K"][then["cell_K"] == cell][0])
+            row = then["cell_K"].tolist().index(cell)  # the first of the cell is its elite
+            same = [(now[name] == then[name][row]) for name in ("generation_K", "centre_K")]
+            score = now["score_K"][np.logical_and(*same)]
+            scored += int((np.isfinite(score) & (score != then["score_K"][row])).sum())
     assert scored
 
 
@@ -326,6 +327,24 @@ def columns(run):
 def test_without_noise_the_corrected_values_are_the_stored_ones(tmp_path, name):
     stored, corrected = columns(run_of(tmp_path, name, corner=True, episodes=3))
     np.testing.assert_allclose(corrected, stored, rtol=1e-6)
+
+
+@pytest.mark.usefixtures("workers_here")
+def test_a_fork_may_change_the_container_but_not_what_it_is(tmp_path):
+    run = run_of(tmp_path, generations=4, correct=None)
+    assert run.parts()[1]["whole_kept"]["serial_K"].size > len(run.map)
+    further = ["budget.generations=6"]
+    flat = api.fork(run.folder, [*further, "search.elites.depth=1"], out=tmp_path / "flat").run
+    assert flat.parts()[1]["whole_kept"]["serial_K"].size == len(flat.map)
+    for change in ("kind=once", "estimate=median"):
+        with pytest.raises(ConfigError, match=r"its state does not fit these changes:\n  search\.elites\."):
+            api.fork(run.folder, [*further, f"search.elites.{change}"], out=tmp_path / "other")
+    shorter = api.fork(run.folder, [*further, "task.episode_steps=100"], out=tmp_path / "shorter").run
+    assert shorter.map["generation"].min() > 4
+    assert len(shorter.map) < len(run.map)
+    assert "corrected_coverage" not in run.history
+    corrected = api.fork(run.folder, [*further, "map.correct_every=6"], out=tmp_path / "corrected").run
+    assert corrected.history["corrected_coverage"].notna().tolist() == [False] * 6 + [True]
 
 
 @pytest.mark.usefixtures("workers_here")

@@ -32,7 +32,7 @@ class KeptPolicies:
     """Values of all kept policies, by cell and, within a cell, by rank: the fittest first, the older of equal ones."""
 
     serial_K: NDArray[np.int64]
-    """Number of each policy among all that were ever kept. Older policies have smaller ones."""
+    """A number for each policy, greater than those of all older ones that are kept with it."""
     cell_K: NDArray[np.int64]
     fitness_K: NDArray[np.float64]
     """Mean, or median, of the fitness over all samples."""
