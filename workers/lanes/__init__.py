@@ -95,11 +95,16 @@ class Lanes:
         self.steps_N = np.zeros(lanes, np.int64)
         """Steps since the reset of each lane."""
 
-    def reset(self, lane_M: NDArray[np.intp]) -> Seen:
-        """Begin the next episode in some lanes, in increasing order; returns what is seen in these, [M]."""
+    def reset(self, lane_M: NDArray[np.intp], keys_M: NDArray[np.uint32] | None = None) -> Seen:
+        """Begin the next episode in some lanes, in increasing order; returns what is seen in these, [M].
+
+        Args:
+            keys_M: keys of the resets [M, 4]; None for those of the lanes' seeds and episodes.
+        """
         self.episode_N[lane_M] += 1
         self.steps_N[lane_M] = 0
-        keys_M = stream_keys(0, Domain.ENVIRONMENT_RESET, 0, self.seed_N[lane_M], self.episode_N[lane_M])
+        if keys_M is None:
+            keys_M = stream_keys(0, Domain.ENVIRONMENT_RESET, 0, self.seed_N[lane_M], self.episode_N[lane_M])
         return self._lanes.begin(lane_M, keys_M)
 
     def step(self, action_N_A: NDArray[np.float32]) -> Seen:

@@ -1,0 +1,1 @@
+"""Reinforcement learners of others on our tasks, certified as our searches are; see `__main__`."""

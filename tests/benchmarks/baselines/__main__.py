@@ -1,0 +1,76 @@
+"""What do reinforcement learners of others find on our tasks, with the CPU time that our searches have?
+
+    python -m tests.learners.environment                  # once: an environment for them
+    python -m tests.benchmarks.baselines --tasks ant_trap --systems sac --seeds 0 --cpu-seconds 3600
+
+Runs are done one after another, each in a process with one thread, and go on from their checkpoints below
+`runs/baselines` if they were stopped or the budget has grown. Each gives a row of results/baselines.csv, with the steps
+that it has reached.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from es_service.protocol.process_environment import worker_environment
+from tests.benchmarks.baselines.rows import in_words, put, read
+from tests.learners.environment import FOLDER, ROOT, problem, python_of
+
+RESULTS = Path(__file__).parents[1] / "results" / "baselines.csv"
+TASKS = ("point_maze", "ant_maze", "ant_trap")
+SYSTEMS = ("td3", "sac", "rnd")
+"""Those of `systems.SYSTEMS`, which only the learners' environment can import."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS)
+    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=SYSTEMS)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--steps", type=int, default=10**9, help="environment steps after which a run ends")
+    parser.add_argument("--cpu-seconds", type=float, default=3600.0, help="CPU time after which a run ends")
+    parser.add_argument("--environment", type=Path, default=FOLDER, help="the environment of the learners")
+    parser.add_argument("--folder", type=Path, default=ROOT / "runs" / "baselines", help="folder of the checkpoints")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the table that is written")
+    given = parser.parse_args()
+    if why := problem(given.environment):
+        parser.error(f"{given.environment} cannot be used: {why}. To build it: python -m tests.learners.environment")
+    failed = []
+    for seed in given.seeds:
+        for task in given.tasks:
+            for system in given.systems:
+                name = f"{task}-{system}-{seed}"
+                request = {
+                    "task": task,
+                    "system": system,
+                    "seed": seed,
+                    "folder": str((given.folder / name).absolute()),
+                    "steps": given.steps,
+                    "cpu_seconds": given.cpu_seconds,
+                }
+                command = [python_of(given.environment), "-m", "tests.benchmarks.baselines.learn", json.dumps(request)]
+                done = subprocess.run(
+                    command,
+                    cwd=ROOT,
+                    env=worker_environment(os.environ),
+                    stdout=subprocess.PIPE,
+                    text=True,
+                    check=False,
+                )
+                if done.returncode:
+                    failed.append(name)
+                    continue
+                put(given.results, json.loads(done.stdout.splitlines()[-1]))
+                print(done.stdout.splitlines()[-1], flush=True)
+    print(in_words(read(given.results)))
+    if failed:
+        sys.exit(f"failed, and said why above: {', '.join(failed)}")
+
+
+if __name__ == "__main__":
+    main()
