@@ -13,13 +13,12 @@ import dataclasses
 import json
 import sys
 from collections.abc import Mapping
-from contextlib import suppress
 from types import MappingProxyType
 from typing import Any
 
 from es_service.protocol.messages import TaskSpec
 from workers.environments import TaskError, describe_environment
-from workers.host.repeats import does_not_repeat
+from workers.host.repeats import tried
 from workers.rollouts import BACKENDS
 
 
@@ -34,8 +33,7 @@ def described(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> 
     """
     task = describe_environment(name, settings)
     if task.kind == "python":
-        with suppress(Exception):  # what its code raises is told where it is run
-            task = dataclasses.replace(task, does_not_repeat=does_not_repeat(task))
+        task = dataclasses.replace(task, does_not_repeat=tried(task))
     able = {name: one for name, one in BACKENDS.items() if task.kind in one.task_kinds}
     reasons = {name: why for name, one in able.items() if (why := one.examine(task))}
     return dataclasses.replace(task, unsupported=reasons)

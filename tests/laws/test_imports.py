@@ -48,6 +48,7 @@ JOINERS = {
     "es_service.environments.vector",
     "es_service.runs.compiling",
     "es_service.runs.moment",
+    "es_service.runs.repeating",
     "es_service.runs.scaling",
     "es_service.runs.session",
     "es_service.config.tasks",
