@@ -67,8 +67,14 @@ def _rollouts(task: str, theirs: str, steps: int, hidden: int, batches: tuple[in
 def _me_es(pairs: int, generations: int) -> Comparison:
     sizes = {"pairs": pairs, "generations": generations}
     theirs = {"kind": "qdax me_es", "cells": [20, 20], **sizes}
-    ours = {"kind": "search", "algorithm": "me_es", "whole": True, **sizes}
+    ours = {"kind": "search", "algorithm": "me_es", "sizes": {"pairs": pairs}, "generations": generations}
     return Comparison(f"point_maze: ME-ES, {pairs} pairs", "qdax", theirs, ours, "ms_per_generation")
+
+
+def _map_elites(batch: int, generations: int) -> Comparison:
+    theirs = {"kind": "qdax map_elites", "cells": [20, 20], "batch": batch, "generations": generations}
+    ours = {"kind": "search", "algorithm": "map_elites", "sizes": {"batch": batch}, "generations": generations}
+    return Comparison(f"point_maze: MAP-Elites, batch {batch}", "qdax", theirs, ours, "ms_per_generation")
 
 
 def _physics(integrator: str) -> Comparison:
@@ -90,6 +96,8 @@ COMPARISONS = (
     _rollouts("point_maze", "pointmaze", 200, 64, (4, 16, 64)),
     _me_es(64, 400),
     _me_es(512, 50),
+    _map_elites(64, 400),
+    _map_elites(256, 150),
     _physics("RK4"),
     _physics("EULER"),
     _environments("Ant-v5, sync", "mujoco", {"kind": "gymnasium steps", "mode": "sync", "count": 16}, 1),
@@ -100,7 +108,7 @@ COMPARISONS = (
         "point_maze: ES without episodes, 64 pairs",
         "evosax",
         {"kind": "evosax es", "pairs": 64, "parameters": 4482, "generations": 200},
-        {"kind": "search", "algorithm": "es", "pairs": 64, "generations": 400, "whole": False},
+        {"kind": "search", "algorithm": "es", "sizes": {"pairs": 64}, "generations": 400, "whole": False},
         "ms_per_generation",
     ),
 )
@@ -142,17 +150,18 @@ def our_physics(seconds: float) -> dict[str, Any]:
     }
 
 
-def our_search(algorithm: str, pairs: int, generations: int, whole: bool) -> dict[str, Any]:
+def our_search(algorithm: str, sizes: Mapping[str, int], generations: int, whole: bool = True) -> dict[str, Any]:
     """Milliseconds per generation of a run on PointMaze, one evaluation episode; the first ten do not count.
 
     Args:
+        sizes: keys of `search` that say how many policies or pairs a generation has.
         whole: everything between two generations by the clock, the store too; else only the gradient and the driver.
     """
     config = api.load_config(
         {
             "task": {"environment": "point_maze"},
             "policy": {"hidden": [64, 64]},
-            "search": {"algorithm": algorithm, "pairs": pairs, "evaluation_episodes": 1},
+            "search": {"algorithm": algorithm, "evaluation_episodes": 1, **sizes},
             "budget": {"generations": 10 + generations},
             "compute": {"workers": cores(), "engine": "inline"},
         }
@@ -169,7 +178,7 @@ def our_search(algorithm: str, pairs: int, generations: int, whole: bool) -> dic
     return {
         "env_steps_per_second": float(counted["env_steps"].iloc[-1] - history["env_steps"].iloc[9]) / taken,
         "ms_per_generation": 1000 * taken / generations,
-        "settings": f"{pairs} pairs, {generations} generations, {cores()} workers",
+        "settings": f"{sizes}, {generations} generations, {cores()} workers",
     }
 
 

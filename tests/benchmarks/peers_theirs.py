@@ -8,6 +8,7 @@ each program has its own environment.
 
 from __future__ import annotations
 
+import functools
 import importlib
 import json
 import sys
@@ -97,17 +98,49 @@ def qdax_me_es(pairs: int, generations: int, cells: Sequence[int]) -> dict[str, 
         jax.random.split(jax.random.PRNGKey(1), 1), jnp.zeros(environment.observation_size)
     )
     centroids = compute_euclidean_centroids(tuple(cells), -1.0, 1.0)
-    carry = search.init(first, centroids, jax.random.PRNGKey(2))
-    loop = jax.jit(lambda carry: jax.lax.scan(search.scan_update, carry, (), length=generations)[0])
-    carry = jax.block_until_ready(loop(carry))
-    start = time.perf_counter()
-    jax.block_until_ready(loop(carry))
-    taken = time.perf_counter() - start
+    taken = _loop_seconds(search, search.init(first, centroids, jax.random.PRNGKey(2)), generations)
     return {
         "env_steps_per_second": generations * (2 * pairs + 1) * steps / taken,
         "ms_per_generation": 1000 * taken / generations,
         "settings": f"{2 * pairs} samples, {generations} generations",
     }
+
+
+def qdax_map_elites(batch: int, generations: int, cells: Sequence[int]) -> dict[str, Any]:
+    """Milliseconds per generation of MAP-Elites with iso+line variation on PointMaze, likewise."""
+    import jax
+    import jax.numpy as jnp
+    from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroids
+    from qdax.core.emitters.mutation_operators import isoline_variation
+    from qdax.core.emitters.standard_emitters import MixingEmitter
+    from qdax.core.map_elites import MAPElites
+
+    steps = 200
+    environment, network, score = _qdax_task("pointmaze", steps, 64)
+    vary = functools.partial(isoline_variation, iso_sigma=0.005, line_sigma=0.05)
+    emitter = MixingEmitter(lambda policies, key: (policies, key), vary, variation_percentage=1.0, batch_size=batch)
+    search = MAPElites(score, emitter, lambda repertoire: {"best": repertoire.fitnesses.max()})
+    first = jax.vmap(network.init, in_axes=(0, None))(
+        jax.random.split(jax.random.PRNGKey(1), batch), jnp.zeros(environment.observation_size)
+    )
+    centroids = compute_euclidean_centroids(tuple(cells), -1.0, 1.0)
+    taken = _loop_seconds(search, search.init(first, centroids, jax.random.PRNGKey(2)), generations)
+    return {
+        "env_steps_per_second": generations * batch * steps / taken,
+        "ms_per_generation": 1000 * taken / generations,
+        "settings": f"batch {batch}, {generations} generations",
+    }
+
+
+def _loop_seconds(search: Any, carry: Any, generations: int) -> float:
+    """Seconds of a compiled loop of generations, after one of as many that does not count."""
+    import jax
+
+    loop = jax.jit(lambda carry: jax.lax.scan(search.scan_update, carry, (), length=generations)[0])
+    carry = jax.block_until_ready(loop(carry))
+    start = time.perf_counter()
+    jax.block_until_ready(loop(carry))
+    return time.perf_counter() - start
 
 
 def mujoco_ant(integrator: str, cores: int, batch: int, control_steps: int, seconds: float) -> dict[str, Any]:
@@ -209,6 +242,7 @@ def evosax_es(pairs: int, parameters: int, generations: int) -> dict[str, Any]:
 KINDS: Mapping[str, Callable[..., dict[str, Any]]] = {
     "qdax rollouts": qdax_rollouts,
     "qdax me_es": qdax_me_es,
+    "qdax map_elites": qdax_map_elites,
     "mujoco ant": mujoco_ant,
     "gymnasium steps": gymnasium_steps,
     "envpool steps": envpool_steps,
