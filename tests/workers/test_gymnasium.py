@@ -90,6 +90,32 @@ def test_episodes_are_those_of_a_loop_by_hand(name):
             np.testing.assert_allclose(found.fitness[episode], total, rtol=1e-5)
 
 
+@pytest.mark.usefixtures("one_process")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "CartPole-v1",
+        *(
+            pytest.param(name, marks=pytest.mark.long)
+            for name in ("Acrobot-v1", "Pendulum-v1", "MountainCar-v0", "MountainCarContinuous-v0")
+        ),
+    ],
+)
+def test_classic_environments_are_searched(name, tmp_path):
+    run = api.run(config_of(f"gymnasium:{name}", episode_steps=50), tmp_path / "run").run
+    assert np.isfinite(run.history.best_fitness).all()
+    assert run.history.invalid_members.sum() == 0
+    found = run.policy("best")(np.zeros(run.policy_spec.widths[0]))
+    assert found.shape == (CLASSIC[name][1],)
+
+
+def test_an_episode_of_a_vector_entry_point_depends_on_how_many_are_beside_it():
+    """The reason why the rollout does not use it; if this changes, it could."""
+    first = [gymnasium.make_vec("CartPole-v1", num_envs=count).reset(seed=3)[0][0] for count in (2, 3)]
+    assert gymnasium.spec("CartPole-v1").vector_entry_point is not None
+    assert not np.array_equal(*first)
+
+
 @pytest.mark.parametrize(
     ("descriptor", "names", "bounds"),
     [

@@ -8,6 +8,11 @@ among which the policy chooses. `task.options` are keyword arguments of `gymnasi
 An episode ends where the environment says that it is terminated or truncated, or after `task.episode_steps`; the time
 limit that Gymnasium adds is left out, and its number of steps is the default. The checks that Gymnasium adds to each
 step are left out, too.
+
+A vector entry point of the registration is not used: `VectorEnv.reset` takes one seed for all environments (or, in
+some, one for each), those of Gymnasium draw the resets of all from one generator, and episodes that end are reset on
+their own at the next step. So an episode would depend on the others of its batch, and no attribute tells whether it
+does.
 """
 
 from __future__ import annotations
