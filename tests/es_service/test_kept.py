@@ -118,7 +118,7 @@ def test_the_map_is_the_top_layer_in_the_order_of_filling():
 )
 def test_policies_are_drawn_by_rank_without_replacement(draw, weights):
     kept = kept_of((5, 3.5), (4, 3.5), (3, 3.5), (1, 8.0), depth=3)
-    rng, trials, weights = np.random.default_rng(0), 1500, np.array(weights)
+    rng, trials, weights = np.random.default_rng(0), 800, np.array(weights)
     share = weights / weights.sum()
     pairs = np.zeros((4, 4))
     for _ in range(trials):

@@ -55,6 +55,8 @@ CHANGES = {
     "memes, elites measured again": {"search": {"algorithm": "memes", "elites": {"kind": "eme"}}},
 }
 """Name -> settings of a run that are none of a method's own."""
+LONG = ("memes, elites measured again",)
+"""Those that only `make long` runs."""
 KILLS = ("before_begin", "mid_transaction", "before_commit", "after_commit")
 KEPT_PARENTS = 6
 """Parents of policies that a worker keeps: far fewer than it needs."""
@@ -145,7 +147,11 @@ class Shuffling(Engine[FaultyWorkers]):
         return [results[i] for i in range(len(work))]
 
 
-@pytest.fixture(scope="module", params=[*ALGORITHMS, *CHANGES])
+def named(name: str) -> object:
+    return pytest.param(name, marks=pytest.mark.long) if name in LONG else name
+
+
+@pytest.fixture(scope="module", params=[named(name) for name in (*ALGORITHMS, *CHANGES)])
 def whole(request, tmp_path_factory, workers_here):
     """(name, finished run on one worker that nobody disturbs, folders as a kill at each commit would leave them)."""
     folder, kills, committed = tmp_path_factory.mktemp("whole"), [], -1
