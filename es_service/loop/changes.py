@@ -154,7 +154,9 @@ def _malformed(search: SearchState, earlier: SearchState | None) -> str:
         return wrong
     if earlier is not None and (search.map is None) != (earlier.map is None):
         return "the behaviour map was added or removed, which only `map.enabled` decides"
-    if (earlier is None or search.own is not earlier.own) and (wrong := state_parts.problem(search.own)):
+    if (earlier is None or search.own is not earlier.own) and (
+        wrong := state_parts.problem(search.own, earlier.own if earlier is not None else {})
+    ):
         return wrong
     map_before = earlier.map if earlier is not None else None
     return _malformed_map(search.map, map_before) if search.map is not None and search.map is not map_before else ""

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -113,8 +114,12 @@ class ByCell:
 Named = Whole | Appended | ByCell
 
 
-def problem(own: Mapping[str, Any]) -> str:
-    """Why values cannot be stored; empty if they can."""
+def problem(own: Mapping[str, Any], before: Mapping[str, Any] = MappingProxyType({})) -> str:
+    """Why values cannot be stored; empty if they can.
+
+    Args:
+        before: values that can be; entries of `ByCell` that are the same objects are not looked at again.
+    """
     for name, value in own.items():
         what = f"its own value {name!r}"
         if not isinstance(value, Named):
@@ -125,9 +130,12 @@ def problem(own: Mapping[str, Any]) -> str:
             continue
         if not name.isidentifier():
             return f"the name of {what} is no Python identifier"
-        if isinstance(value, ByCell) and not all(isinstance(cell, int) and cell >= 0 for cell in value.entries):
+        entries, then = value.entries if isinstance(value, ByCell) else {}, before.get(name)
+        known = then.entries if isinstance(then, ByCell) else {}
+        new = {cell: arrays for cell, arrays in entries.items() if known.get(cell) is not arrays}
+        if not all(isinstance(cell, int) and cell >= 0 for cell in new):
             return f"{what} has cells that are no whole numbers from 0 on"
-        every = value.entries.values() if isinstance(value, ByCell) else [value.arrays]
+        every = new.values() if isinstance(value, ByCell) else [value.arrays]
         wrong = [one for arrays in every for one in arrays.values() if not _is_array(one)]
         if wrong:
             return f"{what} has {_kind(wrong[0])} where a NumPy array of bools or numbers must be"
