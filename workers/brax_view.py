@@ -53,6 +53,7 @@ class TaskBraxEnv(Env):
         chosen = dict(task_options or {})
         self.task: TaskSpec = task_named(task, chosen)
         options = {name: option.default for name, option in self.task.options.items()} | chosen
+        self._backend = str(options.get("backend", "spring"))
         self._functions = lane_functions(make_environment(task, options))
 
     def reset(self, rng: jax.Array) -> State:
@@ -85,8 +86,8 @@ class TaskBraxEnv(Env):
 
     @property
     def backend(self) -> str:
-        """The physics of the shipped tasks; those of a task of Brax are its option `backend`."""
-        return "spring"
+        """The option `backend` of a task of Brax; of others the physics of the shipped ants."""
+        return self._backend
 
     def _info(self, seen: Seen) -> dict[str, Any]:
         distance = {"goal_distance": seen.goal_distance} if self.task.has_goal else {}

@@ -17,6 +17,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
 import jax
 import numpy as np
 
@@ -30,6 +31,8 @@ CHUNK_STEPS = 16_384
 """Environment steps between looks at the budget."""
 CHECKPOINT_S = 600.0
 """CPU seconds between checkpoints."""
+OF_THE_PROCESS = ("env", "replay_buffer", "_logger", "_custom_logger", "_vec_normalize_env")
+"""Attributes of a learner that a checkpoint has by itself, or that each process makes anew."""
 NEWEST = "newest"
 """File with the name of the folder of the newest checkpoint."""
 
@@ -63,15 +66,14 @@ class Run:
         """Environment steps of all sessions."""
         return self.learner.num_timesteps
 
-    def work(self, steps: int, seconds: float, chunk: int = CHUNK_STEPS) -> bool:
-        """Learn until a budget is spent, with checkpoints; returns whether it is."""
+    def work(self, steps: int, seconds: float, chunk: int = CHUNK_STEPS) -> None:
+        """Learn until one of the budgets is spent, with checkpoints."""
         kept = self.cpu_seconds
         while self.steps < steps and self.cpu_seconds < seconds:
             self.learner.learn(min(chunk, steps - self.steps), reset_num_timesteps=self.steps == 0)
             if self.cpu_seconds - kept > CHECKPOINT_S:
                 self.keep()
                 kept = self.cpu_seconds
-        return True
 
     def keep(self) -> None:
         """Store a checkpoint; the one before stays until this one is whole."""
@@ -79,7 +81,8 @@ class Run:
         new = self.folder / name
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir()
-        self.learner.save(new / "learner.zip")
+        learnt = {name: value for name, value in vars(self.learner).items() if name not in OF_THE_PROCESS}
+        (new / "learner.pkl").write_bytes(cloudpickle.dumps(learnt))  # its own `save` leaves out the state of its keys
         self.learner.save_replay_buffer(new / "buffer.pkl")
         rest = {
             "environments": self._envs.environments.get_state(),
@@ -96,7 +99,7 @@ class Run:
                 shutil.rmtree(old)
 
     def _restore(self, kept: Path) -> None:
-        self.learner = type(self.learner).load(kept / "learner.zip", env=self.learner.env, force_reset=False)
+        vars(self.learner).update(pickle.loads((kept / "learner.pkl").read_bytes()))
         self.learner.load_replay_buffer(kept / "buffer.pkl")
         rest = pickle.loads((kept / "rest.pkl").read_bytes())
         self._envs.environments.set_state(rest["environments"])
