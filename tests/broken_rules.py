@@ -580,6 +580,66 @@ CASES = [
         ),
         ("traces", RESULTS, "np.asarray(episodes.trace_T_B)[first].copy()", "np.asarray(episodes.trace_T_B)[first]"),
     ),
+    *cases(
+        "an environment of another library",
+        "tests/es_service/test_xla_environments.py",
+        (
+            "is another one in the second process",
+            "workers/lanes/blocks.py",
+            "child.ask((kind, lane_M[low:high] - start, given_M[low:high]))",
+            "child.ask((kind, lane_M[low:high] - start - (start > 0), given_M[low:high]))",
+        ),
+    ),
+    *cases(
+        "an environment of another library",
+        "tests/es_service/test_environments.py::test_many_are_as_many_single_ones_in_each_mode",
+        (
+            "counts its episodes for all",
+            "workers/lanes/__init__.py",
+            "self.episode_N[lane_M] += 1",
+            "self.episode_N += 1",
+        ),
+    ),
+    *cases(
+        "an environment of another library",
+        "tests/es_service/test_environments.py::test_observations_are_new_arrays_unless_one_is_asked_for_that_is_reused",
+        (
+            "returns an array that it goes on writing",
+            "es_service/environments/vector.py",
+            "return self._observation_N_O.copy() if self._copies else self._observation_N_O",
+            "return self._observation_N_O",
+        ),
+    ),
+    *cases(
+        "an environment of another library",
+        "tests/es_service/test_environments.py::test_pictures_show_where_an_environment_is_and_the_way_of_its_episode",
+        (
+            "draws the way of earlier episodes",
+            "es_service/environments/drawing.py",
+            "self._ways[lane] = [place.copy()]",
+            "self._ways[lane].append(place.copy())",
+        ),
+    ),
+    *cases(
+        "an environment of another library",
+        "tests/es_service/test_brax_env.py::test_each_episode_has_a_start_of_its_own_that_depends_on_the_key_alone",
+        (
+            "begins where it began before",
+            "workers/brax_view.py",
+            "begun = (start.pipeline_state, start.obs, later)",
+            "begun = (start.pipeline_state, start.obs, keys)",
+        ),
+    ),
+    *cases(
+        "an environment of another library",
+        "tests/es_service/test_baselines.py",
+        (
+            "is certified in other episodes",
+            "tests/benchmarks/baselines/episodes.py",
+            "seed, OTHER_PROGRAMS + number, np.arange(count), 0, 0,",
+            "seed, OTHER_PROGRAMS + number, np.arange(count), 1, 0,",
+        ),
+    ),
 ]
 
 if __name__ == "__main__":
