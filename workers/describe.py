@@ -18,7 +18,7 @@ from typing import Any
 
 from es_service.protocol.messages import TaskSpec
 from workers.environments import TaskError, describe_environment
-from workers.host.repeats import tried
+from workers.host.repeats import tried_apart
 from workers.rollouts import BACKENDS
 
 
@@ -32,8 +32,6 @@ def described(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> 
         TaskError: the task does not exist or cannot be used.
     """
     task = describe_environment(name, settings)
-    if task.kind == "python":
-        task = dataclasses.replace(task, does_not_repeat=tried(task))
     able = {name: one for name, one in BACKENDS.items() if task.kind in one.task_kinds}
     reasons = {name: why for name, one in able.items() if (why := one.examine(task))}
     return dataclasses.replace(task, unsupported=reasons)
@@ -42,7 +40,10 @@ def described(name: str, settings: Mapping[str, Any] = MappingProxyType({})) -> 
 def main(name: str, settings: str = "{}") -> None:
     """Print the description of a task, or the problem with it, as JSON."""
     try:
-        answer = {"task": dataclasses.asdict(described(name, json.loads(settings)))}
+        task = described(name, json.loads(settings))
+        if task.kind == "python":
+            task = dataclasses.replace(task, does_not_repeat=tried_apart(task))
+        answer = {"task": dataclasses.asdict(task)}
     except TaskError as error:
         answer = {"problem": str(error)}
     print(json.dumps(answer))

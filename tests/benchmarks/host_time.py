@@ -32,7 +32,7 @@ from workers.worker import make_worker
 
 NAME, LANES = "gymnasium:Ant-v5", 16
 OPTIONS = {"terminate_when_unhealthy": False}
-SLEEP_S, NODES, CORES, CALLS = 0.1, 4, 16, 640
+SLEEP_S = 0.1
 
 
 def sleeper(parameters):
@@ -51,11 +51,14 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--generations", type=int, default=5)
+    parser.add_argument("--nodes", type=int, default=4)
+    parser.add_argument("--cores", type=int, default=16, help="declared cores of each node")
+    parser.add_argument("--calls", type=int, default=640, help="calls of a generation")
     given = parser.parse_args()
     if given.what == "ant":
         ant(given.rounds, given.steps)
     else:
-        sleep(given.generations)
+        sleep(given.generations, given.nodes, given.cores, given.calls)
 
 
 def ant(rounds: int, steps: int) -> None:
@@ -129,7 +132,7 @@ def _mujoco(steps: int) -> Callable[[], object]:
     return lambda: rollout.rollout(model, data, state, control)
 
 
-def sleep(generations: int) -> None:
+def sleep(generations: int, nodes: int, cores: int, calls: int) -> None:
     """Print the table of `sleep`."""
     from tests.system.cluster import ROOT, Cluster
 
@@ -137,14 +140,14 @@ def sleep(generations: int) -> None:
         file, run = Path(place, "config.yaml"), Path(place, "run")
         config = {
             "task": {"environment": "function:tests.benchmarks.host_time:sleeper"},
-            "search": {"algorithm": "map_elites", "batch": CALLS, "iso_sigma": 0.1},
+            "search": {"algorithm": "map_elites", "batch": calls, "iso_sigma": 0.1},
             "budget": {"generations": generations},
             "compute": {"engine": "ray", "no_worker_timeout_s": 600.0, "first_chunk_timeout_s": 600.0},
         }
         file.write_text(yaml.safe_dump(config))
         with Cluster(Path(place)) as hosts:
-            for number in range(NODES):
-                hosts.start(f"node{number}", CORES)
+            for number in range(nodes):
+                hosts.start(f"node{number}", cores)
             program = [
                 Path(sys.executable).parent / "es-service",
                 "run",
@@ -159,9 +162,9 @@ def sleep(generations: int) -> None:
                 raise SystemExit(printed)
         history = open_run(run).history
         seconds = history.seconds_rollout.iloc[1:]
-        print("| generation | seconds of 640 calls | share of 64 times one |\n| --- | --- | --- |")
+        print(f"| generation | seconds of {calls} calls | share of {nodes * cores} times one |\n| --- | --- | --- |")
         for generation, one in seconds.items():
-            print(f"| {generation} | {one:.2f} | {CALLS * SLEEP_S / (NODES * CORES) / one:.0%} |")
+            print(f"| {generation} | {one:.2f} | {calls * SLEEP_S / (nodes * cores) / one:.0%} |")
         print(f"workers: {history.workers.iloc[-1]}")
 
 

@@ -188,6 +188,8 @@ class Cluster(Hosts):
 
     settings: Mapping[str, str] = RAY_SETTINGS
     """Environment variables of every process."""
+    patience_s = 60.0
+    """Longest time in which a node starts."""
 
     @property
     def address(self) -> str:
@@ -210,7 +212,7 @@ class Cluster(Hosts):
         return next(pid for pid, command in self.processes(node).items() if "WorkerActor" in command)
 
     def _wait_until_joined(self, node: str) -> None:
-        until = time.monotonic() + 60
+        until = time.monotonic() + self.patience_s
         while "Ray runtime started" not in (self.log_folder / f"{node}.log").read_text():
             assert time.monotonic() < until, (self.log_folder / f"{node}.log").read_text()
             time.sleep(0.1)

@@ -103,7 +103,7 @@ def test_a_simulator_that_fails_once_on_a_cluster_of_hosts_changes_no_bit(tmp_pa
 
         def session(generations, *command):
             limits = ["--set", f"budget.generations={generations}", "--address", hosts.address]
-            code, printed = hosts.run("head", PROGRAM, *command, *limits, timeout=240.0, HOST_FAULT=str(fault))
+            code, printed = hosts.run("head", PROGRAM, *command, *limits, timeout=600.0, HOST_FAULT=str(fault))
             assert code == 0, printed
             return printed
 
@@ -129,7 +129,7 @@ def test_a_simulator_that_always_fails_on_a_cluster_ends_with_its_seed(tmp_path)
     with Cluster(tmp_path) as hosts:
         hosts.start("a", 2)
         code, printed = hosts.run(
-            "head", PROGRAM, "run", file, "--out", tmp_path / "run", "--address", hosts.address, timeout=240.0
+            "head", PROGRAM, "run", file, "--out", tmp_path / "run", "--address", hosts.address, timeout=600.0
         )
     assert code == 1
     assert "ValueError: the fifth step cannot be done" in printed

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -75,10 +76,10 @@ class Drift:
 
 
 class Slow(Drift):
-    """A drift whose first later step in a worker that finds a file with this process's kind of fault has that fault."""
+    """A drift whose first step in a worker that finds a file with this process's kind of fault has that fault."""
 
     def step(self, action):
-        if self.steps < 12:  # whoever describes the task does fewer
+        if sys.argv[0].endswith("describe.py"):  # a task is described before there are workers
             return super().step(action)
         fault = Path(os.environ["HOST_FAULT"])
         try:

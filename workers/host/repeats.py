@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
+import select
+import signal
 import time
-from multiprocessing.connection import Connection
+from contextlib import suppress
 
 import numpy as np
 
@@ -18,35 +19,35 @@ STEPS = 60
 """Most steps of an episode that is tried."""
 LONGEST_S = 0.5
 """Time after which a trial does no further step, so that a slow simulator is described soon."""
-WAIT_S = 5.0
-"""Longest wait for the whole trial."""
+APART_S = 20.0
+"""Longest time of a whole trial in a process of its own."""
 SEED, OTHER_SEED = 1, 2
 
 
-def tried(task: TaskSpec) -> str:
-    """`does_not_repeat` in a process of its own; empty as well if that ends, raises or hangs, as a simulator may.
+def tried_apart(task: TaskSpec) -> str:
+    """`does_not_repeat` in a copy of this process, which a simulator may end or make wait; empty if nothing was found.
 
-    What is wrong then is told where episodes are run.
+    For a process with one thread. Whatever the simulator prints goes to stderr.
     """
-    processes = multiprocessing.get_context("fork")  # of a process that has imported no JAX and has no threads
-    here, there = processes.Pipe(duplex=False)
-    child = processes.Process(target=_tell, args=(there, task))
-    child.start()
-    there.close()
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.setsid()  # so that processes that the simulator starts end with it
+            os.dup2(2, 1)
+            os.write(write, does_not_repeat(task).encode())
+        finally:
+            os._exit(0)
+    os.close(write)
     try:
-        return here.recv() if here.poll(WAIT_S) else ""
-    except EOFError:
-        return ""
+        ready, _, _ = select.select([read], [], [], APART_S)
+        return os.read(read, 1000).decode() if ready else ""
     finally:
-        child.kill()
-        child.join()
-
-
-def _tell(there: Connection, task: TaskSpec) -> None:
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for output in (1, 2):  # what a simulator prints is not the description
-        os.dup2(nowhere, output)
-    there.send(does_not_repeat(task))
+        os.close(read)
+        with suppress(ProcessLookupError):  # it may not have begun its session yet, so both
+            os.killpg(child, signal.SIGKILL)
+        os.kill(child, signal.SIGKILL)  # it has not been waited for, so that the number is its own
+        os.waitpid(child, 0)
 
 
 def does_not_repeat(task: TaskSpec) -> str:
