@@ -76,7 +76,7 @@ _MAP = (
     Column("map_cells", "INTEGER", True, "filled cells of the map after this generation"),
     Column("coverage", "REAL", True, "filled cells as a fraction of all"),
     Column("coverage_reachable", "REAL", True, "the same of the cells that can be reached, where the task knows them"),
-    Column("map_fitness_max", "REAL", True, "highest fitness of an elite, as it was when it entered"),
+    Column("map_fitness_max", "REAL", True, "highest fitness of an elite, as it entered or as all its samples say"),
     Column("qd_score", "REAL", True, "sum over elites of fitness less map.qd_offset"),
 )
 _CORRECTED = (

@@ -2,8 +2,8 @@
 
 An elite is the evaluated centre or policy with the highest fitness among all whose descriptor is in a cell. Its
 parameters, its observation statistics and the trace of one of its episodes are in the run store, from which they are
-read when they are needed; they follow an entry that moves to another cell, and leave with it. Shipped searches only
-insert; a search that measures its elites again may also change, move and remove entries. All functions are pure.
+read when they are needed; they follow an entry that moves to another cell, and leave with it. Most searches only
+insert; one that measures its elites again may also change, move and remove entries. All functions are pure.
 
 Axes: N filled cells, in the order in which they were filled; B descriptor dimensions; D policy parameters; O
 observation; T points of a trace.
@@ -234,7 +234,7 @@ def unchanged_entries(map_: BehaviourMap, before: BehaviourMap) -> NDArray[np.bo
 def rows_in(map_: BehaviourMap, other: BehaviourMap) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Whether each cell is filled in another map, [N], and the index of its entry there, [N] (0 if it is not)."""
     first, row_N = min(map_.size, other.size), np.arange(map_.size)
-    if np.array_equal(map_.cell_N[:first], other.cell_N[:first]):  # no entry has left, as in shipped searches
+    if np.array_equal(map_.cell_N[:first], other.cell_N[:first]):  # no entry has left, as in most searches
         return row_N < first, np.where(row_N < first, row_N, 0)
     sorted_rows = np.argsort(other.cell_N)
     found_N = np.searchsorted(other.cell_N, map_.cell_N, sorter=sorted_rows)
