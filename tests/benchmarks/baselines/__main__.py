@@ -52,6 +52,7 @@ def main() -> None:
                     "folder": str((given.folder / name).absolute()),
                     "steps": given.steps,
                     "cpu_seconds": given.cpu_seconds,
+                    "parent": os.getpid(),
                 }
                 command = [python_of(given.environment), "-m", "tests.benchmarks.baselines.learn", json.dumps(request)]
                 done = subprocess.run(

@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.baselines.learn '{"task": "ant_trap", "system": "sac", "seed": 0, "folder": ..., ...}'
 
-It goes on from the folder's checkpoint if there is one, certifies the policy that it has at the end, and prints its row
-as one line of JSON. The policy is the newest one: nothing is selected.
+It ends with the process that started it. It goes on from the folder's checkpoint if there is one, certifies the policy
+that it has at the end, and prints its row as one line of JSON. The policy is the newest one: nothing is selected.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import jax
 import numpy as np
 
 from es_service.protocol.machine import cpu_kind
+from es_service.protocol.parent import end_with
 from es_service.runs.certification import EPISODES
 from tests.benchmarks.baselines.episodes import certification_episodes
 from tests.benchmarks.baselines.systems import BUFFER, SIZES, SYSTEMS, made
@@ -139,6 +140,7 @@ class Run:
 
 def main() -> None:
     asked = json.loads(sys.argv[1])
+    end_with(asked.pop("parent"))
     steps, seconds = asked.pop("steps"), asked.pop("cpu_seconds")
     run = Run(**asked | {"folder": Path(asked["folder"])})
     before = run.steps
