@@ -147,6 +147,7 @@ def _generation(
     clock.lap("seconds_driver")
     evaluations = evaluate(search, evaluator, proposal, clock)
     updated = update(search, evaluator, proposal, evaluations, clock)
+    clock.lap("seconds_driver")
     correction = correct(search, evaluator, store, state, updated)
     clock.lap("seconds_evaluation")
     faults = fault_columns(evaluator.counts, since=since)
