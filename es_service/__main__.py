@@ -10,13 +10,18 @@ import contextlib
 import os
 import signal
 import sys
+from typing import TYPE_CHECKING
 
 from es_service.errors import Interrupted
 from es_service.runs.signals import interrupt
 
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
+
 
 def main() -> None:
     """Run the command line; SIGINT and SIGTERM at any moment end it with exit code 128 + n."""
+    sys.unraisablehook = report_ignored
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, interrupt)
     try:
@@ -29,6 +34,13 @@ def main() -> None:
             with contextlib.suppress(OSError):
                 stream.flush()
         os._exit(128 + stop.signal_number)
+
+
+def report_ignored(ignored: UnraisableHookArgs) -> None:
+    """Hook for exceptions that Python ignores, as in a callback of its imports: an interruption is not reported,
+    because `interrupt` has kept it and the program ends by it."""
+    if not isinstance(ignored.exc_value, Interrupted):
+        sys.__unraisablehook__(ignored)
 
 
 if __name__ == "__main__":

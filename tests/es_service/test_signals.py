@@ -26,6 +26,17 @@ with signals.stop_on_signals() as should_stop, Live("busy"):
     os.kill(os.getpid(), signal.SIGINT)
     time.sleep(60)
 """
+IGNORED = """
+import os, signal, sys, weakref
+from es_service.__main__ import report_ignored
+from es_service.runs.signals import interrupt
+sys.unraisablehook = report_ignored
+signal.signal(signal.SIGTERM, interrupt)
+held = {{1}}
+watched = weakref.ref(held, lambda reference: {does})
+del held
+print("went on")
+"""
 
 
 def test_a_signal_that_was_caught_and_forgotten_stops_whatever_begins_next(monkeypatch):
@@ -36,6 +47,14 @@ def test_a_signal_that_was_caught_and_forgotten_stops_whatever_begins_next(monke
         signals.interrupt(signal.SIGTERM, None)
     with signals.stop_on_signals() as should_stop:
         assert should_stop() == signal.SIGTERM
+
+
+@pytest.mark.parametrize(("does", "reported"), [("os.kill(os.getpid(), signal.SIGTERM)", False), ("1 / 0", True)])
+def test_only_an_interruption_that_python_ignored_is_not_reported(does, reported):
+    program = IGNORED.format(does=does)
+    ended = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stdout) == (0, "went on\n")
+    assert ("Traceback" in ended.stderr) == reported
 
 
 def test_a_second_signal_leaves_the_terminal_with_its_cursor():
