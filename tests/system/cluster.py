@@ -188,7 +188,7 @@ class Cluster(Hosts):
 
     settings: Mapping[str, str] = RAY_SETTINGS
     """Environment variables of every process."""
-    patience_s = 60.0
+    patience_s = 180.0
     """Longest time in which a node starts."""
 
     @property

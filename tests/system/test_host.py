@@ -75,7 +75,7 @@ def test_workers_of_ray_have_the_bits_of_this_process(workers, tmp_path, referen
 
 
 FAULTS = {
-    "hang": r"lost a worker; .* within 4 s of computing \(task.time_limit_s\)",
+    "hang": r"lost a worker; .* within 30 s of computing \(task.time_limit_s\)",
     "exit": "lost a worker; ",
     "leak": "lost a worker; .*its node ran out of memory",
     "it raises this once": "",
@@ -87,8 +87,9 @@ FAULTS = {
 @pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))
 @pytest.mark.parametrize("cores", [1, 2])
 def test_a_simulator_that_fails_once_on_a_cluster_of_hosts_changes_no_bit(tmp_path, cores):
-    """It hangs, ends its process, takes all the memory that it may have, and raises, one after another in one run."""
-    config = HOST | {"task": {"environment": f"python:{MODULE}:Slow", "time_limit_s": 4.0}, "map": {"cells": [16]}}
+    """It hangs, ends its process, takes all the memory that it may have, and raises, one after another in one run. The
+    time limit is that of the hang; to take 3 GiB may need ten seconds on a busy machine."""
+    config = HOST | {"task": {"environment": f"python:{MODULE}:Slow", "time_limit_s": 30.0}, "map": {"cells": [16]}}
     undisturbed = tmp_path / "undisturbed"
     with workers_in_this_process(), pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOST_FAULT", str(tmp_path / "none"))
