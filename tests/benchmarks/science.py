@@ -6,10 +6,10 @@
         --set search.sigma=0.1                         # a trial: printed only
 
 Of runs with the usual seeds, settings and one of the two lengths each finished one becomes a line of
-results/NAME_runs.jsonl.gz, NAME as in RECORDED, and a row of results/NAME.csv; those that have one are not repeated
-(delete the file to begin again), those that were interrupted go on where they were. In the end results/NAME.png is
-drawn. One run per core, in one process: nothing is sent, which changes no result and saves a quarter of the time
-(`--engine` runs them as everybody does).
+runs/science/NAME_runs.jsonl.gz, NAME as in RECORDED, and a row of results/NAME.csv; those that have a line are not
+repeated, those that were interrupted go on where they were. In the end runs/science/NAME.png is drawn. One run
+per core, in one process: nothing is sent, which changes no result and saves a quarter of the time (`--engine` runs them
+as everybody does).
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def main() -> None:
     arguments = parser.parse_args()
     name = RECORDED.get(arguments.env_steps)
     trial = bool(arguments.set) or name is None or not set(arguments.seeds) <= set(SEEDS)
-    kept = RESULTS / f"{name}_runs.jsonl.gz"
+    kept = RUNS / f"{name}_runs.jsonl.gz"
     known = set() if trial else {(one["row"]["method"], one["row"]["seed"]) for one in kept_runs(kept)}
     RUNS.mkdir(parents=True, exist_ok=True)
     if not arguments.engine:
@@ -235,7 +235,7 @@ def main() -> None:
     print(quartiles(table_of(found)).to_string())
     if not trial:
         table_of(found).to_csv(RESULTS / f"{name}.csv", index=False, lineterminator="\n")
-        science_picture.draw(found, RESULTS / f"{name}.png")
+        science_picture.draw(found, RUNS / f"{name}.png")
 
 
 if __name__ == "__main__":
