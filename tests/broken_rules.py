@@ -503,8 +503,8 @@ CASES = [
         (
             "are forgotten while they are needed",
             KEPT_PARENTS,
-            "if self._bytes <= self._most_bytes or name in wanted:",
-            "if self._bytes <= self._most_bytes:",
+            "self.forget_oldest(self._most_bytes, spared=wanted)",
+            "self.forget_oldest(self._most_bytes)",
         ),
         (
             "are made before what they are made of",

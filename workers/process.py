@@ -14,8 +14,9 @@ import traceback
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
+from es_service.protocol.kept import Kept
 from es_service.protocol.kept_parents import LackingError
-from es_service.protocol.kept_subjects import KeptSubjects
+from es_service.protocol.kept_subjects import forget_old_subjects
 from es_service.protocol.messages import Subject, WorkerSpec
 from es_service.protocol.parent import end_with
 from es_service.protocol.raised import RaisedError, raised
@@ -96,7 +97,7 @@ def _serve(parent: socket.socket, run_chunks: Compilable | RaisedError, spec: Wo
         parent.sendall(framed(("broken", run_chunks)))
         return
     parent.sendall(framed(("up",)))
-    subjects: KeptSubjects[Subject] = KeptSubjects(attrgetter("nbytes"))
+    subjects: Kept[int, Subject] = Kept(attrgetter("nbytes"))
     parents = Parents(spec.parent_cache_bytes, BACKENDS[spec.rollout].made)
     compiled: set[str] = set()
     while True:
@@ -118,7 +119,7 @@ def _serve(parent: socket.socket, run_chunks: Compilable | RaisedError, spec: Wo
                 except BaseException as error:  # also sys.exit in an environment
                     answer = ("failure", item, attempt, raised(error, spec.environment))
                 parent.sendall(framed(answer))
-                subjects.forget_oldest()
+                forget_old_subjects(subjects)
 
 
 if __name__ == "__main__":

@@ -19,14 +19,16 @@ from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from itertools import count
 from typing import IO
 
 from es_service.dispatch.dispatch_log import Log, no_log
 from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
+from es_service.protocol.kept import Kept
 from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
-from es_service.protocol.kept_subjects import KeptSubjects
+from es_service.protocol.kept_subjects import MadeOnce, forget_old_subjects
 from es_service.protocol.messages import Subject, Work, WorkerSpec
 from es_service.protocol.parent import start_child
 from es_service.protocol.process_environment import child_environment
@@ -79,7 +81,7 @@ class _Worker:
     channel: Channel
     parents: KeptParents[int]
     """Sizes of the parents of policies that it keeps."""
-    subjects: KeptSubjects[int] = field(default_factory=lambda: KeptSubjects(int))
+    subjects: Kept[int, int] = field(default_factory=lambda: Kept(int))
     """Bytes of the subjects that it has, by their numbers."""
     unanswered: dict[tuple[Hashable, int], Sequence[Work]] = field(default_factory=dict)
     """Work items that it was sent and has not answered, by id and attempt."""
@@ -95,9 +97,7 @@ class ChildProcesses:
         self._by_descriptor: dict[int, int] = {}
         self._poll = select.poll()
         self._ready: deque[Message] = deque()
-        self._subjects: KeptSubjects[tuple[Subject, int, bytes]] = KeptSubjects(lambda entry: entry[0].nbytes)
-        """By `id`, which the subject in the entry keeps from being reused."""
-        self._next_subject = 0
+        self._subjects, self._numbers = MadeOnce(self._framed_subject), count()
 
     def process_ids(self) -> dict[int, int]:
         """Worker id -> process id, for the workers that are not known to be lost; for diagnosis and tests."""
@@ -136,15 +136,15 @@ class ChildProcesses:
             return  # lost with another thread of its child, which `receive` is going to report
         frames, numbered = [], []
         for subject, chunk in work:
-            number, frame = self._framed_subject(subject)
+            number, frame = self._subjects.of(subject)
             if number not in to.subjects:
                 to.subjects.add(number, subject.nbytes)
                 frames.append(frame)
             numbered.append((number, chunk))
         for name, given in parents_to_send(work, to.parents).items():
             frames.append(framed(("parents", {name: given})))
-        to.subjects.forget_oldest()
-        self._subjects.forget_oldest()
+        forget_old_subjects(to.subjects)
+        self._subjects.forget_old()
         to.unanswered[item_id, attempt] = work
         to.channel.send(*frames, framed(("chunks", item_id, attempt, numbered)))
         self._watch(to.channel)
@@ -184,13 +184,9 @@ class ChildProcesses:
             self.kill(worker)
 
     def _framed_subject(self, subject: Subject) -> tuple[int, bytes]:
-        """Number and message of a subject. One that was forgotten meanwhile gets another number."""
-        if (known := self._subjects.get(id(subject))) is None:
-            frame = framed(("subject", self._next_subject, as_sent(subject)))
-            known = subject, self._next_subject, frame
-            self._subjects.add(id(subject), known)
-            self._next_subject += 1
-        return known[1:]
+        """A new number for a subject, and the message with both."""
+        number = next(self._numbers)
+        return number, framed(("subject", number, as_sent(subject)))
 
     def _add(self, number: int, child: _Child, ours: socket.socket) -> None:
         self._workers[number] = _Worker(child, Channel(ours), KeptParents(self._parent_cache_bytes, int))

@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
-from es_service.protocol.kept_subjects import KEPT_BYTES, KeptSubjects
+from es_service.protocol.kept_subjects import KEPT_BYTES, MadeOnce
 from es_service.protocol.messages import FloatArray, Subject, Work
 from es_service.protocol.recipes import Origin
 
@@ -103,8 +103,7 @@ class Arguments:
 
     def __init__(self, ray: ModuleType) -> None:
         self._ray = ray
-        self._subjects: KeptSubjects[tuple[Subject, Any]] = KeptSubjects(lambda entry: entry[0].nbytes)
-        """By `id`, which the subject in the entry keeps from being reused."""
+        self._subjects = MadeOnce(self._packed)
         self._parents: KeptParents[_Stored] = KeptParents(KEPT_BYTES, attrgetter("nbytes"))
         """Large parents that are stored."""
 
@@ -115,10 +114,8 @@ class Arguments:
         Args:
             kept: see `parents_to_send`.
         """
-        subjects: dict[int, Any] = {}
-        for subject, _ in work:
-            if id(subject) not in subjects:
-                subjects[id(subject)] = self._packed(subject)
+        subjects = {id(subject): self._subjects.of(subject) for subject, _ in work}
+        self._subjects.forget_old()
         index = {key: number for number, key in enumerate(subjects)}
         chunks = pickle.dumps([(index[id(subject)], chunk) for subject, chunk in work], pickle.HIGHEST_PROTOCOL)
         return chunks, *subjects.values(), *self._packed_parents(parents_to_send(work, kept))
@@ -148,9 +145,5 @@ class Arguments:
 
     def _packed(self, subject: Subject) -> Any:
         """The subject, pickled, or the reference under which Ray has stored that."""
-        if (known := self._subjects.get(id(subject))) is None:
-            pickled = pickle.dumps(as_sent(subject), pickle.HIGHEST_PROTOCOL)
-            known = subject, pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)
-            self._subjects.add(id(subject), known)
-            self._subjects.forget_oldest()
-        return known[1]
+        pickled = pickle.dumps(as_sent(subject), pickle.HIGHEST_PROTOCOL)
+        return pickled if len(pickled) <= IN_CALL_BYTES else self._ray.put(pickled)

@@ -9,13 +9,14 @@ takes it to have nothing (`KeptParents.clear`) and sends the item again: that is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from es_service.protocol.kept import Kept
 from es_service.protocol.messages import Subject, Work
 from es_service.protocol.policies import Policies
 from es_service.protocol.recipes import Origin, Recipes, origin_of
@@ -28,7 +29,7 @@ class LackingError(Exception):
     """A worker lacks parents of policies that it must make."""
 
 
-class KeptParents(Mapping[bytes, Value], Generic[Value]):
+class KeptParents(Kept[bytes, Value]):
     """Parents by name, of which those are forgotten that were not needed for the longest time.
 
     What the worker has and its sender does not know of is always older than the rest, and so forgotten first.
@@ -40,40 +41,14 @@ class KeptParents(Mapping[bytes, Value], Generic[Value]):
         Args:
             most_bytes: limit of the sizes together. Parents that one work item needs are kept beyond it.
         """
-        self._kept: dict[bytes, Value] = {}
-        self._most_bytes, self._size_of, self._bytes = most_bytes, size_of, 0
-
-    def add(self, name: bytes, value: Value) -> None:
-        """Keep a parent, as the newest."""
-        if (old := self._kept.pop(name, None)) is not None:
-            self._bytes -= self._size_of(old)
-        self._kept[name] = value
-        self._bytes += self._size_of(value)
+        super().__init__(size_of)
+        self._most_bytes = most_bytes
 
     def needed(self, names: Iterable[bytes]) -> None:
         """Make the parents that a work item needs the newest, and forget the oldest others beyond the limit."""
         wanted = dict.fromkeys(names)
-        for name in wanted:
-            if name in self._kept:
-                self._kept[name] = self._kept.pop(name)
-        for name in list(self._kept):
-            if self._bytes <= self._most_bytes or name in wanted:
-                return
-            self._bytes -= self._size_of(self._kept.pop(name))
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._kept.clear()
-        self._bytes = 0
-
-    def __getitem__(self, name: bytes) -> Value:
-        return self._kept[name]
-
-    def __iter__(self) -> Iterator[bytes]:
-        return iter(self._kept)
-
-    def __len__(self) -> int:
-        return len(self._kept)
+        self.use(wanted)
+        self.forget_oldest(self._most_bytes, spared=wanted)
 
 
 LEAST_BYTES = 1 << 12

@@ -30,16 +30,15 @@ from es_service.search.algorithms import ALGORITHMS
 from es_service.store import reader
 from es_service.store.codec import (
     changed_sum,
-    encode_change,
-    listed,
-    part_sha256,
+    encode_changes,
     row_dict,
     row_values,
+    rows_listed,
     state_sha256,
     state_sum,
 )
-from es_service.store.kept import KeptRows, rows_in_force
 from es_service.store.lock import require_unlocked
+from es_service.store.rows import KeptRows, rows_in_force
 from es_service.store.tables import table_bytes
 
 
@@ -164,9 +163,7 @@ class _Comparison:
 
     def commit(self, generation: int, parts: Changes, history: HistoryRow, evaluations: Table) -> None:
         """Compare a generation. Raises _End after the last one, and after one that differs."""
-        payloads = {part: encode_change(arrays) for part, arrays in parts.items()}
-        sums = {part: part_sha256(part, generation, payload) for part, payload in payloads.items()}
-        new = {part: (generation, listed(sums[part], payload)) for part, payload in payloads.items()}
+        new = rows_listed(encode_changes(generation, parts))
         old = {part: self._in_force[part] for part in new if part in self._in_force}
         self._sum = changed_sum(self._sum, old, new)
         self._in_force |= new

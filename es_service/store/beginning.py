@@ -19,9 +19,10 @@ from es_service.store.codec import (
     Part,
     column_bytes,
     decode_part,
+    encode_changes,
     encode_part,
     history_row,
-    part_sha256,
+    rows_listed,
     state_sha256,
     state_sum,
     text_sha256,
@@ -59,10 +60,9 @@ def store_beginning(connection: sqlite3.Connection, meta: RunMeta, beginning: Be
     newest = beginning.newest
     connection.execute("BEGIN IMMEDIATE")
     in_force: dict[str, tuple[int, str]] = {}
-    for part, arrays in beginning.parts.items():
-        payload = encode_part(arrays)
-        in_force[part] = (newest, part_sha256(part, newest, payload))
-        row = (part, newest, in_force[part][1], payload)
+    for part, arrays in beginning.parts.items():  # one at a time, because all elites together may be large
+        [row] = rows = encode_changes(newest, {part: arrays})
+        in_force |= rows_listed(rows)
         connection.execute("INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)", row)
     names = [column.name for column in meta.columns]
     insert, heading = history_insert(meta.columns), column_bytes(meta.columns)

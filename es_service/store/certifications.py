@@ -81,12 +81,19 @@ def damaged_rows(connection: sqlite3.Connection) -> list[Key]:
     return [(number, rank) for number, rank, row in rows(connection) if row is None]
 
 
-def rows(connection: sqlite3.Connection) -> list[tuple[int, int, CertifiedRow | None]]:
+def rows(
+    connection: sqlite3.Connection, where: str = "", values: Sequence[Any] = ()
+) -> list[tuple[int, int, CertifiedRow | None]]:
     """Number, rank and content of all rows that were not removed, in the order of number and rank; None for the content
     of a damaged one."""
-    query = "SELECT number, rank, facts, payload, sha256 FROM certification ORDER BY number, rank"
-    found = connection.execute(query)
-    return [(row[0], row[1], _decoded(row)) for row in found if not _is_removed(row)]
+    query = f"SELECT number, rank, facts, payload, sha256 FROM certification {where} ORDER BY number, rank"
+    return [(row[0], row[1], _decoded(row)) for row in connection.execute(query, values) if not _is_removed(row)]
+
+
+def newest_rows(connection: sqlite3.Connection) -> list[tuple[int, int, CertifiedRow | None]]:
+    """`rows` of the newest certification of which there are any."""
+    numbers = connection.execute("SELECT DISTINCT number FROM certification ORDER BY number DESC").fetchall()
+    return next((found for number in numbers if (found := rows(connection, "WHERE number IS ?", number))), [])
 
 
 def _is_removed(row: Sequence[Any]) -> bool:

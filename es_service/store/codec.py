@@ -91,11 +91,6 @@ def decode_part(payload: bytes) -> dict[str, NDArray[Any]]:
     return part
 
 
-def encode_change(part: Part | None) -> bytes:
-    """Payload of a row of the state: an encoded part, or nothing for a part that is removed."""
-    return NO_PAYLOAD if part is None else encode_part(part)
-
-
 def part_sha256(part: str, generation: int, payload: bytes) -> str:
     """SHA-256 of a state row. It includes the part's name and the generation, so that rows cannot be exchanged."""
     digest = hashlib.sha256(f"state\0{part}\0{generation}\0".encode())
@@ -106,6 +101,18 @@ def part_sha256(part: str, generation: int, payload: bytes) -> str:
 def listed(sha256: str, payload: bytes) -> str:
     """What a list of rows says of one: its SHA-256, or GONE if it removes its part."""
     return sha256 if payload != NO_PAYLOAD else GONE
+
+
+def encode_changes(generation: int, parts: Mapping[str, Part | None]) -> list[tuple[str, int, str, bytes]]:
+    """State rows as they are stored, (part, generation, SHA-256, payload), of the parts that a generation changes; a
+    part that is None is removed."""
+    payloads = ((part, NO_PAYLOAD if arrays is None else encode_part(arrays)) for part, arrays in parts.items())
+    return [(part, generation, part_sha256(part, generation, payload), payload) for part, payload in payloads]
+
+
+def rows_listed(rows: Sequence[tuple[str, int, str, bytes]]) -> dict[str, tuple[int, str]]:
+    """State rows by part, without payloads: part -> (generation, SHA-256 or GONE)."""
+    return {part: (at, listed(sha256, payload)) for part, at, sha256, payload in rows}
 
 
 def state_sum(rows: Mapping[str, tuple[int, str]]) -> int:

@@ -38,12 +38,11 @@ class Table:
                 values.append(value or 0)
                 missing.append(value is None)
 
-    def columns(self) -> Columns:
-        """The columns by name. They share their memory with the table, to which nothing can be added afterwards."""
+    def columns(self, *, copy: bool = False) -> Columns:
+        """The columns by name. Unless they are copies, nothing can be added to the table afterwards."""
+        make = np.array if copy else np.asarray
         return {
-            name: np.asarray(values)
-            if missing is None
-            else np.ma.MaskedArray(np.asarray(values), np.asarray(missing).view(np.bool_))
+            name: make(values) if missing is None else np.ma.MaskedArray(make(values), make(missing).view(np.bool_))
             for name, values, missing in zip(self._names, self._values, self._missing, strict=True)
         }
 

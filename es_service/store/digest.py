@@ -22,18 +22,23 @@ from es_service.errors import StoreError, WayOut
 from es_service.loop.parts import CELL_PREFIX, ELITE_PREFIX, GEOMETRY_PART
 from es_service.protocol.machine import is_mixed
 from es_service.search.state_parts import PIECE
-from es_service.store.codec import NO_PAYLOAD, column_bytes, decode_part, row_bytes
+from es_service.store.codec import column_bytes, decode_part, row_bytes
 from es_service.store.connection import reading
 from es_service.store.folder import DATABASE
-from es_service.store.reader import kept_states, platforms, state_payload
-from es_service.store.schema import RunMeta, history_select
+from es_service.store.platforms import sound_platforms
+from es_service.store.rows import (
+    history_rows,
+    kept_rows,
+    newest_generation,
+    rows_in_force,
+    state_payload,
+    whole_states,
+)
+from es_service.store.schema import RunMeta
 from es_service.store.tables import leading_values
 from es_service.store.verify import verify
 
 Connection = sqlite3.Connection
-
-NEWEST = 2**62
-"""Number that stands for the newest generation."""
 
 
 def digest_of(parts: Mapping[str, str]) -> str:
@@ -59,8 +64,8 @@ def digest_parts(folder: Path) -> dict[str, str]:
 def digest_at(folder: Path, generation: int) -> str | None:
     """Digest of the run after a generation; None if the state of that generation is not kept."""
     with reading(folder) as (connection, meta):
-        kept = kept_states(connection)
-        return digest_of(_parts(folder, connection, meta, generation)) if generation in kept else None
+        kept = generation in whole_states(connection, kept_rows(connection))
+        return digest_of(_parts(folder, connection, meta, generation)) if kept else None
 
 
 def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
@@ -82,11 +87,12 @@ def checked_parts(folder: Path) -> tuple[dict[str, str], bool]:
 
 
 def _is_mixed(connection: Connection) -> bool:
-    newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
-    return is_mixed(at for first, at in platforms(connection) if newest is not None and first <= newest)
+    newest = newest_generation(connection)
+    return is_mixed(at for first, at in sound_platforms(connection) if newest is not None and first <= newest)
 
 
-def _parts(folder: Path, connection: Connection, meta: RunMeta, until: int = NEWEST) -> dict[str, str]:
+def _parts(folder: Path, connection: Connection, meta: RunMeta, until: int | None = None) -> dict[str, str]:
+    """The parts as of a generation; None: of all that is stored."""
     try:
         history, evaluations = _history(connection, meta, until)
         return {**_state(connection, until), "history": history, "evaluations": evaluations}
@@ -95,11 +101,10 @@ def _parts(folder: Path, connection: Connection, meta: RunMeta, until: int = NEW
         raise StoreError(f"{folder} has data that cannot be read: {error}", run=folder, ways_out=ways_out) from error
 
 
-def _state(connection: Connection, until: int) -> dict[str, str]:
-    query = "SELECT part, max(generation) FROM state WHERE generation <= ? GROUP BY part ORDER BY part"
-    newest = connection.execute(query, (until,)).fetchall()
-    payloads = ((part, state_payload(connection, part, at)) for part, at in newest)
-    parts = {part: arrays_sha256(decode_part(payload)) for part, payload in payloads if payload != NO_PAYLOAD}
+def _state(connection: Connection, until: int | None) -> dict[str, str]:
+    newest = rows_in_force(kept_rows(connection), 2**63 if until is None else until)
+    payloads = ((part, state_payload(connection, part, at)) for part, (at, _) in newest.items())
+    parts = {part: arrays_sha256(decode_part(payload)) for part, payload in payloads}
     of_map = {part: parts.pop(part) for part in [*parts] if part.startswith((GEOMETRY_PART, CELL_PREFIX, ELITE_PREFIX))}
     pieces = {part: parts.pop(part) for part in [*parts] if PIECE in part}
     found = {f"state/{part}": sha256 for part, sha256 in parts.items()}
@@ -124,17 +129,20 @@ def arrays_sha256(arrays: dict[str, NDArray[Any]]) -> str:
     return total.hexdigest()
 
 
-def _history(connection: Connection, meta: RunMeta, until: int) -> tuple[str, str]:
+def _history(connection: Connection, meta: RunMeta, until: int | None) -> tuple[str, str]:
     """SHA-256s of the deterministic columns of the history, and of the evaluated centres."""
     columns = sorted((column for column in meta.columns if column.deterministic), key=lambda column: column.name)
+    places = [meta.columns.index(column) for column in columns]
     # Columns of the evaluated centres that do not count are the last ones.
     all_of_centre = meta.evaluation_columns
     of_centre = [column for column in all_of_centre if column.deterministic]
     total = hashlib.sha256(json.dumps([[column.name, column.type] for column in columns]).encode() + b"\n")
-    query = history_select(columns) + " WHERE history.generation <= ? ORDER BY history.generation"
     centres = hashlib.sha256(column_bytes(of_centre) + b"\n")
-    for *values, evaluations, _, _ in connection.execute(query, (until,)):
-        total.update(row_bytes(tuple(values)))
+    for row, _ in history_rows(connection, meta, check=False):
+        if until is not None and row.generation > until:
+            break
+        total.update(row_bytes(tuple(row.row[place] for place in places)))
+        evaluations = row.evaluations
         if len(of_centre) < len(all_of_centre):
             evaluations = leading_values(evaluations, len(of_centre), len(all_of_centre))
         centres.update(len(evaluations).to_bytes(8, "little") + evaluations)

@@ -1,91 +1,67 @@
 """Which states a run keeps: those of its last two generations, and those of generations that were asked for.
 
-A part of the state has a row for each generation that changed it. A row belongs to the states from its generation on,
-until the next row of the part; it is deleted when none of these states is to be kept. A row without payload removes its
-part; it is deleted together with the last of the older rows, from which it protects the states after it.
+A row of the state is deleted when no state to which it belongs (`rows`) is to be kept. A row that removes its part is
+deleted together with the last of the older rows, from which it protects the states after it.
 """
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 
-from es_service.store.codec import GONE, NO_PAYLOAD, changed_sum, part_sha256, state_sha256
-
-KeptRows = dict[str, dict[int, str]]
-"""Stored state rows: part -> generation -> SHA-256, or GONE for a row that removes the part."""
+from es_service.store.codec import GONE, changed_sum, state_sum
+from es_service.store.rows import KeptRows, rows_in_force, whole_states
 
 
-def kept_rows(connection: sqlite3.Connection) -> KeptRows:
-    """Stored state rows, without their payloads. Those that damage has given values of other types are left out, and
-    those that have lost their payload."""
-    kept: KeptRows = {}
-    typed = "typeof(part) = 'text' AND typeof(generation) = 'integer' AND typeof(sha256) = 'text'"
-    query = f"SELECT part, generation, sha256, length(payload) = 0 FROM state WHERE {typed}"
-    for part, at, sha256, is_empty in connection.execute(query):
-        if not is_empty:
-            kept.setdefault(part, {})[at] = sha256
-        elif sha256 == part_sha256(part, at, NO_PAYLOAD):
-            kept.setdefault(part, {})[at] = GONE
-    return kept
+class KeptStates:
+    """The rows of the state that are stored, as the writer of a run follows them from commit to commit."""
 
+    def __init__(self, connection: sqlite3.Connection, rows: KeptRows, newest: int | None) -> None:
+        """`rows`: all intact rows that are stored; `newest`: newest generation, None if there is none."""
+        self._rows = rows
+        self.total = 0 if newest is None else state_sum(rows_in_force(rows, newest))
+        """`codec.state_sum` of the newest state."""
+        # Parts of which an older row is stored as well, which the generation before the newest needs.
+        self._doubled = [part for part, of_part in rows.items() if len(of_part) > 1]
+        # States of earlier generations that are kept now stay, whatever is kept from now on.
+        self._earlier = [] if newest is None else [at for at in whole_states(connection, rows) if at < newest - 1]
 
-def newest_state(connection: sqlite3.Connection) -> int | None:
-    """Newest generation of a state row; None if there is none."""
-    query = "SELECT max(generation) FROM state WHERE typeof(generation) = 'integer'"
-    return connection.execute(query).fetchone()[0]
+    def names(self) -> list[str]:
+        """Parts of the newest state."""
+        return sorted(part for part, of_part in self._rows.items() if of_part[max(of_part)] != GONE)
 
+    def newest(self, part: str) -> tuple[int, str]:
+        """(generation, SHA-256) of the newest row of a part. Raises KeyError if the newest state has no such part."""
+        at, sha256 = max(self._rows[part].items())
+        if sha256 == GONE:
+            raise KeyError(part)
+        return at, sha256
 
-def outdated_rows(
-    kept: KeptRows, replaced: Iterable[str], keep_every: int | None, earlier: Sequence[int]
-) -> list[tuple[str, int]]:
-    """(part, generation) of the rows that the next commit deletes.
+    def total_after(self, new: Mapping[str, tuple[int, str]]) -> int:
+        """`total` after a commit of these rows: part -> (generation, SHA-256 or GONE)."""
+        old = {part: max(self._rows[part].items()) for part in new if part in self._rows}
+        return changed_sum(self.total, old, new)
 
-    Args:
-        kept: rows that are stored.
-        replaced: parts with several rows, of which the last but one is considered.
-        keep_every: states of generations that are multiples of this are kept; None for none.
-        earlier: other generations whose states are kept.
-    """
-    found = []
-    for part in replaced:
-        at, until = sorted(kept[part])[-2:]
-        is_multiple = keep_every is not None and (until - 1) // keep_every * keep_every >= at
-        if not is_multiple and not any(at <= generation < until for generation in earlier):
-            found.append((part, at))
-            if kept[part][until] == GONE and len(kept[part]) == 2:
-                found.append((part, until))
-    return found
+    def outdated(self, keep_every: int | None) -> list[tuple[str, int]]:
+        """(part, generation) of the rows that the next commit deletes: the rows that remain make up the states of its
+        generation, of the one before it, and of those to keep, such as multiples of `keep_every`."""
+        found = []
+        for part in self._doubled:
+            at, until = sorted(self._rows[part])[-2:]
+            is_multiple = keep_every is not None and (until - 1) // keep_every * keep_every >= at
+            if not is_multiple and not any(at <= generation < until for generation in self._earlier):
+                found.append((part, at))
+                if self._rows[part][until] == GONE and len(self._rows[part]) == 2:
+                    found.append((part, until))
+        return found
 
-
-def earlier_states(connection: sqlite3.Connection, kept: KeptRows, newest: int | None) -> list[int]:
-    """Generations before the last two whose whole state is stored; they stay, whatever is kept from now on."""
-    return [] if newest is None else [at for at in whole_states(connection, kept) if at < newest - 1]
-
-
-def whole_states(connection: sqlite3.Connection, kept: KeptRows) -> list[int]:
-    """Generations whose whole state is stored, in order. Only their hashes are compared."""
-    newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
-    if newest is None:
-        return []
-    new: dict[int, dict[str, tuple[int, str]]] = {newest - 1: {}, newest: {}}
-    for part, rows in kept.items():
-        for at, sha256 in rows.items():
-            new.setdefault(at, {})[part] = (at, sha256)
-    in_force: dict[str, tuple[int, str]] = {}
-    total, whole = 0, []
-    for generation, rows in sorted(new.items()):
-        total = changed_sum(total, {part: in_force[part] for part in rows if part in in_force}, rows)
-        in_force |= rows
-        state = connection.execute("SELECT state_sha256 FROM history WHERE generation = ?", (generation,)).fetchone()
-        # A fork has the whole history of its parent, but only the newest of the parent's states.
-        if in_force and state is not None and state[0] == state_sha256(total):
-            whole.append(generation)
-    return whole
-
-
-def rows_in_force(kept: KeptRows, generation: int) -> dict[str, tuple[int, str]]:
-    """Rows that make up the state at a generation: part -> (generation, sha256) of its newest row up to then. A part
-    that this row removes is left out."""
-    newest = {part: max((at for at in rows if at <= generation), default=None) for part, rows in kept.items()}
-    return {part: (at, kept[part][at]) for part, at in newest.items() if at is not None and kept[part][at] != GONE}
+    def commit(self, new: Mapping[str, tuple[int, str]], outdated: Iterable[tuple[str, int]], total: int) -> None:
+        """Follow a commit, with what `total_after` and `outdated` have returned for it."""
+        self.total = total
+        for part, at in outdated:
+            del self._rows[part][at]
+            if not self._rows[part]:
+                del self._rows[part]
+        for part, (at, sha256) in new.items():
+            self._rows.setdefault(part, {})[at] = sha256
+        self._doubled = [part for part in new if len(self._rows[part]) > 1]

@@ -42,25 +42,24 @@ def store_list(execute: Execute) -> None:
     execute("INSERT OR REPLACE INTO meta VALUES (?, ?, ?)", (LIST, text, text_sha256(LIST, text)))
 
 
-def sound_platforms(connection: sqlite3.Connection) -> list[tuple[int, str]]:
-    """Recorded platforms as (first generation, JSON text), in order.
+def sound_platforms(connection: sqlite3.Connection) -> list[tuple[int, dict[str, Any]]]:
+    """Recorded platforms as (first generation, platform), in order.
 
     Raises:
         Damaged: a record does not match its SHA-256, or is missing.
     """
-    found: list[tuple[int, str]] = []
+    found: dict[int, dict[str, Any]] = {}
     for at, text, sha256 in connection.execute("SELECT generation, platform, sha256 FROM platform ORDER BY generation"):
         if text_sha256(f"platform {at}", text) != sha256:
             raise Damaged(f"the platform recorded at generation {at} does not match its SHA-256")
-        found.append((at, text))
+        found[at] = json.loads(text)
     listed = connection.execute("SELECT value FROM meta WHERE key = ?", (LIST,)).fetchone()
     newest = connection.execute("SELECT max(generation) FROM history").fetchone()[0]
-    stored = {at for at, _ in found}
     for at in [] if listed is None or newest is None else json.loads(listed[0]):
         # The row of a generation that was lost, and is not computed again yet, was deleted with it.
-        if at <= newest and at not in stored:
+        if at <= newest and at not in found:
             raise Damaged(f"the platform recorded at generation {at} is missing")
-    return found
+    return [*found.items()]
 
 
 def newest_before(execute: Execute, generation: int) -> dict[str, Any] | None:

@@ -9,22 +9,31 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
 from es_service.errors import StoreError
-from es_service.store.codec import Row, column_bytes, decode_part, part_sha256, row_dict
+from es_service.store.codec import row_dict
 from es_service.store.columns import Columns, Table
 from es_service.store.connection import connected_to, reading
 from es_service.store.folder import COPY
-from es_service.store.kept import kept_rows, newest_state, rows_in_force, whole_states
-from es_service.store.reader import GENERATION, platforms, state_payload
-from es_service.store.schema import Damaged, RunMeta, history_select
+from es_service.store.platforms import sound_platforms
+from es_service.store.reader import GENERATION
+from es_service.store.rows import (
+    HistoryRow,
+    history_rows,
+    kept_rows,
+    newest_generation,
+    newest_state,
+    rows_in_force,
+    sound_part,
+    whole_states,
+)
+from es_service.store.schema import Damaged, RunMeta
 from es_service.store.tables import table_rows
-from es_service.store.verify import row_is_sound
 
 Arrays = dict[str, NDArray[Any]]
 Kept = Callable[[str, Arrays], Arrays | None]
@@ -57,57 +66,71 @@ def read_sound(folder: Path, kept: Kept = lambda part, arrays: arrays) -> SoundR
     Raises:
         StoreError: neither the database nor its copy has a sound description of the run.
     """
-    problems: list[str] = []
-    with _any_sound(folder, problems) as (connection, meta):
-        rows = Rows(meta)
-        rows.read(connection, problems)
-        return _sound_run(connection, rows, kept, problems)
+    return Followed(folder, kept).read()[0]
 
 
 class Followed:
     """A run that is read again and again; each time, what was read before is not read anew."""
 
-    def __init__(self, folder: Path, kept: Kept, wanted: Callable[[str], bool]) -> None:
+    def __init__(self, folder: Path, kept: Kept, wanted: Callable[[str], bool] = lambda part: True) -> None:
         """`kept`: as in `read_sound`; `wanted`: whether to read a part of this name at all."""
         self.folder, self._kept, self._wanted = folder, kept, wanted
-        self._rows: Rows | None = None
-        self._known: dict[str, tuple[int, str, Arrays | None]] = {}
+        self._rows: _Rows | None = None
+        self._known: dict[str, tuple[tuple[int, str], Arrays | None]] = {}
 
-    def read(self, most: int) -> tuple[SoundRun, bool]:
-        """The run as far as it is read now, with at most so many new rows, so that the transaction is short; and
-        whether these are all. Raises StoreError as `read_sound`."""
+    def read(self, most: int | None = None) -> tuple[SoundRun, bool]:
+        """The run as far as it is read now, and whether these are all of its rows.
+
+        Args:
+            most: most new rows to be read, so that the transaction is short; None: all, and this is the last time.
+
+        Raises:
+            StoreError: as `read_sound`.
+        """
         problems: list[str] = []
         with _any_sound(self.folder, problems) as (connection, meta):
             if self._rows is None or not self._rows.are_of(connection, meta):
-                self._rows, self._known = Rows(meta), {}
-            whole = self._rows.read(connection, problems, most)
-            found = _sound_run(connection, self._rows, self._kept, problems, self._wanted, self._known)
-            history, evaluations = (  # copies, since nothing can be added to a table whose columns are in use
-                {name: values.copy() for name, values in columns.items()}
-                for columns in (found.history, found.evaluations)
-            )
-            return replace(found, history=history, evaluations=evaluations), whole
+                self._rows, self._known = _Rows(meta), {}
+            rows = self._rows
+            found: list[tuple[int, dict[str, Any]]] = []
+            whole = rows.read(connection, problems, most)
+            with _noted(problems, "the platforms cannot be read"):
+                found = sound_platforms(connection)
+            generation, parts = None, {}
+            with _noted(problems, "the state cannot be read"):
+                generation, parts = self._state(connection, problems)
+            # Nothing can be added to a table whose columns are in use.
+            history, evaluations = (table.columns(copy=most is not None) for table in (rows.history, rows.evaluations))
+            newest = None if rows.last is None else row_dict(meta.columns, rows.last.row)
+            return SoundRun(meta, history, newest, evaluations, found, generation, parts, tuple(problems)), whole
 
-
-def _sound_run(
-    connection: sqlite3.Connection,
-    rows: Rows,
-    kept: Kept,
-    problems: list[str],
-    wanted: Callable[[str], bool] = lambda part: True,
-    known: dict[str, tuple[int, str, Arrays | None]] | None = None,
-) -> SoundRun:
-    """The run of a connection whose rows are read already; see `_state` for `wanted` and `known`."""
-    found: list[tuple[int, dict[str, Any]]] = []
-    with _noted(problems, "the platforms cannot be read"):
-        found = platforms(connection)
-    generation, parts = None, {}
-    with _noted(problems, "the state cannot be read"):
-        generation, parts = _state(connection, kept, problems, wanted, {} if known is None else known)
-    return SoundRun(
-        rows.meta, rows.history.columns(), rows.newest, rows.evaluations.columns(), found, generation, parts,
-        tuple(problems),
-    )  # fmt: skip
+    def _state(self, connection: sqlite3.Connection, problems: list[str]) -> tuple[int | None, dict[str, Arrays]]:
+        """The newest generation whose whole state is stored, and its parts; the newest parts there are if none is."""
+        stored = kept_rows(connection)
+        found = (newest_state(connection), newest_generation(connection))
+        if (newest := max((at for at in found if at is not None), default=None)) is None:
+            return None, {}
+        whole = whole_states(connection, stored)
+        generation = max(whole, default=newest)
+        if newest not in whole:
+            instead = f"; that of generation {generation} is shown" if whole else ""
+            problems.append(f"the state of generation {newest} is incomplete{instead}")
+        known, self._known, damaged = self._known, {}, []
+        for part, row in rows_in_force(stored, generation).items():
+            if not self._wanted(part):
+                continue
+            before = known.get(part)
+            if before is None or before[0] != row:
+                try:
+                    before = row, self._kept(part, sound_part(connection, part, *row))
+                except (sqlite3.Error, Damaged, ValueError):
+                    damaged.append(part)
+                    continue
+            self._known[part] = before
+        if damaged:
+            more = f" and {len(damaged) - 3} more" if len(damaged) > 3 else ""
+            problems.append(f"the state of {', '.join(damaged[:3])}{more} is damaged")
+        return generation, {part: arrays for part, (_, arrays) in self._known.items() if arrays is not None}
 
 
 @contextlib.contextmanager
@@ -137,111 +160,54 @@ def _noted(problems: list[str], what: str) -> Iterator[None]:
         problems.append(f"{what}: {error}")
 
 
-class Rows:
+class _Rows:
     """The sound history rows of a run, and the centres that were evaluated; a damaged row is left out."""
 
     def __init__(self, meta: RunMeta) -> None:
-        self.meta = meta
+        self._meta = meta
         self.history, self.evaluations = Table(meta.columns), Table((GENERATION, *meta.evaluation_columns))
-        self.sha256: object = None
-        """That of the last sound row."""
-        self.last: Row | None = None
-        self.next = 0
-        """Generation of the next row to be read."""
+        self.last: HistoryRow | None = None
         self._lost: list[range] = []
 
     @property
-    def newest(self) -> dict[str, int | float] | None:
-        """The last of the rows, as values by column name."""
-        return None if self.last is None else row_dict(self.meta.columns, self.last)
+    def _next(self) -> int:
+        """Generation of the next row to be read."""
+        return 0 if self.last is None else self.last.generation + 1
 
-    def read(self, connection: sqlite3.Connection, problems: list[str], most: int = -1) -> bool:
-        """Read the rows after those that are read, at most so many (-1: all); return whether they are all."""
-        columns, at = column_bytes(self.meta.columns), [one.name for one in self.meta.columns].index("generation")
-        count, first = 0, self.next
+    def read(self, connection: sqlite3.Connection, problems: list[str], most: int | None) -> bool:
+        """Read the rows after those that are read, at most so many; return whether they are all."""
+        count, first = 0, self._next
         with _noted(problems, "the end of the history cannot be read"):
-            query = history_select(self.meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation"
-            for *values, centres, state, sha256 in connection.execute(f"{query} LIMIT ?", (self.next, most)):
-                row, count = tuple(values), count + 1
-                # A damaged page can also show rows again.
-                if not row_is_sound(columns, row, centres, state, sha256) or row[at] < self.next:
+            for row, is_sound in history_rows(connection, self._meta, first, most):
+                count += 1
+                if not is_sound or row.generation < self._next:  # damage can show rows again
                     continue
-                evaluated = table_rows(self.meta.evaluation_columns, centres)
-                self.history.add(row)
-                if row[at] > self.next:
-                    self._lost.append(range(self.next, row[at]))
-                self.last, self.sha256, self.next = row, sha256, row[at] + 1
+                evaluated = table_rows(self._meta.evaluation_columns, row.evaluations)
+                self.history.add(row.row)
+                if row.generation > self._next:
+                    self._lost.append(range(self._next, row.generation))
+                self.last = row
                 for centre in evaluated:
-                    self.evaluations.add((row[at], *centre))
-        whole = count != most or self.next == first  # so many damaged rows in a row are the end
+                    self.evaluations.add((row.generation, *centre))
+        whole = count != most or self._next == first  # so many damaged rows in a row are the end
         lost = list(self._lost)
         if whole:
             with _noted(problems, "the number of generations cannot be read"):
                 newest = newest_state(connection)
-                if newest is not None and newest >= self.next:
-                    lost.append(range(self.next, newest + 1))
+                if newest is not None and newest >= self._next:
+                    lost.append(range(self._next, newest + 1))
         if lost:
             problems.append(f"the history rows of generations {_spans(lost)} are damaged or missing")
         return whole
 
     def are_of(self, connection: sqlite3.Connection, meta: RunMeta) -> bool:
         """Whether the last row is still that of the run, which may have fallen back, or be another one."""
-        if meta != self.meta or self.next == 0:
-            return meta == self.meta
+        if meta != self._meta or self.last is None:
+            return meta == self._meta
         with _noted([], ""):
             query = "SELECT sha256 FROM history WHERE generation = ?"
-            return connection.execute(query, (self.next - 1,)).fetchone() == (self.sha256,)
+            return connection.execute(query, (self.last.generation,)).fetchone() == (self.last.sha256,)
         return False
-
-
-def _state(
-    connection: sqlite3.Connection,
-    kept: Kept,
-    problems: list[str],
-    wanted: Callable[[str], bool],
-    known: dict[str, tuple[int, str, Arrays | None]],
-) -> tuple[int | None, dict[str, Arrays]]:
-    """The newest generation whose whole state is stored, and its parts; the newest parts there are if none is.
-
-    Args:
-        wanted: whether to read a part of this name at all.
-        known: the parts of an earlier call, which are not read again, and are replaced by those of this one.
-    """
-    stored = kept_rows(connection)
-    found = (newest_state(connection), connection.execute("SELECT max(generation) FROM history").fetchone()[0])
-    if (newest := max((at for at in found if at is not None), default=None)) is None:
-        return None, {}
-    whole = whole_states(connection, stored)
-    generation = max(whole, default=newest)
-    if newest not in whole:
-        problems.append(
-            f"the state of generation {newest} is incomplete"
-            + (f"; that of generation {generation} is shown" if whole else "")
-        )
-    parts: dict[str, Arrays] = {}
-    damaged = []
-    before = dict(known)
-    known.clear()
-    for part, (at, sha256) in sorted(rows_in_force(stored, generation).items()):
-        if not wanted(part):
-            continue
-        at_before, sha256_before, arrays = before.get(part, (None, None, None))
-        if (at, sha256) != (at_before, sha256_before):
-            try:
-                payload = state_payload(connection, part, at)
-                if part_sha256(part, at, payload) != sha256:
-                    raise ValueError(part)
-                arrays = kept(part, decode_part(payload))
-            except (sqlite3.Error, Damaged, ValueError):
-                damaged.append(part)
-                continue
-        known[part] = at, sha256, arrays
-        if arrays is not None:
-            parts[part] = arrays
-    if damaged:
-        more = f" and {len(damaged) - 3} more" if len(damaged) > 3 else ""
-        problems.append(f"the state of {', '.join(damaged[:3])}{more} is damaged")
-    return generation, parts
 
 
 def _spans(spans: list[range]) -> str:

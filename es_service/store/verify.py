@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from es_service.store.certifications import Key, damaged_rows
-from es_service.store.codec import NO_PAYLOAD, column_bytes, decode_part, listed, part_sha256, row_sha256
+from es_service.store.codec import NO_PAYLOAD, decode_part, listed, part_sha256
 from es_service.store.folder import is_disk_full
-from es_service.store.kept import KeptRows, whole_states
 from es_service.store.platforms import sound_platforms
-from es_service.store.schema import Damaged, RunMeta, history_select, load_meta, table_statements
+from es_service.store.rows import KeptRows, history_rows, whole_states
+from es_service.store.schema import Damaged, RunMeta, load_meta, table_statements
 
 _NOT_DAMAGE = {
     sqlite3.SQLITE_BUSY,
@@ -131,29 +131,18 @@ def _verify(connection: sqlite3.Connection, file: Path, first: int) -> Verdict:
 def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems: list[str]) -> tuple[int, int]:
     """The number of history rows, and the number of those before the first damaged one. The rows of generations before
     `first` are taken for sound."""
-    columns = column_bytes(meta.columns)
-    at = [column.name for column in meta.columns].index("generation")
     count, bad = first, []
-    query = history_select(meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation"
-    for *values, evaluations, state, sha256 in connection.execute(query, (first,)):
-        row = tuple(values)
-        generation, count = count, count + 1
-        if row[at] == generation and row_is_sound(columns, row, evaluations, state, sha256):
-            continue
-        bad.append(generation)
-        if row[at] != generation:
-            problems.append(f"history row of generation {generation} is missing")
+    for row, is_sound in history_rows(connection, meta, first):
+        is_there = row.generation == count
+        if not (is_there and is_sound):
+            bad.append(count)
+            problems.append(
+                f"history row of generation {count} {'does not match its SHA-256' if is_there else 'is missing'}"
+            )
+        count += 1
+        if not is_there:
             break
-        problems.append(f"history row of generation {generation} does not match its SHA-256")
     return count, min([*bad, count])
-
-
-def row_is_sound(columns: bytes, row: tuple, evaluations: object, state: object, sha256: object) -> bool:
-    """Whether a history row matches its SHA-256; `columns` comes from `column_bytes`."""
-    try:
-        return isinstance(evaluations, bytes) and row_sha256(columns, row, evaluations, str(state)) == sha256
-    except ValueError:
-        return False
 
 
 def _state(connection: sqlite3.Connection, problems: list[str]) -> tuple[KeptRows, list[tuple[str, int]]]:

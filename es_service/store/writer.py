@@ -20,36 +20,27 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
 from es_service.loop.history import Table
+from es_service.protocol.kept import Kept
+from es_service.search.state_parts import read_only
 from es_service.store.beginning import Beginning, load_start
 from es_service.store.certifications import encoded, next_number
-from es_service.store.codec import (
-    GONE,
-    Part,
-    changed_sum,
-    column_bytes,
-    decode_part,
-    encode_change,
-    history_row,
-    listed,
-    part_sha256,
-    row_dict,
-    state_sha256,
-    state_sum,
-)
+from es_service.store.codec import Part, column_bytes, encode_changes, history_row, row_dict, rows_listed, state_sha256
 from es_service.store.create import create_run_folder
 from es_service.store.folder import DATABASE, explained, is_network_filesystem, require_run_folder
-from es_service.store.kept import earlier_states, outdated_rows, rows_in_force
+from es_service.store.kept import KeptStates
 from es_service.store.lock import RunLock, acquire_lock
 from es_service.store.platforms import newest_before, record, store_list
-from es_service.store.recent import RecentParts
 from es_service.store.repair import open_sound
-from es_service.store.schema import PAGE_BYTES, RunMeta, history_insert, history_select
+from es_service.store.rows import history_rows, sound_part
+from es_service.store.schema import PAGE_BYTES, Damaged, RunMeta, history_insert
 from es_service.store.tables import table_bytes
 from es_service.store.upkeep import Upkeep
 
 Values = Mapping[str, int | float | None]
 """One history row: column name -> value; NaN or None stands for no value."""
 _LOG = logger(__name__)
+RECENT_BYTES = 128 * 2**20
+"""Most bytes of parts that are kept decoded: elites of which new policies descend are read again and again."""
 NO_ROWS: Table = {}
 NOTHING = Beginning()
 """Beginning of an ordinary run."""
@@ -80,20 +71,16 @@ class RunStore:
         self.lock = lock
         self._hook = hook
         self._closed = self._recorded = False
-        self._recent = RecentParts()
+        self._recent: Kept[str, Part] = Kept(lambda part: sum(values.nbytes for values in part.values()))
         self._connection, verdict = open_sound(folder, self.notices)
         self.meta = verdict.meta
         self.generation = verdict.good
-        self._kept = verdict.kept
-        # Parts of which an older row is stored as well, which the generation before the newest needs.
-        self._doubled = [part for part, rows in self._kept.items() if len(rows) > 1]
-        self._state_sum = 0 if self.generation is None else state_sum(rows_in_force(self._kept, self.generation))
         self._insert_history = history_insert(self.meta.columns)
         self._heading = column_bytes(self.meta.columns)
         try:
             with self._explaining(f"opening {DATABASE}"):
                 self.start = load_start(self._connection)
-                self._earlier = earlier_states(self._connection, self._kept, self.generation)
+                self._kept = KeptStates(self._connection, verdict.kept, verdict.good)
                 self.upkeep = Upkeep(self._connection, folder, is_network_filesystem(folder), hook, self.notices)
             hook("opened")
         except BaseException:
@@ -158,7 +145,7 @@ class RunStore:
         Raises:
             StoreError: a part has been damaged since the run was opened.
         """
-        names = sorted(rows_in_force(self._kept, self.generation)) if self.generation is not None else []
+        names = self._kept.names()
         return {name: self._part(name) for name in names if without is None or not name.startswith(without)}
 
     def part(self, name: str) -> Part:
@@ -168,25 +155,26 @@ class RunStore:
             KeyError: there is no such part.
             StoreError: the part has been damaged since the run was opened.
         """
-        kept = self._recent.get(name)
-        return self._recent.add(name, self._part(name)) if kept is None else kept
+        if (part := self._recent.get(name)) is None:
+            part = read_only(self._part(name))
+            self._recent.add(name, part)
+            self._recent.forget_oldest(RECENT_BYTES)
+        else:
+            self._recent.use([name])
+        return part
 
     def _part(self, name: str) -> dict[str, NDArray[Any]]:
         """As `part`, from the database."""
-        at, sha256 = max(self._kept[name].items())
-        if sha256 == GONE:
-            raise KeyError(name)
+        row = self._kept.newest(name)
         with self._explaining("loading the state"):
-            row = self._connection.execute(
-                "SELECT payload FROM state WHERE part = ? AND generation = ?", (name, at)
-            ).fetchone()
-            if row is None or part_sha256(name, at, row[0]) != sha256:
+            try:
+                return sound_part(self._connection, name, *row)
+            except Damaged as damage:
                 raise StoreError(
-                    f"{self.folder / DATABASE}: state of {name!r} at generation {at} was damaged after it was opened",
+                    f"{self.folder / DATABASE} was damaged after it was opened: {damage}",
                     run=self.folder,
                     ways_out=[WayOut("resume", "fall back to the newest intact generation", str(self.folder))],
-                )
-            return decode_part(row[0])
+                ) from damage
 
     def commit(
         self, generation: int, parts: Mapping[str, Part | None], history: Values, evaluations: Table = NO_ROWS
@@ -205,22 +193,17 @@ class RunStore:
         expected = 0 if self.generation is None else self.generation + 1
         if generation != expected:
             raise StoreError(f"{self.folder}: cannot store generation {generation}; the next generation is {expected}")
-        payloads = {part: encode_change(arrays) for part, arrays in parts.items()}
-        sums = {part: part_sha256(part, generation, payload) for part, payload in payloads.items()}
-        new = {part: (generation, listed(sums[part], payload)) for part, payload in payloads.items()}
-        old = {part: max(self._kept[part].items()) for part in new if part in self._kept}
-        total = changed_sum(self._state_sum, old, new)
+        rows = encode_changes(generation, parts)
+        new = rows_listed(rows)
         centres = table_bytes(self.meta.evaluation_columns, evaluations)
+        total, outdated = self._kept.total_after(new), self._kept.outdated(self.keep_every)
         history_values = history_row(
             self.meta.columns, self._heading, generation, history, centres, state_sha256(total)
         )
-        # The rows that remain make up the states of the newest generation, of the one before it, and of those to keep.
-        outdated = outdated_rows(self._kept, self._doubled, self.keep_every, self._earlier)
         self._hook("before_begin")
         with self._transaction(f"storing generation {generation}") as execute:
             # Delete first, so that the new rows use the pages of the old ones.
             self._connection.executemany("DELETE FROM state WHERE part = ? AND generation = ?", outdated)
-            rows = ((part, generation, sums[part], payload) for part, payload in payloads.items())
             insert = "INSERT INTO state (part, generation, sha256, payload) VALUES (?, ?, ?, ?)"
             self._connection.executemany(insert, rows)
             self._hook("mid_transaction")
@@ -229,27 +212,21 @@ class RunStore:
                 store_list(execute)
             self._hook("before_commit")
         self._recorded = False
-        self.generation, self._state_sum = generation, total
-        for part, at in outdated:
-            del self._kept[part][at]
-            if not self._kept[part]:
-                del self._kept[part]
-        for part, (at, sha256) in new.items():
-            self._kept.setdefault(part, {})[at] = sha256
+        self.generation = generation
+        self._kept.commit(new, outdated, total)
+        for part in new:
             self._recent.forget(part)
-        self._doubled = [part for part in new if len(self._kept[part]) > 1]
         self._hook("after_commit")
-        _LOG.debug("stored generation %d: %d parts", generation, len(payloads))
-        self.upkeep.after_commit(sum(map(len, payloads.values())) + 4 * PAGE_BYTES)
+        _LOG.debug("stored generation %d: %d parts", generation, len(rows))
+        self.upkeep.after_commit(sum(len(payload) for *_, payload in rows) + 4 * PAGE_BYTES)
 
     def last_history(self) -> dict[str, int | float] | None:
         """History row of the newest generation; NaN stands for no value. None before the first commit."""
         if self.generation is None:
             return None
         with self._explaining("reading the history"):
-            query = history_select(self.meta.columns) + " WHERE history.generation = ?"
-            row = self._connection.execute(query, (self.generation,)).fetchone()
-        return row_dict(self.meta.columns, row[:-3])
+            ((newest, _),) = history_rows(self._connection, self.meta, self.generation, check=False)
+        return row_dict(self.meta.columns, newest.row)
 
     def record_platform(self, generation: int, platform: dict[str, Any]) -> bool:
         """Record the platform of a generation that is not stored yet, and of those after it.

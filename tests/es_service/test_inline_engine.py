@@ -24,7 +24,8 @@ from es_service.dispatch.events import Limits, Placed, WorkerLost, WorkerUp
 from es_service.dispatch.inline_engine import inline_engine
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol import kept_subjects
-from es_service.protocol.kept_subjects import KEPT_SUBJECTS, KeptSubjects
+from es_service.protocol.kept import Kept
+from es_service.protocol.kept_subjects import KEPT_SUBJECTS, forget_old_subjects
 from es_service.protocol.messages import TrainingChunk, Work, around
 from es_service.protocol.raised import RaisedError
 from es_service.protocol.wire import framed, receive
@@ -69,7 +70,7 @@ class Receiver:
 
     def __init__(self, end: socket.socket) -> None:
         self.end, self.received = end, 0
-        self.centres = KeptSubjects(attrgetter("nbytes"))
+        self.centres = Kept(attrgetter("nbytes"))
 
     def item(self) -> list[tuple[float, int]]:
         """(first parameter of the centre, id) of each chunk of the next work item."""
@@ -78,7 +79,7 @@ class Receiver:
             self.centres.add(number, point)
             self.received += 1
         found = [(float(self.centres[number].parameters_D[0]), chunk.chunk_id) for number, chunk in said[3]]
-        self.centres.forget_oldest()
+        forget_old_subjects(self.centres)
         return found
 
 

@@ -5,7 +5,7 @@ import sqlite3
 import numpy as np
 import pytest
 
-from es_service.store.recent import RecentParts
+from es_service.protocol.kept import Kept
 from tests.es_service.store_examples import assert_same_state, create, history_row, parts_of
 
 
@@ -14,20 +14,24 @@ def arrays(kilobytes, value=0.0):
 
 
 def test_parts_not_asked_for_the_longest_are_forgotten_when_there_are_too_many_bytes():
-    recent = RecentParts(most_bytes=3 * 1024)
-    for name in "xyz":
-        recent.add(name, arrays(1))
-    assert recent.get("x") is not None
-    recent.add("w", arrays(1))
-    assert [name for name in "wxyz" if recent.get(name) is not None] == ["w", "x", "z"]
-    recent.add("large", arrays(4))
-    assert not any(recent.get(name) for name in ["w", "x", "z", "large"])
-    recent.add("small", arrays(3))
-    assert recent.get("small") is not None
+    recent = Kept(lambda part: sum(values.nbytes for values in part.values()))
+
+    def add(name, kilobytes, **limits):
+        recent.add(name, arrays(kilobytes))
+        recent.forget_oldest(3 * 1024, **limits)
+        return list(recent)
+
+    assert [add(name, 1) for name in "xyz"][-1] == ["x", "y", "z"]
+    recent.use(["x", "not kept"])
+    assert add("w", 1) == ["z", "x", "w"]
+    assert add("large", 4) == []
+    assert add("large", 4, spared=["large"]) == ["large"]
+    assert add("small", 3) == ["small"]
     recent.forget("small")
     recent.forget("small")
-    recent.add("other", arrays(3))
-    assert recent.get("other") is not None, "what is forgotten needs no room"
+    assert add("other", 2) == ["other"], "what is forgotten needs no room"
+    assert add("other", 3) == ["other"], "nor what is replaced"
+    assert [add(name, 0, most=2) for name in "xy"][-1] == ["x", "y"]
 
 
 def test_a_store_returns_the_newest_part_though_it_keeps_parts(tmp_path):

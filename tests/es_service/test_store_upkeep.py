@@ -12,8 +12,8 @@ from es_service.errors import StoreError
 from es_service.store import connection as store_connection
 from es_service.store import folder as run_folder
 from es_service.store import repair as store_repair
+from es_service.store import rows as store_rows
 from es_service.store import upkeep as store_upkeep
-from es_service.store import verify as store_verify
 from es_service.store import writer as store
 from es_service.store.folder import is_network_filesystem
 from es_service.store.reader import read_generation, read_history, read_parts
@@ -122,7 +122,7 @@ def test_the_copy_is_a_verified_single_file_refreshed_when_it_is_time(tmp_path, 
 def test_a_copy_checks_only_rows_that_the_former_one_has_not(tmp_path, monkeypatch, former):
     """Each time all of a long run would keep its driver from its workers. Damage is noticed: test_store_damage."""
     checked: list[int] = []
-    sound = store_verify.row_is_sound
+    sound = store_rows.row_is_sound
 
     def counted(columns, row, *stored):
         checked.append(row[0])
@@ -139,7 +139,7 @@ def test_a_copy_checks_only_rows_that_the_former_one_has_not(tmp_path, monkeypat
             flip_bit(copy, position_of(copy, b"BLE meta"), bit=7)
         elif former == "missing":
             copy.unlink()
-        monkeypatch.setattr(store_verify, "row_is_sound", counted)
+        monkeypatch.setattr(store_rows, "row_is_sound", counted)
         advance(run, 20)
         assert checked == (list(range(18, 21)) if former == "sound" else list(range(21)))
         assert run.notices == []
