@@ -35,6 +35,7 @@ def standing_data(standing: Standing) -> dict[str, Any]:
         "seed": run.constants["seed"],
         "state": state(standing),
         "driver": standing.driver,
+        "last_end": standing.end,
         "limits": standing.limits,
         "newest": row,
         "objectives": {

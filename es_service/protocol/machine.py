@@ -13,7 +13,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-VERSION = "0.16.0"
+VERSION = "0.17.0"
 """Version of es-service, written here because the metadata of an editable installation keep the version of the last
 `pip install`."""
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "brax", "mujoco", "mujoco-mjx", "llvmlite")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from es_service.dispatch.dispatch_log import Committed, Log, dispatch_log, no_lo
 from es_service.dispatch.engine import Engine
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.errors import ConfigError, EvaluationError, StoreError, WayOut
+from es_service.errors import ConfigError, EvaluationError, Interrupted, StoreError, WayOut
 from es_service.logs import in_generation, logger
 from es_service.loop import driver
 from es_service.loop.parts import moments_from_arrays
@@ -34,6 +35,7 @@ from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
 from es_service.store.beginning import SEVERAL
 from es_service.store.codec import Part
+from es_service.store.lock import RunLock
 from es_service.store.writer import RunStore
 from workers.actor import WorkerActor
 from workers.host.described import described
@@ -142,6 +144,7 @@ def work(
     _LOG.info("working on %s: engine %s, rollout %s", store.folder, compute.engine, compute.rollout)
     _LOG.info(parallel_sentence(config))
     with (
+        _noting_the_end(store.lock),
         _naming_the_run(store.folder),
         dispatch_log(store.folder, store.generation, enabled=config.compute.dispatch_log) as log,
         stop_on_signals() as should_stop,
@@ -189,9 +192,23 @@ def work(
             tell(f"compute.workers: {count} workers start and not {compute.workers}, since {parallel_sentence(config)}")
         engine.wait_for_place()  # before the loop, whose time is that of the run and of its budget
         recorder = Recorder(store, engine, platform_info(), code, tell, strict=strict)
-        _, reason = driver.run(search, engine, recorder, state, after_generation, tell_failed)
+        state, reason = driver.run(search, engine, recorder, state, after_generation, tell_failed)
         _LOG.info("the session ends: %s", reason)
+        store.lock.note_end("" if driver.spent(config.budget, state) else reason)
     return Outcome(open_run(store.folder), reason)
+
+
+@contextmanager
+def _noting_the_end(lock: RunLock) -> Iterator[None]:
+    """Keep what ends a session, for whoever asks later why the run stands still."""
+    try:
+        yield
+    except Interrupted as stop:
+        lock.note_end(f"interrupted by {signal.Signals(stop.signal_number).name}")
+        raise
+    except BaseException as error:
+        lock.note_end(": ".join([type(error).__name__, *filter(None, [" ".join(str(error).split())])]))
+        raise
 
 
 @contextmanager

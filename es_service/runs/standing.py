@@ -16,7 +16,7 @@ from es_service.loop.history import Row
 from es_service.runs.certified import target_reached
 from es_service.runs.view import Run
 from es_service.store.folder import CONFIG, DATABASE, runs_inside
-from es_service.store.lock import lock_holder
+from es_service.store.lock import last_end, lock_holder
 from es_service.store.reader import read_newest
 
 TARGET = "target_certified"
@@ -38,6 +38,8 @@ class Standing:
     """Why the budget cannot be read; empty if it can."""
     certified: str = ""
     """Why the run is over by `budget.target_certified`; empty if it is not."""
+    end: str = ""
+    """How the last session ended, in words, if there is no driver; empty if it is not known."""
 
     @property
     def reasons(self) -> dict[str, str]:
@@ -79,7 +81,8 @@ def standing_at(run: Run, driver: Mapping[str, Any] | None, row: Row | None) -> 
         certified = target_reached(run.folder, budget.target_certified)
     except StoreError:
         certified = ""  # damage of a certification, which `verify` names
-    return Standing(run, driver, row, limits_of(budget), certified=certified)
+    end = "" if driver else last_end(run.folder)
+    return Standing(run, driver, row, limits_of(budget), certified=certified, end=end)
 
 
 def is_waiting(standing: Standing) -> bool:
@@ -104,7 +107,7 @@ def state(standing: Standing) -> str:
         return f"stopped, and its budget cannot be read: {standing.problem}"
     if standing.reasons:
         return f"finished: {next(iter(standing.reasons.values()))}"
-    return "stopped before its budget was spent"
+    return "stopped before its budget was spent" + (f": {standing.end}" if standing.end else "")
 
 
 def way_on(standing: Standing) -> WayOut:

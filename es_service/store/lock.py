@@ -1,7 +1,7 @@
 """The lock of a run: an exclusive `flock` on `run.lock`, which its writer holds and whose file names the writer.
 
 The kernel releases the lock when the process ends in any way, so a lock is never stale. The content of the file is only
-for messages.
+for messages: who holds the lock or, if it is free, how the last session of the run ended.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import os
 import socket
 import time
 import weakref
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ from es_service.store.folder import LOCK, explained
 
 _PATIENCE_S = 0.5
 """Seconds for which a writer tries to take the lock, because `lock_holder` holds a shared lock for an instant."""
+_MOST, _MOST_WORDS = 4096, 500
+"""Bytes of the file that are read, and characters of the words about an end, which always fit into them."""
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 _held: weakref.WeakSet[RunLock] = weakref.WeakSet()
 
@@ -32,6 +35,7 @@ class RunLock:
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
+        self._end = _content(os.pread(descriptor, _MOST, 0))
         self._identity = {"host": socket.gethostname(), "pid": os.getpid(), "since": _now()}
         self.say()
         _held.add(self)
@@ -39,18 +43,24 @@ class RunLock:
     def say(self, *, waiting: bool = False, doing: str = "") -> None:
         """Write who holds the lock into its file, since when the run has been waiting for a worker, if it is, and what
         it is doing if that takes long and nothing else shows it."""
-        text = json.dumps(self._identity | {"waiting_since": _now() if waiting else None, "doing": doing}).encode()
-        # The lock itself is enough; on a full disk its file does not name the writer.
-        with contextlib.suppress(OSError):
-            # Spaces, so that a reader at this moment finds no end of a longer text, and no empty file.
-            os.pwrite(self._descriptor, text.ljust(os.fstat(self._descriptor).st_size), 0)
+        self._write(self._identity | {"waiting_since": _now() if waiting else None, "doing": doing})
+
+    def note_end(self, how: str) -> None:
+        """Keep how the session ends, in words, for `last_end`."""
+        self._end = self._identity | {"ended": _now(), "how": how[:_MOST_WORDS]}
 
     def release(self) -> None:
         """Release the lock, so that another writer can take it. This may be called again."""
         if self._descriptor >= 0:
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._descriptor, 0)
+            self._write(self._end)  # of a holder that noted no end: what the one before it has left
             self.abandon()
+
+    def _write(self, content: Mapping[str, Any]) -> None:
+        # The lock itself is enough; on a full disk its file does not name the writer.
+        with contextlib.suppress(OSError):
+            text = json.dumps(content).encode()
+            # Spaces, so that a reader at this moment finds no end of a longer text, and no empty file.
+            os.pwrite(self._descriptor, text.ljust(os.fstat(self._descriptor).st_size), 0)
 
     def abandon(self) -> None:
         """Close the file of the lock. The lock remains while another process has inherited the same open file."""
@@ -125,7 +135,7 @@ def lock_holder(folder: Path) -> dict[str, Any] | None:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
         return None
     except BlockingIOError:
-        return _identity(os.pread(descriptor, 4096, 0))
+        return _identity(_content(os.pread(descriptor, _MOST, 0)))
     except OSError:
         return None
     finally:
@@ -138,17 +148,34 @@ def require_unlocked(folder: Path) -> None:
         raise _locked(folder)
 
 
-def _identity(text: bytes) -> dict[str, Any]:
+def last_end(folder: Path) -> str:
+    """How the last session of the run in `folder` ended, in words, if no process holds its lock; empty if the session
+    has not said it, as before version 0.17, or if there was none."""
+    try:
+        found = _content((folder / LOCK).read_bytes()[:_MOST])
+    except OSError:
+        return ""
+    if "ended" in found:
+        return str(found.get("how", ""))
+    if "pid" not in found:
+        return ""
+    return f"its driver on {found.get('host')}, pid {found['pid']}, was killed, or its host failed"
+
+
+def _content(text: bytes) -> dict[str, Any]:
     try:
         found = json.loads(text)
     except ValueError:
-        found = None
-    known = found if isinstance(found, dict) else {}
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _identity(known: Mapping[str, Any]) -> dict[str, Any]:
     return {key: known.get(key) for key in ("host", "pid", "since", "waiting_since", "doing")}
 
 
 def _locked(folder: Path) -> RunLockedError:
-    holder = lock_holder(folder) or _identity(b"")
+    holder = lock_holder(folder) or _identity({})
     return RunLockedError(
         f"{folder} is being written by process {holder['pid'] or '(unknown)'} on host {holder['host'] or '(unknown)'} "
         f"since {holder['since'] or '(unknown)'}; stop that process first, or wait until it ends.",

@@ -10,7 +10,7 @@ import pytest
 
 from es_service.errors import RunLockedError, StoreError, WayOut
 from es_service.store import lock as run_lock
-from es_service.store.lock import acquire_lock, lock_holder
+from es_service.store.lock import acquire_lock, last_end, lock_holder
 from es_service.store.writer import RunStore
 from tests.es_service.store_examples import create, finished
 
@@ -58,6 +58,29 @@ def test_what_a_dead_writer_left_in_the_file_means_nothing(tmp_path):
     assert holder is not None
     assert (holder["pid"], holder["waiting_since"]) == (os.getpid(), None)
     lock.release()
+
+
+def test_how_the_last_session_ended_is_known_until_another_one_ends(tmp_path):
+    assert last_end(tmp_path) == ""
+    lock = acquire_lock(tmp_path)
+    lock.note_end("interrupted by SIGTERM")
+    lock.release()
+    assert last_end(tmp_path) == "interrupted by SIGTERM"
+    acquire_lock(tmp_path).release()  # as of a certification, which is no session
+    assert last_end(tmp_path) == "interrupted by SIGTERM"
+    lock = acquire_lock(tmp_path)
+    lock.note_end("\u2028" * 100_000)
+    lock.release()
+    assert set(last_end(tmp_path)) == {"\u2028"}
+    lock = acquire_lock(tmp_path)
+    lock.abandon()  # as a kill does
+    killed = f"its driver on {socket.gethostname()}, pid {os.getpid()}, was killed, or its host failed"
+    assert last_end(tmp_path) == killed
+    acquire_lock(tmp_path).release()
+    assert last_end(tmp_path) == killed
+    for text in ("", "[", "3", '{"ended": 1}'):
+        (tmp_path / "run.lock").write_text(text)
+        assert last_end(tmp_path) == ""
 
 
 def test_a_holder_that_has_not_yet_written_its_name(tmp_path):

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import socket
 import sqlite3
 from types import SimpleNamespace
@@ -21,7 +22,8 @@ from es_service.cli.main import app
 from es_service.cli.tables import status
 from es_service.cli.tables.overview import print_overview
 from es_service.cli.tables.status import follow_status, print_status, print_summary
-from es_service.errors import ConfigError
+from es_service.errors import ConfigError, Interrupted
+from es_service.loop.interfaces import Stop
 from es_service.runs import recent
 from es_service.runs.standing import Standing, look, more, state
 from es_service.store import reader
@@ -208,6 +210,32 @@ def test_stopped_and_running(run, console, capsys):
     assert " left\n" in printed
     assert "\ngeneration         5 of 8,000\n" in printed
     config.write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("end", "told"),
+    [
+        (Stop("that is enough"), "that is enough"),
+        (ValueError("no\n luck"), "ValueError: no luck"),
+        (Interrupted(signal.SIGTERM), "interrupted by SIGTERM"),
+        (KeyboardInterrupt(), "KeyboardInterrupt"),
+    ],
+)
+def test_why_a_run_has_stopped_is_told_until_it_is_finished(end, told, tmp_path):
+    def ends(row):
+        if isinstance(end, BaseException):
+            raise end
+        return end
+
+    folder = tmp_path / "run"
+    with contextlib.suppress(ValueError, Interrupted, KeyboardInterrupt):
+        api.run(SMALL | {"budget": {"generations": 2}}, folder, on_generation=ends)
+    assert state(look(api.open_run(folder))) == f"stopped before its budget was spent: {told}"
+    assert state(look(api.resume(folder).run)) == "finished: the budget of 2 generations is spent"
+    (folder / "config.yaml").write_text(
+        (folder / "config.yaml").read_text().replace("generations: 2", "generations: 3")
+    )
+    assert state(look(api.open_run(folder))) == "stopped before its budget was spent"
 
 
 def test_who_follows_a_run_is_told_once_that_it_waits_or_compiles(run, console, monkeypatch, capsys):
