@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from es_service.dispatch.events import Compiled
+from es_service.dispatch.events import Compiled, key_of
 from es_service.dispatch.scheduler_changes import put_worker
 from es_service.dispatch.scheduler_state import SchedulerState, Worker, usual_chunk_s
 from es_service.protocol.messages import GradientChunk
@@ -24,14 +24,15 @@ def begin_first_slot(state: SchedulerState, worker: Worker, now: float) -> Worke
         return worker._replace(deadline_s=math.inf, late_s=math.inf)
     item, limits = worker.slots[0].item, state.limits
     if item.kind not in worker.warm:
-        limit, limit_s = "compile_deadline_s", limits.compile_deadline_s
+        limit, limit_s = "compile_timeout_s", limits.compile_timeout_s
         return worker._replace(started_s=now, deadline_s=now + limit_s, limit=limit, late_s=math.inf)
     usual_s = usual_chunk_s(state, item.kind)
-    limit, limit_s = "min_deadline_s", max(limits.min_deadline_s, limits.deadline_factor * item.size * (usual_s or 0.0))
-    if usual_s is None and limit_s < limits.first_deadline_s:
-        limit, limit_s = "first_deadline_s", limits.first_deadline_s
-    if limits.chunk_limit_s is not None and item.kind != GradientChunk.__name__:
-        limit, limit_s = "chunk_limit_s", item.size * limits.chunk_limit_s
+    long_s = limits.deadline_factor * item.size * (usual_s or 0.0)
+    limit, limit_s = "chunk_timeout_s", max(limits.chunk_timeout_s, long_s)
+    if usual_s is None and limit_s < limits.first_chunk_timeout_s:
+        limit, limit_s = "first_chunk_timeout_s", limits.first_chunk_timeout_s
+    if limits.time_limit_s is not None and item.kind != GradientChunk.__name__:
+        limit, limit_s = "time_limit_s", item.size * limits.time_limit_s
     usual_item_s = math.inf if usual_s is None else item.size * usual_s
     late_s = now + max(limits.late_factor * usual_item_s, usual_item_s + limits.late_by_s)
     return worker._replace(started_s=now, deadline_s=now + limit_s, limit=limit, late_s=late_s)
@@ -62,11 +63,11 @@ def missed_deadline(s: SchedulerState, worker: int) -> str:
     """Text that says what a worker has not done in time."""
     record = s.up.get(worker) or s.draining.get(worker)
     if record is None:
-        limit_s = s.limits.start_deadline_s
-        return f"did not come up within {plain(limit_s)} s ({s.limits.name_of('start_deadline_s')})"
-    item_id, name = record.slots[0].item.id, s.limits.name_of(record.limit)
+        limit_s = s.limits.start_timeout_s
+        return f"did not come up within {plain(limit_s)} s ({key_of('start_timeout_s')})"
+    item_id, name = record.slots[0].item.id, key_of(record.limit)
     within = f"within {plain(record.deadline_s - record.started_s)} s"
-    if record.limit == "compile_deadline_s":
+    if record.limit == "compile_timeout_s":
         return f"did not finish compiling for work item {item_id} {within} ({name})"
     return f"no answer to work item {item_id} {within} of computing ({name})"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 
 
@@ -20,7 +20,10 @@ class WorkItem:
 
 @dataclass(frozen=True)
 class Limits:
-    """Settings for the assignment of work and the handling of faults. Raises ValueError for a count below 1."""
+    """Settings for the assignment of work and the handling of faults. Raises ValueError for a count below 1.
+
+    Those that a config sets have the names of its keys; see `key_of`.
+    """
 
     workers: int
     """Workers wanted at the start; `SetWorkers` changes this number."""
@@ -34,23 +37,23 @@ class Limits:
     max_attempts: int = 4
     """Number of faults of one work item after which the run fails. A fault is an exception, or the loss of the worker
     that ran the item. It should be above `max_failures_in_a_row`, so that a single broken worker is replaced first."""
-    start_deadline_s: float = 120.0
+    start_timeout_s: float = 120.0
     """Longest time in which a worker must come up, counted again from when it has a place."""
-    compile_deadline_s: float = 600.0
+    compile_timeout_s: float = 600.0
     """Longest time in which a worker must compile for its first item of a kind."""
-    first_deadline_s: float = 600.0
+    first_chunk_timeout_s: float = 600.0
     """Longest time for an item while no duration of its kind is known, without the time of compiling. If
-    `min_deadline_s` is longer, that limit applies."""
+    `chunk_timeout_s` is longer, that limit applies."""
     late_factor: float = 2.0
     """A worker is late when its item has taken late_factor x size x median of recent durations of its kind. At the end
     of a phase, its items are then sent to an idle worker too; with infinity, no item ever is."""
     late_by_s: float = 0.03
     """Least time by which a late item exceeds its usual duration, since a copy of a very short item saves nothing."""
-    min_deadline_s: float = 30.0
+    chunk_timeout_s: float = 30.0
     """Lower bound of the limit for later items."""
     deadline_factor: float = 5.0
-    """Later items may take max(min_deadline_s, deadline_factor x size x median of recent durations of their kind)."""
-    chunk_limit_s: float | None = None
+    """Later items may take max(chunk_timeout_s, deadline_factor x size x median of recent durations of their kind)."""
+    time_limit_s: float | None = None
     """Longest time for a chunk of episodes, in the place of the limits for first and later items; None: these."""
     episodes_together: int | None = None
     """Most episodes of an evaluation or policy chunk that are sent together; None: whole chunks."""
@@ -66,20 +69,26 @@ class Limits:
     that were started before the first of them was lost count as one attempt."""
     place_timeout_s: float = math.inf
     """Longest wait for a first place: no worker has come up so far, and none has a place."""
+    waits_for_place: bool = True
+    """Whether a place may still come, with a machine that joins; else `no_worker_timeout_s` limits this wait, too."""
     no_worker_timeout_s: float = 300.0
     """Longest time in which work items wait and no worker is up, after the first had come up. It only has an effect if
-    it is longer than `start_deadline_s`."""
-    names: Mapping[str, str] = field(default_factory=dict)
-    """Field -> its name in messages, by which a user can change it; other fields keep their own names."""
-
-    def name_of(self, limit: str) -> str:
-        """Name of a field in messages."""
-        return self.names.get(limit, limit)
+    it is longer than `start_timeout_s`."""
 
     def __post_init__(self) -> None:
         for name in ("workers", "cores", "in_flight", "max_attempts", "max_failures_in_a_row", "max_start_failures"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} ({getattr(self, name)}) must be at least 1")
+
+
+def key_of(limit: str) -> str:
+    """What a user can change of a field of `Limits`, for messages: a key of the config."""
+    others = {
+        "start_timeout_s": "half of compute.no_worker_timeout_s",
+        "chunk_timeout_s": "at least compute.chunk_timeout_s",
+        "time_limit_s": "task.time_limit_s",
+    }
+    return others.get(limit, f"compute.{limit}")
 
 
 # Events, which an engine reports.

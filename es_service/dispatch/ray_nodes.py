@@ -93,8 +93,7 @@ def layout(
         text = f"this machine has no room for a worker. {demand(ray, claim)}. Lower compute.worker_resources."
         raise StartError(text)
     if ours:  # it has room, so a worker without a place is one whose process does not start
-        names = {**limits.names, "place_timeout_s": limits.name_of("no_worker_timeout_s")}
-        limits = replace(limits, place_timeout_s=limits.no_worker_timeout_s, names=names)
+        limits = replace(limits, waits_for_place=False)
     growth = Growth(-(-most // cpus), ahead) if grows else None
     workers = with_work(limits.workers, cpus, most) if growth is None else growth.wanted(nodes, before=1)
     return claim, replace(limits, workers=workers, cores=cpus), growth

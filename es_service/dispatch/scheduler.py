@@ -53,6 +53,7 @@ from es_service.dispatch.events import (
     WorkerLost,
     WorkerUp,
     because,
+    key_of,
 )
 from es_service.dispatch.scheduler_changes import append_items, drop_item, pop_worker, put_worker, return_item
 from es_service.dispatch.scheduler_state import (
@@ -93,7 +94,7 @@ def handle(s: SchedulerState, event: Event, now: float) -> list[Command]:
             append_items(s, items)
         case Placed(worker):
             if (record := s.starting.get(worker)) is not None:
-                deadline_s = now + s.limits.start_deadline_s
+                deadline_s = now + s.limits.start_timeout_s
                 put_worker(s, s.starting, worker, record._replace(deadline_s=deadline_s, placed=True))
         case WorkerUp(worker):
             if pop_worker(s, s.starting, worker) is not None:
@@ -261,7 +262,7 @@ def _expire(s: SchedulerState, out: list[Command], now: float, silent: tuple[int
             _lose(s, out, worker, reason, now, fault=not has_no_place, charge=not is_silent)
     name, limit_s = down_limit(s)
     if s.failed is None and s.down_since_s is not None and now >= s.down_since_s + limit_s:
-        for_s = f"for {plain(limit_s)} s ({s.limits.name_of(name)})"
+        for_s = f"for {plain(limit_s)} s ({key_of(name)})"
         text = f"was up {for_s} while {len(s.items)} work items waited" if s.next_rank else f"got a place {for_s}"
         _fail(s, out, loss_text(s, f"no worker {text}; last loss: "))
 
@@ -280,6 +281,6 @@ def _start_workers(s: SchedulerState, out: list[Command], now: float) -> None:
     if missing <= 0 or now < s.start_at_s:
         return
     for worker in range(s.next_worker, s.next_worker + missing):
-        put_worker(s, s.starting, worker, Worker(worker, deadline_s=now + s.limits.start_deadline_s))
+        put_worker(s, s.starting, worker, Worker(worker, deadline_s=now + s.limits.start_timeout_s))
         out.append(StartWorker(worker))
     s.next_worker += missing

@@ -154,7 +154,7 @@ def usual_chunk_s(state: SchedulerState, kind: str) -> float | None:
 def is_down(state: SchedulerState) -> bool:
     """Whether work items wait and no worker is up; before the first has come up, whether none has a place.
 
-    The time in which one that has a place comes up is limited by `start_deadline_s`.
+    The time in which one that has a place comes up is limited by `start_timeout_s`.
     """
     if state.up or state.draining:
         return False
@@ -170,7 +170,8 @@ def is_waiting(state: SchedulerState) -> bool:
 
 def down_limit(state: SchedulerState) -> tuple[str, float]:
     """Field of `Limits` that limits the time for which the state `is_down`, and its value in seconds."""
-    name = "no_worker_timeout_s" if state.next_rank else "place_timeout_s"
+    for_place = not state.next_rank and state.limits.waits_for_place
+    name = "place_timeout_s" if for_place else "no_worker_timeout_s"
     return name, getattr(state.limits, name)
 
 

@@ -90,10 +90,10 @@ def predict(
     limits = events.Limits(
         workers=actors,
         cores=cores,
-        compile_deadline_s=NEVER_S,
-        first_deadline_s=NEVER_S,
-        min_deadline_s=NEVER_S,
-        start_deadline_s=NEVER_S,
+        compile_timeout_s=NEVER_S,
+        first_chunk_timeout_s=NEVER_S,
+        chunk_timeout_s=NEVER_S,
+        start_timeout_s=NEVER_S,
         late_factor=late_factor,
     )
     state = initial_state(limits)

@@ -45,17 +45,6 @@ from workers.rollouts import BACKENDS
 _LOG = logger(__name__)
 CALLS_S = 60.0
 """Seconds in which the process of a function can be replaced, beside the time of its calls."""
-LIMIT_NAMES = {
-    "start_deadline_s": "half of compute.no_worker_timeout_s",
-    "compile_deadline_s": "compute.compile_timeout_s",
-    "first_deadline_s": "compute.first_chunk_timeout_s",
-    "min_deadline_s": "at least compute.chunk_timeout_s",
-    "place_timeout_s": "compute.place_timeout_s",
-    "no_worker_timeout_s": "compute.no_worker_timeout_s",
-    "chunk_limit_s": "task.time_limit_s",
-}
-"""Config keys that set the engine's time limits, as its messages name them."""
-
 OnGeneration = Callable[[Mapping[str, Any]], object]
 """Called with each history row after its generation is committed. A `Stop` that it returns ends the session."""
 OnNotice = Callable[[str], None]
@@ -231,15 +220,14 @@ def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
     return Limits(
         workers=worker_count(config, most),
         max_attempts=compute.max_attempts,
-        start_deadline_s=compute.no_worker_timeout_s / 2,  # so that two attempts fit into it
-        compile_deadline_s=compute.compile_timeout_s,
-        first_deadline_s=compute.first_chunk_timeout_s,
-        min_deadline_s=compute.chunk_timeout_s,
+        start_timeout_s=compute.no_worker_timeout_s / 2,  # so that two attempts fit into it
+        compile_timeout_s=compute.compile_timeout_s,
+        first_chunk_timeout_s=compute.first_chunk_timeout_s,
+        chunk_timeout_s=compute.chunk_timeout_s,
         place_timeout_s=math.inf if compute.place_timeout_s is None else compute.place_timeout_s,
         no_worker_timeout_s=compute.no_worker_timeout_s,
-        names=LIMIT_NAMES,
         late_factor=Limits.late_factor if rollout.copies_late_items else math.inf,
-        chunk_limit_s=chunk_limit_s(config, task),
+        time_limit_s=chunk_limit_s(config, task),
         episodes_together=rollout.episodes_together(task),
     )
 

@@ -57,10 +57,10 @@ class World:
             workers=r.randint(1, 4),
             in_flight=r.randint(1, 2),
             max_attempts=r.randint(2, 5),
-            start_deadline_s=3.0,
-            compile_deadline_s=5.0,
-            first_deadline_s=8.0,
-            min_deadline_s=2.0,
+            start_timeout_s=3.0,
+            compile_timeout_s=5.0,
+            first_chunk_timeout_s=8.0,
+            chunk_timeout_s=2.0,
             deadline_factor=4.0,
             late_factor=r.choice((1.2, 2.0, math.inf)),
             late_by_s=r.choice((0.0, 0.3)),
@@ -129,13 +129,13 @@ class World:
     def start_process(self, worker: int) -> None:
         self.alive.add(worker)
         self.inbox[worker], self.open[worker] = deque(), []
-        self.start_due[worker] = self.now + self.limits.start_deadline_s
+        self.start_due[worker] = self.now + self.limits.start_timeout_s
         self.unplaced.add(worker)
         if not self.happens("no_place"):
             self.give_place(worker)
         elif self.random.random() < 0.5:
             self.waits.add(worker)
-            self.at(1.2 * self.limits.start_deadline_s * self.random.random(), self.give_place, worker)
+            self.at(1.2 * self.limits.start_timeout_s * self.random.random(), self.give_place, worker)
 
     def give_place(self, worker: int) -> None:
         if worker in self.alive or self.happens("speaks_after_stop"):
@@ -242,7 +242,7 @@ class World:
                 self.unplaced.discard(worker)
                 if worker in self.known:
                     self.seen["placed late"] += worker in self.waits
-                    self.start_due[worker] = self.now + self.limits.start_deadline_s
+                    self.start_due[worker] = self.now + self.limits.start_timeout_s
             case WorkerUp(worker) if worker in self.known and worker not in self.up:
                 self.up.add(worker)
                 self.was_up = True

@@ -318,7 +318,7 @@ def test_answers_that_wait_are_read_before_the_clock(monkeypatch, answered):
             transport.inbox.append(sent.answer())
 
     transport.on_send = leap
-    with Engine(transport, Limits(workers=2, first_deadline_s=1.0, min_deadline_s=1.0)) as engine:
+    with Engine(transport, Limits(workers=2, first_chunk_timeout_s=1.0, chunk_timeout_s=1.0)) as engine:
         assert engine.evaluate(around(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
         assert transport.killed == ([] if answered else [0, 1])
         assert engine.counts.lost_workers == (0 if answered else 2)
@@ -329,7 +329,7 @@ def test_the_next_deadline_bounds_the_wait(monkeypatch):
     now = [0.0]
     transport = scripted_with_clock(monkeypatch, now)
     transport.on_send = lambda sent: transport.inbox.append(sent.answer()) if sent.worker else None
-    with Engine(transport, Limits(workers=1, first_deadline_s=0.25, min_deadline_s=0.25)) as engine:
+    with Engine(transport, Limits(workers=1, first_chunk_timeout_s=0.25, chunk_timeout_s=0.25)) as engine:
         engine.evaluate(around(FIRST, CHUNKS))
     assert transport.killed == [0]
     assert now[0] == pytest.approx(0.25)
@@ -342,7 +342,11 @@ def test_what_a_hung_worker_had_written_is_told_with_its_loss(monkeypatch, is_la
     transport.last_words = {0: "no licence; retrying", 1: "all is well"}
     transport.on_send = lambda sent: transport.inbox.append(sent.answer()) if sent.worker else None
     limits = Limits(
-        workers=2, first_deadline_s=1.0, min_deadline_s=1.0, max_attempts=1 if is_last else 2, late_factor=math.inf
+        workers=2,
+        first_chunk_timeout_s=1.0,
+        chunk_timeout_s=1.0,
+        max_attempts=1 if is_last else 2,
+        late_factor=math.inf,
     )
     with Engine(transport, limits) as engine:
         if is_last:

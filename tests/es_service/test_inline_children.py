@@ -72,7 +72,7 @@ def test_a_child_stopped_in_mid_message_blocks_nobody():
     assert one.parameters_D.nbytes > 5_000_000
     chunks = [EvaluationChunk(1, chunk_id) for chunk_id in range(3)]
     before = footprint()
-    with inline_engine(wide, Limits(workers=1, min_deadline_s=0.5)) as engine:
+    with inline_engine(wide, Limits(workers=1, chunk_timeout_s=0.5)) as engine:
         result = engine.evaluate(around(one, chunks))
         with pytest.raises(AssertionError):
             assert_same(engine.evaluate(around(other, chunks)), result)
@@ -124,7 +124,7 @@ def test_threads_are_lost_together_also_those_that_have_nothing_to_do(number):
     blamed for the first."""
     before = footprint()
     long = spec(rollout="simd", episode_steps=200_000)
-    limits = Limits(workers=6, min_deadline_s=3.0, restart_backoff_s=0.01)
+    limits = Limits(workers=6, chunk_timeout_s=3.0, restart_backoff_s=0.01)
     with inline_engine(long, limits, threads=True) as engine:
         expected = engine.evaluate(around(FIRST, CHUNKS[:1]))
         engine.evaluate(around(FIRST, CHUNKS[:1]))  # so that it is known how long it takes

@@ -200,7 +200,7 @@ def ray_engine(ray: PretendedRay, limits: Limits, watch: PretendedWatch | None =
 @pytest.mark.parametrize("state", ["dead", "hung"])
 def test_a_node_that_dies_is_one_fault_of_what_it_ran_however_many_workers_it_held(state):
     """One chunk, and more idle actors on its node than it has attempts: they are called, in vain, and blame nobody."""
-    ray, limits = PretendedRay(), Limits(6, min_deadline_s=0.05, first_deadline_s=0.05, restart_backoff_s=0.01)
+    ray, limits = PretendedRay(), Limits(6, chunk_timeout_s=0.05, first_chunk_timeout_s=0.05, restart_backoff_s=0.01)
 
     def node_dies(actor: Actor) -> None:
         for number in range(5):
@@ -240,7 +240,7 @@ def test_an_actor_that_waited_for_its_place_says_once_that_it_has_one():
 
 def test_an_actor_that_is_given_no_place_is_not_lost():
     """Of three there is room for two. One of those hangs, long enough for the third to be started anew many times."""
-    ray, limits = PretendedRay(room=2), Limits(3, start_deadline_s=0.02, min_deadline_s=0.3, first_deadline_s=0.3)
+    ray, limits = PretendedRay(room=2), Limits(3, start_timeout_s=0.02, chunk_timeout_s=0.3, first_chunk_timeout_s=0.3)
 
     def hang(actor: Actor) -> None:
         ray.end(actor, "hung")
@@ -266,8 +266,11 @@ def test_a_run_that_got_no_place_says_what_it_needs_and_what_there_is(watch, roo
     """In a Ray of our own, there is room for each worker, so more nodes would not help."""
     if watch is not None:
         watch.now = Membership(rooms, {}, frozenset(), frozenset({"head", *rooms}))
-    ray, limits = PretendedRay(0), Limits(2, start_deadline_s=0.1, place_timeout_s=0.25)
-    text = r"no worker got a place for 0\.25 s \(place_timeout_s\).* Each worker needs 1 CPU; .*has 2 CPU.*" + advice
+    ray, limits = PretendedRay(0), Limits(2, start_timeout_s=0.1, place_timeout_s=0.25)
+    text = (
+        r"no worker got a place for 0\.25 s \(compute.place_timeout_s\).* Each worker needs 1 CPU; .*has 2 CPU.*"
+        + advice
+    )
     with ray_engine(ray, limits, watch) as engine, pytest.raises(EvaluationError, match=text):
         engine.wait_for_place()
     assert {actor.state for actor in ray.actors} == {"dead"}, "none still asks for a place"
@@ -287,7 +290,7 @@ def test_the_wait_for_a_first_place_is_told_of_twice_and_can_be_stopped(monkeypa
 
     watch = PretendedWatch()
     watch.now = Membership({"node": 2}, {}, frozenset(), frozenset({"node"}))
-    limits = Limits(2, start_deadline_s=0.2)
+    limits = Limits(2, start_timeout_s=0.2)
     with Engine(transport(ray, limits, watch), limits, should_stop, on_wait=told.append) as engine:
         assert engine.evaluate(around(FIRST, [CHUNK])) == [f"of {CHUNK}"]
         engine.wait_for_place()
@@ -377,7 +380,7 @@ def test_a_node_that_refuses_is_told_of_once_and_gets_no_other_worker(grows):
     ray.refusing = {"bad"}
     ray.node_of = lambda number: "good" if ray.selectors[number] or number % 2 else "bad"
     watch.now = Membership({"good": 2, "bad": 2}, {"good": 2, "bad": 2}, frozenset(), frozenset({"good", "bad"}))
-    limits = Limits(4 if grows else 6, start_deadline_s=1000.0)
+    limits = Limits(4 if grows else 6, start_timeout_s=1000.0)
     actors = transport(ray, limits, watch, Growth(4) if grows else None, on_refusal=told.append)
     with Engine(actors, limits) as engine:
         for _ in range(5):

@@ -114,7 +114,7 @@ def test_deadlines_follow_the_median_of_their_kind():
     state, _ = step(state, Result(0, "c", 1), 7.0)
     assert next_deadline(state) == 7.0 + 5.0 * 2.0
     state, _ = step(state, Result(0, "d", 1), 8.0)
-    assert next_deadline(state) == 8.0 + 10.0, "never below min_deadline_s"
+    assert next_deadline(state) == 8.0 + 10.0, "never below chunk_timeout_s"
     state, _ = step(state, Result(0, "e", 1), 9.0)
     assert next_deadline(state) == 9.0 + 100.0, "of another kind, no duration is known"
     assert state.durations_s == {"train": (4.0, 2.0, 1.0, 1.0, 1.0)}
@@ -150,19 +150,19 @@ def test_compiling_has_a_time_of_its_own_and_a_first_item_has_a_duration():
 def test_the_message_of_a_missed_deadline_says_what_the_worker_was_doing():
     """And names the limit. The item of one that hangs while it compiles is charged, like any other."""
     state, _ = play(cold(1, max_attempts=1), (0.0, items("a")))
-    doing = "did not finish compiling for work item a within 200 s (compile_deadline_s)"
+    doing = "did not finish compiling for work item a within 200 s (compute.compile_timeout_s)"
     failed = f"work item a failed in 1 attempts; the last time worker 0 was lost while running it: {doing}"
     assert step(state, Tick(), 200.0)[1][:2] == [StopWorker(0, doing), Fail(failed)]
     state, _ = step(state, Compiled(0, "train", 50.0), 50.0)
-    doing = "no answer to work item a within 100 s of computing (first_deadline_s)"
+    doing = "no answer to work item a within 100 s of computing (compute.first_chunk_timeout_s)"
     assert StopWorker(0, doing) in step(state, Tick(), 150.0)[1]
     state, _ = play(state, (60.0, Result(0, "a", 1)), (61.0, items("b")))
-    doing = "no answer to work item b within 50 s of computing (min_deadline_s)"
+    doing = "no answer to work item b within 50 s of computing (at least compute.chunk_timeout_s)"
     assert StopWorker(0, doing) in step(state, Tick(), 111.0)[1]
 
 
 def test_a_first_item_has_no_less_time_than_later_ones():
-    state, _ = play(ready(1, first_deadline_s=10.0, min_deadline_s=60.0), (0.0, items("a")))
+    state, _ = play(ready(1, first_chunk_timeout_s=10.0, chunk_timeout_s=60.0), (0.0, items("a")))
     assert next_deadline(state) == 60.0
 
 
@@ -181,8 +181,8 @@ def test_deadlines_and_durations_are_in_proportion_to_the_size_of_an_item():
     ("limit_s", "said"), [(0.25, "0.25"), (12.5, "12.5"), (99.96, "100"), (3600.0, "3600"), (1_234_567.8, "1234568")]
 )
 def test_seconds_are_said_without_an_exponent(limit_s, said):
-    state, _ = play(ready(1, first_deadline_s=limit_s, min_deadline_s=0.1), (0.0, items("a")))
-    reason = f"no answer to work item a within {said} s of computing (first_deadline_s)"
+    state, _ = play(ready(1, first_chunk_timeout_s=limit_s, chunk_timeout_s=0.1), (0.0, items("a")))
+    reason = f"no answer to work item a within {said} s of computing (compute.first_chunk_timeout_s)"
     assert step(state, Tick(), limit_s)[1][0] == StopWorker(0, reason)
 
 
@@ -200,7 +200,7 @@ def test_the_clock_of_a_prefetched_task_starts_when_the_one_ahead_is_done():
     assert next_deadline(state) == 14.5 + 12.5
     assert step(state, Tick(), 26.9) == (state, [])
     state, commands = step(state, Tick(), 27.0)
-    reason = "no answer to work item d within 12.5 s of computing (min_deadline_s)"
+    reason = "no answer to work item d within 12.5 s of computing (at least compute.chunk_timeout_s)"
     assert commands == [StopWorker(0, reason), StartWorker(1)]
     assert step(state, WorkerUp(1), 28.0)[1] == [Assign(1, "d", 2)]
 

@@ -24,6 +24,8 @@ from es_service.dispatch.events import (
 from es_service.dispatch.scheduler_state import initial_state, is_waiting, next_deadline
 from tests.es_service.scheduler_play import LIMITS, items, play, ready, step
 
+TOO_LATE = "did not come up within 50 s (half of compute.no_worker_timeout_s)"
+
 
 def test_a_worker_that_keeps_raising_is_quarantined_without_blaming_its_next_task():
     state, _ = play(ready(), (1.0, items("abcdefg")), (2.0, Failure(0, "a", 1, "no")), (3.0, Failure(0, "c", 1, "bad")))
@@ -87,7 +89,7 @@ def test_workers_that_are_lost_together_before_they_come_up_are_one_try_however_
         else:
             losses = [(now + 0.01 * number, WorkerLost(worker, "")) for number, worker in enumerate(state.starting)]
             state, _ = play(state, *losses)
-        now += LIMITS.max_backoff_s  # less than start_deadline_s
+        now += LIMITS.max_backoff_s  # less than start_timeout_s
         state, _ = step(state, Tick(), now)
     assert state.failed is not None
     assert state.failed.startswith("no worker started in 3 consecutive attempts")
@@ -99,7 +101,7 @@ def test_a_place_gives_a_worker_all_its_time_to_come_up():
     state, _ = play(state, *((49.0, Placed(worker)) for worker in range(3)))
     assert next_deadline(state) == 99.0
     state, commands = play(state, (98.0, WorkerUp(0)), (99.0, Tick()))
-    assert commands[0] == StopWorker(1, "did not come up within 50 s (start_deadline_s)")
+    assert commands[0] == StopWorker(1, TOO_LATE)
     for stranger in (0, 1, 7):
         assert step(state, Placed(stranger), 99.5) == (state, [])
 
@@ -123,19 +125,18 @@ def test_a_worker_that_never_comes_up_is_killed_and_replaced():
     state, _ = play(initial_state(LIMITS), (0.0, Tick()), (1.0, WorkerUp(1)))
     assert next_deadline(state) == 50.0
     state, commands = step(state, Tick(), 50.0)
-    assert commands == [StopWorker(0, "did not come up within 50 s (start_deadline_s)"), StartWorker(2)]
+    assert commands == [StopWorker(0, TOO_LATE), StartWorker(2)]
     assert step(state, WorkerUp(0), 51.0) == (state, [])
     assert step(state, WorkerLost(0, "stopped"), 51.0) == (state, [])
 
 
 def test_a_worker_without_a_place_is_started_anew_and_nobody_hears_of_it():
     """However often: then the last that is up is lost, and the run waits for others as long as it should."""
-    patient = initial_state(replace(LIMITS, compile_deadline_s=1000.0))
+    patient = initial_state(replace(LIMITS, compile_timeout_s=1000.0))
     state, _ = play(patient, (0.0, Tick()), (1.0, WorkerUp(0)), (1.0, items("a")))
     for number in range(1, 6):
         state, commands = step(state, Tick(silent=(number,)), 50.0 * number)
-        reason = "did not come up within 50 s (start_deadline_s)"
-        assert commands == [StopWorker(number, reason), StartWorker(number + 1)]
+        assert commands == [StopWorker(number, TOO_LATE), StartWorker(number + 1)]
     assert (state.lost_workers, state.last_lost, state.start_failures) == (0, None, 0)
     state, _ = play(state, (251.0, WorkerLost(0, "killed")), (252.0, WorkerLost(6, "no memory")))
     assert (state.failed, state.lost_workers) == (None, 2)
@@ -145,7 +146,7 @@ def test_what_a_silent_worker_does_not_answer_in_time_is_not_to_blame():
     state, _ = play(ready(1), (0.0, items("a")))
     state, commands = step(state, Tick(silent=(0,)), 100.0)
     assert commands == [
-        StopWorker(0, "no answer to work item a within 100 s of computing (first_deadline_s)"),
+        StopWorker(0, "no answer to work item a within 100 s of computing (compute.first_chunk_timeout_s)"),
         StartWorker(1),
     ]
     assert state.lost_workers == 1
@@ -159,8 +160,8 @@ def test_no_worker_for_too_long_after_the_first_had_come_up_fails_the_run():
     assert (state.failed, next_deadline(state)) == (None, 80.0)
     state, commands = step(state, Tick(), 80.0)
     assert commands[0] == Fail(
-        "no worker was up for 30 s (no_worker_timeout_s) while 2 work items waited; "
-        "last loss: worker 2: did not come up within 50 s (start_deadline_s)"
+        "no worker was up for 30 s (compute.no_worker_timeout_s) while 2 work items waited; "
+        "last loss: worker 2: " + TOO_LATE
     )
 
 
@@ -186,11 +187,11 @@ def test_a_run_waits_for_its_first_place_for_as_long_as_it_takes():
 
 
 def test_a_first_place_can_have_a_time_limit():
-    limits = replace(LIMITS, place_timeout_s=70.0, names={"place_timeout_s": "the.key"})
+    limits = replace(LIMITS, place_timeout_s=70.0)
     state, _ = play(initial_state(limits), (0.0, Tick()), (40.0, items("a")), (50.0, Tick((0, 1))))
     assert next_deadline(state) == 70.0
     assert step(state, Tick((2, 3)), 70.0)[1] == [
-        Fail("no worker got a place for 70 s (the.key); last loss: no worker was lost"),
+        Fail("no worker got a place for 70 s (compute.place_timeout_s); last loss: no worker was lost"),
         StopWorker(2, "the run failed"),
         StopWorker(3, "the run failed"),
     ]
@@ -224,7 +225,9 @@ def test_a_drained_worker_finishes_what_it_has_and_is_replaced_without_blame():
     assert play(initial_state(LIMITS), (0.0, Tick()), (1.0, Drain(0)))[1] == [StopWorker(0, "drained"), StartWorker(2)]
     # One that hangs while draining is killed all the same.
     state, commands = play(state, (3.0, WorkerUp(2)), (101.0, Tick()))
-    assert StopWorker(0, "no answer to work item a within 100 s of computing (first_deadline_s)") in commands
+    assert (
+        StopWorker(0, "no answer to work item a within 100 s of computing (compute.first_chunk_timeout_s)") in commands
+    )
 
 
 def test_the_number_of_workers_follows_the_wish():

@@ -12,12 +12,22 @@ from es_service.cli.commands import error_message
 from es_service.config.compute import ComputeConfig
 from es_service.config.model import TaskConfig
 from es_service.config.parallel import chunks_at_once, chunks_of_phases, parallel_sentence
-from es_service.dispatch.events import Compiled, Result, StopWorker, Submit, Tick, WorkerLost, WorkerUp, WorkItem
+from es_service.dispatch.events import (
+    Compiled,
+    Result,
+    StopWorker,
+    Submit,
+    Tick,
+    WorkerLost,
+    WorkerUp,
+    WorkItem,
+    key_of,
+)
 from es_service.dispatch.scheduler import handle
 from es_service.dispatch.scheduler_state import initial_state
 from es_service.errors import ConfigError, StoreError
 from es_service.runs import session
-from es_service.runs.session import LIMIT_NAMES, dispatch_limits, initial_centres, worker_count
+from es_service.runs.session import dispatch_limits, initial_centres, worker_count
 
 CONFIG = {
     "task": {"environment": "point_maze"},
@@ -63,8 +73,12 @@ def test_messages_of_deadlines_name_the_keys_that_set_them():
 
 
 def test_keys_that_messages_name_exist():
-    for name in LIMIT_NAMES.values():
-        (section, key), *others = re.findall(r"(compute|task)\.(\w+)", name)
+    times = {
+        name for name in vars(dispatch_limits(load_config(CONFIG))) if re.search(r"_time(out|_limit)_s$|^time_", name)
+    }
+    assert {"start_timeout_s", "chunk_timeout_s", "time_limit_s", "no_worker_timeout_s"} < times
+    for limit in times:
+        (section, key), *others = re.findall(r"(compute|task)\.(\w+)", key_of(limit))
         assert not others
         assert key in {"compute": ComputeConfig, "task": TaskConfig}[section].model_fields
 

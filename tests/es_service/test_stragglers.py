@@ -204,7 +204,7 @@ def test_a_phase_ends_without_a_worker_that_hangs_and_the_worker_is_replaced_wit
     state, commands = play(state, (13.0, Result(1, "a", 1)))
     assert (commands, pending(state), next_deadline(state)) == ([Deliver("a")], 0, 20.0)
     state, commands = play(state, (14.0, items("cd")), (20.0, Tick()))
-    reason = "no answer to work item a within 10 s of computing (min_deadline_s)"
+    reason = "no answer to work item a within 10 s of computing (at least compute.chunk_timeout_s)"
     assert commands[:2] == [StopWorker(0, reason), StartWorker(2)]
     assert [state.items[item].faults for item in "cd"] == [0, 0]
 
@@ -281,7 +281,7 @@ def test_sums_over_neighbouring_blocks_are_counted_once_whichever_copy_answers_f
     monkeypatch.setattr(engine_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
     weights = np.zeros(1, np.float32)
     limits = Limits(
-        rng.randint(2, 6), cores=rng.choice((1, 4)), item_s=0.004, late_by_s=0.002, max_attempts=20, min_deadline_s=2.0
+        rng.randint(2, 6), cores=rng.choice((1, 4)), item_s=0.004, late_by_s=0.002, max_attempts=20, chunk_timeout_s=2.0
     )
     with Engine(transport, limits) as engine:
         for generation in range(6):

@@ -225,7 +225,7 @@ def test_calls_are_sent_one_by_one_and_the_limit_of_time_is_that_of_calls():
     assert dispatch_limits(config).episodes_together == 1
     assert chunks_of_phases(load_config(config_of(NOISY)))["evaluation"] == 30
     limited = load_config(config_of(HILL), ["task.time_limit_s=5"])
-    assert dispatch_limits(limited).chunk_limit_s == 2 * 5.0 + 60.0
+    assert dispatch_limits(limited).time_limit_s == 2 * 5.0 + 60.0
     with pytest.raises(ConfigError, match=r"task.time_limit_s: 5 is not allowed for point_maze"):
         load_config({**config_of(HILL), "task": {"environment": "point_maze", "time_limit_s": 5}, "map": {}})
 
