@@ -210,13 +210,11 @@ def _go_on(
 
 
 def _to_target(config: RunConfig, outcome: Outcome, listener: _Listener, *, strict: bool = False) -> Outcome:
-    """Certify the best centre whenever a session has ended for that, and continue if it does not reach the target."""
+    """Certify the best centre whenever a session has ended for that, and continue: if it reaches the target, no longer
+    than until the next session has opened the run."""
     while outcome.reason == targets.TO_CERTIFY:
-        folder = outcome.run.folder
-        targets.certify_best(folder, config, listener.on_notice)
-        if reason := target_reached(folder, config.budget.target_certified):
-            return Outcome(open_run(folder), reason)
-        _, outcome = _session(folder, lambda store: config, listener, strict=strict)
+        targets.certify_best(outcome.run.folder, config, listener.on_notice)
+        _, outcome = _session(outcome.run.folder, lambda store: config, listener, strict=strict)
     return outcome
 
 
@@ -235,8 +233,7 @@ def _session(
             listener.on_notice(notice)
         store.notices.clear()
         config = make_config(store)
-        require_cores(config, WayOut("resume", "", str(folder), asked))
-        require_resumable(store, config, strict=strict)
+        require_resumable(store, config, asked, strict=strict)
         try:
             write_config(folder, config.resolved_yaml())
         except OSError as error:

@@ -266,7 +266,7 @@ class Engine(Generic[AnyTransport]):
             self._handle(message)
         else:  # check deadlines only if no message waits, or a late check would kill workers that have answered
             self._step(events.Tick(self.transport.silent()))
-        self._waits.look(self._state, time.monotonic(), self.transport.shortage)
+        self._waits.tell(self._state, time.monotonic(), self.transport.shortage)
 
     def _handle(self, message: Message) -> None:
         if not isinstance(message, Answer):

@@ -21,7 +21,7 @@ from typing import Any
 
 from es_service.config.compute import ENGINE_IMPLIES
 from es_service.dispatch.ray_head import require_head
-from es_service.dispatch.ray_nodes import OTHER_CLUSTER, Claim, Membership, cores_of_nodes, look
+from es_service.dispatch.ray_nodes import OTHER_CLUSTER, Claim, Membership, cores_of_nodes, read_membership
 from es_service.dispatch.ray_side_effects import environment_kept, signal_handlers_kept
 from es_service.errors import EvaluationError, Interrupted, StartError, WayOut
 from es_service.logs import logger
@@ -183,7 +183,7 @@ class Watch:
 
     def __init__(self, ray: ModuleType, claim: Claim) -> None:
         self._ray, self._claim = ray, claim
-        self._latest = look(ray, claim)
+        self._latest = read_membership(ray, claim)
         self._answered_s = self._asked_s = time.monotonic()
         self._is_replaced = False
         self._end = threading.Event()
@@ -218,7 +218,7 @@ class Watch:
     def _run(self) -> None:
         while not self._end.wait(MEMBERSHIP_S):
             try:
-                self._latest = look(self._ray, self._claim)
+                self._latest = read_membership(self._ray, self._claim)
                 self._answered_s = time.monotonic()
             except Exception as error:  # of any class; it means that there is no answer
                 self._is_replaced = OTHER_CLUSTER in str(error)

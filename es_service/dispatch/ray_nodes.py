@@ -88,7 +88,7 @@ def layout(
         nodes = [] if ours or gpus else cores_of_nodes(ray)
         cpus = actor_cores(nodes, None, most) if grows else actor_cores(nodes, limits.workers, None)
     claim = Claim(cpus, gpus)
-    nodes = look(ray, claim)
+    nodes = read_membership(ray, claim)
     if ours and not nodes.room:
         text = f"this machine has no room for a worker. {demand(ray, claim)}. Lower compute.worker_resources."
         raise StartError(text)
@@ -134,7 +134,7 @@ def cores_of_nodes(ray: ModuleType) -> list[int]:
     return [int(count) for count in cpus if count >= 1.0]
 
 
-def look(ray: ModuleType, claim: Claim) -> Membership:
+def read_membership(ray: ModuleType, claim: Claim) -> Membership:
     """The nodes of the cluster now. Raises an exception of Ray if its head node does not answer."""
     ask_head(ray)
     leaving = frozenset(_draining(ray))

@@ -35,7 +35,7 @@ class Waits:
         """A phase begins, with chunks of these kinds."""
         self._kinds, self._begun_s = tuple(dict.fromkeys(kinds)), now
 
-    def look(self, state: SchedulerState, now: float, shortage: Callable[[], str]) -> None:
+    def tell(self, state: SchedulerState, now: float, shortage: Callable[[], str]) -> None:
         """Tell what has changed. `shortage` is called only if it is told."""
         since_s = state.down_since_s if is_waiting(state) else None
         waits = since_s is not None and now >= since_s + NOTICE_S

@@ -24,7 +24,7 @@ from es_service.loop.parts import (
 )
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
-from es_service.runs.certified import Certified, certified_policies, newest_certified
+from es_service.runs.certified import Certified, newest_certified
 from es_service.runs.standing import Standing, standing_at
 from es_service.runs.view import Run, is_light
 from es_service.search.maps.behaviour_map import BehaviourMap
@@ -196,7 +196,7 @@ def _paths(found: SoundRun) -> dict[int, NDArray[np.float32]]:
 
 def _certified(folder: Path, problems: list[str]) -> Certified | None:
     try:
-        return newest_certified(certified_policies(folder))
+        return newest_certified(folder)
     except StoreError as error:
         if error.sentence not in problems:
             problems.append(error.sentence)

@@ -106,10 +106,10 @@ def certified_policies(folder: Path) -> list[Certified]:
     return [_from_row(row) for row in read_certifications(folder)]
 
 
-def newest_certified(policies: list[Certified]) -> Certified | None:
-    """The policy that the newest certification has put first; None if there is none, or if damage has removed it."""
-    newest = max((one.number for one in policies), default=None)
-    return next((one for one in policies if (one.number, one.rank) == (newest, 0)), None)
+def newest_certified(folder: Path) -> Certified | None:
+    """The policy that the newest certification of a run has put first; None if there is none, or if damage has removed
+    it. No other certification is read. Raises StoreError if it is damaged."""
+    return next((_from_row(row) for row in read_certifications(folder, newest=True) if row.rank == 0), None)
 
 
 def target_reached(folder: Path, target: float | None) -> str:

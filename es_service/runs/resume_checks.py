@@ -1,4 +1,5 @@
-"""Checks of whether a run can be continued with a config: its constants, its task, and the columns of its tables."""
+"""Checks of whether a run can be continued with a config: cores of this machine, constants of the run, its task, the
+columns of its tables, and if asked for its code."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from es_service.loop.history import Column, evaluated_columns, history_columns
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.checked_config import changes_from
 from es_service.runs.identity import require_unchanged
-from es_service.runs.standing import Standing, look
+from es_service.runs.session import require_cores
+from es_service.runs.standing import Standing, read_standing
 from es_service.runs.view import open_run
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store.schema import RunMeta
@@ -26,19 +28,22 @@ KEPT_OF_A_TASK = ("observation_size", "action_size", "descriptor_names", "has_go
 """Fields of a task that the policies and the history of a run depend on."""
 
 
-def require_resumable(store: RunStore, config: RunConfig, *, strict: bool) -> None:
-    """Raise an error if a run cannot be continued with a config.
+def require_resumable(store: RunStore, config: RunConfig, asked: Mapping[str, Any], *, strict: bool) -> None:
+    """Raise an error if a run cannot be continued with a config on this machine.
 
     Args:
+        asked: settings of the call, which ways out repeat.
         strict: whether to refuse other code, other packages and another kind of processor, too.
 
     Raises:
-        ConfigError: a constant of the run would change (all are listed), the task has changed, or `strict` is set and
-            something has changed. StoreError: the run has other columns than this version writes.
+        ConfigError: a constant of the run would change (all are listed), the task has changed, the workers are too many
+            for the cores of this machine, or `strict` is set and something has changed. StoreError: the run has other
+            columns than this version writes.
     """
     folder = store.folder
+    require_cores(config, WayOut("resume", "", str(folder), asked))
     if changes := changes_from(store.meta.constants, config):
-        raise refused_changes(folder, changes, ALGORITHMS, _budget_of_a_fork(config, look(open_run(folder))))
+        raise refused_changes(folder, changes, ALGORITHMS, _budget_of_a_fork(config, read_standing(open_run(folder))))
     task = task_of(config)
     if other := _other_task(store.meta.task, task):
         raise ConfigError(

@@ -61,7 +61,7 @@ def newest_runs(folder: Path, most: int = 10) -> list[Path]:
     return sorted(written, key=lambda run: written[run], reverse=True)[:most]
 
 
-def look(run: Run) -> Standing:
+def read_standing(run: Run) -> Standing:
     """The present standing of a run. Raises StoreError if the run cannot be read."""
     driver = lock_holder(run.folder)  # read before the history, so that the last row is not missed
     return standing_at(run, driver, read_newest(run.folder))

@@ -222,7 +222,7 @@ class Run:
         if which == "centre":
             return self.at(wanted=is_no_elite).policy("centre")
         if which == "certified":
-            found = newest_certified(certified_policies(self.folder))
+            found = newest_certified(self.folder)
             if found is None:
                 way_out = WayOut("certify", "certify one", str(self.folder))
                 raise NotInRunError(f"{self.folder} has no certified policy", run=self.folder, ways_out=[way_out])

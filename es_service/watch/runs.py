@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 from es_service.errors import ServiceError, StoreError
 from es_service.report.data import RunData, followed, run_data
-from es_service.runs.certified import Certified, certified_policies, newest_certified
-from es_service.runs.standing import Standing, look
+from es_service.runs.certified import Certified, newest_certified
+from es_service.runs.standing import Standing, read_standing
 from es_service.runs.view import open_run
 from es_service.store.folder import CONFIG, COPY, DATABASE, LOCK, holds_run
 from es_service.store.lock import lock_holder
@@ -142,8 +142,8 @@ def require_inside(found: Found) -> None:
 def _summary(found: Found) -> Summary:
     try:
         require_inside(found)
-        standing = look(open_run(found.folder))
-        certified = newest_certified(certified_policies(found.folder))
+        standing = read_standing(open_run(found.folder))
+        certified = newest_certified(found.folder)
     except ServiceError as error:
         return Summary(found, None, None, " ".join(error.sentence.split()))
     except FORGED as error:

@@ -17,7 +17,7 @@ from es_service.dispatch.engine import Answer, Engine
 from es_service.dispatch.events import Compiled, Drain, Failure, Limits, Placed, SetWorkers, WorkerLost, WorkerUp
 from es_service.dispatch.ray_calls import IN_CALL_BYTES
 from es_service.dispatch.ray_engine import Actors
-from es_service.dispatch.ray_nodes import ONE_CORE, Claim, Growth, Membership, emptiest, look
+from es_service.dispatch.ray_nodes import ONE_CORE, Claim, Growth, Membership, emptiest, read_membership
 from es_service.errors import EvaluationError, Interrupted
 from es_service.protocol.kept_subjects import KEPT_SUBJECTS
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk, around
@@ -453,7 +453,7 @@ def test_nodes_that_are_about_to_go_are_alive_and_give_no_room():
     unused = {"stays": {"CPU": 3.0}, "leaves": {"CPU": 2.0}}
     private = SimpleNamespace(state=SimpleNamespace(state=state, available_resources_per_node=lambda: unused))
     ray = SimpleNamespace(nodes=lambda: nodes, _private=private)
-    seen = look(ray, ONE_CORE)
+    seen = read_membership(ray, ONE_CORE)
     assert seen == Membership({"stays": 4}, {"stays": 3}, frozenset({"leaves"}), frozenset({"stays", "leaves"}))
 
 

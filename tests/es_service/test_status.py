@@ -25,7 +25,7 @@ from es_service.cli.tables.status import follow_status, print_status, print_summ
 from es_service.errors import ConfigError, Interrupted
 from es_service.loop.interfaces import Stop
 from es_service.runs import recent
-from es_service.runs.standing import Standing, look, more, state
+from es_service.runs.standing import Standing, more, read_standing, state
 from es_service.store import reader
 from es_service.store.lock import acquire_lock
 from tests.run_examples import write_run
@@ -138,7 +138,7 @@ def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, cap
     print_summary(console, run, "")
     print_status(console, run)
     printed = capsys.readouterr().out
-    suggested = settings(more(look(run)))
+    suggested = settings(more(read_standing(run)))
     assert f"state              finished: the {'target' if 'reached' in spent else 'budget'}" in printed
     assert spent in printed
     assert printed.count(f"resume {run.folder} {' '.join(suggested)}") == 2
@@ -150,10 +150,10 @@ def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, cap
     way = refused.value.way_out
     assert way is not None
     assert (way.action, way.run) == ("fork", str(run.folder))
-    assert way.settings == {"search.sigma": 0.05, **more(look(run))}
+    assert way.settings == {"search.sigma": 0.05, **more(read_standing(run))}
     with pytest.warns(RuntimeWarning, match="no generation was run"):
         empty = api.fork(run.folder, ["search.sigma=0.05"], out=tmp_path / "empty").run
-    assert more(look(empty)) == more(look(run))
+    assert more(read_standing(empty)) == more(read_standing(run))
     for going_on in (
         api.fork(way.run, way.settings, out=tmp_path / "fork"),
         api.resume(empty.folder, suggested[1::2]),

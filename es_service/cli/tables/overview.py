@@ -12,7 +12,7 @@ from es_service.cli.several import of_each
 from es_service.errors import ServiceError
 from es_service.report.progress import short
 from es_service.runs.folders import output_of
-from es_service.runs.standing import Standing, look, state
+from es_service.runs.standing import Standing, read_standing, state
 from es_service.runs.view import open_run
 
 _COLUMNS = ("run", "algorithm", "task", "seed", "generation", "env steps", "best", "cells", "state")
@@ -27,7 +27,7 @@ def print_overview(console: Console, folders: Sequence[Path]) -> bool:
         folders: those of runs or of sweeps.
     """
     rows, problems = [], 0
-    for folder, found in of_each(folders, lambda run: _row(look(open_run(run)))):
+    for folder, found in of_each(folders, lambda run: _row(read_standing(open_run(run)))):
         if isinstance(found, ServiceError):
             rows.append(_without_row(folder, f"error: {' '.join(found.sentence.split())}"))
             problems += 1

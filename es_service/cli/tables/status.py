@@ -11,9 +11,9 @@ from es_service.cli.console import print_line
 from es_service.cli.tables.certified import certified_line
 from es_service.errors import StoreError
 from es_service.report.progress import plain_line
-from es_service.runs.certified import certified_policies, newest_certified
+from es_service.runs.certified import newest_certified
 from es_service.runs.recent import FAULTS_OF, Recent, read_recent
-from es_service.runs.standing import Standing, doing, is_waiting, look, more, population_size, state, way_on
+from es_service.runs.standing import Standing, doing, is_waiting, more, population_size, read_standing, state, way_on
 from es_service.runs.view import Run
 
 FOLLOW_INTERVAL_S = 1.0
@@ -23,7 +23,7 @@ SHOWN_PARAMETERS = 12
 
 def print_status(console: Console, run: Run) -> None:
     """Print the settings of a run, its state (waiting, running, stopped or finished) and its progress."""
-    standing = look(run)
+    standing = read_standing(run)
     constants, parent = run.constants, run.meta.parent
     method = (constants["search.algorithm"], population_size(constants))
     fields = {
@@ -45,7 +45,7 @@ def follow_status(console: Console, run: Run) -> None:
     """Print a line for the newest generation, at most one a second, until no driver is running; and one for a wait."""
     next_generation, told = 0, ""
     while True:
-        standing = look(run)
+        standing = read_standing(run)
         waits_for = "a place" if is_waiting(standing) else doing(standing)
         if waits_for and waits_for != told:
             print_line(console, state(standing))
@@ -62,7 +62,7 @@ def follow_status(console: Console, run: Run) -> None:
 
 def print_summary(console: Console, run: Run, reason: str) -> None:
     """Print the summary of a session at its end: the result, the folder and the next commands."""
-    standing, folder = look(run), run.folder
+    standing, folder = read_standing(run), run.folder
     sigma = next((key for key in ("search.sigma", "search.iso_sigma") if key in run.constants), None)
     doubled = {sigma: float(f"{run.constants[sigma] * 2:g}")} if sigma else {}
     print_line(console, f"\nDone: {reason}.")
@@ -139,7 +139,7 @@ def _objectives(recent: Recent) -> dict[str, str]:
 def _certified(run: Run) -> dict[str, str]:
     """The policy of the newest certification, if there is one."""
     try:
-        found = newest_certified(certified_policies(run.folder))
+        found = newest_certified(run.folder)
     except StoreError as error:
         return {"certified": f"not known: {error.sentence}"}
     return {} if found is None else {"certified": f"{found.name}: {certified_line(found.row())}"}
