@@ -32,7 +32,8 @@ from workers.episode import episode_steps
 from workers.policies.policy import initial_parameters
 from workers.simd.backend.emit import graph_function
 from workers.simd.backend.function_builder import FunctionBuilder, module
-from workers.simd.backend.target import compile_object, host_target, load_object
+from workers.simd.backend.machine_code import compile_object, load_object
+from workers.simd.backend.target import host_target
 from workers.simd.backend.words import aligned, words_of
 from workers.simd.episodes.check import check_resets
 from workers.simd.episodes.kernel import compile_kernel
@@ -48,9 +49,7 @@ REPEATS = 2000
 def run_of(functions: list[FunctionBuilder], call: str, parameters: list[str]) -> Callable[..., float]:
     """Seconds of one call of the last function, given its arguments; the least of five times REPEATS."""
     target = host_target()
-    inside = FunctionBuilder(
-        "inside", [f"ptr %{name}" for name in parameters] + ["float %unit", "i64 %times"], target.width
-    )
+    inside = FunctionBuilder("inside", [f"ptr %{name}" for name in parameters] + ["float %unit", "i64 %times"], target)
     inside.loop("%times", lambda *_: [inside.do(call)][:0])
     address, alive = load_object(compile_object(module([*functions, inside]), target), target)
     signature = [*[ctypes.c_void_p] * len(parameters), ctypes.c_float, ctypes.c_int64]
@@ -88,7 +87,7 @@ def measure(task: str) -> dict[str, float]:
     width, pairs = target.width, target.width // 2
     inputs_O = np.flatnonzero(~always_zero(environment))
     steps = episode_steps(environment, spec, training=True, inputs_O=inputs_O)
-    network = plan(spec.policy, inputs_O, width)
+    network = plan(spec.policy, inputs_O, target)
     key, inputs = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32), jax.ShapeDtypeStruct((len(inputs_O),), jnp.float32)
     action = jax.ShapeDtypeStruct((spec.policy.outputs,), jnp.float32)
     carry = jax.eval_shape(steps.begin, key)
@@ -96,10 +95,10 @@ def measure(task: str) -> dict[str, float]:
 
     graph, _, outputs = trace_jaxpr(jax.make_jaxpr(steps.look)(carry, inputs, inputs))
     sources = [("carry", words), ("constants", len(inputs_O)), ("constants", len(inputs_O))]
-    look = graph_function("look", graph, outputs, sources, "seen", width)
+    look = graph_function("look", graph, outputs, sources, "seen", target)
     graph, _, outputs = trace_jaxpr(jax.make_jaxpr(steps.move)(carry, inputs, action, key))
     sources = [("carry", words), ("constants", len(inputs_O)), ("action", actions), ("keys", KEY_WORDS)]
-    move = graph_function("move", graph, outputs, sources, "carry", width)
+    move = graph_function("move", graph, outputs, sources, "carry", target)
 
     rng = np.random.default_rng(0)
     lanes = stream_keys(0, Domain.TRAINING_RESET, 0, np.arange(width))
@@ -124,7 +123,7 @@ def measure(task: str) -> dict[str, float]:
     parts["look"] = run_of([look], call, ["carry", "constants", "seen"])(carries, constants, seen)
     names = ["seen", "alive", "centre", "noise", "hidden", "action"]
     arrays = (seen, alive, centre, noise, aligned((network.hidden_vectors, width)), acted)
-    fill = fill_function(network.vectors, len(network.places) - network.vectors, width)
+    fill = fill_function(network.vectors, len(network.places) - network.vectors, target)
     call = "call void @fill(ptr %keys, ptr %places, ptr %noise)"
     pair_keys = stream_keys(0, Domain.PARAMETER_NOISE, 0, np.arange(pairs))
     filled = run_of([fill], call, ["keys", "places", "noise"])(pair_keys, network.places, noise, times=20)
@@ -156,7 +155,7 @@ def read_gbytes(kib: float) -> float:
     """GB/s of reading a buffer of this size again and again, vector by vector."""
     target = host_target()
     vectors = int(kib * 1024) // (4 * target.width) // 8 * 8
-    sums = FunctionBuilder("read", ["ptr noalias %from", "ptr noalias %to"], target.width)
+    sums = FunctionBuilder("read", ["ptr noalias %from", "ptr noalias %to"], target)
     floats = sums.llvm_types["f"]
 
     def body(number: str, carried: list[str]) -> list[str]:

@@ -21,7 +21,7 @@ from es_service.config.model import worker_spec
 from es_service.config.tasks import task_of
 from es_service.protocol.messages import Centre, Chunk, EvaluationChunk, TrainingChunk
 from workers.policies.policy import initial_parameters
-from workers.simd.backend.target import WIDTHS, host_target
+from workers.simd.backend.target import ISAS, host_target
 from workers.worker import make_worker
 
 CONFIGS = ("paper/ant_maze_nsra_es", "paper/ant_trap_me_es", "paper/point_maze_me_es")
@@ -50,7 +50,7 @@ def milliseconds(config_file: Path) -> list[float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--isa", choices=sorted(WIDTHS), help="instruction set; default: the widest of this processor")
+    parser.add_argument("--isa", choices=sorted(ISAS), help="instruction set; default: the widest of this processor")
     target = host_target(parser.parse_args().isa)
     print(f"{target.describe()}; milliseconds of a chunk")
     print(f"{'config':<24} {'training':>9} {'16 episodes':>12} {'those wanted':>13}")

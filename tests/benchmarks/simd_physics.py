@@ -104,7 +104,8 @@ def facts_of(task: str) -> dict:
 def peak() -> float:
     """GFLOP/s of independent fused operations, 24 in flight, on vectors of this machine's width."""
     from workers.simd.backend.emit import emit
-    from workers.simd.backend.target import compile_object, host_target, load_object
+    from workers.simd.backend.machine_code import compile_object, load_object
+    from workers.simd.backend.target import host_target
     from workers.simd.backend.words import aligned
     from workers.simd.graph.graph import Graph
 
@@ -115,7 +116,7 @@ def peak() -> float:
     for _ in range(10):
         ends = [graph.op("fma", end, gain, drift) for end in ends]
     outputs = graph.close(loop, ends)
-    code = compile_object(emit(graph, outputs, 26, lanes), host_target())
+    code = compile_object(emit(graph, outputs, 26, host_target()), host_target())
     address, alive = load_object(code, host_target())
     words, out = aligned((1, 26, lanes)), aligned((1, 24, lanes))
     words[:] = np.float32(0.5).view(np.uint32)

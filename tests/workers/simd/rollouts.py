@@ -14,14 +14,14 @@ from tests.helpers import spec
 from workers.environments import SHIPPED, make_environment
 from workers.episode import Episodes
 from workers.policies.policy import initial_parameters
-from workers.simd.backend.target import WIDTHS, NoVectorsError, host_target
+from workers.simd.backend.target import ISAS, NoVectorsError, host_target
 from workers.simd.episodes import rollout
 
 
 def targets() -> list[Any]:
     """Targets of this processor, the widest first."""
     found = []
-    for isa in WIDTHS:
+    for isa in ISAS:
         try:
             found.append(host_target(isa))
         except NoVectorsError:

@@ -13,7 +13,7 @@ from jax import lax
 
 from tests.workers.simd.rollouts import isas
 from workers.environments import make_environment
-from workers.simd.backend import target
+from workers.simd.backend import machine_code, target
 from workers.simd.backend.target import host_target
 from workers.simd.backend.words import aligned, pack
 from workers.simd.episodes.kernel import Kernel, compile_kernel
@@ -134,7 +134,7 @@ def control_word() -> int:
       ret i32 %value
     }
     declare void @llvm.x86.sse.stmxcsr(ptr)"""
-    address, alive = target.load_object(target.compile_object(text, host_target()), host_target())
+    address, alive = machine_code.load_object(machine_code.compile_object(text, host_target()), host_target())
     found = ctypes.CFUNCTYPE(ctypes.c_uint32)(address)()
     del alive
     return found
@@ -171,11 +171,11 @@ def test_outputs_may_be_inputs_constants_or_nothing() -> None:
 
 
 def test_a_narrow_processor_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    cpu, features = target._host()
-    monkeypatch.setattr(target, "_host", lambda: (cpu, features | {"avx2": False, "fma": False}))
+    triple, cpu, features = target._host()
+    monkeypatch.setattr(target, "_host", lambda: (triple, cpu, features | {"avx2": False, "fma": False}))
     with pytest.raises(target.NoVectorsError, match="has no AVX2 and no FMA"):
         host_target()
-    monkeypatch.setattr(target, "_host", lambda: (cpu, features | {"avx512f": False}))
+    monkeypatch.setattr(target, "_host", lambda: (triple, cpu, features | {"avx512f": False}))
     assert host_target().isa == "avx2"
     with pytest.raises(target.NoVectorsError, match="has no AVX-512"):
         host_target("avx512")

@@ -15,7 +15,7 @@ from tests.helpers import random_parameters
 from tests.workers.simd.rollouts import targets
 from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.native import load_compiled
-from workers.simd.backend.target import WIDTHS, Target
+from workers.simd.backend.target import Target
 from workers.simd.backend.words import aligned
 from workers.simd.episodes import layout
 from workers.simd.episodes.hidden import keep_function
@@ -33,8 +33,10 @@ def run(
     """(actions [lane, output], hidden room after them) of a block of members; of the centre for keys None."""
     noisy = keys is not None
     arguments = ["x", "alive", "centre", "keys", "places", "noise", "hidden", "action"]
-    builder = FunctionBuilder("inside", [*(f"ptr noalias %{name}" for name in arguments), "float %unit"], network.width)
-    fill = fill_function(network.vectors, len(network.places) - network.vectors, network.width)
+    builder = FunctionBuilder(
+        "inside", [*(f"ptr noalias %{name}" for name in arguments), "float %unit"], network.target
+    )
+    fill = fill_function(network.vectors, len(network.places) - network.vectors, network.target)
     keep = [keep_function(network)] * (noisy and network.keeps_weights)
     if noisy:
         builder.do("call void @fill(ptr %keys, ptr %places, ptr %noise)")
@@ -70,25 +72,22 @@ def actions_of(shape: PolicySpec, parameters_D: np.ndarray, x: np.ndarray) -> np
     return values
 
 
-@pytest.mark.parametrize("isa", WIDTHS)
+@pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)
 @pytest.mark.parametrize("seen", [1, 2])
 @pytest.mark.parametrize(
     "widths", [(3, 1), (2, 16, 2), (5, 64, 17), (4, 33, 48, 5), (29, 20, 8), (1, 1, 1), (7, 144, 3), (6, 40)]
 )
 def test_actions_are_those_of_members_with_their_own_weights(
-    widths: tuple[int, ...], seen: int, isa: str, tmp_path: Path
+    widths: tuple[int, ...], seen: int, target: Target, tmp_path: Path
 ):
     """Of every input, or of every second one, the others being zero."""
-    (target,) = [one for one in targets() if one.isa == isa] or [None]
-    if target is None:
-        pytest.skip(f"no {isa}")
     shape = PolicySpec(widths)
     centre_D = random_parameters(4, shape.parameters, 0.5)
     inputs_O = np.arange(0, widths[0], seen)
     x = np.zeros((target.width, widths[0]), np.float32)
     x[:, inputs_O] = np.random.default_rng(0).normal(size=(target.width, len(inputs_O)))
     keys = stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(target.width // 2))
-    network = plan(shape, inputs_O, target.width)
+    network = plan(shape, inputs_O, target)
     alive = np.ones(target.width, np.int32)
     found, _ = run(network, target, tmp_path, centre_D, x[:, inputs_O], alive, keys)
     for member in range(target.width):
@@ -104,7 +103,7 @@ def test_weights_made_once_per_episode_give_the_bits_of_those_made_in_each_step(
     target: Target, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     shape = PolicySpec((5, 64, 17, 3))
-    network = plan(shape, np.arange(5), target.width)
+    network = plan(shape, np.arange(5), target)
     centre_D, x = random_parameters(4, shape.parameters, 0.5), random_parameters(5, 5 * target.width, 1.0)
     keys = stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(target.width // 2))
     given = network, target, tmp_path, centre_D, x.reshape(-1, 5), np.ones(target.width, np.int32), keys
@@ -121,7 +120,7 @@ def test_weights_made_once_per_episode_give_the_bits_of_those_made_in_each_step(
 def test_the_dead_cost_nothing(noisy: bool, target: Target, tmp_path: Path):
     """Hidden layers of eight neighbours all dead are not computed, and the others' actions are what they were."""
     shape = PolicySpec((3, 64, 64, 2))
-    network, group = plan(shape, np.arange(3), target.width), min(8, target.width)
+    network, group = plan(shape, np.arange(3), target), min(8, target.width)
     centre_D, x = random_parameters(4, shape.parameters, 0.5), np.ones((target.width, 3), np.float32)
     keys = stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(target.width // 2)) if noisy else None
     alive = np.ones(target.width, np.int32)
@@ -146,7 +145,7 @@ def test_a_sum_starts_with_its_bias(target, widths, tmp_path):
     centre_D[3 * wide :] = 1.0 if len(widths) == 3 else 0.0
     if len(widths) == 3:
         centre_D[-1] = 0.0
-    network = plan(shape, np.arange(2), target.width)
+    network = plan(shape, np.arange(2), target)
     x, alive = np.ones((target.width, 2), np.float32), np.ones(target.width, np.int32)
     found, _ = run(network, target, tmp_path, centre_D, x, alive, None)
     np.testing.assert_array_equal(found, 0.0)  # with the bias last, 0 + 1

@@ -134,7 +134,7 @@ def inputs_and_product() -> tuple[FoldingGraph, list[int], int]:
 def computed(graph: FoldingGraph, outputs: list[int]) -> list[np.ndarray]:
     """Outputs by machine code, which are the twin's."""
     target = host_target()
-    text = emit(graph, outputs, len(X), target.width)
+    text = emit(graph, outputs, len(X), target)
     native = load_compiled(text, lambda: text, target)
     words = pack(list(X.T[:, :, None].transpose(1, 0, 2)), target.width)
     out = aligned((len(words), len(outputs), target.width))

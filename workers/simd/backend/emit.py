@@ -10,6 +10,7 @@ import struct
 from collections.abc import Mapping, Sequence
 
 from workers.simd.backend.function_builder import FunctionBuilder, module
+from workers.simd.backend.target import Target
 from workers.simd.graph.graph import Graph
 from workers.simd.graph.operations import OPERATIONS
 from workers.simd.graph.schedule import Region, schedule
@@ -21,16 +22,16 @@ MOST_LIVE = 16384
 """Most values that may be needed at the same time, of which the stack holds what registers cannot: one MiB."""
 
 
-def emit(graph: Graph, outputs: Sequence[int], inputs: int, width: int) -> str:
-    """LLVM IR of `void kernel(ptr in, ptr out, i64 blocks)` on vectors of `width` lanes.
+def emit(graph: Graph, outputs: Sequence[int], inputs: int, target: Target) -> str:
+    """LLVM IR of `void kernel(ptr in, ptr out, i64 blocks)` for a target.
 
     Both arrays are [block, word, lane]; a block has `inputs` input words and one output word for each of `outputs`.
 
     Raises:
         UnsupportedError: loops carry more values than fit on the stack.
     """
-    block = graph_function("block", graph, outputs, [("in", inputs)], "out", width)
-    inside = FunctionBuilder("inside", ["ptr noalias %in", "ptr noalias %out", "i64 %blocks"], width)
+    block = graph_function("block", graph, outputs, [("in", inputs)], "out", target)
+    inside = FunctionBuilder("inside", ["ptr noalias %in", "ptr noalias %out", "i64 %blocks"], target)
 
     def one(number: str, _: list[str]) -> list[str]:
         block_in = inside.at("%in", inside.index((number, inputs)), inside.llvm_types["i"])
@@ -44,7 +45,7 @@ def emit(graph: Graph, outputs: Sequence[int], inputs: int, width: int) -> str:
 
 @refusing()
 def graph_function(
-    name: str, graph: Graph, outputs: Sequence[int], sources: Sequence[tuple[str, int]], out: str, width: int
+    name: str, graph: Graph, outputs: Sequence[int], sources: Sequence[tuple[str, int]], out: str, target: Target
 ) -> FunctionBuilder:
     """Function `void name(ptr ...)` that computes a graph from words in memory.
 
@@ -57,7 +58,7 @@ def graph_function(
         UnsupportedError: more values are needed at the same time, or carried by loops, than fit on the stack.
     """
     pointers = list(dict.fromkeys([*(pointer for pointer, _ in sources), out]))
-    builder = FunctionBuilder(name, [f"ptr noalias %{pointer}" for pointer in pointers], width)
+    builder = FunctionBuilder(name, [f"ptr noalias %{pointer}" for pointer in pointers], target)
     input_addresses: list[tuple[str, int]] = []
     used = dict.fromkeys(pointers, 0)
     for pointer, words in sources:

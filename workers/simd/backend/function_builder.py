@@ -13,33 +13,23 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Sequence
 
-MXCSR = 0x9FC0
-"""Value of the processor's floating-point control register in kernels: round to nearest, no traps, and denormal results
-and operands count as zeros. XLA computes in the same mode, and denormal numbers would make a kernel five times slower.
-"""
-EXACT_MXCSR = 0x1F80
-"""The same without treating denormal numbers as zeros, as NumPy computes."""
+from workers.simd.backend.target import Target
+
 SCALAR_TYPES = {"f": "float", "i": "i32", "b": "i1"}
 """LLVM type of one value for each dtype of a graph."""
 
 KERNEL = """\
 define void @kernel({parameters}) #0 {{
 entry:
-  %before = alloca i32
-  %during = alloca i32
-  call void @llvm.x86.sse.stmxcsr(ptr %before)
-  store i32 {mxcsr}, ptr %during
-  call void @llvm.x86.sse.ldmxcsr(ptr %during)
+{set_mode}
   call void @inside({arguments})
-  call void @llvm.x86.sse.ldmxcsr(ptr %before)
+{restore_mode}
   ret void
 }}
 
-declare void @llvm.x86.sse.stmxcsr(ptr)
-declare void @llvm.x86.sse.ldmxcsr(ptr)
 {declarations}
 
-attributes #0 = {{ nounwind "prefer-vector-width"="512" "min-legal-vector-width"="{bits}" }}
+attributes #0 = {{ {attributes} }}
 """
 
 VALUE = re.compile(r"%v\d+")
@@ -51,10 +41,10 @@ Values = list[str]
 class FunctionBuilder:
     """Builder of the text of one LLVM function, line by line. Its methods return the names of values."""
 
-    def __init__(self, name: str, parameters: Sequence[str], width: int) -> None:
-        """Begin the function `void @name(parameters)` on vectors of `width` lanes; a parameter is "type %name"."""
-        self.name, self.parameters, self.width = name, list(parameters), width
-        self.llvm_types = {dtype: f"<{width} x {scalar}>" for dtype, scalar in SCALAR_TYPES.items()}
+    def __init__(self, name: str, parameters: Sequence[str], target: Target) -> None:
+        """Begin the function `void @name(parameters)` on the vectors of a target; a parameter is "type %name"."""
+        self.name, self.parameters, self.target, self.width = name, list(parameters), target, target.width
+        self.llvm_types = {dtype: f"<{self.width} x {scalar}>" for dtype, scalar in SCALAR_TYPES.items()}
         """LLVM type of a vector for each dtype of a graph."""
         self.lines: list[str] = []
         self.memory: list[str] = []
@@ -205,20 +195,23 @@ class FunctionBuilder:
         return "\n".join([*lines, *self.memory, *self.lines, "  ret void", "}", ""])
 
 
-def module(functions: Sequence[FunctionBuilder], mxcsr: int = MXCSR) -> str:
+def module(functions: Sequence[FunctionBuilder], *, exact: bool = False) -> str:
     """LLVM IR of functions and of @kernel, which calls the last function; that one must be named "inside".
 
     Args:
-        mxcsr: value of the floating-point control register meanwhile.
+        exact: whether denormal numbers are numbers meanwhile, and not zeros.
     """
     inside = functions[-1]
     assert inside.name == "inside"
-    parameters = [parameter.replace(" noalias", "") for parameter in inside.parameters]
+    processor = inside.target.processor
+    parameters = ", ".join(parameter.replace(" noalias", "") for parameter in inside.parameters)
+    called = sorted(set().union(*(function.declarations for function in functions)))
     frame = KERNEL.format(
-        parameters=", ".join(parameters),
-        arguments=", ".join(parameters),
-        mxcsr=mxcsr,
-        declarations="\n".join(sorted(set().union(*(function.declarations for function in functions)))),
-        bits=32 * inside.width,
+        parameters=parameters,
+        arguments=parameters,
+        set_mode=processor.set_mode.format(mode=processor.exact if exact else processor.zeros),
+        restore_mode=processor.restore_mode,
+        declarations="\n".join([processor.declarations, *called]),
+        attributes=processor.attributes.format(bits=32 * inside.width),
     )
     return "\n".join([*(function.text() for function in functions), frame])

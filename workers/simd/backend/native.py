@@ -8,8 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from workers.simd.backend import cache
-from workers.simd.backend.target import Target, compile_object, compiler_version, load_object
+from workers.simd.backend.machine_code import compile_object, compiler_version, load_object
+from workers.simd.backend.target import Target
 
 OWN_VERSION = hashlib.sha256(
     b"".join(path.read_bytes() for path in sorted(Path(__file__).parents[1].rglob("*.py")))
@@ -29,10 +32,15 @@ class Native(NamedTuple):
     """Whether the code came from the cache."""
 
     def function(self, *arguments: Any) -> Callable[..., None]:
-        """The function `kernel` for arguments of these ctypes; the code lives as long as it does."""
+        """The function `kernel` for arguments of these ctypes, where arrays stand for pointers to their data; the code
+        lives as long as it does."""
         found = ctypes.CFUNCTYPE(None, *arguments)(self.address)
-        found.code = self.alive  # pyright: ignore[reportAttributeAccessIssue]
-        return found
+
+        def call(*given: Any) -> None:
+            assert self.alive
+            found(*[one.ctypes.data if isinstance(one, np.ndarray) else one for one in given])
+
+        return call
 
 
 def load_compiled(

@@ -1,15 +1,100 @@
-"""The processor that kernels are compiled for, and LLVM's compiler, called in process without a linker or libm."""
+"""The processors that kernels are compiled for, and all that code for one of them has of its own.
+
+PROCESSORS   by architecture: how code treats denormal numbers as zeros, and attributes of its functions
+ISAS         by instruction set: vectors, registers, and the features without which its code does not run
+Target       one processor with one instruction set; what the rest of this package asks about either
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
-import llvmlite
 import llvmlite.binding as llvm
 
-WIDTHS = {"avx512": 16, "avx2": 8, "four": 4}
-"""Float32 lanes of a vector, by instruction set (isa). "four" is AVX2 with half of each vector, for tests."""
+
+class Processor(NamedTuple):
+    """An architecture. LLVM IR that is not the same for all processors is written here."""
+
+    triple: str
+    """LLVM's triple of code that this machine need not run; that of this machine's own code is LLVM's default."""
+    declarations: str
+    set_mode: str
+    """Lines of IR that keep the floating-point control register and then set it to {mode}."""
+    restore_mode: str
+    """Lines that restore it."""
+    zeros: int
+    """Mode of kernels: rounds to nearest, has no traps, and denormal results and operands count as zeros. XLA computes
+    in the same mode, and denormal numbers would make a kernel five times slower on x86-64."""
+    exact: int
+    """The same without treating denormal numbers as zeros, as NumPy computes."""
+    attributes: str
+    """Attributes of every function, with {bits} for those of a vector of the code."""
+
+
+PROCESSORS = {
+    "x86_64": Processor(
+        triple="x86_64-unknown-linux-gnu",
+        declarations="declare void @llvm.x86.sse.stmxcsr(ptr)\ndeclare void @llvm.x86.sse.ldmxcsr(ptr)",
+        set_mode="""\
+  %before = alloca i32
+  %during = alloca i32
+  call void @llvm.x86.sse.stmxcsr(ptr %before)
+  store i32 {mode}, ptr %during
+  call void @llvm.x86.sse.ldmxcsr(ptr %during)""",
+        restore_mode="  call void @llvm.x86.sse.ldmxcsr(ptr %before)",
+        zeros=0x9FC0,  # MXCSR.FZ and DAZ, all exceptions masked
+        exact=0x1F80,
+        attributes='nounwind "prefer-vector-width"="512" "min-legal-vector-width"="{bits}"',
+    ),
+    "aarch64": Processor(
+        triple="aarch64-unknown-linux-gnu",
+        declarations="declare i64 @llvm.aarch64.get.fpcr()\ndeclare void @llvm.aarch64.set.fpcr(i64)",
+        set_mode="""\
+  %before = call i64 @llvm.aarch64.get.fpcr()
+  call void @llvm.aarch64.set.fpcr(i64 {mode})""",
+        restore_mode="  call void @llvm.aarch64.set.fpcr(i64 %before)",
+        zeros=0x1000000,  # FPCR.FZ, for operands too
+        exact=0,
+        attributes="nounwind",
+    ),
+}
+ARCHITECTURES = {"x86_64": "x86_64", "amd64": "x86_64", "aarch64": "aarch64", "arm64": "aarch64"}
+"""Architecture of code by the first part of LLVM's triple of a machine."""
+
+
+class Isa(NamedTuple):
+    """An instruction set, and the vectors of code for it."""
+
+    title: str
+    architecture: str
+    width: int
+    """Float32 lanes of a vector of the code."""
+    register_bits: int
+    registers: int
+    """Vector registers that the instruction set has."""
+    cpu: str
+    """LLVM's name for any processor that has it."""
+    needs: tuple[str, ...]
+    """LLVM's names of the features without which its code does not run."""
+    hides: tuple[str, ...] = ()
+    """Features whose names begin with one of these are not used."""
+
+
+# fmt: off
+ISAS = {
+    "avx512": Isa("AVX-512", "x86_64", 16, 512, 32, "x86-64-v4",
+                  ("avx2", "fma", "avx512f", "avx512dq", "avx512vl", "avx512bw")),
+    "avx2": Isa("AVX2", "x86_64", 8, 256, 16, "x86-64-v3", ("avx2", "fma"), ("avx512",)),
+    "four": Isa("AVX2 on half vectors", "x86_64", 4, 256, 16, "x86-64-v3", ("avx2", "fma"), ("avx512",)),
+    # Every 64-bit Arm processor that runs Linux or macOS has NEON, with fused multiply-adds.
+    "neon": Isa("NEON", "aarch64", 4, 128, 32, "generic", ()),
+    "neon8": Isa("NEON on two registers", "aarch64", 8, 128, 32, "generic", ()),
+    "neon16": Isa("NEON on four registers", "aarch64", 16, 128, 32, "generic", ()),
+}
+# fmt: on
+"""Instruction sets by name. The first one of its architecture that a processor has is used; tests use the others."""
 
 
 class NoVectorsError(Exception):
@@ -21,7 +106,9 @@ class Target:
     """Processor and instruction set that code is compiled for."""
 
     isa: str
-    """Instruction set, a key of WIDTHS."""
+    """Instruction set, a key of ISAS."""
+    triple: str
+    """LLVM's name of the architecture, operating system and object format."""
     cpu: str
     """LLVM's name of the processor."""
     features: str
@@ -30,69 +117,65 @@ class Target:
     @property
     def width(self) -> int:
         """Number of float32 lanes of a vector."""
-        return WIDTHS[self.isa]
+        return ISAS[self.isa].width
+
+    @property
+    def processor(self) -> Processor:
+        """The architecture."""
+        return PROCESSORS[ISAS[self.isa].architecture]
+
+    @property
+    def sums_at_once(self) -> int:
+        """Number of vectors of sums that are kept in half of the registers; the others are for their operands."""
+        isa = ISAS[self.isa]
+        return isa.registers // 2 // max(1, 32 * isa.width // isa.register_bits)
 
     def describe(self) -> str:
         """Description for messages, such as `znver5, AVX-512, 16 lanes`."""
-        names = {"avx512": "AVX-512", "avx2": "AVX2", "four": "AVX2 on half vectors"}
-        return f"{self.cpu}, {names[self.isa]}, {self.width} lanes"
+        return f"{self.cpu}, {ISAS[self.isa].title}, {self.width} lanes"
 
 
 @cache
-def _host() -> tuple[str, dict[str, bool]]:
-    """LLVM's name of this processor and its features."""
+def _host() -> tuple[str, str, dict[str, bool]]:
+    """LLVM's triple of this machine, its name of the processor, and the processor's features."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    return llvm.get_host_cpu_name(), dict(llvm.get_host_cpu_features())
+    return llvm.get_default_triple(), llvm.get_host_cpu_name(), dict(llvm.get_host_cpu_features())
 
 
 def host_target(isa: str | None = None) -> Target:
-    """Target of this processor with a given instruction set; with its widest one if None.
+    """Target of this processor with a given instruction set; with the first one that it has if None.
 
     Raises:
         NoVectorsError: the processor cannot run such code; the message says what it lacks.
     """
-    cpu, features = _host()
-    lacks = [name for name in ("avx2", "fma") if not features.get(name)]
-    if lacks:
+    triple, cpu, features = _host()
+    machine = triple.partition("-")[0]
+    of_machine = {name: one for name, one in ISAS.items() if one.architecture == ARCHITECTURES.get(machine)}
+    if not of_machine:
+        raise NoVectorsError(f"simd has no code for the architecture {machine}, only for {', '.join(PROCESSORS)}")
+    if isa is not None and isa not in of_machine:
+        raise NoVectorsError(f"{ISAS[isa].title} was requested, which {machine} does not have")
+    lacks: list[str] = []
+    for name in [isa] if isa else of_machine:
+        lacks = [one for one in ISAS[name].needs if not features.get(one)]
+        if not lacks:
+            wanted = {one: on and not one.startswith(ISAS[name].hides) for one, on in features.items()}
+            return Target(
+                name, triple, cpu, ",".join(f"{'+' if on else '-'}{one}" for one, on in sorted(wanted.items()))
+            )
+    if isa:
         raise NoVectorsError(
-            f"the processor ({cpu}) has no {' and no '.join(name.upper() for name in lacks)}; simd needs AVX2 and FMA"
+            f"the processor ({cpu}) has no {ISAS[isa].title}, for which code was requested; it lacks {', '.join(lacks)}"
         )
-    has_512 = all(features.get(name) for name in ("avx512f", "avx512dq", "avx512vl", "avx512bw"))
-    if isa is None:
-        isa = "avx512" if has_512 else "avx2"
-    if isa == "avx512" and not has_512:
-        raise NoVectorsError(f"the processor ({cpu}) has no AVX-512, for which code was requested")
-    wanted = {name: on and (isa == "avx512" or not name.startswith("avx512")) for name, on in features.items()}
-    return Target(isa, cpu, ",".join(f"{'+' if on else '-'}{name}" for name, on in sorted(wanted.items())))
-
-
-def machine(target: Target) -> llvm.TargetMachine:
-    """Code generator of LLVM for a target."""
-    return llvm.Target.from_default_triple().create_target_machine(
-        cpu=target.cpu, features=target.features, opt=2, reloc="pic", codemodel="small", jit=True
+    needs = " and ".join(name.upper() for name in ISAS[list(of_machine)[-1]].needs)
+    raise NoVectorsError(
+        f"the processor ({cpu}) has no {' and no '.join(name.upper() for name in lacks)}; simd needs {needs}"
     )
 
 
-def compile_object(text: str, target: Target) -> bytes:
-    """Compile LLVM IR to an object file. LLVM's optimiser is not run, because the graph is already simplified."""
-    _host()
-    module = llvm.parse_assembly(text)
-    code = machine(target)
-    module.triple, module.data_layout = llvm.get_default_triple(), str(code.target_data)
-    module.verify()
-    return code.emit_object(module)
-
-
-def load_object(code: bytes, target: Target) -> tuple[int, object]:
-    """Load an object file; returns (address of `kernel`, object that must stay alive as long as it is used)."""
-    _host()
-    # MCJIT is not used: it may place code and constants too far apart for the addresses of the small code model.
-    jit = llvm.create_lljit_compiler(machine(target), use_jit_link=True, suppress_errors=True)
-    library = llvm.JITLibraryBuilder().add_object_img(code).export_symbol("kernel").link(jit, "kernels")
-    return library["kernel"], (jit, library)
-
-
-def compiler_version() -> str:
-    """Versions of llvmlite and LLVM, on which machine code depends besides its IR and target."""
-    return f"llvmlite {llvmlite.__version__}, LLVM {'.'.join(map(str, llvm.llvm_version_info))}"
+def target_of(isa: str) -> Target:
+    """Target of any processor with an instruction set, for code that this machine need not be able to run."""
+    found = ISAS[isa]
+    features = ",".join(f"+{name}" for name in found.needs)
+    return Target(isa, PROCESSORS[found.architecture].triple, found.cpu, features)

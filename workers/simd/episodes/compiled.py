@@ -169,7 +169,7 @@ class EpisodeKernel:
         def go(steps: int) -> None:
             steps_kept = self._room_for_steps(blocks, steps) if kept is None else kept
             require(steps_kept.shape[:2] == (blocks, steps), "there is no room for the outputs of these steps")
-            self._call(*[array.ctypes.data for array in (*arrays, steps_kept)], np.float32(unit), blocks, steps)
+            self._call(*arrays, steps_kept, np.float32(unit), blocks, steps)
 
         return carries, go
 
@@ -201,7 +201,7 @@ def compile_episodes(
         NoVectorsError: this processor lacks the vector instructions.
     """
     target = target or host_target()
-    program = write_episodes(environment, spec, inputs_O, target.width, training=training, own_weights=own_weights)
+    program = write_episodes(environment, spec, inputs_O, target, training=training, own_weights=own_weights)
     begin = compile_resets(program.steps.begin, target, folder, check_resets)
     signature = [*[ctypes.c_void_p] * 9, ctypes.c_float, ctypes.c_int64, ctypes.c_int64]
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 from es_service.protocol.policy_spec import Activation
 from workers.simd.backend.emit import inline
 from workers.simd.backend.function_builder import FunctionBuilder, Values
-from workers.simd.episodes.layout import Layer, Network, sums_at_once
+from workers.simd.episodes.layout import Layer, Network
 from workers.simd.frontend.primitives.choices import extreme_of
 from workers.simd.graph import elementary
 from workers.simd.graph.folding import FoldingGraph
@@ -35,7 +35,7 @@ class View(NamedTuple):
 def shared(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
     """Write out = f(centre x), for several members at a time."""
     floats = builder.llvm_types["f"]
-    members = min(builder.width, sums_at_once(builder.width) // layer.tile)
+    members = min(builder.width, builder.target.sums_at_once // layer.tile)
     assert builder.width % members == 0
 
     def tile(first: str, number: str) -> Values:
@@ -67,7 +67,7 @@ def perturbed(builder: FunctionBuilder, network: Network, layer: Layer, x: View,
     The weights of - come from an addition, because the multipliers are the bottleneck.
     """
     floats = builder.llvm_types["f"]
-    pairs = min(builder.width // 2, max(1, sums_at_once(builder.width) // (2 * layer.tile)))
+    pairs = min(builder.width // 2, max(1, builder.target.sums_at_once // (2 * layer.tile)))
     assert builder.width % (2 * pairs) == 0
     kept = builder.at("%noise", network.kept_at, "i8")
 
@@ -116,7 +116,7 @@ def perturbed(builder: FunctionBuilder, network: Network, layer: Layer, x: View,
 def keep_function(network: Network) -> FunctionBuilder:
     """Function `void keep(ptr centre, ptr noise, float unit)`, which writes the weights of a block's + members behind
     their noise."""
-    builder = FunctionBuilder("keep", ["ptr noalias %centre", "ptr noalias %noise", "float %unit"], network.width)
+    builder = FunctionBuilder("keep", ["ptr noalias %centre", "ptr noalias %noise", "float %unit"], network.target)
     floats = builder.llvm_types["f"]
     kept = builder.at("%noise", network.kept_at, "i8")
 
@@ -144,7 +144,7 @@ def own(builder: FunctionBuilder, layer: Layer, x: View, out: View) -> None:
     A weight is used once per call, so memory is the bottleneck. A tile is therefore as wide as the registers allow,
     which reads the weights in the order in which they are stored.
     """
-    floats, most = builder.llvm_types["f"], sums_at_once(builder.width)
+    floats, most = builder.llvm_types["f"], builder.target.sums_at_once
     tiles = max(count for count in (1, 2, 4, 8) if layer.tiles % count == 0 and count * layer.tile <= most)
     wide = layer._replace(tile=tiles * layer.tile, tiles=layer.tiles // tiles)
     members = min(builder.width, most // wide.tile)

@@ -48,7 +48,7 @@ class Kernel:
     out_tree: Any
     out_avals: tuple[Any, ...]
     facts: Facts
-    _function: Callable[[int, int, int], None]
+    _function: Callable[[Words, Words, int], None]
 
     @property
     def words_in(self) -> int:
@@ -79,7 +79,7 @@ class Kernel:
                 "they must be aligned, contiguous and of dtype uint32",
             )
         require(out.flags.writeable and words is not out, "the results need an array of their own")
-        self._function(words.ctypes.data, out.ctypes.data, blocks)
+        self._function(words, out, blocks)
 
     def __call__(self, *arguments: Any) -> Any:
         """Apply the function to pytrees whose leaves have a leading axis of lanes; returns NumPy arrays."""
@@ -122,7 +122,7 @@ def compile_kernel(
 
     Raises:
         UnsupportedError: the function contains something that cannot be compiled.
-        NoVectorsError: the processor has no AVX2 or FMA.
+        NoVectorsError: this processor lacks the vector instructions.
     """
     target = target or host_target()
     started = time.perf_counter()
@@ -134,7 +134,7 @@ def compile_kernel(
     def text() -> str:
         graph, inputs, outputs = trace_jaxpr(closed)
         traced.append((graph, outputs))
-        return emit(graph, outputs, inputs, target.width)
+        return emit(graph, outputs, inputs, target)
 
     def kernel(native: Native) -> Kernel:
         computed = sum(graph.keys[node][0] in OPERATIONS for graph, outputs in traced for node in live(graph, outputs))

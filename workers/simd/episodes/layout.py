@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from es_service.protocol.policy_spec import Activation, Output, PolicySpec
+from workers.simd.backend.target import Target
 from workers.simd.backend.words import ALIGNMENT, aligned
 
 KEPT_BYTES = 1 << 18
@@ -48,11 +49,16 @@ class Network(NamedTuple):
     """Number of vectors of weights of all hidden layers."""
     places: NDArray[np.uint32]
     """Places in the flat vector of parameters: of the vectors, then of the single weights."""
-    width: int
-    """Lanes of a vector."""
+    target: Target
+    """What the code is for, whose vectors these are."""
     output: Output
     """What the last layer's sums become; all but `tanh` are made of them elsewhere."""
     bias: bool
+
+    @property
+    def width(self) -> int:
+        """Lanes of a vector."""
+        return self.target.width
 
     @property
     def hidden_vectors(self) -> int:
@@ -112,26 +118,18 @@ class Network(NamedTuple):
         return rows, rows.ctypes.data + np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.strides[0])
 
 
-def sums_at_once(width: int) -> int:
-    """Number of vectors of sums that fit into registers together with their operands.
-
-    There are 32 registers of 512 bits, or 16 of 256 bits.
-    """
-    return 16 if width == 16 else 8
-
-
-def plan(spec: PolicySpec, inputs_O: NDArray[np.intp], width: int) -> Network:
+def plan(spec: PolicySpec, inputs_O: NDArray[np.intp], target: Target) -> Network:
     """Lay out a policy's weights.
 
     Args:
         spec: the policy, without a memory. Without biases, their places are those of other weights, and never used.
         inputs_O: inputs of the first layer that are computed; others are always zero.
-        width: lanes of a vector.
+        target: what the code is for.
     """
-    layers, places, coordinate = [], [], 0
+    layers, places, coordinate, width = [], [], 0, target.width
     # With noise, four pairs are computed at a time. They share what is made of the centre, so few vectors of many pairs
     # cost less than many vectors of few. Tiles are powers of 2, so that the members that fit divide the width.
-    most = sums_at_once(width) // 8
+    most = max(1, target.sums_at_once // 8)
     rows, (*hidden, (inputs, outputs)) = inputs_O.tolist(), spec.layers
     for given, wanted in hidden:
         vectors = -(-wanted // width)
@@ -147,4 +145,4 @@ def plan(spec: PolicySpec, inputs_O: NDArray[np.intp], width: int) -> Network:
         coordinate + row * outputs + output for row in [*rows, inputs if spec.bias else 0] for output in range(outputs)
     ]
     kept = np.array(places, np.uint32)
-    return Network(tuple(layers), len(rows), outputs, vectors, kept, width, spec.output, spec.bias)
+    return Network(tuple(layers), len(rows), outputs, vectors, kept, target, spec.output, spec.bias)

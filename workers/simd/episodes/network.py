@@ -41,7 +41,7 @@ def policy_function(network: Network, weights: Weights) -> FunctionBuilder:
     given = {"shared": ["centre"], "perturbed": ["centre", "noise"], "own": ["weights", "places", "singles"]}[weights]
     parameters = [f"ptr noalias %{name}" for name in ("x", "alive", *given)]
     parameters += ["float %unit"] if weights == "perturbed" else []
-    builder = FunctionBuilder("policy", [*parameters, "ptr noalias %hidden", "ptr noalias %action"], width)
+    builder = FunctionBuilder("policy", [*parameters, "ptr noalias %hidden", "ptr noalias %action"], network.target)
     buffers = [builder.at("%hidden", half * network.hidden_vectors // 2, builder.llvm_types["f"]) for half in range(2)]
     view = View("%x", 1, width)
     for number, layer in enumerate(network.hidden):
@@ -68,7 +68,7 @@ def singles_function(network: Network) -> FunctionBuilder:
     The arguments are as in `policy_function`.
     """
     builder = FunctionBuilder(
-        "singles", [f"ptr noalias %{name}" for name in ("weights", "places", "singles")], network.width
+        "singles", [f"ptr noalias %{name}" for name in ("weights", "places", "singles")], network.target
     )
     floats = builder.llvm_types["f"]
 

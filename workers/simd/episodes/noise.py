@@ -10,6 +10,7 @@ from jax.extend.core import ClosedJaxpr
 from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, normal_integers
 from workers.simd.backend.emit import inline
 from workers.simd.backend.function_builder import FunctionBuilder, Values, module
+from workers.simd.backend.target import Target
 from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
 
@@ -61,14 +62,15 @@ def lanes(builder: FunctionBuilder) -> str:
     return f"<{', '.join(f'i32 {lane}' for lane in range(builder.width))}>"
 
 
-def fill_function(vectors: int, singles: int, width: int) -> FunctionBuilder:
+def fill_function(vectors: int, singles: int, target: Target) -> FunctionBuilder:
     """Function `void fill(ptr keys, ptr places, ptr noise)`, which writes the bytes j of all pairs of a block.
 
     noise begins with [pair, vector, lane] for the vectors of weights, whose lanes are successive coordinates from the
     vector's entry in `places` on. [single, member] for the single weights follows; the remaining entries of `places`
     are their coordinates, and both members of a pair have the same noise.
     """
-    builder = FunctionBuilder("fill", ["ptr noalias %keys", "ptr noalias %places", "ptr noalias %noise"], width)
+    builder = FunctionBuilder("fill", ["ptr noalias %keys", "ptr noalias %places", "ptr noalias %noise"], target)
+    width = target.width
     bytes_ = f"<{width} x i8>"
 
     def pair(number: str, _: Values) -> Values:
@@ -99,15 +101,15 @@ def fill_function(vectors: int, singles: int, width: int) -> FunctionBuilder:
     return builder
 
 
-def gradient_module(width: int) -> str:
+def gradient_module(target: Target) -> str:
     """LLVM IR of `void kernel(ptr weights, ptr keys, i64 pairs, ptr sums, i64 groups)`, the sum of weighted noise.
 
     sums has groups of UNROLLED vectors. They become the sum over pairs of weight * standard normal noise; pairs are
     added in their order.
     """
     parameters = ["ptr noalias %weights", "ptr noalias %keys", "i64 %pairs", "ptr noalias %sums", "i64 %groups"]
-    builder = FunctionBuilder("inside", parameters, width)
-    floats = builder.llvm_types["f"]
+    builder = FunctionBuilder("inside", parameters, target)
+    width, floats = target.width, builder.llvm_types["f"]
 
     def group(number: str, _: Values) -> Values:
         first = builder.value(f"trunc i64 {builder.index((number, UNROLLED * width))} to i32")

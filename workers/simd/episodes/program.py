@@ -23,6 +23,7 @@ from workers.environments import Environment
 from workers.episode import Carry, EpisodeSteps, episode_steps
 from workers.simd.backend.emit import graph_function
 from workers.simd.backend.function_builder import FunctionBuilder, Values, module
+from workers.simd.backend.target import Target
 from workers.simd.backend.words import words_of
 from workers.simd.episodes.hidden import keep_function
 from workers.simd.episodes.layout import Network, plan
@@ -59,19 +60,19 @@ def write_episodes(
     environment: Environment,
     spec: WorkerSpec,
     inputs_O: np.ndarray,
-    width: int,
+    target: Target,
     *,
     training: bool,
     own_weights: bool = False,
 ) -> EpisodeProgram:
-    """Program of a run's episodes for vectors of `width` lanes, for any processor; `compile_episodes` compiles it.
+    """Program of a run's episodes for a target, which need not be this processor; `compile_episodes` compiles it.
 
     Raises:
         UnsupportedError: a step of the environment cannot be compiled. `text` of the result may raise it as well.
     """
     weights: Weights = "perturbed" if training else "own" if own_weights else "shared"
     steps = episode_steps(environment, spec, training=training, inputs_O=inputs_O)
-    network = plan(spec.policy, inputs_O, width)
+    network = plan(spec.policy, inputs_O, target)
     key, inputs = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32), jax.ShapeDtypeStruct((len(inputs_O),), jnp.float32)
     outputs = jax.ShapeDtypeStruct((spec.policy.outputs,), jnp.float32)
     carry = jax.eval_shape(steps.begin, key)
@@ -129,23 +130,23 @@ def _module(
     Args:
         kept: words of a carry that are copied to `kept` [block, step, word, lane] after each step.
     """
-    width = network.width
+    width, target = network.width, network.target
     actions = network.outputs
     graph, _, outputs = look
     sources = [("carry", words), ("constants", inputs), ("constants", inputs)]
-    look_code = graph_function("look", graph, outputs, sources, "seen", width)
+    look_code = graph_function("look", graph, outputs, sources, "seen", target)
     graph, _, outputs = move
     sources = [("carry", words), ("constants", inputs), ("action", actions), ("action_key", KEY_WORDS)]
-    move_code = graph_function("move", graph, outputs, sources, "carry", width)
+    move_code = graph_function("move", graph, outputs, sources, "carry", target)
     policy_code = policy_function(network, weights)
-    fill_code = fill_function(network.vectors, len(network.places) - network.vectors, width)
+    fill_code = fill_function(network.vectors, len(network.places) - network.vectors, target)
     keep_code = [keep_function(network)] * network.keeps_weights
     before = {"perturbed": [fill_code, *keep_code], "own": [singles_function(network)], "shared": []}[weights]
     own, noisy = weights == "own", weights == "perturbed"
 
     pointers = ["carries", "action_keys", "constants", "centre", "keys", "places", "noise", "room", "kept"]
     builder = FunctionBuilder(
-        "inside", [*(f"ptr noalias %{name}" for name in pointers), "float %unit", "i64 %blocks", "i64 %steps"], width
+        "inside", [*(f"ptr noalias %{name}" for name in pointers), "float %unit", "i64 %blocks", "i64 %steps"], target
     )
     vector = builder.llvm_types["i"]
     seen, action = "%room", builder.at("%room", inputs, vector)

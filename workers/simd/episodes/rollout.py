@@ -17,7 +17,7 @@ from workers.compilable import Compilable
 from workers.environments import Environment, make_environment
 from workers.episode import Carry
 from workers.simd.backend.native import Native, load_compiled
-from workers.simd.backend.target import WIDTHS, Target, host_target
+from workers.simd.backend.target import Target, host_target, target_of
 from workers.simd.backend.words import aligned, require
 from workers.simd.episodes.check import check_episodes, check_gradient, check_resets
 from workers.simd.episodes.compiled import EpisodeKernel, compile_episodes
@@ -56,7 +56,7 @@ def why_not(task: TaskSpec) -> str:
     )
     environment, inputs_O = make_environment(task.name, options), np.arange(task.observation_size)
     try:
-        write_episodes(environment, spec, inputs_O, WIDTHS["avx2"], training=True).text()
+        write_episodes(environment, spec, inputs_O, target_of("avx2"), training=True).text()
     except UnsupportedError as error:
         return str(error)
     except Exception as error:  # also after a fault of the compiler, xla can run the task
@@ -203,12 +203,12 @@ def make_gradient_sum(parameters: int, target: Target | None = None) -> Compilab
             weights_P, keys_P = np.ascontiguousarray(weights_P, np.float32), np.ascontiguousarray(noise_keys_P)
             require(keys_P.dtype == np.uint32 and keys_P.shape == (len(weights_P), KEY_WORDS), "a key for each weight")
             sums = aligned((groups, group)).view(np.float32)
-            call(weights_P.ctypes.data, keys_P.ctypes.data, len(weights_P), sums.ctypes.data, groups)
+            call(weights_P, keys_P, len(weights_P), sums, groups)
             return sums.reshape(-1)[:parameters]
 
         return gradient_sum
 
-    name, text = f"gradient {definition()}", lambda: gradient_module(target.width)
+    name, text = f"gradient {definition()}", lambda: gradient_module(target)
     checked = lambda native: check_gradient(function(native), parameters)  # noqa: E731
     gradient_sum = function(load_compiled(name, text, target, check=checked))
     return Compilable(gradient_sum, lambda *_: None)

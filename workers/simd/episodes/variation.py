@@ -14,7 +14,7 @@ import numpy as np
 
 from es_service.protocol.noise import KEY_WORDS, NORMAL_STD, Domain, stream_keys
 from es_service.protocol.recipes import FloatArray, IsoLine, Recipes, recipes_of
-from workers.simd.backend.function_builder import EXACT_MXCSR, FunctionBuilder, Values, module
+from workers.simd.backend.function_builder import FunctionBuilder, Values, module
 from workers.simd.backend.native import Native, load_compiled
 from workers.simd.backend.target import Target, host_target
 from workers.simd.backend.words import require
@@ -48,18 +48,17 @@ def make_variation(target: Target | None = None) -> Callable[[Recipes], FloatArr
             address = np.array([parent_D.__array_interface__["data"][0] for parent_D in parents], np.uint64)
             x_N, y_N = np.ascontiguousarray(address[parent_N_2.T])
             out_N = policy_N_D.ctypes.data + np.arange(len(recipes), dtype=np.uint64) * np.uint64(4 * size)
-            arrays = [array.ctypes.data for array in (key_N_4, x_N, y_N, out_N)]
             sigmas = (np.float32(sigma) for sigma in recipes.rule)
-            call(*arrays, len(recipes), size, -(-size // target.width), *sigmas)
+            call(key_N_4, x_N, y_N, out_N, len(recipes), size, -(-size // target.width), *sigmas)
             return policy_N_D
 
         return made
 
-    name, text = f"variation {definition()}", lambda: variation_module(target.width)
+    name, text = f"variation {definition()}", lambda: variation_module(target)
     return function(load_compiled(name, text, target, check=lambda native: check_variation(function(native))))
 
 
-def variation_module(width: int) -> str:
+def variation_module(target: Target) -> str:
     """LLVM IR of `void kernel(ptr keys, ptr x, ptr y, ptr out, i64 policies, i64 parameters, i64 vectors, float iso,
     float line)`, which writes the parameters of policies.
 
@@ -68,7 +67,8 @@ def variation_module(width: int) -> str:
     """
     pointers = [f"ptr noalias %{name}" for name in ("keys", "x", "y", "out")]
     integers = [f"i64 %{name}" for name in ("policies", "parameters", "vectors")]
-    builder = FunctionBuilder("inside", [*pointers, *integers, "float %iso", "float %line"], width)
+    builder = FunctionBuilder("inside", [*pointers, *integers, "float %iso", "float %line"], target)
+    width = target.width
     floats, integer = builder.llvm_types["f"], builder.llvm_types["i"]
     std, last = builder.splat(float_constant(np.float32(NORMAL_STD))), builder.value(f"sub i64 %parameters, {width}")
     iso = builder.splat("%iso")
@@ -105,7 +105,7 @@ def variation_module(width: int) -> str:
         return []
 
     builder.loop("%policies", policy)
-    return module([builder], EXACT_MXCSR)
+    return module([builder], exact=True)
 
 
 def check_variation(made: Callable[[Recipes], FloatArray]) -> None:
