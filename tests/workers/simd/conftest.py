@@ -1,4 +1,5 @@
-"""Where the processor has no vectors no kernel can be compiled; and no test finds kernels of a changed compiler."""
+"""Where the processor has no vectors no kernel can be compiled; no test finds kernels of a changed compiler; and those
+for Arm are run by qemu."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.workers.simd.emulated import emulation
 from workers.simd.backend import cache
 from workers.simd.backend.target import NoVectorsError, host_target
 
@@ -22,7 +24,7 @@ def kernels_of_this_compiler(
     except NoVectorsError as error:
         pytest.skip(str(error))
     changes = "monkeypatch" in request.fixturenames
-    with pytest.MonkeyPatch.context() as patch:
+    with emulation(), pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache") if changes else compiled / "simd"))
         patch.setattr(cache, "MOST_ENTRIES", 10_000)
         yield

@@ -33,11 +33,6 @@ def _qemu() -> str | None:
     return next(filter(None, map(shutil.which, QEMU)), None)
 
 
-def arm_targets() -> list[Target]:
-    """Targets of Arm, one for each width of the code."""
-    return [target_of(name) for name in WIDTHS]
-
-
 def lacking() -> str:
     """What this machine lacks, in a sentence; empty if it can run code for Arm."""
     lacks = [COMPILER] if shutil.which(COMPILER) is None else []
@@ -48,6 +43,14 @@ def lacking() -> str:
 needs_emulation = pytest.mark.skipif(
     bool(lacking()) or platform.machine() not in ("x86_64", "AMD64"), reason=lacking() or "compares with x86-64"
 )
+
+
+def arm_targets() -> list[Any]:
+    """Targets of Arm as parameters of a test: one width of the code in `make test`, the others in `make long`."""
+    return [
+        pytest.param(target_of(name), marks=[needs_emulation, *[pytest.mark.long] * (number > 0)])
+        for number, name in enumerate(WIDTHS)
+    ]
 
 
 @functools.cache
@@ -71,13 +74,12 @@ class Emulated:
         parts = ["-nostdlib", "-static", f"{folder}/driver.o", file.name]
         subprocess.run([COMPILER, *parts, "-o", self.program], check=True)
 
-    def call(self, signature: tuple[Any, ...], given: tuple[Any, ...], reach: int) -> None:
+    def call(self, signature: tuple[Any, ...], given: tuple[Any, ...]) -> None:
         """Call the kernel.
 
         Args:
             signature: ctypes of the arguments.
-            given: arrays and numbers. Arrays of uint64 are addresses in the memory of this process.
-            reach: bytes of memory that belong to such an address.
+            given: arrays and numbers. Arrays of uint64 are addresses of policies in the memory of this process.
         """
         segments: list[np.ndarray] = []
         addresses: list[int] = []
@@ -94,10 +96,10 @@ class Emulated:
                 place = len(segments)
                 segments.append(one)
                 for number, address in enumerate(one.reshape(-1).tolist() if one.dtype == np.uint64 else ()):
-                    assert reach, "an address, but nobody said to how much memory"
                     if address not in pointed:
                         pointed[address] = len(segments)
-                        segments.append(np.ctypeslib.as_array((ctypes.c_uint8 * reach).from_address(address)))
+                        floats_there = ctypes.c_float * _policy_size(given)
+                        segments.append(np.ctypeslib.as_array(floats_there.from_address(address)))
                     addresses += [place, 8 * number, pointed[address]]
         assert len(integers) <= 24
         assert len(floats) <= 2
@@ -118,13 +120,15 @@ class Emulated:
         assert start == len(done.stdout)
 
 
-@contextmanager
-def emulation(reach: int = 0) -> Iterator[None]:
-    """A context in which kernels for Arm are run by qemu, those for this processor as ever.
+def _policy_size(given: tuple[Any, ...]) -> int:
+    """Floats in memory from the address of a policy on, of the two kernels that are given such addresses."""
+    carries, places = given[0], given[5]  # of episodes; the kernel of recipes has the number of parameters there
+    return int(places.max()) + carries.shape[-1] if isinstance(places, np.ndarray) else places
 
-    Args:
-        reach: bytes of memory that belong to an address that a kernel is given.
-    """
+
+@contextmanager
+def emulation() -> Iterator[None]:
+    """A context in which kernels for Arm are run by qemu, those for this processor as ever."""
     load_object, function = native.load_object, Native.function
 
     def load(code: bytes, target: Target) -> tuple[int, object]:
@@ -133,7 +137,7 @@ def emulation(reach: int = 0) -> Iterator[None]:
     def function_of(self: Native, *signature: Any) -> Any:
         if not isinstance(self.alive, Emulated):
             return function(self, *signature)
-        return lambda *given: self.alive.call(signature, given, reach)
+        return lambda *given: self.alive.call(signature, given)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native, "load_object", load)

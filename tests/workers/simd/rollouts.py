@@ -11,6 +11,7 @@ import workers.rollout
 from es_service.protocol.messages import PolicySpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, stream_keys
 from tests.helpers import spec
+from tests.workers.simd.emulated import arm_targets
 from workers.environments import SHIPPED, make_environment
 from workers.episode import Episodes
 from workers.policies.policy import initial_parameters
@@ -29,9 +30,9 @@ def targets() -> list[Any]:
     return found
 
 
-def isas() -> list[str]:
-    """Instruction sets of code that this machine can run."""
-    return [target.isa for target in targets()]
+def every_target() -> list[Any]:
+    """Targets of this processor and, as parameters of a test, of Arm."""
+    return [*targets(), *arm_targets()]
 
 
 def task_spec(task: str, **changes: Any) -> WorkerSpec:

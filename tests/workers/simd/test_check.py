@@ -11,7 +11,7 @@ import pytest
 from es_service.protocol.messages import EvaluationChunk, PolicySpec, TrainingChunk
 from es_service.protocol.noise import Domain, stream_keys
 from tests.helpers import centre, chunk_runner, random_parameters, spec
-from tests.workers.simd.rollouts import targets
+from tests.workers.simd.rollouts import every_target, targets
 from workers.environments import make_environment
 from workers.simd.backend.function_builder import FunctionBuilder
 from workers.simd.episodes import noise
@@ -24,7 +24,7 @@ from workers.simd.graph.operations import OPERATIONS
 KINDS = [{"training": True}, {"training": False}, {"training": False, "own_weights": True}]
 
 
-@pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)
+@pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
 @pytest.mark.parametrize("kind", KINDS, ids=["training", "evaluation", "policies"])
 @pytest.mark.parametrize("hidden", [(), (16,), (33, 48), (144,)], ids=str)
 def test_policies_of_all_shapes_have_the_bits_of_their_twin(hidden, kind, target, tmp_path: Path) -> None:

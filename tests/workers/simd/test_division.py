@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from tests.workers.simd.rollouts import isas
-from workers.simd.backend.target import host_target
+from tests.workers.simd.rollouts import every_target
+from workers.simd.backend.target import Target
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.graph import division
 
@@ -46,10 +46,10 @@ def assert_same_bits(found: np.ndarray, wanted: np.ndarray) -> None:
     np.testing.assert_array_equal(found[is_number].view(np.int32), wanted[is_number].view(np.int32))
 
 
-@pytest.mark.parametrize("isa", isas())
-def test_a_remainder_has_the_bits_of_xla_s_and_numpy_s(isa: str) -> None:
+@pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
+def test_a_remainder_has_the_bits_of_xla_s_and_numpy_s(target: Target) -> None:
     f = jax.ShapeDtypeStruct((), jnp.float32)
-    kernel = compile_kernel(lambda x, y: (lax.rem(x, y), jnp.mod(x, y)), f, f, target=host_target(isa))
+    kernel = compile_kernel(lambda x, y: (lax.rem(x, y), jnp.mod(x, y)), f, f, target=target)
     edges = pairs(EDGES)
     with np.errstate(all="ignore"):
         size, step = np.abs(edges).astype(np.float64)
@@ -84,9 +84,9 @@ def test_wrapping_by_a_constant_has_the_bits_of_xla_s(divisor: float) -> None:
         assert_same_bits(found, np.asarray(wanted))
 
 
-@pytest.mark.parametrize("isa", isas())
+@pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
 @pytest.mark.parametrize("dtype", ["int32", "uint32"])
-def test_integers_are_divided_as_by_xla_where_processors_would_stop_too(isa: str, dtype: str) -> None:
+def test_integers_are_divided_as_by_xla_where_processors_would_stop_too(target: Target, dtype: str) -> None:
     def function(a, b):
         constants = np.array([0, 1, -1, 7, -(2**31)], np.int32).view(dtype)
         by_constants = [divide(a, by) for divide in (lax.div, lax.rem) for by in constants]
@@ -96,7 +96,7 @@ def test_integers_are_divided_as_by_xla_where_processors_would_stop_too(isa: str
     random = [rng.integers(0, 2**32, 1000, dtype=np.uint32) >> rng.integers(0, 31, 1000, np.uint32) for _ in range(2)]
     edges = pairs(INTEGERS)
     of = jax.ShapeDtypeStruct((), dtype)
-    kernel = compile_kernel(function, of, of, target=host_target(isa))
+    kernel = compile_kernel(function, of, of, target=target)
     a, b = (np.concatenate([one.view(dtype), other.view(dtype)]) for one, other in zip(edges, random, strict=True))
     for found, wanted in zip(kernel(a, b), jax.jit(jax.vmap(function))(a, b), strict=True):
         np.testing.assert_array_equal(found, np.asarray(wanted))

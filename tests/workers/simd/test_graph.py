@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from workers.simd.graph.folding import FoldingGraph
-from workers.simd.graph.operations import OPERATIONS
+from workers.simd.graph.operations import OPERATIONS, compute
 from workers.simd.graph.twin import evaluate
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 2.5, -3.5, math.inf, -math.inf, math.nan, 1e-38, 3e38], np.float32)
@@ -141,13 +141,13 @@ def test_fused_operation_rounds_once() -> None:
     a, b, c = (rng.normal(size=20_000).astype(np.float32) for _ in range(3))
     c[::2] = -(a * b)[::2] * (1 + rng.integers(-2, 3, 10_000) * np.float32(2**-23))
     exact = a.astype(np.longdouble) * b.astype(np.longdouble) + c.astype(np.longdouble)
-    np.testing.assert_array_equal(OPERATIONS["fma"].meaning(a, b, c), exact.astype(np.float32))
+    np.testing.assert_array_equal(compute("fma", (a, b, c)), exact.astype(np.float32))
     # Half-way cases that rounding twice would get wrong: 1 + 2^-24 and a little more, or a little less.
     one, half = np.float32(1.0), np.float32(2.0**-24)
     little = np.float32(2.0**-30)
-    assert OPERATIONS["fma"].meaning(little, little, one) == one
-    assert OPERATIONS["fma"].meaning(np.float32(1 + 2**-23), half, one) == np.nextafter(one, np.float32(2))
-    assert OPERATIONS["fma"].meaning(np.float32(1 - 2**-24), half, one) == one
+    assert compute("fma", (little, little, one)) == one
+    assert compute("fma", (np.float32(1 + 2**-23), half, one)) == np.nextafter(one, np.float32(2))
+    assert compute("fma", (np.float32(1 - 2**-24), half, one)) == one
 
 
 NAMES = [name for name, operation in OPERATIONS.items() if set(operation.takes) <= {"f"} and operation.gives == "f"]

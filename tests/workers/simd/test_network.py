@@ -12,7 +12,7 @@ import pytest
 from es_service.protocol.messages import PolicySpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normals, stream_keys
 from tests.helpers import random_parameters
-from tests.workers.simd.rollouts import targets
+from tests.workers.simd.rollouts import every_target
 from workers.simd.backend.function_builder import FunctionBuilder, module
 from workers.simd.backend.native import load_compiled
 from workers.simd.backend.target import Target
@@ -56,9 +56,7 @@ def run(
     given_keys = keys if noisy else np.zeros((1, 4), np.uint32)
     noise = aligned((network.block_bytes // 4,)).view(np.int8)
     arrays = (lanes, alive, network.pack(centre_D), given_keys, network.places, noise, hidden, action)
-    call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * len(arrays), ctypes.c_float)(native.address)
-    call(*(array.ctypes.data for array in arrays), SIGMA / NORMAL_STD)
-    assert native.alive
+    native.function(*[ctypes.c_void_p] * len(arrays), ctypes.c_float)(*arrays, SIGMA / NORMAL_STD)
     return action.view(np.float32).T.copy(), hidden.reshape(-1)
 
 
@@ -72,7 +70,7 @@ def actions_of(shape: PolicySpec, parameters_D: np.ndarray, x: np.ndarray) -> np
     return values
 
 
-@pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)
+@pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
 @pytest.mark.parametrize("seen", [1, 2])
 @pytest.mark.parametrize(
     "widths", [(3, 1), (2, 16, 2), (5, 64, 17), (4, 33, 48, 5), (29, 20, 8), (1, 1, 1), (7, 144, 3), (6, 40)]
@@ -98,7 +96,7 @@ def test_actions_are_those_of_members_with_their_own_weights(
     np.testing.assert_allclose(found, actions_of(shape, centre_D.astype(float), x), atol=3e-6)
 
 
-@pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)
+@pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
 def test_weights_made_once_per_episode_give_the_bits_of_those_made_in_each_step(
     target: Target, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -116,7 +114,7 @@ def test_weights_made_once_per_episode_give_the_bits_of_those_made_in_each_step(
 
 
 @pytest.mark.parametrize("noisy", [True, False])
-@pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)
+@pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
 def test_the_dead_cost_nothing(noisy: bool, target: Target, tmp_path: Path):
     """Hidden layers of eight neighbours all dead are not computed, and the others' actions are what they were."""
     shape = PolicySpec((3, 64, 64, 2))
@@ -136,7 +134,7 @@ def test_the_dead_cost_nothing(noisy: bool, target: Target, tmp_path: Path):
         assert (second_layer[-group:] != UNTOUCHED).any(axis=1).tolist() == [bool(last_one)] * group
 
 
-@pytest.mark.parametrize("target", targets(), ids=lambda target: target.isa)
+@pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
 @pytest.mark.parametrize("widths", [(2, 1), (2, 3, 1)])
 def test_a_sum_starts_with_its_bias(target, widths, tmp_path):
     shape, wide = PolicySpec(widths), widths[1]

@@ -9,8 +9,9 @@ import pytest
 
 from es_service.protocol.noise import Domain, stream_keys
 from es_service.protocol.recipes import IsoLine, Recipes, recipes_of
-from tests.workers.simd.rollouts import targets
+from tests.workers.simd.rollouts import every_target
 from workers.rollouts import BACKENDS
+from workers.simd.backend.target import Target
 from workers.simd.episodes import variation
 from workers.simd.episodes.check import WrongCodeError
 
@@ -29,17 +30,18 @@ def assert_equal(found: np.ndarray, wanted: np.ndarray) -> None:
     np.testing.assert_array_equal(found.view(np.uint32), wanted.view(np.uint32))
 
 
+@pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
 @pytest.mark.parametrize("rule", RULES, ids=str)
-def test_policies_have_the_bits_of_their_definition_at_every_width_and_size(rule):
-    for target in targets():
-        made = variation.make_variation(target)
-        for size in (1, 7, 8, 9, 15, 16, 17, 31, 32, 114, 4482):
-            asked = recipes(size, rule=rule)
-            assert_equal(made(asked), asked.made())
-            assert_equal(made(asked.part([4])), asked.made()[4:5])
+def test_policies_have_the_bits_of_their_definition_at_every_width_and_size(rule, target: Target):
+    made = variation.make_variation(target)
+    for size in (1, 7, 8, 9, 15, 16, 17, 31, 32, 114, 4482):
+        asked = recipes(size, rule=rule)
+        assert_equal(made(asked), asked.made())
+        assert_equal(made(asked.part([4])), asked.made()[4:5])
 
 
-def test_values_that_are_denormal_infinite_or_no_numbers_are_those_of_numpy():
+@pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
+def test_values_that_are_denormal_infinite_or_no_numbers_are_those_of_numpy(target: Target):
     """So the code that treats denormal numbers as zeros elsewhere is not used here."""
     kinds = np.array([1e-40, -1e-45, 0.0, -0.0, 1.0, 3e38, np.inf, np.nan, 1e-38], np.float32)
     parents = np.stack([np.roll(np.tile(kinds, 4), shift) for shift in range(4)])
@@ -47,7 +49,7 @@ def test_values_that_are_denormal_infinite_or_no_numbers_are_those_of_numpy():
         asked = recipes(36, rule=rule, parents=parents)
         with np.errstate(all="ignore"):
             wanted = asked.made()
-        found = variation.make_variation()(asked)
+        found = variation.make_variation(target)(asked)
         assert (np.isnan(found) == np.isnan(wanted)).all()
         assert_equal(np.nan_to_num(found), np.nan_to_num(wanted))
         assert (np.abs(wanted[wanted != 0.0]) < 1e-38).any() == has_denormal

@@ -32,16 +32,16 @@ class Operation(NamedTuple):
 
 
 def _fused(a: Any, b: Any, c: Any) -> Any:
-    """a * b + c, rounded once: in float64 the product is exact and the sum is rounded to odd, then to float32."""
+    """a * b + c of floats: in float64 the product is exact and the sum is rounded to odd, so that rounding it again is
+    rounding once."""
     product = np.asarray(a, np.float64) * np.asarray(b, np.float64)
-    c = np.asarray(c, np.float64)
     total = product + c
     away = total - product
     error = (product - (total - away)) + (c - away)  # exact: total + error == product + c
     bits = total.view(np.int64)
     inexact_and_even = np.isfinite(total) & (error != 0) & (bits & 1 == 0)
     toward = np.where((error > 0) == (total > 0), 1, -1)
-    return np.where(inexact_and_even, (bits + toward).view(np.float64), total).astype(np.float32)
+    return np.where(inexact_and_even, (bits + toward).view(np.float64), total)
 
 
 def _unsigned(x: Any) -> Any:
@@ -120,7 +120,12 @@ NUMPY_DTYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtyp
 """NumPy's dtype for each dtype of a graph."""
 BIT_MOVES = {"unbits", "bits", "neg", "abs", "select"}
 """Operations that pass floats through unchanged. All others replace denormal arguments and results by zeros."""
+ROUNDED = {"mul", "div", "fma"}
+"""Operations whose results may be both inexact and tiny. The twin computes them in float64 and rounds once."""
 SMALLEST_NORMAL = np.finfo(np.float32).tiny
+LEAST_KEPT = 2.0**-126 - 2.0**-151
+"""Least absolute value that is not a zero after rounding: what 24 bits round to 2^-126, as on x86-64. Processors of Arm
+look before rounding, so what is below 2^-126 is a zero there."""
 
 
 def compute(name: str, arguments: Sequence[Any]) -> Any:
@@ -129,10 +134,13 @@ def compute(name: str, arguments: Sequence[Any]) -> Any:
     if name not in BIT_MOVES:
         arguments = [_flushed(x) if dtype == "f" else x for dtype, x in zip(operation.takes, arguments, strict=True)]
     with np.errstate(all="ignore"):
+        if name in ROUNDED:
+            exact = operation.meaning(*(np.asarray(x, np.float64) for x in arguments))
+            return np.asarray(_flushed(exact, LEAST_KEPT), np.float32)
         found = np.asarray(operation.meaning(*arguments), NUMPY_DTYPES[operation.gives])
     return _flushed(found) if operation.gives == "f" and name not in BIT_MOVES else found
 
 
-def _flushed(x: Any) -> Any:
-    """Floats with denormal numbers replaced by zeros of the same sign."""
-    return x * (np.abs(x) >= SMALLEST_NORMAL)
+def _flushed(x: Any, least: float = SMALLEST_NORMAL) -> Any:
+    """Floats with those below `least` replaced by zeros of the same sign; denormal numbers by default."""
+    return x * (np.abs(x) >= least)

@@ -1,0 +1,153 @@
+"""64-bit Arm gives the bits of x86-64: primitives, whole episodes, and a run's digest, by code that qemu runs.
+
+Tests beside this one take targets of Arm, too: operations, noise, gradients, policies, recipes, steps of each task.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from es_service import api
+from es_service.protocol.messages import PolicySpec
+from es_service.store.digest import digest_parts
+from tests import helpers
+from tests.workers.simd.emulated import WIDTHS, arm_targets, emulation, needs_emulation
+from tests.workers.simd.primitive_cases import CASES
+from tests.workers.simd.rollouts import arguments, targets, task_spec
+from workers.environments import make_environment
+from workers.simd.backend.target import Target, target_of
+from workers.simd.episodes import compiled, kernel, rollout, variation
+from workers.simd.episodes.check import require_same
+from workers.simd.episodes.compiled import compile_episodes
+from workers.simd.episodes.kernel import compile_kernel
+from workers.simd.frontend.trace import trace_jaxpr
+from workers.simd.graph.twin import evaluate
+
+GENTLE = settings(
+    deadline=None, derandomize=True, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
+)
+ON_ARM = pytest.mark.parametrize("target", arm_targets(), ids=lambda target: target.isa)
+
+
+def same_words(found: Any, wanted: Any, what: str) -> None:
+    """Hold the leaves of two results against each other, bit for bit; all NaN count as the same."""
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        one, other = np.asarray(one), np.asarray(other)
+        assert (one.dtype, one.shape) == (other.dtype, other.shape)
+        if one.dtype == np.float32:
+            require_same(one, other, what)
+        else:
+            np.testing.assert_array_equal(one, other, err_msg=what)
+
+
+def every_primitive(draw: Any, target: Target) -> None:
+    """One kernel of all cases together, on Arm, on this processor and in NumPy."""
+    functions, given_ = zip(*(case(draw) for case in CASES.values()), strict=True)
+
+    def function(given_: Any) -> Any:
+        return [one(*arguments) for one, arguments in zip(functions, given_, strict=True)]
+
+    lanes = min(len(x) for x in jax.tree.leaves(given_))
+    given_ = jax.tree.map(lambda x: np.asarray(x)[:lanes], given_)
+    of = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), given_)
+    found, wanted = (compile_kernel(function, of, target=one)(given_) for one in (target, targets()[0]))
+    for name, one, other in zip(CASES, found, wanted, strict=True):
+        same_words(one, other, name)
+    graph, _, outputs = trace_jaxpr(jax.make_jaxpr(function)(of))
+    twin = evaluate(graph, outputs, as_words(given_))
+    require_same(as_words(found), as_words([value[:, None] for value in twin]), "the twin")
+
+
+def as_words(tree: Any) -> np.ndarray:
+    """Words [word, lane] of arrays [lane, ...]; a bool is 0 or 1."""
+    rows = [np.asarray(x).reshape(len(x), -1).T for x in jax.tree.leaves(tree)]
+    return np.concatenate([x.astype(np.uint32) if x.itemsize < 4 else x.copy().view(np.uint32) for x in rows])
+
+
+@ON_ARM
+@settings(GENTLE, max_examples=2)
+@given(data=st.data())
+def test_every_primitive_has_the_bits_of_x86_and_of_its_twin(data: st.DataObject, target: Target) -> None:
+    every_primitive(data.draw, target)
+
+
+@pytest.mark.long
+@ON_ARM
+@settings(GENTLE, max_examples=30)
+@given(data=st.data())
+def test_so_it_has_for_more_shapes_and_values(data: st.DataObject, target: Target) -> None:
+    every_primitive(data.draw, target)
+
+
+@ON_ARM
+@pytest.mark.parametrize("kind", ["training", "evaluation", "policies"])
+@pytest.mark.parametrize(
+    ("task", "steps", "hidden"),
+    [
+        ("point_maze", 200, (16, 16)),
+        pytest.param("point_maze", 200, (64, 64), marks=pytest.mark.long),
+        pytest.param("ant_trap", 1000, (16, 16), marks=pytest.mark.long),
+        pytest.param("ant_trap", 20, (256, 256), marks=pytest.mark.long),
+        pytest.param("ant_maze", 300, (16, 16), marks=pytest.mark.long),
+    ],
+)
+def test_whole_episodes_have_the_bits_of_x86(task: str, steps: int, hidden: tuple, kind: str, target: Target) -> None:
+    environment, whole = make_environment(task, {}), task_spec(task)
+    shape = PolicySpec((whole.policy.widths[0], *hidden, whole.policy.widths[-1]))
+    worker_spec = dataclasses.replace(whole, policy=shape, episode_steps=steps)
+    centre_D, unit, mean_O, std_O, keys, resets, actions = arguments(worker_spec, 2.0)
+    lanes, training, own = 16, kind == "training", kind == "policies"
+    found = []
+    for one in (targets()[0], target):
+        made = compile_episodes(
+            environment, worker_spec, np.arange(len(mean_O)), training=training, own_weights=own, target=one
+        )
+        weights, mean, std = made.network.pack(centre_D), mean_O, std_O
+        if own:
+            rng = np.random.default_rng(0)
+            policies = [(centre_D + rng.normal(0, 0.1, (lanes, len(centre_D)))).astype(np.float32)]
+            kept, weights = made.network.pack_own(policies, shape.parameters)
+            mean, std = np.tile(mean_O, (lanes, 1)), np.tile(std_O, (lanes, 1))
+        of_lanes = (given_.reshape(-1, 4)[:lanes] for given_ in (resets, actions))
+        wanted_L = None if training else np.arange(lanes) % 3 > 0
+        noise = keys[: lanes // 2] if training else None
+        found.append(made.run(weights, float(unit), mean, std, noise, *of_lanes, wanted_L))
+        assert not own or len(kept)
+    assert len(np.unique(found[0].returns)) > lanes // 2
+    same_words(found[1], found[0], task)
+
+
+CONFIG = {
+    "task": {"environment": "point_maze"},
+    "policy": {"hidden": [8, 8]},
+    "search": {"algorithm": "ns_es", "pairs": 8, "sigma": 0.1, "evaluation_episodes": 4, "centres": 2},
+    "novelty": {"neighbours": 3},
+    "budget": {"generations": 10},
+    "compute": {"engine": "inline", "workers": 1, "rollout": "simd"},
+}
+
+
+def digest_on(target: Target, folder: Path) -> dict[str, str]:
+    """Parts of the digest of a run whose workers compute with kernels for a target."""
+    with helpers.workers_in_this_process(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(helpers, "_WORKERS", {})
+        for module in (compiled, kernel, rollout, variation):
+            patch.setattr(module, "host_target", lambda: target)
+        api.run(api.load_config(CONFIG), out=folder)
+    return digest_parts(folder)
+
+
+@needs_emulation
+@pytest.mark.parametrize("isa", WIDTHS[:1])
+def test_a_run_computed_on_arm_has_the_digest_of_x86(isa: str, tmp_path: Path) -> None:
+    """Ten generations: episodes of populations and centres and sums of gradients, of two centres by turns."""
+    with emulation():
+        assert digest_on(target_of(isa), tmp_path / "arm") == digest_on(targets()[0], tmp_path / "x86")
