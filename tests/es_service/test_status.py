@@ -230,12 +230,12 @@ def test_why_a_run_has_stopped_is_told_until_it_is_finished(end, told, tmp_path)
     folder = tmp_path / "run"
     with contextlib.suppress(ValueError, Interrupted, KeyboardInterrupt):
         api.run(SMALL | {"budget": {"generations": 2}}, folder, on_generation=ends)
-    assert state(look(api.open_run(folder))) == f"stopped before its budget was spent: {told}"
-    assert state(look(api.resume(folder).run)) == "finished: the budget of 2 generations is spent"
+    assert state(read_standing(api.open_run(folder))) == f"stopped before its budget was spent: {told}"
+    assert state(read_standing(api.resume(folder).run)) == "finished: the budget of 2 generations is spent"
     (folder / "config.yaml").write_text(
         (folder / "config.yaml").read_text().replace("generations: 2", "generations: 3")
     )
-    assert state(look(api.open_run(folder))) == "stopped before its budget was spent"
+    assert state(read_standing(api.open_run(folder))) == "stopped before its budget was spent"
 
 
 def test_who_follows_a_run_is_told_once_that_it_waits_or_compiles(run, console, monkeypatch, capsys):
