@@ -8,7 +8,6 @@ Prints one line of JSON.
 from __future__ import annotations
 
 import json
-import resource
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -18,6 +17,7 @@ import numpy as np
 from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, stream_keys
 from es_service.protocol.rollouts import why_not
+from es_service.protocol.system import peak_memory_mib
 from workers.describe import described
 from workers.environments import SHIPPED
 from workers.policies.policy import initial_parameters
@@ -72,7 +72,7 @@ def measure(
     return {
         "steps_per_second": round(steps / (now - ready)),
         "compile_seconds": round(ready - started, 2),
-        "peak_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        "peak_mib": peak_memory_mib(),
     }
 
 

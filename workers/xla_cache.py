@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-from pathlib import Path
 
+from es_service.protocol.machine import cpu_kind
+from es_service.protocol.system import processor_fields
 from workers.simd.backend.cache import cache_folder
 
 MOST_BYTES = 200 * 2**20
@@ -40,6 +41,6 @@ def xla_cache_settings() -> dict[str, str]:
 
 def _processor() -> str:
     """A name for processors that run the same machine code: JAX's key does not contain what this one can do."""
-    lines = Path("/proc/cpuinfo").read_text().split("\n\n", 1)[0].splitlines()
-    features = [line for line in lines if line.startswith(("vendor_id", "cpu family", "model\t", "flags"))]
+    fields = processor_fields()
+    features = [cpu_kind(), *(fields[name] for name in ("flags", "Features", "CPU variant") if name in fields)]
     return hashlib.sha256("\n".join(features).encode()).hexdigest()[:16]

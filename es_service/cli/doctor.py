@@ -28,6 +28,7 @@ from es_service.errors import Interrupted, ServiceError
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import Centre, EpisodesResult, TrainingChunk
 from es_service.protocol.noise import TEST_VECTORS, normal_integers, stream_keys
+from es_service.protocol.system import memory_bytes
 from es_service.runs.signals import stop_on_signals
 from es_service.search.observation_statistics import no_observations, normalisation
 from es_service.store.folder import is_network_filesystem
@@ -94,8 +95,9 @@ def _ray() -> Iterator[Finding]:
 def _machine() -> Iterator[Finding]:
     usable, present = cores(), os.cpu_count() or 1
     yield "ok", f"{usable} of {present} cores are usable; by default, each runs one worker"
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
-    yield ("ok" if memory >= MIN_MEMORY_BYTES else "note"), f"{memory / 2**30:.1f} GiB of memory free"
+    memory, is_free = memory_bytes()
+    level = "ok" if memory >= MIN_MEMORY_BYTES else "note"
+    yield level, f"{memory / 2**30:.1f} GiB of memory {'free' if is_free else 'in all'}"
 
 
 def _vectors() -> Iterator[Finding]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
+
+from es_service.protocol.system import usable_cpus
 
 CGROUP = Path("/sys/fs/cgroup")
 """Folder of the control groups, as this process sees it."""
@@ -13,13 +14,13 @@ MEMBERSHIP = Path("/proc/self/cgroup")
 
 
 def cores() -> int:
-    """Cores in this process's CPU affinity, or the least quota of its control groups (`docker run --cpus`, `systemd-run
-    -p CPUQuota=`, a Slurm job), rounded up, if that is less.
+    """Cores in this process's CPU affinity (on macOS all), or the least quota of its control groups (`docker run
+    --cpus`, `systemd-run -p CPUQuota=`, a Slurm job), rounded up, if that is less.
 
     The quota of a group also holds for all groups inside it, so the group of the process and all groups around it
     count, in both versions of control groups. A group without a readable quota has none.
     """
-    return min([len(os.sched_getaffinity(0)), *_quotas()])
+    return min([usable_cpus(), *_quotas()])
 
 
 def _quotas() -> Iterator[int]:

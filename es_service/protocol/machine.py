@@ -10,8 +10,9 @@ import json
 import platform
 from collections.abc import Collection, Iterable, Mapping
 from importlib import metadata
-from pathlib import Path
 from typing import Any
+
+from es_service.protocol.system import architecture, processor_fields
 
 VERSION = "0.17.0"
 """Version of es-service, written here because the metadata of an editable installation keep the version of the last
@@ -66,15 +67,16 @@ def code_text(code: Mapping[str, str]) -> str:
 
 
 def cpu_kind() -> str:
-    """Vendor, family, model and widest vector extension of the first processor, such as `AuthenticAMD 26/2 avx512f`.
+    """Kind of the first processor.
 
-    Only the machine's architecture where /proc/cpuinfo cannot be read.
+    On x86-64 vendor, family, model and widest vector extension, such as `AuthenticAMD 26/2 avx512f`. On Arm the
+    numbers of maker and model and the architecture, such as `0x41/0xd0c aarch64`; on a Mac `Apple M1 aarch64`. Only the
+    architecture where the system does not say more.
     """
-    try:
-        lines = Path("/proc/cpuinfo").read_text().split("\n\n", 1)[0].splitlines()
-    except OSError:
-        return platform.machine()
-    fields = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
-    flags = fields.get("flags", "").split()
-    vectors = next((flag for flag in ("avx512f", "avx2", "avx", "sse2") if flag in flags), platform.machine())
-    return f"{fields.get('vendor_id', '?')} {fields.get('cpu family', '?')}/{fields.get('model', '?')} {vectors}"
+    fields = processor_fields()
+    if "vendor_id" in fields:
+        flags = fields.get("flags", "").split()
+        vectors = next((flag for flag in ("avx512f", "avx2", "avx", "sse2") if flag in flags), architecture())
+        return f"{fields['vendor_id']} {fields.get('cpu family', '?')}/{fields.get('model', '?')} {vectors}"
+    maker = [fields[name] for name in ("CPU implementer", "CPU part") if name in fields]
+    return " ".join(filter(None, ["/".join(maker), fields.get("brand", ""), architecture()]))

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from functools import cache
@@ -19,13 +20,28 @@ from queue import SimpleQueue
 
 PR_SET_PDEATHSIG = 1
 """Linux's `prctl` option that sets the signal sent to a process when its parent dies."""
+LOOK_S = 0.2
+"""Seconds between two looks for the parent, where the kernel does not tell of its death."""
 
 
 def end_with(parent: int) -> None:
-    """Have this process killed when its parent ends, for whatever reason; end it if the parent has ended already."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    """Have this process killed when its parent ends, for whatever reason; end it if the parent has ended already.
+
+    The kernel does it on Linux. Elsewhere a thread looks for the parent every LOOK_S seconds.
+    """
+    prctl = getattr(ctypes.CDLL(None), "prctl", None)
+    if prctl:
+        prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    else:
+        threading.Thread(target=_look_for, args=(parent,), daemon=True, name="looks for the parent").start()
     if os.getppid() != parent:
         os._exit(1)
+
+
+def _look_for(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(LOOK_S)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def start_child(start: Callable[[], subprocess.Popen[bytes]]) -> subprocess.Popen[bytes]:

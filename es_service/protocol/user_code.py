@@ -12,14 +12,13 @@ import importlib.util
 import os
 import re
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from importlib.machinery import ModuleSpec, SourceFileLoader
-from pathlib import Path
 from threading import RLock
 from types import ModuleType
 
 from es_service.protocol.sources import UserModule, modules_of, sha256
+from es_service.protocol.system import process_start_s
 
 _ONE_AT_A_TIME = RLock()
 
@@ -95,19 +94,13 @@ def _is_same(module: ModuleType, own: UserModule) -> bool:
     loader = getattr(module, "__loader__", None)
     if isinstance(loader, _Loader):
         return loader.sha256 == own.sha256
-    return own.file.stat().st_ctime < _process_start_s()
+    return own.file.stat().st_ctime < process_start_s()
 
 
 def _is_gone(module: ModuleType) -> bool:
     """Whether a module of the user was imported from a file that does not exist any more."""
     loader = getattr(module, "__loader__", None)
     return isinstance(loader, _Loader) and not os.path.exists(loader.path)
-
-
-def _process_start_s() -> float:
-    """When this process started, in seconds since the epoch."""
-    ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])  # since boot; 22nd in proc(5)
-    return time.time() - time.clock_gettime(time.CLOCK_BOOTTIME) + ticks / os.sysconf("SC_CLK_TCK")
 
 
 class _Finder:

@@ -9,7 +9,6 @@ Axes: N entries of the novelty archive, Q queries, K nearest candidates, B descr
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Literal
@@ -17,6 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from es_service.protocol.system import usable_cpus
 from es_service.search.novelty_tree import COPIES, Tree, make_tree
 from es_service.search.state_parts import same_rows
 
@@ -180,7 +180,7 @@ def novelty(
         novelty_Q[rows] = _mean_nearest(archive, query_Q_B[rows], excluded_Q[rows], neighbours, distance)
 
     blocks = range(0, len(query_Q_B), BLOCK)
-    threads = min(len(blocks), len(os.sched_getaffinity(0)))
+    threads = min(len(blocks), usable_cpus())
     if threads > 1:
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(fill, blocks))

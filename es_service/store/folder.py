@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import errno
 import os
-import re
 import shutil
 import sqlite3
 from pathlib import Path
 
 from es_service.errors import StoreError, WayOut
+from es_service.protocol.system import mounts, mounts_of_linux
 
 CONFIG = "config.yaml"
 DATABASE = "run.db"
@@ -24,6 +24,7 @@ NETWORK_FILE_SYSTEMS = frozenset((
     "9p", "acfs", "afs", "beegfs", "ceph", "cifs", "coda", "fhgfs", "fuse", "gfs2", "glusterfs", "gpfs", "lustre",
     "ncpfs", "nfs", "nfs4", "ocfs2", "orangefs", "panfs", "prl_fs", "pvfs2", "smb3", "smbfs", "vboxsf",
     "virtiofs", "vmhgfs", "wekafs",
+    "afpfs", "macfuse", "osxfuse", "webdav",  # of macOS
 ))
 # fmt: on
 """File systems without WAL, because other hosts can use the files or shared memory may not work."""
@@ -38,24 +39,15 @@ def is_network_filesystem(path: Path, mountinfo: str | None = None) -> bool:
 
     Args:
         path: a path, which need not exist.
-        mountinfo: text of a `/proc/<pid>/mountinfo`; None for that of this process. Without this file, the result is
-            false.
+        mountinfo: text of a `/proc/<pid>/mountinfo`; None for what this process sees. Where neither Linux nor the
+            command `mount` says what is mounted, the result is false.
     """
-    if mountinfo is None:
-        try:
-            mountinfo = Path("/proc/self/mountinfo").read_text(errors="surrogateescape")
-        except OSError:
-            return False
     target = Path(path).resolve()
     depth, kind = -1, ""
-    for line in mountinfo.splitlines():
-        fields, separator, source = line.partition(" - ")
-        if not separator or len(fields.split()) < 5 or not source.split():
-            continue
-        mount_point = Path(re.sub(r"\\([0-7]{3})", lambda octal: chr(int(octal[1], 8)), fields.split()[4]))
+    for mount_point, type_there in mounts() if mountinfo is None else mounts_of_linux(mountinfo):
         # If there are two mounts on one point, the later one hides the other; therefore >=.
         if target.is_relative_to(mount_point) and len(mount_point.parts) >= depth:
-            depth, kind = len(mount_point.parts), source.split()[0].lower()
+            depth, kind = len(mount_point.parts), type_there
     return kind in NETWORK_FILE_SYSTEMS or (kind.startswith("fuse.") and kind not in LOCAL_FUSE)
 
 

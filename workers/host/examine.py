@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import resource
 import sys
 import time
 from collections.abc import Callable
@@ -22,6 +21,7 @@ import numpy as np
 from es_service.protocol.messages import TaskSpec
 from es_service.protocol.noise import Domain, normal_integers, stream_keys
 from es_service.protocol.raised import raised
+from es_service.protocol.system import peak_memory_mib
 from workers.describe import described
 from workers.environments import TaskError, make_function_task, make_host_task
 from workers.environments.host_task import HostEnvironment
@@ -101,7 +101,7 @@ def _measured(hashes: dict[str, str], work: Callable[[], int], seconds: float) -
     while not steps or time.perf_counter() - started < seconds:
         steps += work()
     rate = steps / (time.perf_counter() - started)
-    return Examined(hashes, round(rate, 1), round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+    return Examined(hashes, round(rate, 1), peak_memory_mib())
 
 
 def _hash(said: list[Any]) -> str:
