@@ -1,8 +1,9 @@
-"""A virtual environment with reinforcement learners of others beside this project, since they bring PyTorch.
+"""Virtual environments with learners of others beside this project, since what they bring does not go together.
 
-    python -m tests.learners.environment               # once: below runs/learners; about 1.5 GB
+    python -m tests.learners.environment               # once: below runs/learners, about 1.5 GB
+    python -m tests.learners.environment qdax          # below runs/qdax, about 1.4 GB
 
-It is also that of the learners in tests/benchmarks.
+They are also those of the systems in tests/benchmarks/baselines.
 """
 
 from __future__ import annotations
@@ -10,67 +11,96 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-FOLDER = ROOT / "runs" / "learners"
-PINS = {
-    "sbx-rl": "0.28.0",
-    "stable-baselines3": "2.9.2",
-    "torch": "2.13.0",
-    "torchrl": "0.14.1",
-    "evotorch": "0.6.1",
+FOLDER = ROOT / "runs"
+"""Folder of all environments, one below it for each name."""
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Packages of learners with their versions. Others are those of constraints.txt, or what pip takes."""
+
+    pins: dict[str, str]
+    alone: tuple[str, ...] = ()
+    """Those that are installed without what they ask for."""
+    others: tuple[str, ...] = ()
+    """What these need of it."""
+
+
+ENVIRONMENTS = {
+    "learners": Environment(
+        {
+            "sbx-rl": "0.28.0",
+            "stable-baselines3": "2.9.2",
+            "torch": "2.13.0",
+            "torchrl": "0.14.1",
+            "evotorch": "0.6.1",
+        }
+    ),
+    # One of the requirements of evorl-jax, a tracker of experiments, cannot be built.
+    "qdax": Environment(
+        {"qdax": "0.5.0", "evorl-jax": "0.1.1"}, alone=("evorl-jax",), others=("hydra-core", "omegaconf")
+    ),
 }
-"""Packages of learners and their versions. Others are those of constraints.txt, or what pip takes."""
 FOR_TESTS = ("hypothesis", "pytest", "pytest-timeout")
 
 
-def python_of(folder: Path = FOLDER) -> Path:
-    """The Python of the environment."""
-    return folder / "bin" / "python"
+def python_of(name: str = "learners", folder: Path = FOLDER) -> Path:
+    """The Python of an environment."""
+    return folder / name / "bin" / "python"
 
 
-def versions() -> dict[str, str]:
-    """Versions of the packages of learners that this Python has."""
+def versions(name: str) -> dict[str, str]:
+    """Versions of the packages of an environment that this Python has."""
     found = {}
-    for name in PINS:
+    for package in ENVIRONMENTS[name].pins:
         try:
-            found[name] = metadata.version(name).partition("+")[0]  # PyTorch for CPUs has +cpu
+            found[package] = metadata.version(package).partition("+")[0]  # PyTorch for CPUs has +cpu
         except metadata.PackageNotFoundError:
             continue
     return found
 
 
-def problem(folder: Path = FOLDER) -> str:
-    """Why the environment cannot be used; empty if it can."""
-    if not python_of(folder).exists():
+def problem(name: str = "learners", folder: Path = FOLDER) -> str:
+    """Why an environment cannot be used; empty if it can."""
+    python = python_of(name, folder)
+    if not python.exists():
         return "it does not exist"
-    code = "import json; from tests.learners.environment import versions; print(json.dumps(versions()))"
-    done = subprocess.run([python_of(folder), "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    code = f"import json; from tests.learners.environment import versions; print(json.dumps(versions({name!r})))"
+    done = subprocess.run([python, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode:
         return done.stderr.strip().splitlines()[-1]
-    found = json.loads(done.stdout)
+    found, pins = json.loads(done.stdout), ENVIRONMENTS[name].pins
     return ", ".join(
-        f"{name} {found.get(name, 'is missing')}, not {pin}" for name, pin in PINS.items() if found.get(name) != pin
+        f"{package} {found.get(package, 'is missing')}, not {pin}"
+        for package, pin in pins.items()
+        if found.get(package) != pin
     )
 
 
-def build(folder: Path = FOLDER) -> Path:
-    """Make the environment if it is not there or cannot be used; returns its Python.
+def build(name: str = "learners", folder: Path = FOLDER) -> Path:
+    """Make an environment if it is not there or cannot be used; returns its Python.
 
     Raises:
         RuntimeError: it cannot be used after it was made.
     """
-    if problem(folder):
-        subprocess.run([sys.executable, "-m", "venv", "--clear", folder], check=True)
-        pins = [f"{name}=={pin}" for name, pin in PINS.items()]
-        pip = [python_of(folder), "-m", "pip", "install", "-qq", "-c", "constraints.txt", "-e", ".[gymnasium]"]
-        subprocess.run([*pip, *pins, *FOR_TESTS], cwd=ROOT, check=True)
-        if still := problem(folder):
-            raise RuntimeError(f"{folder} is not the environment of the learners: {still}")
-    return python_of(folder)
+    if problem(name, folder):
+        wanted = ENVIRONMENTS[name]
+        subprocess.run([sys.executable, "-m", "venv", "--clear", folder / name], check=True)
+        pip = [python_of(name, folder), "-m", "pip", "install", "-qq", "-c", "constraints.txt"]
+        pins = {package: f"{package}=={pin}" for package, pin in wanted.pins.items()}
+        alone = [pins.pop(package) for package in wanted.alone]
+        subprocess.run([*pip, "-e", ".[gymnasium]", *pins.values(), *wanted.others, *FOR_TESTS], cwd=ROOT, check=True)
+        if alone:
+            subprocess.run([*pip, "--no-deps", *alone], cwd=ROOT, check=True)
+        if still := problem(name, folder):
+            raise RuntimeError(f"{folder / name} is not the environment {name}: {still}")
+    return python_of(name, folder)
 
 
 if __name__ == "__main__":
-    print(f"{build()} is ready")
+    print(f"{build(*sys.argv[1:2])} is ready")

@@ -1,17 +1,21 @@
-"""Reinforcement learners of others, in an environment of their own, on our tasks: the tests of tests/learners there."""
+"""Learners of others, in environments of their own, on our tasks: the tests of tests/learners there."""
 
 import os
 import subprocess
 
 import pytest
 
-from tests.learners.environment import ROOT, build
+from tests.learners.environment import ENVIRONMENTS, ROOT, build
+
+OF_QDAX = "tests/learners/test_qdax.py"
 
 
 @pytest.mark.long
 @pytest.mark.timeout(3600)
-def test_learners_take_our_tasks():
-    command = [build(), "-m", "pytest", "tests/learners", "-q", "-W", "default", "-p", "no:cacheprovider"]
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_learners_take_our_tasks(name):
+    where = {"qdax": [OF_QDAX], "learners": ["tests/learners", f"--ignore={OF_QDAX}"]}[name]
+    command = [build(name), "-m", "pytest", *where, "-q", "-W", "default", "-p", "no:cacheprovider"]
     done = subprocess.run(
         command, cwd=ROOT, env={**os.environ, "PYTHONPATH": ""}, capture_output=True, text=True, check=False
     )

@@ -9,16 +9,22 @@ from typing import Any
 
 import pandas as pd
 
+from tests.benchmarks.baselines.programs import SYSTEMS
+from tests.benchmarks.paper_tables import PAPER, TASKS
+
 KEY = ("task", "system", "seed")
 """Columns that name a run."""
+HEADINGS = ("system", "seeds", "steps", "CPU s", "updates a step", "return", "successes", "least distance", "paper")
 COLUMNS = (
     *KEY,
     *("steps", "cpu_seconds", "is_finished"),
-    *("return_mean", "return_low", "return_high", "success", "success_low", "success_high", "episodes"),
+    *(f"{what}_{part}" for what in ("return", "goal_distance") for part in ("mean", "low", "high")),
+    *("success", "success_low", "success_high", "episodes", "candidates"),
     *("updates_per_step", "network", "settings", "versions", "cpu"),
 )
 """Environment steps and CPU seconds of all processes are those that the run has reached, certification not included.
-Return and share of successes are those of the certification, with intervals of 95 %."""
+Return, least distance to the goal and share of successes are those of the certification, with intervals of 95 %, of the
+policy that selection episodes chose among `candidates`. Updates are batches that networks learn from."""
 
 
 def read(table: Path) -> list[dict[str, Any]]:
@@ -45,12 +51,31 @@ def put(table: Path, row: Mapping[str, Any]) -> None:
 
 
 def in_words(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows as a table in Markdown; a run that goes on says how far it is."""
-    lines = ["| task | system | seed | steps | CPU s | certified return | successes |", "| --- " * 7 + "|"]
-    for row in rows:
-        cost = f"{row['cpu_seconds']:,.0f}" + ("" if row["is_finished"] else ", goes on")
-        value = f"{row['return_mean']:,.1f} ({row['return_low']:,.1f} to {row['return_high']:,.1f})"
-        share = "" if pd.isna(row["success"]) else f"{row['success']:.0%}"
-        named = " | ".join(str(row[name]) for name in KEY)
-        lines.append(f"| {named} | {row['steps']:,} | {cost} | {value} | {share} |")
-    return "\n".join(lines)
+    """The rows as a table in Markdown for each task, all runs of a system in one line, in the order of `SYSTEMS`; a run
+    that goes on says how far it is."""
+    tables = []
+    for number, task in enumerate(TASKS):
+        runs = [row for row in rows if row["task"] == task]
+        lines = [f"**{task}**", "", "| " + " | ".join(HEADINGS) + " |", "| --- " * len(HEADINGS) + "|"]
+        for system, one in SYSTEMS.items():
+            if of_system := [row for row in runs if row["system"] == system]:
+                paper = PAPER.get(one.name, ("",) * len(TASKS))[number]
+                lines.append("| " + " | ".join([one.name, *_cells(of_system), paper]) + " |")
+        if runs:
+            tables.append("\n".join(lines))
+    return "\n\n".join(tables)
+
+
+def _cells(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What the runs of a system have reached; what all have alike is named once."""
+    ends = ["" if row["is_finished"] else ", goes on" for row in rows]
+    cells = [
+        [str(row["seed"]) for row in rows],
+        [f"{row['steps'] / 1e6:.3g}M{end}" for row, end in zip(rows, ends, strict=True)],
+        [f"{row['cpu_seconds']:,.0f}" for row in rows],
+        [f"{row['updates_per_step']:.2g}" for row in rows],
+        [f"{row['return_mean']:,.1f}" for row in rows],
+        ["" if pd.isna(row["success"]) else f"{row['success']:.0%}" for row in rows],
+        ["" if pd.isna(row["goal_distance_mean"]) else f"{row['goal_distance_mean']:.2f}" for row in rows],
+    ]
+    return [values[0] if len({*values}) == 1 else ", ".join(values) for values in cells]

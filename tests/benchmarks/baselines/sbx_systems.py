@@ -22,25 +22,8 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from es_service.environments.sb3 import SB3VecEnv
+from tests.benchmarks.baselines.run import SIZES, Sizes
 
-
-@dataclass(frozen=True)
-class Sizes:
-    """What a task has of its own."""
-
-    network: tuple[int, ...]
-    environments: int
-    updates: int
-    """Updates for each step of all environments: one for 16 steps."""
-    random_steps: int
-    """Steps with random actions, before the first update."""
-
-
-SIZES = {
-    "point_maze": Sizes((64, 64), 16, 1, 1_000),
-    "ant_maze": Sizes((256, 256), 64, 4, 10_000),
-    "ant_trap": Sizes((256, 256), 64, 4, 10_000),
-}
 BUFFER = 1_000_000
 """Transitions that are kept."""
 

@@ -1,0 +1,54 @@
+"""A run of a method of ours, with the config of the paper's tables, in the same budgets as the others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import es_service
+from es_service.runs.certification import certify_run
+from es_service.runs.checked_config import load_config
+from es_service.store.folder import holds_run
+from tests.benchmarks.baselines.run import Facts, Found, Run
+
+CONFIGS = Path(__file__).parents[3] / "configs" / "paper"
+
+
+class OurRun(Run):
+    """A run folder, which is its own checkpoint. What it has found is what `es-service evaluate --certify` chooses."""
+
+    chunk = 10_000_000  # a session begins in a second
+
+    def __init__(self, task: str, system: str, seed: int, folder: Path) -> None:
+        self._folder = folder / "run"
+        compute = {"compute.inline_workers": "threads", "compute.workers": 1, "compute.engine": "inline"}
+        endless = {"budget.env_steps": None, "budget.generations": 2**40}
+        config = CONFIGS / f"{task}_{system}.yaml"
+        self._config = load_config(config, {"seed": seed} | compute | endless)
+        name = f"{config.parent.name}/{config.name}"
+        self.facts = Facts(0.0, tuple(self._config.policy.hidden), f"configs/{name}", ("es-service",))
+        super().__init__(task, system, seed, folder)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of all sessions."""
+        return int(es_service.open_run(self._folder).history.env_steps.iloc[-1]) if holds_run(self._folder) else 0
+
+    def advance(self, steps: int) -> None:
+        """Search until the generation with the last of so many environment steps."""
+        wanted = self.steps + steps
+
+        def ended(row: dict) -> es_service.Stop | None:
+            return es_service.Stop("its steps are spent") if row["env_steps"] >= wanted else None
+
+        es_service.run_or_resume(self._config, self._folder, on_generation=ended, progress=False)
+
+    def write(self, folder: Path) -> None:
+        """Nothing: the run has stored each generation."""
+
+    def read(self, folder: Path) -> None:
+        """Nothing."""
+
+    def certified(self, episodes: int) -> Found:
+        """The best of the best centre, or of the ten elites with the highest fitness."""
+        [one] = certify_run(self._folder, episodes=episodes, workers=1)
+        return Found(one.episodes, one.candidates)
