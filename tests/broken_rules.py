@@ -483,7 +483,7 @@ CASES = [
     *cases(
         "corrected values",
         OF_MEASURED,
-        ("count no steps", "es_service/loop/driver.py", " + correction.env_steps", ""),
+        ("count no steps", "es_service/loop/finished.py", " + correction.env_steps", ""),
         (
             "have the stored places",
             "es_service/loop/correction.py",

@@ -211,6 +211,15 @@ class Engine(Generic[AnyTransport]):
             EvaluationError: a work item failed in all its attempts, or no worker starts or gets a place.
             Interrupted: a stop was requested.
         """
+        return self.begin(work)()
+
+    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
+        """As `evaluate`, but returns when chunks have been sent; the function that it returns waits for the results.
+
+        Results for which nobody waits are dropped when another evaluation begins, and this waits for them first.
+        """
+        while pending(self._state):
+            self._serve()
         while (message := self.transport.receive(0.0)) is not None:
             # A worker that is known to be lost gets no chunk. One whose loss is not known yet, such as an idle actor,
             # may get one. Only one work item is charged for that, since all other workers are then asked first.
@@ -222,10 +231,14 @@ class Engine(Generic[AnyTransport]):
         self._waits.begin((item_id.kind for item_id, _ in parts), time.monotonic())
         self._work, self._results = dict(parts), {}
         self._step(events.Submit(tuple(events.WorkItem(item_id, item_id.kind, item_id.chunks) for item_id, _ in parts)))
-        while pending(self._state):
-            self._serve()
-        results = (result for item_id, _ in parts for result in self._results.pop(item_id))
-        return [whole(one, list(islice(results, len(own)))) for one, own in zip(work, pieces, strict=True)]
+
+        def wait() -> list[ChunkResult]:
+            while pending(self._state):
+                self._serve()
+            results = (result for item_id, _ in parts for result in self._results.pop(item_id))
+            return [whole(one, list(islice(results, len(own)))) for one, own in zip(work, pieces, strict=True)]
+
+        return wait
 
     def close(self) -> None:
         """Kill all workers and wait until they have ended; in a cluster that was joined they end shortly afterwards."""

@@ -6,7 +6,8 @@ import time
 
 
 class Clock:
-    """Measures how the time of each generation is spent. The time of a commit counts for the following generation.
+    """Measures how the time of each generation is spent. The time in which a generation is stored counts for the
+    following one, whose episodes are computed meanwhile.
 
     Args:
         before_s: seconds spent in earlier sessions of the run.

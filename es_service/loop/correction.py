@@ -10,6 +10,7 @@ Axes: N elites, E episodes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,8 +20,7 @@ from es_service.loop.checks import valid_members
 from es_service.loop.evaluated import Update
 from es_service.loop.generation import entered, steps_of
 from es_service.loop.history import CORRECTED, HistoryRow, doubles
-from es_service.loop.interfaces import Search, Store
-from es_service.loop.parts import elite_from_arrays, elite_part
+from es_service.loop.interfaces import Search
 from es_service.loop.policies import policy_episodes, policy_work
 from es_service.loop.state import RunState
 from es_service.protocol.evaluator import Evaluator
@@ -45,12 +45,14 @@ class Correction:
 
 
 @np.errstate(invalid="ignore", over="ignore")  # an elite with an infinite fitness leaves
-def correct(search: Search, evaluator: Evaluator, store: Store, before: RunState, updated: Update) -> Correction:
+def correct(
+    search: Search, evaluator: Evaluator, elites: Callable[[int], Elite], before: RunState, updated: Update
+) -> Correction:
     """The corrected columns of a generation; without values where it does not correct, and none if no generation does.
 
     Args:
-        store: with the state before the generation.
-        before: that state.
+        elites: returns the elite of a cell before the generation.
+        before: the state before it.
         updated: what the generation has changed.
     """
     settings, map_ = search.config.map, updated.search.map
@@ -65,8 +67,8 @@ def correct(search: Search, evaluator: Evaluator, store: Store, before: RunState
     again, steps, episodes = empty_map(map_.geometry), 0, 0
     for ask, first in enumerate(range(0, map_.size, ELITES_AT_ONCE)):
         cells = map_.cell_N[first : first + ELITES_AT_ONCE].tolist()
-        elites = [new[cell] if cell in new else _stored(store, before, map_, cell) for cell in cells]
-        results = _episodes(search, evaluator, elites, generation, ask)
+        kept = [new[cell] if cell in new else elites(_origin(before, map_, cell)) for cell in cells]
+        results = _episodes(search, evaluator, kept, generation, ask)
         valid_N = np.asarray(valid_members(results).all(axis=1))
         columns = (map_.centre_N[first : first + len(cells)][valid_N], np.full(int(valid_N.sum()), np.nan))
         descriptor_N_B = doubles(results.descriptor).mean(axis=1)[valid_N]
@@ -79,14 +81,14 @@ def correct(search: Search, evaluator: Evaluator, store: Store, before: RunState
     return Correction(dict(zip(CORRECTED, values, strict=True)), steps, episodes)
 
 
-def _stored(store: Store, before: RunState, map_: BehaviourMap, cell: int) -> Elite:
-    """An elite that the store has, where it was before the generation."""
+def _origin(before: RunState, map_: BehaviourMap, cell: int) -> int:
+    """The cell in which an elite was before the generation."""
     row, earlier = map_.row_of(cell), before.search.map
     assert row is not None
     assert earlier is not None
     origin = earlier.cell_of(int(map_.generation_N[row]), int(map_.centre_N[row]))
     assert origin is not None, "an elite that is neither new nor in the map before"
-    return elite_from_arrays(store.part(elite_part(origin)))
+    return origin
 
 
 def _episodes(search: Search, evaluator: Evaluator, elites: list[Elite], generation: int, ask: int) -> EpisodesResult:

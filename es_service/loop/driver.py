@@ -1,8 +1,9 @@
-"""The main loop of a run. A generation is: propose, evaluate, update, record.
+"""The main loop of a run. A generation is: propose, evaluate, update, finish.
 
-The loop is independent of Ray, JAX, files and any single method; everything that it works with is an argument. At any
-time the store has the last finished generation, and the next one depends only on (config, seed, state). Generation 0
-proposes the initial centres, without populations around them, so that it has no gradient and takes no step.
+The loop is independent of Ray, JAX, files and any single method; everything that it works with is an argument. A
+generation depends only on (config, seed, state), and is stored while the rollouts of the next one are computed.
+Generation 0 proposes the initial centres, without populations around them, so that it has no gradient and takes no
+step.
 """
 
 from __future__ import annotations
@@ -11,12 +12,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from es_service.config.model import BudgetConfig
 from es_service.config.search import PopulationConfig
 from es_service.loop import budget as budgets
-from es_service.loop.changes import changed_parts
 from es_service.loop.checks import (
     invalidate,
     require_asks,
@@ -26,53 +25,38 @@ from es_service.loop.checks import (
     require_weights,
 )
 from es_service.loop.clock import Clock
-from es_service.loop.correction import Correction, correct
+from es_service.loop.correction import correct
+from es_service.loop.elites import Elites
 from es_service.loop.evaluated import (
     Evaluations,
     Proposal,
     Update,
-    evaluated_table,
     in_ask_order,
     initial_centres,
     policies_asked,
     told_of,
 )
+from es_service.loop.finished import Finished, finish, rows
 from es_service.loop.generation import (
-    better,
-    entered,
     estimate_gradients,
     evaluate_centres,
     evaluate_populations,
-    fittest,
     halves,
     initial_state,
     make_centre,
     tell,
 )
-from es_service.loop.history import (
-    HistoryRow,
-    evaluation_columns,
-    fault_columns,
-    map_columns,
-    norm,
-    or_none,
-    population_columns,
-    search_columns,
-)
+from es_service.loop.history import HistoryRow, fault_columns
 from es_service.loop.interfaces import Search, Stop, Store, Stored
-from es_service.loop.parts import ELITE_PREFIX, elite_from_arrays, elite_part, state_from_parts
+from es_service.loop.parts import ELITE_PREFIX, state_from_parts
 from es_service.loop.policies import as_population
 from es_service.loop.state import RunState
 from es_service.protocol.evaluator import DispatchCounts, Evaluator
 from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, TaskSpec
 from es_service.search.algorithms.base import Ask, SearchState
-from es_service.search.maps.behaviour_map import EMPTY, Elite
+from es_service.search.maps.behaviour_map import Elite
 from es_service.search.maps.geometry import reachable_cells
 from es_service.search.novelty import novelty
-from es_service.search.observation_statistics import merge_moments
-
-Reachable = NDArray[np.bool_] | None
-"""Whether each cell of the map can be reached, [cells]; None if this is unknown."""
 
 
 def run(
@@ -100,12 +84,49 @@ def run(
         Interrupted: a signal asked the run to stop.
     """
     clock = Clock(state.wall_clock_s if state is not None else 0.0)
-    state, answer = state or initial_state(search), None
+    state = state or initial_state(search)
     reachable = None if state.search.map is None else reachable_cells(state.search.map.geometry, search.task)
-    while (reason := answer.reason if isinstance(answer, Stop) else spent(search.config.budget, state)) is None:
-        state, row = _generation(search, evaluator, store, clock, state, reachable, failed)
+    elites = Elites(store.part)
+    finished: list[Finished] = []
+
+    def record() -> None:
+        """Store and report the generation that is finished, if there is one that is not stored. Raises _Stopped."""
+        if not finished:
+            return
+        clock.lap("seconds_rollout")  # of the next generation, whose work has been sent
+        newest = finished.pop()
+        if newest.failures:
+            failed(newest.failures)
+        row, table = rows(search, newest, reachable)
+        clock.lap("seconds_driver")
+        store.commit(newest.state.generation, newest.parts, row, table)
+        elites.stored()
+        clock.lap("seconds_store")
         answer = report(row)
+        clock.lap("seconds_driver")
+        if isinstance(answer, Stop):
+            raise _Stopped(answer.reason)
+
+    try:
+        while (reason := spent(search.config.budget, state)) is None:
+            try:
+                finished.append(_generation(search, evaluator, store, elites, clock, state, record))
+            except BaseException:
+                record()  # if the next generation has failed before it was sent
+                raise
+            state = finished[0].state
+        record()
+    except _Stopped as stopped:
+        reason = stopped.reason
     return state, reason
+
+
+class _Stopped(Exception):  # noqa: N818 (ends the loop)
+    """`report` has returned a `Stop`."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
 
 
 def stored_state(store: Stored, task: TaskSpec) -> RunState | None:
@@ -132,32 +153,34 @@ def _generation(
     search: Search,
     evaluator: Evaluator,
     store: Store,
+    elites: Elites,
     clock: Clock,
     state: RunState,
-    reachable: Reachable,
-    failed: Callable[[Sequence[str]], object],
-) -> tuple[RunState, HistoryRow]:
-    """One generation: a pure function of (search, state, elites in the store) but for its timings.
+    record: Callable[[], object],
+) -> Finished:
+    """One generation: a pure function of (search, state, elites) but for its timings.
 
     It may ask for several populations, and for policies. Each step computes all of them side by side; results are taken
     in ask order.
+
+    Args:
+        record: stores the generation before; called as soon as work has been sent.
     """
     since = evaluator.counts if state.generation >= 0 else DispatchCounts()
-    proposal = propose(search, store, state)
+    proposal = propose(search, elites, state)
     clock.lap("seconds_driver")
-    evaluations = evaluate(search, evaluator, proposal, clock)
+    evaluations = evaluate(search, evaluator, proposal, clock, record)
     updated = update(search, evaluator, proposal, evaluations, clock)
     clock.lap("seconds_driver")
-    correction = correct(search, evaluator, store, state, updated)
+    correction = correct(search, evaluator, elites, state, updated)
     clock.lap("seconds_evaluation")
     faults = fault_columns(evaluator.counts, since=since)
-    results = [*evaluations.members, updated.evaluated.evaluation]  # policies are in both
-    if failures := list(dict.fromkeys(text for one in results for text in one.failures)):
-        failed(failures)
-    return record(search, store, state, proposal, evaluations, updated, correction, reachable, faults, clock)
+    finished = finish(state, proposal, evaluations, updated, correction, faults, store.part, search, clock)
+    elites.change(finished.parts)
+    return finished
 
 
-def propose(search: Search, store: Store, state: RunState) -> Proposal:
+def propose(search: Search, elites: Callable[[int], Elite], state: RunState) -> Proposal:
     """What the next generation evaluates: centres restart from elites, and the search asks."""
     config, algorithm, generation = search.config, search.algorithm, state.generation + 1
     begun = state.search
@@ -166,8 +189,8 @@ def propose(search: Search, store: Store, state: RunState) -> Proposal:
         return Proposal(0, begun, {}, (), points, ())
     start_cells = algorithm.start_cells(begun, generation)
     for index, cell in start_cells.items():
-        begun = algorithm.restart(begun, index, cell, _elite(store, cell))
-    parents = {cell: _elite(store, cell) for cell in algorithm.parents(begun, generation)}
+        begun = algorithm.restart(begun, index, cell, elites(cell))
+    parents = {cell: elites(cell) for cell in algorithm.parents(begun, generation)}
     asked = algorithm.ask(replace(begun, elites=parents), generation)
     require_asks(asked, begun, config.compute.chunk_pairs, search.task.observation_size, generation)
     points = [
@@ -179,14 +202,17 @@ def propose(search: Search, store: Store, state: RunState) -> Proposal:
     return Proposal(generation, begun, start_cells, asked, points, policies)
 
 
-def evaluate(search: Search, evaluator: Evaluator, proposal: Proposal, clock: Clock) -> Evaluations:
-    """Roll out the populations and the policies."""
+def evaluate(
+    search: Search, evaluator: Evaluator, proposal: Proposal, clock: Clock, record: Callable[[], object]
+) -> Evaluations:
+    """Roll out the populations and the policies; meanwhile, `record` is called."""
     config, asks = search.config, proposal.asks
     if not proposal.asked:
+        record()
         return Evaluations((), (), (), ())
     pairs = [ask.pairs for ask in asks]
     populations, observed, policies = evaluate_populations(
-        evaluator, proposal.centres, pairs, config.compute.chunk_pairs, proposal.policies
+        evaluator, proposal.centres, pairs, config.compute.chunk_pairs, proposal.policies, record
     )
     clock.lap("seconds_rollout")
     members = [*populations, *map(as_population, policies)]
@@ -253,69 +279,3 @@ def _step(
     require_finite(new_centres, config.search, generation)
     clock.lap("seconds_driver")
     return moved, new_centres
-
-
-def record(
-    search: Search,
-    store: Store,
-    before: RunState,
-    proposal: Proposal,
-    evaluations: Evaluations,
-    updated: Update,
-    correction: Correction,
-    reachable: Reachable,
-    faults: HistoryRow,
-    clock: Clock,
-) -> tuple[RunState, HistoryRow]:
-    """Commit the generation: the state after it, its row of the history, and those of what it has evaluated."""
-    config, generation, learned = search.config, proposal.generation, updated.search
-    evaluated, told, results = updated.evaluated, updated.told, updated.evaluated.evaluation
-    episodes = sum(one.fitness.size for one in evaluations.populations) * config.task.episodes_per_member
-    cell_N = None if learned.map is None else learned.map.cells_with(generation, evaluated.index_N)
-    state = RunState(
-        generation=generation,
-        search=replace(learned, elites={}),
-        observations=merge_moments(before.observations, evaluations.observed),
-        best=better(before.best, told, evaluated.point),
-        env_steps=before.env_steps + int(evaluated.env_steps_N.sum()) + correction.env_steps,
-        episodes=before.episodes + episodes + results.fitness.size + correction.episodes,
-        wall_clock_s=clock.total(),
-        elites=entered(learned, cell_N, evaluated.points, results.trace_T_B),
-    )
-    table = evaluated_table(evaluated, search.task, cell_N, proposal.start_cells, updated.novelty_N)
-    at = fittest(told)  # the history's row is about this one
-    shown = int(evaluated.index_N[at])
-    row: HistoryRow = {
-        "generation": generation,
-        "env_steps": state.env_steps,
-        "episodes": state.episodes,
-        "best_fitness": state.best.fitness,
-        **search_columns(
-            shown, float(evaluated.fitness_weight_N[at]), or_none(updated.novelty_N[at]), learned.archive.size
-        ),
-        **map_columns(
-            learned.map,
-            config.map.qd_offset,
-            reachable,
-            cell=None if cell_N is None or cell_N[at] == EMPTY else int(cell_N[at]),
-            start_cell=proposal.start_cells.get(shown),
-        ),
-        **correction.columns,
-        "update_norm": or_none(evaluated.update_norm_N[at]),
-        "parameter_norm": norm(evaluated.point(at).parameters_D),
-        **population_columns(evaluations.members),
-        **evaluation_columns(table, results, at, search.task),
-        **faults,
-        "wall_clock_s": state.wall_clock_s,
-    }
-    clock.lap("seconds_driver")
-    seconds, laps = clock.finish_generation()
-    row |= {"steps_per_second": (state.env_steps - before.env_steps) / seconds, **laps}
-    parts = changed_parts(state, before if before.generation >= 0 else None, store.part)
-    store.commit(generation, parts, row, table)
-    clock.lap("seconds_store")
-    return state, row
-
-
-def _elite(store: Store, cell: int) -> Elite:
-    return elite_from_arrays(store.part(elite_part(cell)))

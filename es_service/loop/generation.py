@@ -22,7 +22,7 @@ from es_service.loop.interfaces import Search
 from es_service.loop.policies import PolicyWork, policy_episodes
 from es_service.loop.state import Best, RunState, statistics_in_force
 from es_service.protocol.episodes import joined
-from es_service.protocol.evaluator import Evaluator
+from es_service.protocol.evaluator import Evaluator, evaluate_beside
 from es_service.protocol.gradient_tree import tree_sum
 from es_service.protocol.messages import (
     EVALUATION_EPISODES_PER_CHUNK,
@@ -94,8 +94,12 @@ def evaluate_populations(
     pairs: Sequence[int],
     chunk_pairs: int,
     policies: Sequence[PolicyWork] = (),
+    meanwhile: Callable[[], object] = lambda: None,
 ) -> tuple[list[EpisodesResult], list[Moments], list[EpisodesResult]]:
     """Roll out each centre's number of pairs around it, and side by side with them policies.
+
+    Args:
+        meanwhile: see `evaluate_beside`.
 
     Returns:
         The results of each population, with axes [P, S]; the observation moments in the order of the populations and,
@@ -105,7 +109,7 @@ def evaluate_populations(
         around(centre, [TrainingChunk(centre.generation, chunk_id, ask) for chunk_id in range(count // chunk_pairs)])
         for ask, (centre, count) in enumerate(zip(centres, pairs, strict=True))
     ]
-    found = _evaluate(EpisodesResult, evaluator, [*asked, *(one.work for one in policies)])
+    found = _evaluate(EpisodesResult, evaluator, [*asked, *(one.work for one in policies)], meanwhile)
     trained, of_policies = found[: len(asked)], found[len(asked) :]
     moments = [result.moments for results in trained for result in results if result.moments is not None]
     return (
@@ -195,9 +199,14 @@ def _agreement(first_D: FloatArray, second_D: FloatArray) -> float:
     return max(0.0, both / length) if length > 0.0 else 0.0
 
 
-def _evaluate(kind: type[Result], evaluator: Evaluator, asked: Sequence[Sequence[Work]]) -> list[list[Result]]:
+def _evaluate(
+    kind: type[Result],
+    evaluator: Evaluator,
+    asked: Sequence[Sequence[Work]],
+    meanwhile: Callable[[], object] = lambda: None,
+) -> list[list[Result]]:
     """The results of each ask's chunks; all are computed side by side."""
-    results = evaluator.evaluate([one for work in asked for one in work])
+    results = evaluate_beside(evaluator, [one for work in asked for one in work], meanwhile)
     checked = [result for result in results if isinstance(result, kind)]
     assert len(checked) == len(results), f"an evaluator returned a result that is not a {kind.__name__}"
     found = iter(checked)

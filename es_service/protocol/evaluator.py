@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from es_service.protocol.messages import ChunkResult, Work
 
@@ -38,3 +38,22 @@ class Evaluator(Protocol):
             Interrupted: a stop was requested.
         """
         ...
+
+
+@runtime_checkable
+class Beginning(Protocol):
+    """Interface of an evaluator that computes while the driver does something else."""
+
+    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
+        """Have chunks run, and return the function that waits for their results, with what `evaluate` returns."""
+        ...
+
+
+def evaluate_beside(evaluator: Evaluator, work: Sequence[Work], meanwhile: Callable[[], object]) -> list[ChunkResult]:
+    """`evaluator.evaluate(work)`, and something that the driver does meanwhile, or before if that is not possible."""
+    if isinstance(evaluator, Beginning):
+        wait = evaluator.begin(work)
+        meanwhile()
+        return wait()
+    meanwhile()
+    return evaluator.evaluate(work)

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from es_service.errors import StoreError, WayOut
 from es_service.logs import logger
 from es_service.loop.history import Table
-from es_service.protocol.kept import Kept
-from es_service.search.state_parts import read_only
 from es_service.store.beginning import Beginning, load_start
 from es_service.store.certifications import encoded, next_number
 from es_service.store.codec import Part, column_bytes, encode_changes, history_row, row_dict, rows_listed, state_sha256
@@ -71,7 +69,6 @@ class RunStore:
         self.lock = lock
         self._hook = hook
         self._closed = self._recorded = False
-        self._recent: Kept[str, Part] = Kept(lambda part: sum(values.nbytes for values in part.values()))
         self._connection, verdict = open_sound(folder, self.notices)
         self.meta = verdict.meta
         self.generation = verdict.good
@@ -146,25 +143,15 @@ class RunStore:
             StoreError: a part has been damaged since the run was opened.
         """
         names = self._kept.names()
-        return {name: self._part(name) for name in names if without is None or not name.startswith(without)}
+        return {name: self.part(name) for name in names if without is None or not name.startswith(without)}
 
-    def part(self, name: str) -> Part:
-        """One part of the newest generation's state: name -> read-only array. Parts read lately are kept in memory.
+    def part(self, name: str) -> dict[str, NDArray[Any]]:
+        """One part of the newest generation's state: name -> array.
 
         Raises:
             KeyError: there is no such part.
             StoreError: the part has been damaged since the run was opened.
         """
-        if (part := self._recent.get(name)) is None:
-            part = read_only(self._part(name))
-            self._recent.add(name, part)
-            self._recent.forget_oldest(RECENT_BYTES)
-        else:
-            self._recent.use([name])
-        return part
-
-    def _part(self, name: str) -> dict[str, NDArray[Any]]:
-        """As `part`, from the database."""
         row = self._kept.newest(name)
         with self._explaining("loading the state"):
             try:
@@ -214,8 +201,6 @@ class RunStore:
         self._recorded = False
         self.generation = generation
         self._kept.commit(new, outdated, total)
-        for part in new:
-            self._recent.forget(part)
         self._hook("after_commit")
         _LOG.debug("stored generation %d: %d parts", generation, len(rows))
         self.upkeep.after_commit(sum(len(payload) for *_, payload in rows) + 4 * PAGE_BYTES)

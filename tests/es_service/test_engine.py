@@ -207,6 +207,19 @@ def test_short_chunks_travel_together_once_their_duration_is_known(monkeypatch):
     assert numbers[2] == [5] * 40
 
 
+def test_chunks_are_sent_when_an_evaluation_begins_and_their_results_can_be_left_behind():
+    transport = Scripted()
+    with Engine(transport, Limits(workers=2)) as engine:
+        engine.evaluate(around(FIRST, CHUNKS))
+        sent = len(transport.sent)
+        wait = engine.begin(around(SECOND, CHUNKS))
+        assert len(transport.sent) > sent
+        assert wait() == [expected(SECOND, chunk) for chunk in CHUNKS]
+        engine.begin(around(SECOND, CHUNKS))
+        assert engine.evaluate(around(FIRST, CHUNKS)) == [expected(FIRST, chunk) for chunk in CHUNKS]
+        assert engine._results == {}
+
+
 @pytest.mark.parametrize("already_there", [True, False])
 def test_a_late_answer_of_an_earlier_call_is_not_taken_for_one_of_this(already_there):
     """The same chunks around another centre: only the number of the call tells the two answers apart."""

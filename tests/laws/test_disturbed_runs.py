@@ -141,10 +141,15 @@ class FaultyWorkers:
 class Shuffling(Engine[FaultyWorkers]):
     """Sends the chunks out in any order."""
 
-    def evaluate(self, work: Sequence[Work]) -> list[ChunkResult]:
+    def begin(self, work: Sequence[Work]) -> Callable[[], list[ChunkResult]]:
         order = self.transport.rng.sample(range(len(work)), len(work))
-        results = dict(zip(order, super().evaluate([work[i] for i in order]), strict=True))
-        return [results[i] for i in range(len(work))]
+        wait = super().begin([work[i] for i in order])
+
+        def in_order() -> list[ChunkResult]:
+            results = dict(zip(order, wait(), strict=True))
+            return [results[i] for i in range(len(work))]
+
+        return in_order
 
 
 def named(name: str) -> object:

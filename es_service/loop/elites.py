@@ -1,0 +1,70 @@
+"""Elites by cell, as searches draw them: those that were needed lately are kept in memory, decoded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from es_service.loop.parts import ELITE_PREFIX, Changes, elite_from_arrays, elite_part
+from es_service.protocol.kept import Kept
+from es_service.search.maps.behaviour_map import Elite
+
+RECENT_BYTES = 128 * 2**20
+"""Most bytes that are kept of elites that the store has."""
+
+
+class Elites:
+    """Function from a cell to its elite, whose arrays are read-only. The newest generation need not be stored yet."""
+
+    def __init__(self, part: Callable[[str], Mapping[str, np.ndarray]], most_bytes: int = RECENT_BYTES) -> None:
+        """Keep nothing yet.
+
+        Args:
+            part: returns a part of the state of the newest generation that is stored; raises KeyError if it has none.
+        """
+        self._part, self._most_bytes = part, most_bytes
+        self._kept: Kept[int, Elite] = Kept(lambda elite: sum(array.nbytes for array in vars(elite).values()))
+        self._new: dict[int, Elite | None] = {}
+        """Of the generation that is not stored; None if it has emptied the cell."""
+
+    def __call__(self, cell: int) -> Elite:
+        """The elite of a cell. Raises KeyError if there is none."""
+        if cell in self._new:
+            if (new := self._new[cell]) is None:
+                raise KeyError(cell)
+            return new
+        if (kept := self._kept.get(cell)) is not None:
+            self._kept.use([cell])
+            return kept
+        return self._keep(cell, _read_only(elite_from_arrays(self._part(elite_part(cell)))))
+
+    def change(self, parts: Changes) -> None:
+        """Take in what a generation has changed, before it is stored."""
+        for name, arrays in parts.items():
+            if name.startswith(ELITE_PREFIX):
+                cell = int(name.removeprefix(ELITE_PREFIX))
+                self._new[cell] = None if arrays is None else _read_only(elite_from_arrays(arrays))
+
+    def stored(self) -> None:
+        """The store has what was changed."""
+        for cell, elite in self._new.items():
+            self._kept.forget(cell)
+            if elite is not None:
+                self._keep(cell, elite)
+        self._new.clear()
+
+    def _keep(self, cell: int, elite: Elite) -> Elite:
+        """Keep an elite as the newest, and forget those that were not asked for the longest."""
+        self._kept.add(cell, elite)
+        self._kept.forget_oldest(self._most_bytes)
+        return elite
+
+
+def _read_only(elite: Elite) -> Elite:
+    """The elite in arrays that nobody changes: those that are not read-only are copied."""
+    copies = {name: array.copy() for name, array in vars(elite).items() if array.flags.writeable}
+    for copy in copies.values():
+        copy.flags.writeable = False
+    return replace(elite, **copies) if copies else elite

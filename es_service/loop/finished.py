@@ -1,0 +1,135 @@
+"""What is stored of a generation: the state after it, its row of the history, and those of what it has evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from es_service.loop.changes import Stored, changed_parts
+from es_service.loop.clock import Clock
+from es_service.loop.correction import Correction
+from es_service.loop.evaluated import Evaluations, Proposal, Update, evaluated_table
+from es_service.loop.generation import better, entered, fittest
+from es_service.loop.history import (
+    HistoryRow,
+    Table,
+    evaluation_columns,
+    map_columns,
+    norm,
+    or_none,
+    population_columns,
+    search_columns,
+)
+from es_service.loop.interfaces import Search
+from es_service.loop.parts import Changes
+from es_service.loop.state import RunState
+from es_service.search.maps.behaviour_map import EMPTY
+from es_service.search.observation_statistics import merge_moments
+
+Reachable = NDArray[np.bool_] | None
+"""Whether each cell of the map can be reached, [cells]; None if this is unknown."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A generation that has been computed, and need not be stored yet."""
+
+    before: RunState
+    state: RunState
+    """State after it."""
+    parts: Changes
+    """What it has changed."""
+    cell_N: NDArray[np.int64] | None
+    """Cells of which those evaluated are the elites, EMPTY for the others; None without a map."""
+    proposal: Proposal
+    evaluations: Evaluations
+    updated: Update
+    correction: Correction
+    faults: HistoryRow
+    seconds: float
+    laps: Mapping[str, float]
+    """Seconds of the generation, and how they were spent, by history column."""
+
+    @property
+    def failures(self) -> Sequence[str]:
+        """Texts that name its failed episodes, as far as the rollouts know more of them."""
+        results = [*self.evaluations.members, self.updated.evaluated.evaluation]  # policies are in both
+        return list(dict.fromkeys(text for one in results for text in one.failures))
+
+
+def finish(
+    before: RunState,
+    proposal: Proposal,
+    evaluations: Evaluations,
+    updated: Update,
+    correction: Correction,
+    faults: HistoryRow,
+    stored: Stored,
+    search: Search,
+    clock: Clock,
+) -> Finished:
+    """End a generation with the state after it.
+
+    Args:
+        before: the state before it, which is stored.
+        stored: returns a part of that state.
+    """
+    generation, learned, evaluated = proposal.generation, updated.search, updated.evaluated
+    results, per_member = evaluated.evaluation, search.config.task.episodes_per_member
+    episodes = sum(one.fitness.size for one in evaluations.populations) * per_member
+    cell_N = None if learned.map is None else learned.map.cells_with(generation, evaluated.index_N)
+    state = RunState(
+        generation=generation,
+        search=replace(learned, elites={}),
+        observations=merge_moments(before.observations, evaluations.observed),
+        best=better(before.best, updated.told, evaluated.point),
+        env_steps=before.env_steps + int(evaluated.env_steps_N.sum()) + correction.env_steps,
+        episodes=before.episodes + episodes + results.fitness.size + correction.episodes,
+        wall_clock_s=clock.total(),
+        elites=entered(learned, cell_N, evaluated.points, results.trace_T_B),
+    )
+    parts = changed_parts(state, before if before.generation >= 0 else None, stored)
+    clock.lap("seconds_driver")
+    spent = clock.finish_generation()
+    return Finished(before, state, parts, cell_N, proposal, evaluations, updated, correction, faults, *spent)
+
+
+def rows(search: Search, finished: Finished, reachable: Reachable) -> tuple[HistoryRow, Table]:
+    """A generation's row of the history, and the table of what it has evaluated."""
+    state, before, proposal, updated = finished.state, finished.before, finished.proposal, finished.updated
+    evaluated, told, cell_N, results = updated.evaluated, updated.told, finished.cell_N, updated.evaluated.evaluation
+    table = evaluated_table(evaluated, search.task, cell_N, proposal.start_cells, updated.novelty_N)
+    at = fittest(told)  # the history's row is about this one
+    shown = int(evaluated.index_N[at])
+    row: HistoryRow = {
+        "generation": state.generation,
+        "env_steps": state.env_steps,
+        "episodes": state.episodes,
+        "best_fitness": state.best.fitness,
+        **search_columns(
+            shown,
+            float(evaluated.fitness_weight_N[at]),
+            or_none(updated.novelty_N[at]),
+            state.search.archive.size,
+        ),
+        **map_columns(
+            state.search.map,
+            search.config.map.qd_offset,
+            reachable,
+            cell=None if cell_N is None or cell_N[at] == EMPTY else int(cell_N[at]),
+            start_cell=proposal.start_cells.get(shown),
+        ),
+        **finished.correction.columns,
+        "update_norm": or_none(evaluated.update_norm_N[at]),
+        "parameter_norm": norm(evaluated.point(at).parameters_D),
+        **population_columns(finished.evaluations.members),
+        **evaluation_columns(table, results, at, search.task),
+        **finished.faults,
+        "wall_clock_s": state.wall_clock_s,
+        "steps_per_second": (state.env_steps - before.env_steps) / finished.seconds,
+        **finished.laps,
+    }
+    return row, table

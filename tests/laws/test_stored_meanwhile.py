@@ -1,0 +1,106 @@
+"""A generation is stored and reported while the next one is computed, with the bits of one after the other."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from es_service.errors import EvaluationError
+from es_service.loop import driver
+from es_service.loop.interfaces import Stop
+from es_service.search.algorithms import ALGORITHMS
+from es_service.search.observation_statistics import no_observations
+from tests.laws.me_es_runs import Remembering, Sharing, first_centres
+from tests.laws.test_map_elites import config_of
+from workers.environments import SHIPPED
+
+GENERATIONS = 5
+
+
+class Beginning(Sharing):
+    """Computes what was begun when somebody waits for it, and notes both."""
+
+    def __init__(self, notes):
+        super().__init__()
+        self.notes = notes
+
+    def begin(self, work):
+        name = work[0][1].generation if work else "nothing"
+        self.notes.append(("sent", name))
+
+        def wait():
+            self.notes.append(("waited for", name))
+            return self.evaluate(work)
+
+        return wait
+
+
+class Noting(Remembering):
+    def __init__(self, notes):
+        super().__init__()
+        self.notes = notes
+
+    def commit(self, generation, parts, history, evaluations):
+        self.notes.append(("stored", generation))
+        super().commit(generation, parts, history, evaluations)
+
+
+def run(evaluator, notes, report=lambda row: None, ask=lambda asked, generation: asked):
+    config, store = config_of(GENERATIONS, episodes=1), Noting(notes)
+    algorithm = ALGORITHMS["map_elites"](config)
+    search = driver.Search(
+        config,
+        replace(algorithm, ask=lambda state, generation: ask(algorithm.ask(state, generation), generation)),
+        lambda: (first_centres(config), no_observations(2)),
+        SHIPPED["point_maze"],
+    )
+    return store, lambda: driver.run(search, evaluator, store, None, report)
+
+
+def test_a_generation_is_stored_after_the_next_was_sent_and_before_its_results_are_awaited():
+    notes = []
+    beside, compute = run(Beginning(notes), notes)
+    compute()
+    rollouts = [note for note in notes if note[1] != "nothing"]
+    expected = [("sent", 0), ("waited for", 0)]
+    for generation in range(1, GENERATIONS + 1):
+        expected += [("sent", generation), ("stored", generation - 1), ("waited for", generation)]
+    assert rollouts == [*expected, ("stored", GENERATIONS)]
+    one_by_one, compute = run(Sharing(), [])
+    compute()
+    assert len(beside.after) == len(one_by_one.after) == GENERATIONS + 1
+    for some, others in zip(beside.after, one_by_one.after, strict=True):
+        assert some.keys() == others.keys()
+        for name, arrays in some.items():
+            for key, array in arrays.items():
+                np.testing.assert_array_equal(array, others[name][key])
+
+
+def test_a_stop_ends_the_run_with_the_generation_that_was_reported():
+    notes = []
+    store, compute = run(Beginning(notes), notes, lambda row: Stop("enough") if row["generation"] == 2 else None)
+    state, reason = compute()
+    assert (state.generation, store.generation, reason) == (2, 2, "enough")
+    assert notes[-2:] == [("sent", 3), ("stored", 2)]
+
+
+@pytest.mark.parametrize("evaluator", [Beginning, lambda notes: Sharing()])
+def test_an_error_of_the_next_generation_loses_nothing(evaluator):
+    notes = []
+    store, compute = run(evaluator(notes), notes, ask=lambda asked, generation: asked if generation < 3 else ())
+    with pytest.raises(EvaluationError, match="generation 3"):
+        compute()
+    assert store.generation == 2
+
+
+def test_a_store_that_fails_is_not_asked_again():
+    notes, failing = [], OSError("the disk is full")
+
+    def report(row):
+        if row["generation"] == 2:
+            raise failing
+
+    _, compute = run(Beginning(notes), notes, report)
+    with pytest.raises(OSError, match="the disk is full"):
+        compute()
+    assert [note for note in notes if note[0] == "stored"] == [("stored", 0), ("stored", 1), ("stored", 2)]
