@@ -28,9 +28,9 @@ def report(
         list[str] | None,
         typer.Option(
             "--replay",
-            metavar="best|I,J|none",
-            help="Replay the best centre (default, unless this executes code of a user), a cell's elite, or none; "
-            "can be repeated.",
+            metavar="best|certified|I,J|none",
+            help="Replay the best centre and the certified policy (default, unless this executes code of a user), a "
+            "cell's elite, or none; can be repeated.",
         ),
     ] = None,
     group_by: Annotated[
@@ -61,12 +61,13 @@ def report(
     wanted = list(dict.fromkeys(replay or ["best"]))
     if "none" in wanted and len(wanted) > 1:
         raise ConfigError("--replay none cannot be combined with other replays; leave it out")
-    cells = [place_of(text, "--replay") for text in wanted if text not in ("best", "none")]
+    cells = [place_of(text, "--replay") for text in wanted if text not in ("best", "certified", "none")]
 
     for file in write_report(
         folder,
         out,
         best="best" in wanted,
+        certified="certified" in wanted if replay else None,
         cells=cells,
         trusted=replay is not None,
         evaluate=evaluation_of(folder),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, FloatArray
+from es_service.protocol.noise import Domain, Keys, evaluation_reset_keys
 from es_service.protocol.policies import POLICY_SLOTS
 
 
@@ -23,11 +24,22 @@ class RecordRequest:
     policy: int | None = None
     """The rest of the address of its reset; see `protocol.noise.evaluation_reset_keys`."""
     episode: int = 0
+    """Of a policy the first one, unless it was the only policy of its ask."""
+    domain: Domain = Domain.EVALUATION_RESET
+
+    @property
+    def reset_key(self) -> Keys:
+        """Key of the stream of its reset."""
+        return evaluation_reset_keys(
+            self.seed, self.centre.generation, self.episode, self.ask, self.policy, self.domain
+        )
 
     @property
     def slot(self) -> int:
-        """Slot of the chunk in which a policy's first episode ran, or a centre's episode; with xla it matters."""
-        return self.episode % EVALUATION_EPISODES_PER_CHUNK if self.policy is None else self.policy % POLICY_SLOTS
+        """Slot of the chunk in which the episode ran; with xla it matters."""
+        if self.policy is None:
+            return self.episode % EVALUATION_EPISODES_PER_CHUNK
+        return (self.policy + self.episode) % POLICY_SLOTS
 
 
 class Shape(NamedTuple):

@@ -20,7 +20,7 @@ from es_service.report.data import RunData
 from es_service.report.facts import number
 from es_service.report.markup import Markup, packed, spread, tag
 from es_service.report.page import asset, section
-from es_service.runs.replay import Replay, record
+from es_service.runs.replay import CERTIFIED, Replay, record
 
 MOST_CELLS = 8
 """Elites that are replayed in one page, besides the best centre; each ant takes half a megabyte."""
@@ -29,11 +29,13 @@ PLAIN_STEP_S = 0.05
 """Seconds of a step in the replay of a task that has no time of its own."""
 
 
-def replay_section(data: RunData, *, best: bool, cells: Sequence[Sequence[int]], trusted: bool) -> Mapping[str, Any]:
+def replay_section(
+    data: RunData, *, best: bool, cells: Sequence[Sequence[int]], trusted: bool, certified: bool = False
+) -> Mapping[str, Any]:
     """The section of the page, the data of its script, and the libraries that it needs.
 
     A task that cannot be run on this machine, such as a user's task whose package is missing, has a section that says
-    so. Errors about cells are raised: NotInRunError.
+    so. Errors about policies that the run does not have are raised: NotInRunError.
 
     Args:
         trusted: whether code that the config of the run names may be executed, without which such a run has no replay.
@@ -41,14 +43,16 @@ def replay_section(data: RunData, *, best: bool, cells: Sequence[Sequence[int]],
     run = data.standing.run
     for place in cells:
         run.cell(place)
+    if certified:
+        run.policy("certified")
     names = (run.present_config["task"]["environment"], run.present_config["search"]["algorithm"])
     if not trusted and (code := [name for name in names if is_own(name)]):
         return _no_replay(
             f"A replay would execute {' and '.join(code)}, which the config of this run names. If you trust its "
-            "author, ask for the replay by its name: best, or a cell."
+            "author, ask for the replay by its name: best, certified, or a cell."
         )
     try:
-        replays, found = record(run, best=best, cells=cells)
+        replays, found = record(run, best=best, cells=cells, certified=certified)
     except ServiceError as error:
         return _no_replay(f"No episode could be recorded on this machine: {error.sentence}")
     solid = bool(found.shapes) and all(one.recording.poses_T_L_7 is not None for one in replays)
@@ -70,7 +74,8 @@ def _no_replay(text: str) -> Mapping[str, Any]:
 
 
 def _title(one: Replay) -> str:
-    name = "best centre" if one.candidate.name == "best" else f"cell {one.candidate.name}"
+    names = {"best": "best centre", CERTIFIED: "certified policy"}
+    name = names.get(one.candidate.name, f"cell {one.candidate.name}")
     return f"{name}: fitness {number(one.recording.fitness)} in this episode"
 
 
@@ -88,6 +93,9 @@ def _notes(one: Replay, hidden: str | None) -> Markup:
             text += f"the policy do not count. This is an episode with the settings of this run: {seen}."
         return tag("p", text, class_="note episode", hidden=hidden)
     text = f"First evaluation episode of the policy, of generation {one.candidate.generation:,}: {seen} {mean}."
+    if stored.certification is not None:
+        text = f"Episode {stored.request.episode:,} of certification {stored.certification}, which is the one of "
+        text += f"median fitness: {seen} (mean of all its episodes: {number(one.candidate.stored_fitness)})."
     if one.is_the_stored:
         same = "Its fitness equals the stored one bit for bit."
         if stored.trace_T_B is not None:

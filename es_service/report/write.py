@@ -35,6 +35,7 @@ def write_report(
     *,
     best: bool = True,
     cells: Sequence[Sequence[int]] = (),
+    certified: bool | None = None,
     trusted: bool = False,
     evaluate: Evaluate | None = None,
     figures: AnyPath | None = None,
@@ -45,13 +46,15 @@ def write_report(
         out: file to write; None: `report.html` in the run's folder.
         best: whether to record an episode of the best centre for a replay, which takes seconds.
         cells: places of at most eight cells whose elites are to be replayed, too.
+        certified: whether the certified policy is to be replayed, in its certification episode of median fitness; None:
+            if there is one, and `best` is set.
         trusted: whether a replay may execute code that the config of the run names, a task or a search of a user.
         evaluate: what evaluates a policy, as text; None: the Python call.
         figures: folder to write figures into; None: none are written.
 
     Raises:
-        ConfigError: too many cells, or figures without matplotlib. NotInRunError: a cell does not exist or is empty.
-            StoreError: the run cannot be read, or the file cannot be written.
+        ConfigError: too many cells, or figures without matplotlib. NotInRunError: a cell does not exist or is empty, or
+            no policy is certified. StoreError: the run cannot be read, or the file cannot be written.
     """
     folder = Path(folder)
     if len(cells) > MOST_CELLS:
@@ -64,8 +67,10 @@ def write_report(
     if figures is not None:
         empty_figure()  # a missing matplotlib is reported before episodes are recorded
     data = read_run(folder)
-    found = bool(data.history["generation"].size) and (best or bool(cells))
-    replays = replay_section(data, best=best, cells=cells, trusted=trusted) if found else None
+    if certified is None:
+        certified = best and data.certified is not None
+    found = bool(data.history["generation"].size) and (best or certified or bool(cells))
+    replays = replay_section(data, best=best, cells=cells, certified=certified, trusted=trusted) if found else None
     elsewhere = WayOut("report", "write it elsewhere", str(folder), out="FILE")
     page = run_page(data, evaluate or python_call(folder), replays)
     page = write_page(page, Path(out or folder / REPORT), [elsewhere])

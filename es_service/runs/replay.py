@@ -1,8 +1,9 @@
 """Recording of episodes of a run's stored policies, for replays: the very episodes that the run evaluated.
 
-A policy's first evaluation episode is recorded, the one whose path the map stores. The run stores the address of its
-reset, its fitness and, for an elite, its path; the recording is compared with them, so that a replay never passes for
-something that it is not.
+Of the best centre and of elites, the first evaluation episode is recorded, the one whose path the map stores. The run
+stores the address of its reset, its fitness and, for an elite, its path; the recording is compared with them, so that a
+replay never passes for something that it is not. Of the certified policy, the certification episode of median fitness
+is recorded, which shows neither its luck nor its bad luck.
 """
 
 from __future__ import annotations
@@ -19,20 +20,24 @@ from typing import Any
 import numpy as np
 
 from es_service.config.compute import ENGINE_IMPLIES
-from es_service.config.model import worker_spec
+from es_service.config.model import RunConfig, worker_spec
 from es_service.config.tasks import task_of
 from es_service.errors import EvaluationError
 from es_service.loop.history import Resets
 from es_service.protocol.machine import CODE, platform_info
 from es_service.protocol.messages import Centre, FloatArray
+from es_service.protocol.noise import Domain
 from es_service.protocol.process_environment import child_environment
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
+from es_service.runs.certified import newest_certified
 from es_service.runs.checked_config import changed_config
 from es_service.runs.evaluation import Candidate, candidates
 from es_service.runs.identity import changes_since, code_of
 from es_service.runs.view import Run
 from es_service.store import reader
 
+CERTIFIED = "certified"
+"""Name of the certified policy as a candidate, whose generation is the number of the certification."""
 RECORD_S = 600.0
 """Longest time for the recordings of one report, compilation included."""
 
@@ -59,34 +64,63 @@ class Replay:
 
 @dataclass(frozen=True)
 class StoredEpisode:
-    """What a run has stored of the first evaluation episode of a policy."""
+    """What a run has stored of an episode of a policy."""
 
-    resets: Resets
+    request: RecordRequest
     fitness: float
     trace_T_B: FloatArray | None
     """Its path; None for a policy that is no elite."""
     changes: tuple[str, ...]
     """Differences between what computed it and this machine, in words: packages, processor, code."""
+    certification: int | None = None
+    """Number of the certification whose episode it is; None for an evaluation episode."""
 
 
-def record(run: Run, *, best: bool, cells: Sequence[Sequence[int]]) -> tuple[list[Replay], Recordings]:
-    """Record the first evaluation episode of the best centre and of elites, in a child process on this machine.
+def record(
+    run: Run, *, best: bool, cells: Sequence[Sequence[int]], certified: bool = False
+) -> tuple[list[Replay], Recordings]:
+    """Record an episode of each policy in a child process on this machine, see above.
+
+    Args:
+        best: whether the best centre is recorded.
+        cells: places of the cells whose elites are.
+        certified: whether the certified policy is, which comes first.
 
     Raises:
-        NotInRunError: a cell does not exist or is empty, or the run has no finished generation. ConfigError: the task
-            cannot be used on this machine. EvaluationError: the recording failed.
+        NotInRunError: a cell does not exist or is empty, or the run has no finished generation, or no certified policy.
+            ConfigError: the task cannot be used on this machine. EvaluationError: the recording failed.
     """
     overrides = {"compute.engine": "inline", **ENGINE_IMPLIES["inline"], "compute.workers": "auto"}
     config = changed_config(run.present_config, overrides)
     chosen = candidates(run, best=best, centre=False, cells=cells, every=False)
     now = {**platform_info(), CODE: code_of(config)}
     stored = [_stored(run, one, now) for one in chosen]
+    if certified:
+        policy, episode = _certified(run, config, now)
+        chosen, stored = [policy, *chosen], [episode, *stored]
     requests = [
-        RecordRequest(_centre(one), **vars(Resets(config.seed) if its is None else its.resets))
+        RecordRequest(_centre(one), config.seed) if its is None else its.request
         for one, its in zip(chosen, stored, strict=True)
     ]
     found = _answer((worker_spec(config, task_of(config)), requests))
     return [Replay(*one) for one in zip(chosen, found.recordings, stored, strict=True)], found
+
+
+def _certified(run: Run, config: RunConfig, now: Mapping[str, Any]) -> tuple[Candidate, StoredEpisode]:
+    """The newest certified policy, and its certification episode of median fitness, the lower one of two.
+
+    Raises NotInRunError if there is none.
+    """
+    policy, one = run.policy("certified"), newest_certified(run.folder)
+    assert one is not None
+    fitness_E = one.episodes.return_E if config.task.fitness == "sum" else one.episodes.last_reward_E
+    episode = int(np.argsort(fitness_E, kind="stable")[(fitness_E.size - 1) // 2])
+    candidate = Candidate(CERTIFIED, policy, one.number, float(fitness_E.mean()))
+    request = RecordRequest(
+        _centre(candidate), config.seed, policy=0, episode=episode, domain=Domain.CERTIFICATION_RESET
+    )
+    changes = tuple(changes_since(one.platform, now))
+    return candidate, StoredEpisode(request, float(fitness_E[episode]), None, changes, one.number)
 
 
 def _centre(one: Candidate) -> Centre:
@@ -116,7 +150,8 @@ def _stored(run: Run, one: Candidate, now: Mapping[str, Any]) -> StoredEpisode |
     if parent is not None and one.generation <= parent["generation"] and reader.read_start(run.folder) is None:
         rollouts = parent.get("rollouts", ["unknown"])  # this run is a fork, and its parent has computed the episode
         changes += [f"rollout {' or '.join(rollouts)} -> {rollout}"] if rollouts != [rollout] else []
-    return StoredEpisode(resets, row["fitness_first"], trace_T_B, tuple(changes))
+    request = RecordRequest(_centre(one), **vars(resets))
+    return StoredEpisode(request, row["fitness_first"], trace_T_B, tuple(changes))
 
 
 def _answer(question: tuple) -> Recordings:

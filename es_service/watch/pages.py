@@ -15,6 +15,7 @@ from es_service.report.maps import empty_pattern
 from es_service.report.markup import Markup, tag
 from es_service.report.page import REPLAY, run_sections, run_title, section
 from es_service.report.progress import short
+from es_service.runs.replay import CERTIFIED
 from es_service.runs.standing import state
 from es_service.watch.channels import Picture
 from es_service.watch.runs import FORGED, Found, Reading, Runs, Summary
@@ -147,9 +148,13 @@ def _run_picture(data: RunData, *, whole: bool) -> Picture:
         sections = {"live": _notice(said)} | sections
     shown = {("replays" if one == REPLAY else one): html for one, html in sections.items()}
     if "replays" in shown:
-        best = tag("button", "Replay the best centre", type="button", id="replay-best")
+        policies = {"best": "the best centre"} | ({CERTIFIED: "the certified policy"} if data.certified else {})
+        buttons = [
+            tag("button", f"Replay {what}", type="button", class_="replay", value=which)
+            for which, what in policies.items()
+        ]
         note = tag("p", NO_REPLAY, class_="note") if "map" in scripts else None
-        controls = tag("div", best, tag("span", id="recording", role="status"), class_="controls")
+        controls = tag("div", *buttons, tag("span", id="recording", role="status"), class_="controls")
         shown["replays"] = section("Replay", note, controls, tag("div", id="shown"), id_="replays")
     return Picture(run_title(data), shown, {SECTION_OF[name]: {name: one} for name, one in scripts.items()}, not whole)
 

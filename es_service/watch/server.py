@@ -27,6 +27,7 @@ from es_service.loop.parts import elite_part
 from es_service.report.data import TRACE, RunData
 from es_service.report.page import Evaluate, asset, cell_details
 from es_service.report.replays import replay_section
+from es_service.runs.replay import CERTIFIED
 from es_service.runs.view import open_run
 from es_service.watch import pages
 from es_service.watch.channels import Allowance, Channel, Picture
@@ -157,13 +158,15 @@ class Site:
             return JSONResponse(await _answer(_RECORDING, lambda: self._recorded(found, which)))
 
     def _recorded(self, found: Found, which: str) -> dict[str, Any]:
-        """The section of a replay, of "best" or of the elite of a cell, and what its script needs."""
+        """The section of a replay, of "best", "certified" or the elite of a cell, and what its script needs."""
         data = self._data(found)
-        cells = [] if which == "best" else [_place(data, which)]
-        generation = data.best if which == "best" else _generation(data, int(which))
-        name = (found.key, data.meta.run_id, which, generation)
+        named = {"best": data.best, CERTIFIED: data.certified and data.certified.number}
+        cells = [] if which in named else [_place(data, which)]
+        since = named[which] if which in named else _generation(data, int(which))
+        name = (found.key, data.meta.run_id, which, since)
         if name not in self._replays:
-            section = replay_section(data, best=which == "best", cells=cells, trusted=self._trusted)
+            best, certified = which == "best", which == CERTIFIED
+            section = replay_section(data, best=best, cells=cells, certified=certified, trusted=self._trusted)
             while len(self._replays) >= MOST_REPLAYS:
                 del self._replays[next(iter(self._replays))]
             self._replays[name] = {"html": section["section"], "data": section["scripts"]}

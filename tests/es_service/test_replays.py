@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 
 from es_service import api
-from es_service.loop import driver
+from es_service.errors import NotInRunError
+from es_service.loop import finished
 from es_service.report.write import write_report
+from es_service.runs.certification import certify_run
 from es_service.runs.replay import record
 
 pytestmark = pytest.mark.usefixtures("workers_here")
@@ -63,14 +65,34 @@ def test_a_fork_in_which_fitness_means_something_else_has_no_stored_episode_of_t
 
 
 def test_a_replay_that_is_not_the_stored_episode_is_an_error_in_the_page(tmp_path, monkeypatch):
-    table_of = driver.evaluated_table
+    table_of = finished.evaluated_table
 
     def wrong(*arguments, **named):
         table = table_of(*arguments, **named)
         return table | {"fitness_first": table["fitness_first"] + 1.0}
 
-    monkeypatch.setattr(driver, "evaluated_table", wrong)
+    monkeypatch.setattr(finished, "evaluated_table", wrong)
     page = page_of(api.run(CONFIG, tmp_path / "run").run)
     assert 'class="problem episode"' in page
     assert "This is not the stored episode, whose fitness is" in page
     assert "so this is an error; please report it" in page
+
+
+@pytest.mark.parametrize("fitness", ["sum", "final"])
+def test_the_certified_policy_is_shown_in_its_certification_episode_of_median_fitness(tmp_path, fitness):
+    config = {**CONFIG, "task": CONFIG["task"] | {"fitness": fitness}}
+    run = api.run(config, tmp_path / "run").run
+    with pytest.raises(NotInRunError, match="has no certified policy"):
+        record(run, best=False, cells=[], certified=True)
+    assert "certification" not in page_of(run)
+    for number, episodes in enumerate((5, 20)):
+        [certified] = certify_run(run.folder, episodes=episodes)
+        one, best = record(run, best=True, cells=[], certified=True)[0]
+        assert (one.is_the_stored, one.stored.certification, best.stored.certification) == (True, number, None)
+        kept = certified.episodes
+        fitness_E = kept.return_E if fitness == "sum" else kept.last_reward_E
+        assert one.stored.fitness == sorted(fitness_E)[(episodes - 1) // 2]
+    page = page_of(run)
+    assert "of certification 1, which is the one of median fitness" in page
+    assert page.count("bit for bit") == 2
+    assert 'class="problem' not in page

@@ -232,7 +232,7 @@ def test_a_cell_is_chosen_by_pointer_or_keys_and_replayed(page, tmp_path):
         assert page.text("#recording") == f"cell {chosen.split(':')[0]}"
         page.slide("#scrub", 5)
         assert page.text("#step").startswith("step 5 of")
-        page.click("#replay-best")
+        page.click("button.replay[value=best]")
         page.until("document.getElementById('recording').textContent === 'the best centre'")
         assert "best centre" in page.text("#episode")
 
@@ -245,7 +245,7 @@ def test_a_body_is_replayed_in_three_dimensions(page, tmp_path):
         opened(page, address, f"{tmp_path.name}/a")
         for _ in range(2):  # one replaces the other
             page.value("document.querySelector('#shown').replaceChildren()")
-            page.click("#replay-best")
+            page.click("button.replay[value=best]")
             page.until("Number(document.getElementById('stage')?.dataset.triangles) > 500")
 
 
@@ -255,7 +255,7 @@ def test_a_task_of_a_user_is_only_replayed_if_it_is_trusted(page, tmp_path):
     write_run(tmp_path / "a", task=task)
     with watching(tmp_path) as address:
         opened(page, address, f"{tmp_path.name}/a")
-        page.click("#replay-best")
+        page.click("button.replay[value=best]")
         page.until("/would execute/.test(document.getElementById('shown').textContent)")
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from es_service.loop.policies import policy_episodes, policy_work
 from es_service.protocol.messages import EvaluationChunk, PolicySpec
+from es_service.protocol.noise import Domain
 from es_service.protocol.recordings import RecordRequest
 from tests import helpers
 from tests.workers.test_episode_ends import counting_environment
@@ -30,7 +31,8 @@ TASKS += [pytest.param("ant_trap", 60, "xla", marks=FOUR_TIMES)]
 
 @pytest.mark.parametrize(("name", "steps", "rollout"), TASKS)
 def test_a_recording_is_the_worker_s_own_episode(name, steps, rollout):
-    """That of a centre, also of an initial one, whose episodes are counted on, and that of a policy in any slot."""
+    """That of a centre, also of an initial one, whose episodes are counted on, that of a policy in any slot, and
+    any one of a policy that is certified."""
     spec, size = spec_of(name, rollout, steps), SHIPPED[name].observation_size
     run = helpers.chunk_runner(spec)
     parameters_N_D = np.stack([helpers.random_parameters(n, spec.policy.parameters) for n in range(19)])
@@ -42,6 +44,12 @@ def test_a_recording_is_the_worker_s_own_episode(name, steps, rollout):
     for n in (0, 3, 18):
         request = RecordRequest(replace(centre, parameters_D=parameters_N_D[n]), seed=5, ask=1, policy=n)
         asked.append((request, policies, (n, 0), policies.trace_T_B[n]))
+    domain = Domain.CERTIFICATION_RESET
+    alone = policy_work(parameters_N_D[:1], (mean_N_O[:1], std_N_O[:1]), 19, seed=5, generation=7, domain=domain)
+    certified = policy_episodes(alone, [run(*one) for one in alone.work])
+    asked += [
+        (RecordRequest(centre, seed=5, policy=0, episode=e, domain=domain), certified, (0, e), None) for e in (0, 3, 18)
+    ]
     for chunk, ask in ((0, 0), (2, 0), (0, 2)):
         found = run(centre, EvaluationChunk(7, chunk, ask))
         for e in (0, 3):

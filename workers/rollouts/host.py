@@ -11,7 +11,6 @@ from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, TaskSpec
 from es_service.protocol.noise import (
     NORMAL_STD,
     Domain,
-    evaluation_reset_keys,
     normal_integers,
     stream_keys,
 )
@@ -173,7 +172,7 @@ def _stacked(by_episode: Sequence[Episodes]) -> Episodes:
 def _recording(run: Runner, request: RecordRequest) -> Recording:
     centre, slot = request.centre, request.slot
     count = EVALUATION_EPISODES_PER_CHUNK if request.policy is None else POLICY_SLOTS
-    key = evaluation_reset_keys(request.seed, centre.generation, request.episode, request.ask, request.policy)
+    key = request.reset_key
     watched = Watched(slot, [], [])
     episodes = run(
         _in_lanes(centre.parameters_D, count),

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from es_service.protocol.messages import TaskSpec, WorkerSpec
-from es_service.protocol.noise import NORMAL_STD, Domain, evaluation_reset_keys, normal_integers, stream_keys
+from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, stream_keys
 from es_service.protocol.options import OptionValue
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from workers import environments
@@ -39,7 +39,7 @@ def _record(
     environment: environments.Environment, watched: Mapping[bool, Callable[..., Any]], request: RecordRequest
 ) -> Recording:
     centre = request.centre
-    key = evaluation_reset_keys(request.seed, centre.generation, request.episode, request.ask, request.policy)
+    key = request.reset_key
     carry_T = watched[request.policy is not None](
         centre.parameters_D, centre.observation_mean_O, centre.observation_std_O, key, request.slot
     )

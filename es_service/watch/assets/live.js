@@ -84,5 +84,7 @@
     } catch (error) { status(`the server does not answer: ${error.message}`); }
   };
   document.addEventListener("taken", (event) => replay(event.detail, `cell ${byId("cell").textContent.split(":")[0]}`));
-  document.addEventListener("click", (event) => { if (event.target.id === "replay-best") replay("best", "the best centre"); });
+  document.addEventListener("click", ({ target }) => {
+    if (target.matches("button.replay")) replay(target.value, target.textContent.replace("Replay ", ""));
+  });
 })();
