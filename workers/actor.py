@@ -53,10 +53,11 @@ class WorkerActor:
         """Import JAX with the settings of all workers and build the run's functions; returns the platform's text.
 
         Raises:
-            OtherCodeError: the driver's code is not that of this host.
+            OtherCodeError: this host must not work for the run: it has other code than the driver, or another platform
+                than the run's.
         """
         spec = pickle.loads(self._spec)
-        if problem := why_refused(spec.sources, spec.environment):
+        if problem := why_refused(spec.sources, spec.environment, spec.platform):
             raise OtherCodeError(problem)
         environment = worker_environment(os.environ, self._gpus)
         for name in set(os.environ) - set(environment):

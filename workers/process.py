@@ -59,17 +59,19 @@ def _descriptor(control: socket.socket) -> int | None:
     Raises:
         OSError: the parent's message came without a descriptor.
     """
-    byte, descriptors, _, _ = socket.recv_fds(control, 1, 1, socket.MSG_CMSG_CLOEXEC)
+    byte, descriptors, _, _ = socket.recv_fds(control, 1, 1, getattr(socket, "MSG_CMSG_CLOEXEC", 0))
     if byte and not descriptors:
         raise OSError(
             "the parent's message has no file descriptor for a worker's socket; the limit of open files may be too low"
         )
+    for descriptor in descriptors:
+        os.set_inheritable(descriptor, False)  # macOS has no such flag of the call itself
     return descriptors[0] if descriptors else None
 
 
 def _make_run_chunks(spec: Any) -> Compilable | RaisedError:
     """Function that runs chunks, or the reason why there is none: other code, or an error."""
-    if problem := why_refused(spec.sources, spec.environment):
+    if problem := why_refused(spec.sources, spec.environment, spec.platform):
         return RaisedError(problem, "")
     os.environ.update(xla_cache_settings())
     try:

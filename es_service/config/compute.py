@@ -48,6 +48,11 @@ class ComputeConfig(Section):
         "work; with a number in worker_resources.cpu, it also asks the cluster for more. No more start than there is "
         "work for, in whole actors. It never changes results.",
     )
+    platform: Literal["any", "x86_64", "aarch64"] = Field(
+        "any",
+        description="Architecture of the processors that work for the run; a worker on another one is refused. any: "
+        "all. What computed the run is recorded, and its digest is marked mixed once there are several kinds.",
+    )
     max_workers_per_core: Count = Field(
         4,
         description="Most workers for each core where all workers are on this machine; a larger number of workers is "

@@ -263,4 +263,5 @@ def worker_spec(
         outputs=tuple(sorted({*outputs, *search.outputs()})),
         parent_cache_bytes=compute.parent_cache_mb * 2**20,
         sources=worker_sources(settings.environment),
+        platform=compute.platform,
     )

@@ -1,4 +1,4 @@
-"""The nodes of a Ray cluster that must not work for a run, because their code is not the driver's."""
+"""The nodes of a Ray cluster that must not work for a run, because of their code or their platform."""
 
 from __future__ import annotations
 

@@ -132,6 +132,8 @@ class WorkerSpec:
     """Most bytes of parents that the worker keeps; see `kept_parents.py`."""
     sources: dict[str, str] = field(default_factory=dict)
     """`sources.worker_sources` of the driver, which a worker must have as well; empty if this is not checked."""
+    platform: str = "any"
+    """Architecture that a worker must have, as `system.architecture` names it; any if it makes no difference."""
 
 
 class WorkerPlace(NamedTuple):

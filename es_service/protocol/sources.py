@@ -21,6 +21,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
+from es_service.protocol.system import architecture
+
 Sources = Mapping[str, str]
 """Name of a source file, such as `workers/episode.py` -> the first half of its SHA-256, in hexadecimal digits."""
 OURS = ("es_service", "workers")
@@ -85,16 +87,22 @@ def in_words(files: list[str], most: int = 5) -> str:
 
 
 class OtherCodeError(Exception):
-    """The driver's code is not that of this host; the message names the host and the files."""
+    """This host must not work for a driver; the message names the host and the reason."""
 
 
-def why_refused(expected: Sources, environment: str) -> str:
-    """Why this process must not work for a driver, naming the host and the files; empty if its code is the driver's.
+def why_refused(expected: Sources, environment: str, platform: str = "any") -> str:
+    """Why this process must not work for a driver, naming the host and what is wrong; empty if it may.
 
     Args:
         expected: `worker_sources` of the driver; empty if the driver does not ask for it.
         environment: the value of `task.environment`.
+        platform: the value of `compute.platform`.
     """
+    if platform not in ("any", architecture()):
+        return (
+            f"{socket.gethostname()} has a processor of the architecture {architecture()}, but compute.platform keeps "
+            f"this run to {platform}. Set it to any if its digest may be marked mixed"
+        )
     if not expected or not (other := other_files(expected, worker_sources(environment))):
         return ""
     return (

@@ -3,11 +3,12 @@
 import ctypes
 import os
 import pathlib
+import socket
 import time
 
-for module, names in ((os, ("sched_getaffinity", "sched_setaffinity")), (time, ("CLOCK_BOOTTIME",))):
-    for name in names:
-        delattr(module, name)
+MISSING = [(os, "sched_getaffinity"), (os, "sched_setaffinity"), (time, "CLOCK_BOOTTIME"), (socket, "MSG_CMSG_CLOEXEC")]
+for module, name in MISSING:
+    delattr(module, name)
 
 _library, _read_text, _sysconf = ctypes.CDLL, pathlib.Path.read_text, os.sysconf
 

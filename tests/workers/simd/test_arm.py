@@ -6,6 +6,7 @@ Tests beside this one take targets of Arm, too: operations, noise, gradients, po
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +17,21 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from es_service import api
-from es_service.protocol.messages import PolicySpec
+from es_service.protocol.messages import ChunkResult, PolicySpec, Work, WorkerSpec
 from es_service.store.digest import digest_parts
 from tests import helpers
-from tests.workers.simd.emulated import WIDTHS, arm_targets, emulation, needs_emulation
+from tests.workers.simd.emulated import arm_targets
 from tests.workers.simd.primitive_cases import CASES
 from tests.workers.simd.rollouts import arguments, targets, task_spec
 from workers.environments import make_environment
-from workers.simd.backend.target import Target, target_of
+from workers.simd.backend.target import Target
 from workers.simd.episodes import compiled, kernel, rollout, variation
 from workers.simd.episodes.check import require_same
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.twin import evaluate
+from workers.worker import make_worker
 
 GENTLE = settings(
     deadline=None, derandomize=True, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
@@ -131,23 +133,50 @@ CONFIG = {
     "search": {"algorithm": "ns_es", "pairs": 8, "sigma": 0.1, "evaluation_episodes": 4, "centres": 2},
     "novelty": {"neighbours": 3},
     "budget": {"generations": 10},
-    "compute": {"engine": "inline", "workers": 1, "rollout": "simd"},
+    "compute": {"engine": "inline", "workers": 1, "rollout": "simd", "chunk_pairs": 4, "gradient_block_pairs": 4},
 }
 
 
-def digest_on(target: Target, folder: Path) -> dict[str, str]:
-    """Parts of the digest of a run whose workers compute with kernels for a target."""
+def digest_on(hosts: Sequence[Target], folder: Path) -> dict[str, str]:
+    """Parts of the digest of a run whose work items are computed by hosts of several kinds, by turns."""
+
+    def worker_here(worker_spec: WorkerSpec) -> Callable[[Sequence[Work]], list[ChunkResult]]:
+        workers = [make_worker(worker_spec) for _ in hosts]
+
+        def run(work: Sequence[Work]) -> list[ChunkResult]:
+            found: list[Any] = [None] * len(work)
+            for number, (host, worker) in enumerate(zip(hosts, workers, strict=True)):
+                with pytest.MonkeyPatch.context() as patch:  # kernels are compiled when they are first needed
+                    for module in (compiled, kernel, rollout, variation):
+                        patch.setattr(module, "host_target", lambda host=host: host)
+                    found[number :: len(hosts)] = worker(work[number :: len(hosts)])
+            return found
+
+        return run
+
     with helpers.workers_in_this_process(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(helpers, "_WORKERS", {})
-        for module in (compiled, kernel, rollout, variation):
-            patch.setattr(module, "host_target", lambda: target)
+        patch.setattr(helpers, "worker_here", worker_here)
         api.run(api.load_config(CONFIG), out=folder)
     return digest_parts(folder)
 
 
-@needs_emulation
-@pytest.mark.parametrize("isa", WIDTHS[:1])
-def test_a_run_computed_on_arm_has_the_digest_of_x86(isa: str, tmp_path: Path) -> None:
-    """Ten generations: episodes of populations and centres and sums of gradients, of two centres by turns."""
-    with emulation():
-        assert digest_on(target_of(isa), tmp_path / "arm") == digest_on(targets()[0], tmp_path / "x86")
+@pytest.fixture(scope="module")
+def digest(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """That of this processor alone: ten generations of populations, centres and sums of gradients."""
+    return digest_on(targets()[:1], tmp_path_factory.mktemp("alone") / "run")
+
+
+@ON_ARM
+def test_a_run_computed_on_arm_has_the_digest_of_x86(target: Target, digest: dict[str, str], tmp_path: Path) -> None:
+    assert digest_on([target], tmp_path / "run") == digest
+
+
+@ON_ARM
+def test_hosts_of_both_architectures_in_one_run_give_its_digest(target: Target, digest, tmp_path: Path) -> None:
+    assert digest_on([targets()[0], target], tmp_path / "run") == digest
+
+
+def test_hosts_with_vectors_of_several_widths_in_one_run_give_its_digest(digest, tmp_path: Path) -> None:
+    """AVX-512, AVX2 and half vectors, or those of them that this processor has."""
+    assert len(targets()) > 1
+    assert digest_on(targets(), tmp_path / "run") == digest
