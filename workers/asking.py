@@ -26,6 +26,7 @@ from es_service.protocol.messages import (
     WorkerSpec,
 )
 from es_service.protocol.noise import KEY_WORDS
+from es_service.protocol.recipes import explicit
 from workers.compilable import Compilable
 from workers.host.noise import gradient_summer, members
 from workers.host.seeds import seed_of
@@ -78,8 +79,8 @@ def rows_of(spec: WorkerSpec, work: Sequence[Work]) -> Rows:
             centre_D, mean_O, std_O, keys_E, is_wanted_E = arguments
             parts.append(_quiet(centre_D, mean_O, std_O, keys_E[is_wanted_E]))
         else:
-            parameters_G_N_D, mean_L, std_L, policy_L, keys_L = arguments
-            parts.append(_quiet(np.concatenate(parameters_G_N_D)[policy_L], mean_L, std_L, keys_L))
+            policies, mean_L, std_L, policy_L, keys_L = arguments
+            parts.append(_quiet(explicit(policies)[policy_L], mean_L, std_L, keys_L))
     return Rows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 

@@ -7,7 +7,7 @@ from operator import attrgetter
 
 from es_service.protocol.kept_parents import KeptParents, with_parents
 from es_service.protocol.messages import FloatArray, Work
-from es_service.protocol.recipes import Origin, Recipes
+from es_service.protocol.recipes import Origin, Recipes, recipes_again
 
 
 class Parents:
@@ -25,12 +25,30 @@ class Parents:
 
     def receive(self, parents: Mapping[bytes, FloatArray | Origin]) -> None:
         """Keep parents, those with an origin after they are made. What cannot be made is lacked."""
+        waiting: dict[bytes, Origin] = {}  # they are made together, since a call takes longer than a small policy
         for name, given in parents.items():
-            if not isinstance(given, Origin):
+            if isinstance(given, Origin):
+                if not all(one in self.kept for one in (given.x, given.y)) or not _same_rule(given, waiting):
+                    self._make(waiting)
+                if all(one in self.kept for one in (given.x, given.y)):
+                    waiting[name] = given
+            else:
+                self._make(waiting)
                 self.kept.add(name, given)
-            elif given.x in self.kept and given.y in self.kept:
-                self.kept.add(name, self._made(given.recipes(self.kept))[0])
+        self._make(waiting)
 
     def complete(self, work: Sequence[Work]) -> list[Work]:
         """A work item whose recipes have their parents. Raises LackingError."""
         return with_parents(work, self.kept)
+
+    def _make(self, waiting: dict[bytes, Origin]) -> None:
+        """Make policies and keep them; none of them waits any more."""
+        if waiting:
+            made = self._made(recipes_again(list(waiting.values()), self.kept))
+            for name, parameters_D in zip(waiting, made, strict=True):
+                self.kept.add(name, parameters_D.copy())  # of its own, so that it can be forgotten alone
+            waiting.clear()
+
+
+def _same_rule(origin: Origin, others: Mapping[bytes, Origin]) -> bool:
+    return all(origin.rule == one.rule for one in others.values())

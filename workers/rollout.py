@@ -19,6 +19,7 @@ from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, SIGNS, W
 from es_service.protocol.noise import NORMAL_STD, normal_integers
 from es_service.protocol.outputs import OF_STEPS
 from es_service.protocol.policies import POLICY_SLOTS
+from es_service.protocol.recipes import explicit
 from workers.compilable import Compilable, jitted
 from workers.environments import Environment
 from workers.episode import Carry, episode_steps
@@ -76,9 +77,9 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
     """
     episodes = jitted(_make_episodes(environment, spec, training=False, own_weights=True))
 
-    def filled(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
+    def filled(policies, mean_L_O, std_L_O, policy_L, reset_keys_L):
         lane_L = np.minimum(np.arange(POLICY_SLOTS), len(policy_L) - 1)
-        parameters_L_D = np.concatenate(parameters_G_N_D)[policy_L[lane_L]]
+        parameters_L_D = explicit(policies)[policy_L[lane_L]]
         return parameters_L_D, mean_L_O[lane_L], std_L_O[lane_L], reset_keys_L[lane_L]
 
     def rollout(*given):

@@ -35,7 +35,6 @@ from es_service.protocol.messages import (
 )
 from es_service.protocol.noise import NORMAL_STD, Domain, Keys, evaluation_reset_keys, stream_keys
 from es_service.protocol.policies import slots
-from es_service.protocol.recipes import Recipes
 from workers.compilable import Compilable
 from workers.results import evaluation_result, policies_result, training_result
 from workers.rollouts import BACKENDS
@@ -152,9 +151,7 @@ def kinds_of(spec: WorkerSpec, backend: RolloutBackend) -> dict[type[Chunk], Kin
         TrainingChunk: Kind(functions.training, training_arguments, training_results),
         EvaluationChunk: Kind(functions.evaluation, evaluation_arguments, evaluation_results),
         GradientChunk: Kind(Compilable(gradient_sums, compile_gradient_sum), gradient_arguments, gradient_results),
-        PolicyChunk: Kind(
-            functions.policies, partial(_policy_arguments, spec, backend.made), partial(_policy_results, spec)
-        ),
+        PolicyChunk: Kind(functions.policies, partial(_policy_arguments, spec), partial(_policy_results, spec)),
     }
 
 
@@ -164,9 +161,7 @@ def _wanted(chunk: EvaluationChunk) -> Any:
     return (slot_E >= chunk.first) & (slot_E < chunk.first + chunk.episodes)
 
 
-def _policy_arguments(
-    spec: WorkerSpec, made: Callable[[Recipes], FloatArray], work: Sequence[tuple[Policies, PolicyChunk]]
-) -> tuple[Any, ...]:
+def _policy_arguments(spec: WorkerSpec, work: Sequence[tuple[Policies, PolicyChunk]]) -> tuple[Any, ...]:
     policies, chunk = work[0]
     together = list({id(one): one for one, _ in work}.values())
     ends = accumulate(len(one.parameters_N_D) for one in together)
@@ -177,10 +172,9 @@ def _policy_arguments(
     )
     number_L = np.concatenate([one.first + policy_L for (one, _), (policy_L, _) in zip(work, slots_C, strict=True)])
     episode_L = np.concatenate([episode_L for _, episode_L in slots_C])
-    given = [one.parameters_N_D for one in together]
     inputs = spec.policy.widths[0]
     return (
-        [made(one) if isinstance(one, Recipes) else one for one in given],
+        [one.parameters_N_D for one in together],
         np.concatenate([_statistics(one, one.observation_mean_N_O, 0.0, inputs) for one in together])[row_L],
         np.concatenate([_statistics(one, one.observation_std_N_O, 1.0, inputs) for one in together])[row_L],
         row_L,

@@ -27,7 +27,7 @@ from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
 from es_service.protocol.kept import Kept
-from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
+from es_service.protocol.kept_parents import KeptParents, apart, as_sent, parents_to_send
 from es_service.protocol.kept_subjects import MadeOnce, forget_old_subjects
 from es_service.protocol.messages import Subject, Work, WorkerSpec
 from es_service.protocol.parent import start_child
@@ -141,8 +141,7 @@ class ChildProcesses:
                 to.subjects.add(number, subject.nbytes)
                 frames.append(frame)
             numbered.append((number, chunk))
-        for name, given in parents_to_send(work, to.parents).items():
-            frames.append(framed(("parents", {name: given})))
+        frames += [framed(("parents", parents)) for parents in apart(parents_to_send(work, to.parents))]
         forget_old_subjects(to.subjects)
         self._subjects.forget_old()
         to.unanswered[item_id, attempt] = work

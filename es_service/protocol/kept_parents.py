@@ -9,7 +9,7 @@ takes it to have nothing (`KeptParents.clear`) and sends the item again: that is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -76,6 +76,20 @@ def parents_to_send(work: Sequence[Work], kept: KeptParents[int]) -> dict[bytes,
                 sent[one] = given
     kept.needed(needed)
     return sent
+
+
+def apart(parents: Mapping[bytes, FloatArray | Origin]) -> list[dict[bytes, FloatArray | Origin]]:
+    """Parents in their order, as several messages: each that travels by itself has its own, which may be large."""
+    found: list[dict[bytes, FloatArray | Origin]] = []
+    before = False
+    for name, given in parents.items():
+        is_origin = isinstance(given, Origin)
+        if is_origin and before:
+            found[-1][name] = given
+        else:
+            found.append({name: given})
+        before = is_origin
+    return found
 
 
 def _steps(name: bytes, kept: KeptParents[int]) -> dict[bytes, Origin] | None:

@@ -134,6 +134,11 @@ class Recipes:
         return ""
 
 
+def explicit(policies: Sequence[FloatArray | Recipes]) -> FloatArray:
+    """The parameters of policies, [N, D], some of which are made of recipes."""
+    return np.concatenate([one.made() if isinstance(one, Recipes) else one for one in policies])
+
+
 class Origin(NamedTuple):
     """How one policy was made, so that it can be made again wherever its parents are."""
 
@@ -143,10 +148,13 @@ class Origin(NamedTuple):
     """Names of its parents."""
     key_4: Keys
 
-    def recipes(self, parents: Mapping[bytes, FloatArray]) -> Recipes:
-        """The recipe of the policy alone."""
-        given = parents[self.x], parents[self.y]
-        return Recipes(self.rule, (self.x, self.y), given, np.array([[0, 1]]), self.key_4[None])
+
+def recipes_again(origins: Sequence[Origin], parents: Mapping[bytes, FloatArray]) -> Recipes:
+    """The recipes of policies by their origins, all of which have the same rule."""
+    index = {name: at for at, name in enumerate(dict.fromkeys(name for one in origins for name in (one.x, one.y)))}
+    parent_N_2 = np.array([(index[one.x], index[one.y]) for one in origins])
+    key_N_4 = np.stack([one.key_4 for one in origins])
+    return Recipes(origins[0].rule, tuple(index), tuple(parents[name] for name in index), parent_N_2, key_N_4)
 
 
 _ORIGINS: dict[bytes, Origin] = {}

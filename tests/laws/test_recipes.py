@@ -29,6 +29,7 @@ from es_service.protocol.recipes import (
     Recipes,
     name_of,
     origin_of,
+    recipes_again,
     recipes_of,
     remember,
     unvaried,
@@ -230,7 +231,7 @@ def test_a_policy_has_the_origin_of_which_it_was_made():
     origin = origin_of(name_of(asked.made()[3]))
     assert isinstance(origin, Origin)
     known = dict(zip(asked.names, asked.parents, strict=True))
-    assert bits(origin.recipes(known).made()[0]) == bits(asked.made()[3])
+    assert bits(recipes_again([origin], known).made()[0]) == bits(asked.made()[3])
 
 
 def test_a_policy_as_it_is_has_its_own_bits_and_no_origin():

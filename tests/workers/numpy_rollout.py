@@ -13,6 +13,7 @@ import numpy as np
 from es_service.protocol.messages import SIGNS, TRACE_POINTS, PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, evaluation_reset_keys, normal_integers, normals, uniforms
 from es_service.protocol.outputs import OF_STEPS
+from es_service.protocol.recipes import explicit
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from tests.twins import point_maze
 from workers.compilable import Compilable
@@ -66,8 +67,8 @@ class NumPy(RolloutBackend):
         def evaluation(centre_D, mean_O, std_O, reset_keys_E, wanted_E):
             return stacked([episode(spec, centre_D, mean_O, std_O, key)[0] for key in reset_keys_E])
 
-        def policies(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
-            lanes = zip(np.concatenate(parameters_G_N_D)[policy_L], mean_L_O, std_L_O, reset_keys_L, strict=True)
+        def policies(given, mean_L_O, std_L_O, policy_L, reset_keys_L):
+            lanes = zip(explicit(given)[policy_L], mean_L_O, std_L_O, reset_keys_L, strict=True)
             return stacked([episode(spec, *lane)[0] for lane in lanes])
 
         def gradient_sum(weights_P, noise_keys_P):

@@ -98,9 +98,9 @@ class ChunkFunctions(NamedTuple):
     """Function (centre_D, mean_O, std_O, reset_keys_E_4, wanted_E) -> Episodes with leading axis [E], without action
     noise. Those that are not wanted need not be computed, and their results may be anything."""
     policies: Compilable
-    """Function (parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L_4) -> Episodes with leading axis [L],
-    without action noise. The parameters are a list of arrays [N, D]; policy_L is the row of each lane among the rows of
-    all."""
+    """Function (policies, mean_L_O, std_L_O, policy_L, reset_keys_L_4) -> Episodes with leading axis [L], without
+    action noise. The policies are a list of parameters [N, D] and of recipes with their parents; policy_L is the number
+    of each lane's policy among all."""
     gradient_sum: Compilable
     """Function (weights_P, noise_keys_P_4) -> sum over pairs of weight x standard normal noise, [D]. Pairs are added
     one by one in the order of their ids, so that the float32 bits depend on nothing else."""

@@ -16,6 +16,7 @@ from es_service.protocol.noise import (
 )
 from es_service.protocol.options import OptionValue
 from es_service.protocol.policies import POLICY_SLOTS
+from es_service.protocol.recipes import explicit
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
 from workers.compilable import Compilable
 from workers.environments import is_function_task, make_function_task, make_host_task
@@ -62,8 +63,8 @@ class Host(RolloutBackend):
         def evaluation(centre_D, mean_O, std_O, reset_keys_E, wanted_E):
             return run(_in_lanes(centre_D, len(reset_keys_E)), mean_O, std_O, reset_keys_E, runs_L=wanted_E)
 
-        def policies(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
-            return run(np.concatenate(parameters_G_N_D)[policy_L], mean_L_O, std_L_O, reset_keys_L)
+        def policies(given, mean_L_O, std_L_O, policy_L, reset_keys_L):
+            return run(explicit(given)[policy_L], mean_L_O, std_L_O, reset_keys_L)
 
         functions = (training, evaluation, policies, gradient_summer(count))
         return ChunkFunctions(*(Compilable(function, lambda *_: None) for function in functions))

@@ -55,8 +55,9 @@ def check_episodes(kernel: EpisodeKernel, program: EpisodeProgram) -> None:
     mean_O[:, inputs_O] = rng.normal(0.0, 0.1, (len(mean_O), len(inputs_O)))
     parameters_L_D = _parameters(spec, rng, LANES if kernel.own_weights else 1)
     if kernel.own_weights:
-        memory, weights = kernel.network.pack_own([parameters_L_D], spec.policy.parameters)
-        weights_of = twin.own(memory[:, : spec.policy.parameters])
+        memory, weights = kernel.network.room_for_own(LANES, spec.policy.parameters)
+        memory[...] = parameters_L_D
+        weights_of = twin.own(memory)
     elif noise_keys_P is not None:
         weights_of = twin.perturbed(parameters_L_D[0], np.float32(UNIT), noise_keys_P)
         weights = kernel.network.pack(parameters_L_D[0])

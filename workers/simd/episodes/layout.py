@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -104,18 +103,17 @@ class Network(NamedTuple):
         weights.reshape(-1)[self.vectors * self.width :][: len(single)] = padded_D[single]
         return weights
 
-    def pack_own(
-        self, parameters_G_N_D: Sequence[NDArray[np.float32]], parameters: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.uint64]]:
-        """Policies for kernels with own weights: (their memory, the address of each one's parameters in it).
+    def room_for_own(self, policies: int, parameters: int) -> tuple[NDArray[np.float32], NDArray[np.uint64]]:
+        """Room for policies of kernels with own weights: (their parameters [N, D], the address of each one's).
 
-        The memory must live as long as the addresses are used. Raises ValueError for another number of parameters.
+        The array must live as long as the addresses are used.
         """
         # Rows begin at whole vectors, and a vector that begins in the last row ends in this memory.
         stride = (parameters // self.width + 2) * self.width
-        rows = aligned((sum(map(len, parameters_G_N_D)), stride)).view(np.float32)
-        np.concatenate(parameters_G_N_D, out=rows[:, :parameters])
-        return rows, rows.ctypes.data + np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.strides[0])
+        rows = aligned((policies, stride)).view(np.float32)
+        return rows[:, :parameters], rows.ctypes.data + np.arange(len(rows), dtype=np.uint64) * np.uint64(
+            rows.strides[0]
+        )
 
 
 def plan(spec: PolicySpec, inputs_O: NDArray[np.intp], target: Target) -> Network:

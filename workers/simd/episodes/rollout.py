@@ -6,6 +6,7 @@ import ctypes
 import threading
 from collections.abc import Callable
 from functools import partial
+from itertools import accumulate
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ import numpy as np
 
 from es_service.protocol.messages import PolicySpec, TaskSpec, WorkerSpec
 from es_service.protocol.noise import KEY_WORDS
+from es_service.protocol.recipes import Recipes
 from workers.compilable import Compilable
 from workers.environments import Environment, make_environment
 from workers.episode import Carry
@@ -23,6 +25,7 @@ from workers.simd.episodes.check import check_episodes, check_gradient, check_re
 from workers.simd.episodes.compiled import EpisodeKernel, compile_episodes
 from workers.simd.episodes.noise import UNROLLED, definition, gradient_module
 from workers.simd.episodes.program import write_episodes
+from workers.simd.episodes.variation import make_variation
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.unsupported import UnsupportedError, fault
 
@@ -105,13 +108,22 @@ def make_policy_rollout(environment: Environment, spec: WorkerSpec) -> Compilabl
     lanes."""
     kernels = _Kernels(environment, spec, training=False, own_weights=True)
 
-    def rollout(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
+    make = make_variation()
+
+    def rollout(policies, mean_L_O, std_L_O, policy_L, reset_keys_L):
         kernel = kernels.fitting(mean_L_O)
-        rows, addresses_N = kernel.network.pack_own(parameters_G_N_D, spec.policy.parameters)
+        rows, addresses_N = kernel.network.room_for_own(sum(map(len, policies)), spec.policy.parameters)
+        for first, one in zip(accumulate(map(len, policies), initial=0), policies, strict=False):
+            part = rows[first : first + len(one)]
+            if isinstance(one, Recipes):
+                make(one, part)
+            else:
+                require(one.shape == part.shape, f"parameters {one.shape} have the wrong shape, not {part.shape}")
+                part[...] = one
         require(0 <= policy_L.min() <= policy_L.max() < len(rows), "policy_L names rows that are not there")
         return kernel.run(addresses_N[policy_L], 0.0, mean_L_O, std_L_O, None, reset_keys_L, reset_keys_L)
 
-    def compile_for(parameters_G_N_D, mean_L_O, std_L_O, policy_L, reset_keys_L):
+    def compile_for(policies, mean_L_O, std_L_O, policy_L, reset_keys_L):
         kernels.fitting(mean_L_O).begin.compile(reset_keys_L)
 
     return Compilable(rollout, compile_for)

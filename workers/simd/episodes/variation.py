@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from functools import cache
+from typing import Protocol
 
 import numpy as np
 
@@ -22,20 +23,32 @@ from workers.simd.episodes.check import require_same
 from workers.simd.episodes.noise import definition, float_constant, lanes, load_key, noise_of
 
 
+class Variation(Protocol):
+    """What makes the policies of recipes."""
+
+    def __call__(self, recipes: Recipes, out_N_D: FloatArray | None = None) -> FloatArray:
+        """Their parameters, [N, D], in an array that is given or a new one."""
+        ...
+
+
 @cache
-def make_variation(target: Target | None = None) -> Callable[[Recipes], FloatArray]:
+def make_variation(target: Target | None = None) -> Variation:
     """Function with the results of `Recipes.made`; several threads may call it."""
     target = target or host_target()
     signature = [*[ctypes.c_void_p] * 4, *[ctypes.c_int64] * 3, *[ctypes.c_float] * 2]
 
-    def function(native: Native) -> Callable[[Recipes], FloatArray]:
+    def function(native: Native) -> Variation:
         call = native.function(*signature)
 
-        def made(recipes: Recipes) -> FloatArray:
+        def made(recipes: Recipes, out_N_D: FloatArray | None = None) -> FloatArray:
             parents = [np.ascontiguousarray(parent_D, np.float32) for parent_D in recipes.parents]
             size, (parent_N_2, key_N_4) = parents[0].size, (recipes.parent_N_2, np.ascontiguousarray(recipes.key_N_4))
+            policy_N_D = np.empty((len(recipes), size), np.float32) if out_N_D is None else out_N_D
+            require(policy_N_D.shape == (len(recipes), size), "there must be room for each policy")
             if size < target.width:
-                return recipes.made()
+                policy_N_D[...] = recipes.made()
+                return policy_N_D
+            require(policy_N_D.dtype == np.float32 and policy_N_D.strides[1] == 4, "parameters must follow each other")
             require(
                 all(parent_D.size == size for parent_D in parents)
                 and 0 <= parent_N_2.min() <= parent_N_2.max() < len(parents)
@@ -44,10 +57,10 @@ def make_variation(target: Target | None = None) -> Callable[[Recipes], FloatArr
                 and key_N_4.shape == (len(recipes), KEY_WORDS),
                 "recipes must have keys, and parents of one size",
             )
-            policy_N_D = np.empty((len(recipes), size), np.float32)
             address = np.array([parent_D.__array_interface__["data"][0] for parent_D in parents], np.uint64)
             x_N, y_N = np.ascontiguousarray(address[parent_N_2.T])
-            out_N = policy_N_D.ctypes.data + np.arange(len(recipes), dtype=np.uint64) * np.uint64(4 * size)
+            row_bytes = np.uint64(policy_N_D.strides[0])
+            out_N = policy_N_D.ctypes.data + np.arange(len(recipes), dtype=np.uint64) * row_bytes
             sigmas = (np.float32(sigma) for sigma in recipes.rule)
             call(key_N_4, x_N, y_N, out_N, len(recipes), size, -(-size // target.width), *sigmas)
             return policy_N_D
