@@ -31,8 +31,9 @@ tests: .venv/installed-dev
 
 # Before an issue is closed: fifty kills in one run, a cluster whose hosts come, go, hang and die, browsers.
 long: .venv/installed-dev
-	$(BIN)/python -m pytest -n auto --dist loadfile -m long tests/es_service tests/laws tests/workers
-	$(BIN)/python -m pytest -m long tests/system
+	$(BIN)/python -m pytest -n auto --dist worksteal -m long tests/es_service tests/laws tests/workers
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'long and not alone' tests/system
+	$(BIN)/python -m pytest -m 'long and alone' tests/system
 
 # While writing code: no lint, no tests of more than five seconds, none of the whole system.
 quick: .venv/installed-dev

@@ -22,7 +22,11 @@ from tests.system.processes import ROOT
 from tests.system.session import SMALL
 from tests.system.test_cluster import inline_digest
 
-pytestmark = [pytest.mark.long, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.alone,  # one of its faults is that memory is short
+    pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing())),
+]
 SEED = int(os.environ.get("ES_CHAOS_SEED", "11"))
 CONFIG = SMALL | {
     "search": {"algorithm": "me_es", "pairs": 64, "evaluation_episodes": 16, "block_generations": 5},

@@ -32,7 +32,11 @@ from tests.system.processes import committed, wait_for
 from tests.system.session import SMALL
 from tests.system.test_code_identity import REWARD, SEARCH, TASK
 
-pytestmark = [pytest.mark.long, pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))]
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.alone,  # one of its faults is that memory is short
+    pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing())),
+]
 
 CONFIG = SMALL | {
     "search": SMALL["search"] | {"pairs": 64},

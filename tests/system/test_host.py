@@ -84,6 +84,7 @@ FAULTS = {
 
 
 @pytest.mark.long
+@pytest.mark.alone  # memory is short meanwhile
 @pytest.mark.skipif(cluster.missing() is not None, reason=str(cluster.missing()))
 @pytest.mark.parametrize("cores", [1, 2])
 def test_a_simulator_that_fails_once_on_a_cluster_of_hosts_changes_no_bit(tmp_path, cores):
