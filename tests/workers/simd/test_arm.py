@@ -115,8 +115,8 @@ def test_whole_episodes_have_the_bits_of_x86(task: str, steps: int, hidden: tupl
         weights, mean, std = made.network.pack(centre_D), mean_O, std_O
         if own:
             rng = np.random.default_rng(0)
-            policies = [(centre_D + rng.normal(0, 0.1, (lanes, len(centre_D)))).astype(np.float32)]
-            kept, weights = made.network.pack_own(policies, shape.parameters)
+            kept, weights = made.network.room_for_own(lanes, shape.parameters)
+            kept[...] = centre_D + rng.normal(0, 0.1, kept.shape)
             mean, std = np.tile(mean_O, (lanes, 1)), np.tile(std_O, (lanes, 1))
         of_lanes = (given_.reshape(-1, 4)[:lanes] for given_ in (resets, actions))
         wanted_L = None if training else np.arange(lanes) % 3 > 0
