@@ -116,9 +116,9 @@ def test_weights_made_once_per_episode_give_the_bits_of_those_made_in_each_step(
 @pytest.mark.parametrize("noisy", [True, False])
 @pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
 def test_the_dead_cost_nothing(noisy: bool, target: Target, tmp_path: Path):
-    """Hidden layers of eight neighbours all dead are not computed, and the others' actions are what they were."""
+    """Hidden layers of a group of neighbours all dead are not computed, and the others' actions are what they were."""
     shape = PolicySpec((3, 64, 64, 2))
-    network, group = plan(shape, np.arange(3), target), min(8, target.width)
+    network, group = plan(shape, np.arange(3), target), min(8, target.width, target.sums_at_once)
     centre_D, x = random_parameters(4, shape.parameters, 0.5), np.ones((target.width, 3), np.float32)
     keys = stream_keys(1, Domain.PARAMETER_NOISE, 2, np.arange(target.width // 2)) if noisy else None
     alive = np.ones(target.width, np.int32)
