@@ -541,8 +541,8 @@ CASES = [
         (
             "is its score",
             COMMON,
-            "with_score(map_, centre.cell, evaluation.population_max)",
-            "with_score(map_, centre.cell, evaluation.fitness)",
+            "changed(map_, centre.cell, score=evaluation.population_max)",
+            "changed(map_, centre.cell, score=evaluation.fitness)",
         ),
     ),
     *cases(

@@ -31,7 +31,6 @@ from es_service.search.maps.behaviour_map import (
     removed,
     resampled,
     unchanged_entries,
-    with_score,
 )
 from tests.es_service.map_examples import PLANE
 from tests.twins import behaviour_map as twin
@@ -88,15 +87,15 @@ def test_insertion_and_scores_leave_the_old_map_as_it_was():
         values.setflags(write=False)
     insert(map_, np.array([1.0, 0.1]), 6.0, 2, 0, 0.0)
     insert(map_, np.array([3.0, 0.1]), 6.0, 2, 0, 0.0)
-    with_score(map_, 11, 9.0)
+    changed(map_, 11, score=9.0)
     for name, values in columns_of(map_).items():
         np.testing.assert_array_equal(values, before[name])
 
 
 def test_a_score_is_changed_where_the_centre_has_an_elite():
     map_ = filled(((1.0, 0.1), 5.0), ((5.0, 1.9), 1.0))
-    assert with_score(map_, 11, -3.0).score_N.tolist() == [100.0, -3.0]
-    assert with_score(map_, 5, -3.0) is map_
+    assert changed(map_, 11, score=-3.0).score_N.tolist() == [100.0, -3.0]
+    assert changed(map_, 5, score=-3.0) is map_
 
 
 @given(
@@ -247,7 +246,7 @@ def test_the_qd_score_does_not_depend_on_the_order_of_its_terms():
 
 def test_a_map_comes_back_from_its_parts():
     map_ = filled(((5.0, 1.9), 1.0), ((0.0, 0.0), -2.5), ((3.0, 1.0), 1e-300), ((5.5, 1.8), 2.0))
-    map_ = with_score(map_, 0, math.nan)
+    map_ = changed(map_, 0, score=math.nan)
     parts = map_changes(map_, None)
     assert set(parts) == {GEOMETRY_PART, cell_part(11), cell_part(0), cell_part(6)}
     others = {"centre_0": {"cell": np.asarray(3)}, elite_part(4): {"centre_D": np.zeros(1)}}
@@ -265,14 +264,14 @@ def test_an_empty_map_comes_back_and_no_map_stays_none():
 
 def test_only_rows_that_changed_are_written():
     map_ = filled(((5.0, 1.9), 1.0), ((0.0, 0.0), -2.5), ((3.0, 1.0), 3.0))
-    map_ = with_score(map_, 0, math.nan)
+    map_ = changed(map_, 0, score=math.nan)
     assert map_changes(map_, map_) == {}
-    assert map_changes(with_score(map_, 0, math.nan), map_) == {}
-    assert set(map_changes(with_score(map_, 0, 4.0), map_)) == {cell_part(0)}
-    assert set(map_changes(with_score(map_, 11, math.nan), map_)) == {cell_part(11)}
+    assert map_changes(changed(map_, 0, score=math.nan), map_) == {}
+    assert set(map_changes(changed(map_, 0, score=4.0), map_)) == {cell_part(0)}
+    assert set(map_changes(changed(map_, 11, score=math.nan), map_)) == {cell_part(11)}
     new, _, _ = insert(map_, np.array([0.0, 1.9]), 0.0, 3, 0, math.nan)
     assert set(map_changes(new, map_)) == {cell_part(3)}
-    replaced, _, _ = insert(with_score(map_, 11, 7.0), np.array([3.0, 1.0]), 4.0, 3, 0, 102.0)
+    replaced, _, _ = insert(changed(map_, 11, score=7.0), np.array([3.0, 1.0]), 4.0, 3, 0, 102.0)
     assert set(map_changes(replaced, map_)) == {cell_part(11), cell_part(6)}
     assert set(map_changes(map_, empty_map(PLANE))) == {cell_part(cell) for cell in (11, 0, 6)}
 
@@ -284,7 +283,7 @@ def test_parts_written_one_change_at_a_time_give_the_last_map():
     for generation in range(60):
         before = map_
         if map_.size and rng.random() < 0.5:
-            map_ = with_score(map_, int(rng.choice(map_.cell_N)), rng.normal())
+            map_ = changed(map_, int(rng.choice(map_.cell_N)), score=rng.normal())
         map_, _, _ = insert(map_, rng.uniform([0, 0], [6, 2]), rng.normal(), generation, 0, rng.normal())
         stored |= map_changes(map_, before)
     again = map_from_parts(stored)

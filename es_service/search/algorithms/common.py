@@ -31,7 +31,7 @@ from es_service.search.algorithms.base import (
     with_centre,
 )
 from es_service.search.algorithms.settings import CentresSettings, settings_of
-from es_service.search.maps.behaviour_map import BehaviourMap, insert, with_score
+from es_service.search.maps.behaviour_map import BehaviourMap, changed, insert
 from es_service.search.novelty import empty_archive, extended, novelty
 from es_service.search.objectives import utilities, weight_of_fitness, weighted
 from es_service.search.shaping import pair_weights
@@ -203,7 +203,7 @@ def mapped(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
     if map_ is None:
         return state
     if centre.cell != NO_CELL and np.isfinite(evaluation.population_max):
-        map_ = with_score(map_, centre.cell, evaluation.population_max)
+        map_ = changed(map_, centre.cell, score=evaluation.population_max)
     cell = NO_CELL
     if evaluation.valid:
         map_, offered, entered = insert(

@@ -147,11 +147,6 @@ def changed(
     return map_ if row is None else _with(map_, row, {name: one for name, one in values.items() if one is not None})
 
 
-def with_score(map_: BehaviourMap, cell: int, score: float) -> BehaviourMap:
-    """The map with a new score for a cell's elite; unchanged if the cell is empty."""
-    return changed(map_, cell, score=score)
-
-
 def removed(map_: BehaviourMap, cell: int) -> BehaviourMap:
     """The map without a cell's elite; unchanged if the cell is empty. The others keep their order."""
     row = map_.row_of(cell)
