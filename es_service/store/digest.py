@@ -132,16 +132,15 @@ def arrays_sha256(arrays: dict[str, NDArray[Any]]) -> str:
 def _history(connection: Connection, meta: RunMeta, until: int | None) -> tuple[str, str]:
     """SHA-256s of the deterministic columns of the history, and of the evaluated centres."""
     columns = sorted((column for column in meta.columns if column.deterministic), key=lambda column: column.name)
-    places = [meta.columns.index(column) for column in columns]
     # Columns of the evaluated centres that do not count are the last ones.
     all_of_centre = meta.evaluation_columns
     of_centre = [column for column in all_of_centre if column.deterministic]
     total = hashlib.sha256(json.dumps([[column.name, column.type] for column in columns]).encode() + b"\n")
     centres = hashlib.sha256(column_bytes(of_centre) + b"\n")
-    for row, _ in history_rows(connection, meta, check=False):
+    for row, _ in history_rows(connection, columns, check=False):
         if until is not None and row.generation > until:
             break
-        total.update(row_bytes(tuple(row.row[place] for place in places)))
+        total.update(row_bytes(row.row))
         evaluations = row.evaluations
         if len(of_centre) < len(all_of_centre):
             evaluations = leading_values(evaluations, len(of_centre), len(all_of_centre))

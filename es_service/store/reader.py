@@ -118,7 +118,7 @@ def _sound_rows(
 ) -> Iterator[HistoryRow]:
     """History rows from generation `first` on. Raises Damaged if a row is missing or does not match its SHA-256."""
     expected = first
-    for row, is_sound in history_rows(connection, meta, first, limit):
+    for row, is_sound in history_rows(connection, meta.columns, first, limit):
         if not is_sound or row.generation != expected:
             raise Damaged(f"the history row of generation {expected} is damaged or missing")
         expected += 1

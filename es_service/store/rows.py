@@ -10,11 +10,12 @@ until the next row of the part; a row without payload removes the part.
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
+from es_service.loop.history import Column
 from es_service.store.codec import (
     GONE,
     NO_PAYLOAD,
@@ -26,7 +27,7 @@ from es_service.store.codec import (
     row_sha256,
     state_sha256,
 )
-from es_service.store.schema import Damaged, RunMeta, history_select
+from es_service.store.schema import Damaged, history_select
 
 KeptRows = dict[str, dict[int, str]]
 """Stored state rows: part -> generation -> SHA-256, or GONE for a row that removes the part."""
@@ -37,7 +38,7 @@ class HistoryRow(NamedTuple):
 
     generation: int
     row: Row
-    """Values in the order of the run's columns."""
+    """Values in the order of the columns."""
     evaluations: bytes
     """The evaluated centres, encoded by `tables.table_bytes`."""
     state: str
@@ -46,19 +47,25 @@ class HistoryRow(NamedTuple):
 
 
 def history_rows(
-    connection: sqlite3.Connection, meta: RunMeta, first: int = 0, limit: int | None = None, *, check: bool = True
+    connection: sqlite3.Connection,
+    columns: Sequence[Column],
+    first: int = 0,
+    limit: int | None = None,
+    *,
+    check: bool = True,
 ) -> Iterator[tuple[HistoryRow, bool]]:
     """History rows as (row, whether it is sound), in the order of generations.
 
     Generations may be missing, and damage can show rows again.
 
     Args:
+        columns: those of the run; without `check`, any of them in any order, `generation` included.
         first: generation of the first row.
         limit: greatest number of rows; None for all.
         check: False: no SHA-256 is computed, and every row counts as sound.
     """
-    heading, at = column_bytes(meta.columns), [column.name for column in meta.columns].index("generation")
-    query = history_select(meta.columns) + " WHERE history.generation >= ? ORDER BY history.generation LIMIT ?"
+    heading, at = column_bytes(columns), [column.name for column in columns].index("generation")
+    query = history_select(columns) + " WHERE history.generation >= ? ORDER BY history.generation LIMIT ?"
     for *values, evaluations, state, sha256 in connection.execute(query, (first, -1 if limit is None else limit)):
         row = HistoryRow(values[at], tuple(values), evaluations, state, sha256)
         yield row, not check or row_is_sound(heading, row)

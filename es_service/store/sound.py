@@ -178,7 +178,7 @@ class _Rows:
         """Read the rows after those that are read, at most so many; return whether they are all."""
         count, first = 0, self._next
         with _noted(problems, "the end of the history cannot be read"):
-            for row, is_sound in history_rows(connection, self._meta, first, most):
+            for row, is_sound in history_rows(connection, self._meta.columns, first, most):
                 count += 1
                 if not is_sound or row.generation < self._next:  # damage can show rows again
                     continue

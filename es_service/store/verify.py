@@ -132,7 +132,7 @@ def _history(connection: sqlite3.Connection, meta: RunMeta, first: int, problems
     """The number of history rows, and the number of those before the first damaged one. The rows of generations before
     `first` are taken for sound."""
     count, bad = first, []
-    for row, is_sound in history_rows(connection, meta, first):
+    for row, is_sound in history_rows(connection, meta.columns, first):
         is_there = row.generation == count
         if not (is_there and is_sound):
             bad.append(count)

@@ -210,7 +210,7 @@ class RunStore:
         if self.generation is None:
             return None
         with self._explaining("reading the history"):
-            ((newest, _),) = history_rows(self._connection, self.meta, self.generation, check=False)
+            ((newest, _),) = history_rows(self._connection, self.meta.columns, self.generation, check=False)
         return row_dict(self.meta.columns, newest.row)
 
     def record_platform(self, generation: int, platform: dict[str, Any]) -> bool:
