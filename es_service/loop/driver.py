@@ -54,7 +54,6 @@ from es_service.loop.state import RunState
 from es_service.protocol.evaluator import DispatchCounts, Evaluator
 from es_service.protocol.messages import Centre, EpisodesResult, FloatArray, TaskSpec
 from es_service.search.algorithms.base import Ask, SearchState
-from es_service.search.maps.behaviour_map import Elite
 from es_service.search.maps.geometry import reachable_cells
 from es_service.search.novelty import novelty
 
@@ -180,7 +179,7 @@ def _generation(
     return finished
 
 
-def propose(search: Search, elites: Callable[[int], Elite], state: RunState) -> Proposal:
+def propose(search: Search, elites: Elites, state: RunState) -> Proposal:
     """What the next generation evaluates: centres restart from elites, and the search asks."""
     config, algorithm, generation = search.config, search.algorithm, state.generation + 1
     begun = state.search
@@ -190,7 +189,7 @@ def propose(search: Search, elites: Callable[[int], Elite], state: RunState) -> 
     start_cells = algorithm.start_cells(begun, generation)
     for index, cell in start_cells.items():
         begun = algorithm.restart(begun, index, cell, elites(cell))
-    parents = {cell: elites(cell) for cell in algorithm.parents(begun, generation)}
+    parents = elites.of(algorithm.parents(begun, generation))
     asked = algorithm.ask(replace(begun, elites=parents), generation)
     require_asks(asked, begun, config.compute.chunk_pairs, search.task.observation_size, generation)
     points = [

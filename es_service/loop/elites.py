@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,13 +31,18 @@ class Elites:
 
     def __call__(self, cell: int) -> Elite:
         """The elite of a cell. Raises KeyError if there is none."""
+        return self.of([cell])[cell]
+
+    def of(self, cells: Sequence[int]) -> dict[int, Elite]:
+        """The elites of cells. Raises KeyError if there is none in one of them."""
+        kept, new = self._kept, self._new
+        kept.use(cells)
+        return {cell: (new[cell] if cell in new else kept.get(cell)) or self._read(cell) for cell in cells}
+
+    def _read(self, cell: int) -> Elite:
+        """An elite that is only in the store."""
         if cell in self._new:
-            if (new := self._new[cell]) is None:
-                raise KeyError(cell)
-            return new
-        if (kept := self._kept.get(cell)) is not None:
-            self._kept.use([cell])
-            return kept
+            raise KeyError(cell)
         return self._keep(cell, _read_only(elite_from_arrays(self._part(elite_part(cell)))))
 
     def change(self, parts: Changes) -> None:

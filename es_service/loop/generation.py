@@ -203,10 +203,11 @@ def _evaluate(
     kind: type[Result],
     evaluator: Evaluator,
     asked: Sequence[Sequence[Work]],
-    meanwhile: Callable[[], object] = lambda: None,
+    meanwhile: Callable[[], object] | None = None,
 ) -> list[list[Result]]:
     """The results of each ask's chunks; all are computed side by side."""
-    results = evaluate_beside(evaluator, [one for work in asked for one in work], meanwhile)
+    work = [one for of_ask in asked for one in of_ask]
+    results = evaluator.evaluate(work) if meanwhile is None else evaluate_beside(evaluator, work, meanwhile)
     checked = [result for result in results if isinstance(result, kind)]
     assert len(checked) == len(results), f"an evaluator returned a result that is not a {kind.__name__}"
     found = iter(checked)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -46,6 +46,10 @@ class Kept(Mapping[Key, Value], Generic[Key, Value]):
         """Forget all."""
         self._kept.clear()
         self._bytes = 0
+
+    def get(self, key: Key, default: Any = None) -> Any:
+        """A value, or the default; it is not used by that."""
+        return self._kept.get(key, default)
 
     def __getitem__(self, key: Key) -> Value:
         return self._kept[key]

@@ -114,9 +114,10 @@ class Recipes:
     def problem(self, parameters: int) -> str:
         """In which way these are no recipes of finite policies with some number of parameters; empty if they are."""
         count = len(self.parent_N_2)
-        for parent_D in self.parents:
-            if parent_D.dtype != np.float32 or parent_D.shape != (parameters,):
-                return f"have a parent that is {parent_D.dtype} {parent_D.shape}; must be float32 ({parameters},)"
+        facts = _facts_of(self.parents)
+        for form in dict.fromkeys(one.form for one in facts):
+            if form != f"float32 ({parameters},)":
+                return f"have a parent that is {form}; must be float32 ({parameters},)"
         indices = self.parent_N_2
         if not count or indices.shape != (count, 2) or indices.dtype.kind != "i":
             return f"have parents {indices.dtype} {indices.shape}; must be indices of shape (policies, 2)"
@@ -127,7 +128,7 @@ class Recipes:
         if not all(0.0 <= sigma < np.inf for sigma in self.rule):
             return f"have the standard deviations {tuple(self.rule)}; must be finite and not negative"
         iso, line = (LARGEST_NOISE * sigma for sigma in self.rule)
-        largest = float(np.max([_facts(parent_D).largest for parent_D in self.parents]))
+        largest = float(np.max([one.largest for one in facts]))
         # No difference of parents may overflow either. NaN is not less than anything.
         if not (1.0 + 2.0 * max(1.0, line)) * largest + iso < LARGEST_FLOAT:
             return f"make policies that may not be finite, of parents with values up to {largest:g}"
@@ -193,7 +194,7 @@ def recipes_of(rule: IsoLine, parents: Sequence[FloatArray], parent_N_2: NDArray
     Raises:
         TypeError: a parent is no array.
     """
-    return Recipes(rule, tuple(map(name_of, parents)), tuple(parents), parent_N_2, key_N_4)
+    return Recipes(rule, tuple(one.name for one in _facts_of(parents)), tuple(parents), parent_N_2, key_N_4)
 
 
 def unvaried(policies: Sequence[FloatArray]) -> Recipes:
@@ -216,12 +217,23 @@ class _Facts(NamedTuple):
 
     of: weakref.ref[FloatArray]
     name: bytes
+    form: str
+    """Its type and shape."""
     largest: float
     """Largest magnitude; NaN if a value is NaN."""
 
 
 _KNOWN: dict[int, _Facts] = {}
 """Facts by the `id` of a read-only array, as long as it lives: the same elites are parents again and again."""
+
+
+def _facts_of(parents: Sequence[FloatArray]) -> list[_Facts]:
+    """The facts of arrays, most of which are known."""
+    known = [_KNOWN.get(id(one)) for one in parents]
+    return [
+        facts if facts is not None and facts.of() is one else _facts(one)
+        for one, facts in zip(parents, known, strict=True)
+    ]
 
 
 def _facts(parameters_D: FloatArray) -> _Facts:
@@ -233,7 +245,8 @@ def _facts(parameters_D: FloatArray) -> _Facts:
     values = np.ascontiguousarray(parameters_D)
     name = hashlib.sha256(values.data).digest()[:NAME_BYTES]
     largest = float(np.abs(values).max(initial=0.0))
-    facts = _Facts(weakref.ref(parameters_D, lambda _: _KNOWN.pop(number, None)), name, largest)
+    form = f"{parameters_D.dtype} {parameters_D.shape}"
+    facts = _Facts(weakref.ref(parameters_D, lambda _: _KNOWN.pop(number, None)), name, form, largest)
     if not parameters_D.flags.writeable:
         _KNOWN[number] = facts
     return facts

@@ -15,7 +15,7 @@ from itertools import islice
 from typing import Any
 
 _LENGTH = struct.Struct("!Q")
-_READ_BYTES = 1 << 18
+_READ_BYTES = 1 << 16
 BUFFER_BYTES = 1 << 20
 """Send buffer requested for each socket, so that most messages are sent at once; the system may grant less."""
 
@@ -59,7 +59,7 @@ class Channel:
         end.setblocking(False)
         self._end = end
         self._to_send: deque[memoryview] = deque()
-        self._read = bytearray()
+        self._read, self._part = bytearray(), memoryview(bytearray(_READ_BYTES))
 
     def fileno(self) -> int:
         """File descriptor of the socket. Poll it for reading, and while `is_full` also for writing."""
@@ -107,9 +107,9 @@ class Channel:
         """
         is_open = True
         try:
-            while data := self._end.recv(_READ_BYTES):
-                self._read += data
-                if len(data) < _READ_BYTES:
+            while size := self._end.recv_into(self._part):
+                self._read += self._part[:size]
+                if size < _READ_BYTES:
                     break
             else:
                 is_open = False

@@ -102,11 +102,12 @@ def map_elites(config: RunConfig) -> Algorithm:
     def ask(state: SearchState, generation: int) -> tuple[PolicyAsk, ...]:
         known = {cell: elite.centre_D for cell, elite in state.elites.items()}
         known = known or {index: centre.centre_D for index, centre in enumerate(state.centres)}
-        drawn, drawn_N_2 = np.unique(parent_cells(config, state, generation), return_inverse=True)
+        drawn = np.array(sorted(known))  # all of them are elites that were drawn, or else some are centres
+        parent_N_2 = np.searchsorted(drawn, parent_cells(config, state, generation))
         key_N_4 = stream_keys(config.seed, Domain.VARIATION, generation, np.arange(search.batch))
         parents = [known[one] for one in drawn.tolist()]
         rule = IsoLine(search.iso_sigma, search.line_sigma)
-        return (PolicyAsk(recipes_of(rule, parents, drawn_N_2.reshape(-1, 2), key_N_4)),)
+        return (PolicyAsk(recipes_of(rule, parents, parent_N_2, key_N_4)),)
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         if evaluations[0].generation == 0:
