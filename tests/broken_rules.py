@@ -639,6 +639,12 @@ CASES = [
             "seed, OTHER_PROGRAMS + number, np.arange(count), 0, 0,",
             "seed, OTHER_PROGRAMS + number, np.arange(count), 1, 0,",
         ),
+        (
+            "forgets the CPU time of its earlier sessions",
+            "tests/benchmarks/baselines/run.py",
+            "self._before += float((kept / CPU_SECONDS).read_text())",
+            "pass",
+        ),
     ),
 ]
 

@@ -54,6 +54,7 @@ def test_a_later_row_of_a_run_replaces_the_earlier_one(tmp_path):
         put(table, {"task": "ant_trap", "system": "td3"})
 
 
+@pytest.mark.slow
 def test_a_run_of_ours_goes_on_and_is_certified(tmp_path):
     def begun() -> OurRun:
         return OurRun("point_maze", "map_elites", 3, tmp_path)

@@ -8,7 +8,7 @@ import es_service
 from es_service.runs.certification import certify_run
 from es_service.runs.checked_config import load_config
 from es_service.store.folder import holds_run
-from tests.benchmarks.baselines.run import Facts, Found, Run
+from tests.benchmarks.baselines.run import COMPUTE, Facts, Found, Run
 
 CONFIGS = Path(__file__).parents[3] / "configs" / "paper"
 
@@ -20,7 +20,7 @@ class OurRun(Run):
 
     def __init__(self, task: str, system: str, seed: int, folder: Path) -> None:
         self._folder = folder / "run"
-        compute = {"compute.inline_workers": "threads", "compute.workers": 1, "compute.engine": "inline"}
+        compute = {f"compute.{name}": value for name, value in COMPUTE.items()}
         endless = {"budget.env_steps": None, "budget.generations": 2**40}
         config = CONFIGS / f"{task}_{system}.yaml"
         self._config = load_config(config, {"seed": seed} | compute | endless)

@@ -10,6 +10,7 @@ import resource
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -28,6 +29,15 @@ NEWEST = "newest"
 """File with the name of the folder of the newest checkpoint."""
 CPU_SECONDS = "cpu_seconds"
 """File of a checkpoint with the CPU seconds of all sessions so far."""
+
+
+COMPUTE = {
+    "engine": "inline",
+    "workers": 1,
+    "rollout": "simd",
+    **dict.fromkeys(("chunk_timeout_s", "compile_timeout_s", "no_worker_timeout_s"), 86_400),
+}
+"""One worker, for which runs of the lowest priority wait as long as a busy machine takes."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +81,15 @@ class Found:
 
 
 def cpu_seconds() -> float:
-    """CPU time of this process and of its children that have ended, in seconds."""
+    """CPU time of this process and of its children, those that have ended and those that live, in seconds."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(one.ru_utime + one.ru_stime for one in used)
+    ticks = 0
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):  # a process that has just ended
+            fields = stat.read_text().rpartition(")")[2].split()
+            if int(fields[1]) == os.getpid():
+                ticks += sum(map(int, fields[11:15]))  # its own, and of its children that have ended
+    return sum(one.ru_utime + one.ru_stime for one in used) + ticks / os.sysconf("SC_CLK_TCK")
 
 
 class Run(ABC):
@@ -174,10 +190,7 @@ class Run(ABC):
 
 
 def relu_config(task: str, seed: int) -> dict[str, Any]:
-    """A config of the task with the policy of these systems: ReLU, tanh at the end, observations as they are.
-
-    Its worker is a thread of this process, so that `cpu_seconds` counts it.
-    """
+    """A config of the task with the policy of these systems: ReLU, tanh at the end, observations as they are."""
     return {
         "task": {"environment": task},
         "policy": {
@@ -188,7 +201,7 @@ def relu_config(task: str, seed: int) -> dict[str, Any]:
         },
         "search": {"algorithm": "es"},
         "budget": {"generations": 1},
-        "compute": {"inline_workers": "threads", "workers": 1, "rollout": "simd"},
+        "compute": COMPUTE,
         "seed": seed,
     }
 
