@@ -174,6 +174,18 @@ def test_a_child_with_other_code_is_refused(threads):
     assert "workers/gone.py, workers/policies/policy.py" in str(caught.value)
 
 
+def test_a_worker_of_another_architecture_is_refused():
+    other = "aarch64" if architecture() == "x86_64" else "x86_64"
+    spec, says = replace(SPEC, platform=other), f"compute.platform keeps this run to {other}"
+    with pytest.raises(OtherCodeError, match=says):
+        WorkerActor(pickle.dumps(spec), 0).build()
+    with (
+        inline_engine(spec, Limits(workers=1, restart_backoff_s=0.0)) as engine,
+        pytest.raises(EvaluationError, match=says),
+    ):
+        engine.evaluate([(centre(random_parameters()), TrainingChunk(1, 0))])
+
+
 def test_other_code_makes_a_run_mixed_and_unknuser_code_does_not():
     old, new, unknown = {"cpu": "a", CODE: {"f": "1"}}, {"cpu": "a", CODE: {"f": "2"}}, {"cpu": "a"}
     assert is_mixed([old, new])
