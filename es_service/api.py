@@ -6,36 +6,26 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from itertools import count
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
-from uuid import uuid4
 
-from es_service.config.changes import again_with
 from es_service.config.keys import Overrides, parse_overrides
 from es_service.config.loading import Source
 from es_service.config.model import RunConfig
-from es_service.config.tasks import task_of
-from es_service.dispatch import dispatch_log
-from es_service.errors import StartError, WayOut
-from es_service.logs import in_run
+from es_service.errors import WayOut
 from es_service.loop.interfaces import Stop as Stop
 from es_service.report.progress import in_notebook, show_in_notebook
-from es_service.runs import targets, view
-from es_service.runs.certified import target_reached
-from es_service.runs.checked_config import accepted, changed_config, load_config
+from es_service.runs import view
+from es_service.runs.checked_config import changed_config, load_config
 from es_service.runs.evaluator import evaluator as evaluator
 from es_service.runs.lineage import fork_config, forked, started
-from es_service.runs.resume_checks import columns, require_resumable
-from es_service.runs.session import Caller, OnGeneration, OnNotice, Outcome, require_cores, work
+from es_service.runs.session import Caller, OnGeneration, OnNotice, Outcome
+from es_service.runs.sessions import Listener, continue_run, create_run
 from es_service.runs.view import Run, open_run
 from es_service.store.beginning import Beginning
-from es_service.store.create import remove_run_folder
-from es_service.store.folder import CONFIG, explained, holds_run, write_config
-from es_service.store.schema import RunMeta
+from es_service.store.folder import CONFIG, holds_run
 from es_service.store.writer import RunStore, no_hook
 
 RUNS_FOLDER = Path("runs")
@@ -59,28 +49,28 @@ def _ignore(sentence: str) -> None:
     """Do nothing; the default for `on_compile`."""
 
 
-@dataclass(frozen=True)
-class _Listener:
-    """Functions that a session calls; `run` describes them."""
-
-    on_generation: OnGeneration | None
-    on_notice: OnNotice
-    on_compile: OnNotice
-    progress: bool
-    hook: Callable[[str], None] = no_hook
-    caller: Caller | None = None
+def _listener(
+    on_generation: OnGeneration | None,
+    on_notice: OnNotice,
+    on_compile: OnNotice,
+    progress: bool,
+    hook: Callable[[str], None] = no_hook,
+    caller: Caller | None = None,
+) -> Listener:
+    """What a session calls: with each history row `on_generation`, or if there is none, what shows the progress in a
+    notebook."""
 
     @contextmanager
-    def shown(self, folder: Path) -> Iterator[OnGeneration]:
-        """Yield what is to be called with each history row: `on_generation`, or if there is none, what shows the
-        progress in a notebook."""
-        if self.on_generation is not None:
-            yield self.on_generation
-        elif self.progress and in_notebook():
+    def shown(folder: Path) -> Iterator[OnGeneration]:
+        if on_generation is not None:
+            yield on_generation
+        elif progress and in_notebook():
             with show_in_notebook(str(folder)) as show:
                 yield show
         else:
             yield lambda row: None
+
+    return Listener(shown, on_notice, on_compile, hook, caller)
 
 
 def run(
@@ -120,8 +110,8 @@ def run(
     parent, beginning = None, Beginning()
     if config.search.init_from is not None:
         parent, beginning = started(config, config.search.init_from, on_notice)
-    listener = _Listener(on_generation, on_notice, on_compile, progress, hook, caller)
-    return _create_and_work(config, out, parent, beginning, again, listener)
+    listener = _listener(on_generation, on_notice, on_compile, progress, hook, caller)
+    return create_run(config, _folder(out, config), parent, beginning, again, listener)
 
 
 def resume(
@@ -154,8 +144,8 @@ def resume(
         return changed_config(source, overrides)
 
     overrides, asked = _with_values(overrides)
-    listener = _Listener(on_generation, on_notice, on_compile, progress, hook)
-    return _go_on(Path(folder), changed, listener, asked, strict=strict)
+    listener = _listener(on_generation, on_notice, on_compile, progress, hook)
+    return continue_run(Path(folder), changed, listener, asked, strict=strict)
 
 
 def run_or_resume(
@@ -188,62 +178,8 @@ def run_or_resume(
             on_compile=on_compile,
             caller=caller,
         )
-    listener = _Listener(on_generation, on_notice, on_compile, progress, caller=caller)
-    return _go_on(Path(out), lambda store: wanted, listener)
-
-
-def _go_on(
-    folder: Path,
-    make_config: Callable[[RunStore], RunConfig],
-    listener: _Listener,
-    asked: Mapping[str, Any] = MappingProxyType({}),
-    *,
-    strict: bool = False,
-) -> Outcome:
-    """Continue a run, in as many sessions as `budget.target_certified` makes of it.
-
-    Args:
-        asked: settings of the call, which ways out repeat.
-    """
-    config, outcome = _session(folder, make_config, listener, asked, strict=strict)
-    return _to_target(config, outcome, listener, strict=strict)
-
-
-def _to_target(config: RunConfig, outcome: Outcome, listener: _Listener, *, strict: bool = False) -> Outcome:
-    """Certify the best centre whenever a session has ended for that, and continue: if it reaches the target, no longer
-    than until the next session has opened the run."""
-    while outcome.reason == targets.TO_CERTIFY:
-        targets.certify_best(outcome.run.folder, config, listener.on_notice)
-        _, outcome = _session(outcome.run.folder, lambda store: config, listener, strict=strict)
-    return outcome
-
-
-def _session(
-    folder: Path,
-    make_config: Callable[[RunStore], RunConfig],
-    listener: _Listener,
-    asked: Mapping[str, Any] = MappingProxyType({}),
-    *,
-    strict: bool = False,
-) -> tuple[RunConfig, Outcome]:
-    """Open a run, check that the config of this session fits it, and work on it."""
-    with RunStore.open(folder, hook=listener.hook) as store, in_run(store.meta.run_id):
-        # Repairs remain even if the config is refused below, so they are reported now; `work` reports later notices.
-        for notice in store.notices:
-            listener.on_notice(notice)
-        store.notices.clear()
-        config = make_config(store)
-        require_resumable(store, config, asked, strict=strict)
-        try:
-            write_config(folder, config.resolved_yaml())
-        except OSError as error:
-            raise explained(error, folder, f"writing {CONFIG}") from error
-        if reason := target_reached(folder, config.budget.target_certified):
-            return config, Outcome(open_run(folder), reason)
-        with listener.shown(folder) as on_generation:
-            until = targets.until_due(on_generation, folder, config)
-            told = listener.on_notice, listener.on_compile
-            return config, work(config, store, until, *told, strict=strict, caller=listener.caller)
+    listener = _listener(on_generation, on_notice, on_compile, progress, caller=caller)
+    return continue_run(Path(out), lambda store: wanted, listener)
 
 
 def fork(
@@ -278,8 +214,8 @@ def fork(
     again = WayOut("fork", "", os.fspath(parent), asked, generation=generation, out=_text(out))
     config = fork_config(parent, overrides)
     lineage, beginning = forked(open_run(parent), config, generation)
-    listener = _Listener(on_generation, on_notice, on_compile, progress, hook)
-    outcome = _create_and_work(config, out, lineage, beginning, again, listener)
+    listener = _listener(on_generation, on_notice, on_compile, progress, hook)
+    outcome = create_run(config, _folder(out, config), lineage, beginning, again, listener)
     if outcome.run.generation == (begun := lineage["generation"]):
         on_notice(
             f"no generation was run: {outcome.reason} already at generation {begun}, where this fork begins; resume it "
@@ -298,6 +234,10 @@ def _text(path: str | os.PathLike[str] | None) -> str | None:
     return None if path is None else os.fspath(path)
 
 
+def _folder(out: str | os.PathLike[str] | None, config: RunConfig) -> Path:
+    return default_folder(config) if out is None else Path(out)
+
+
 def default_folder(config: RunConfig, which: str = "") -> Path:
     """A new folder under `runs/`, named after task, algorithm, `which` or the seed, time and process id, so that runs
     that start at the same time get different folders. Colons become underscores, because scp and others read HOST:PATH.
@@ -307,55 +247,3 @@ def default_folder(config: RunConfig, which: str = "") -> Path:
     name = f"{kind}_{which or f'seed{config.seed}'}_{when}-{os.getpid()}"
     names = (name if number == 1 else f"{name}-{number}" for number in count(1))
     return next(RUNS_FOLDER / name for name in names if not (RUNS_FOLDER / name).exists())
-
-
-def _create_and_work(
-    config: RunConfig,
-    out: str | os.PathLike[str] | None,
-    parent: dict[str, Any] | None,
-    beginning: Beginning,
-    again: WayOut,
-    listener: _Listener,
-) -> Outcome:
-    """Create a run and work on it. If its workers cannot be started, there is no run afterwards.
-
-    Args:
-        again: the call that was made, which ways out repeat with other settings.
-    """
-    require_cores(config, again)
-    folder = Path(out) if out is not None else default_folder(config)
-    is_new, task = not folder.exists(), task_of(accepted(config))
-    history, evaluations = columns(config, task)
-    meta = RunMeta(
-        run_id=uuid4().hex,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        config=config.model_dump(mode="json"),
-        constants=config.constants(),
-        task=asdict(task),
-        columns=history,
-        evaluation_columns=evaluations,
-        parent=parent,
-    )
-    with (
-        RunStore.create(folder, config.resolved_yaml(), meta, beginning, hook=listener.hook) as store,
-        in_run(meta.run_id),
-        listener.shown(folder) as on_generation,
-    ):
-        begun = store.generation
-        try:
-            until = targets.until_due(on_generation, folder, config)
-            outcome = work(config, store, until, listener.on_notice, listener.on_compile, caller=listener.caller)
-        except StartError as error:
-            if store.generation != begun:
-                raise  # of something else that the caller started in a callback: this run has computed generations
-            store.close()
-            (folder / dispatch_log.FILE).unlink(missing_ok=True)
-            remove_run_folder(folder, whole=is_new)
-            error.run = None
-            error.ways_out = tuple(
-                again_with(again, way.purpose, way.settings) if way.action == "resume" else way
-                for way in error.ways_out
-                if way.action != "resume" or way.settings
-            )
-            raise
-    return _to_target(config, outcome, listener)
