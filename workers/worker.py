@@ -34,15 +34,13 @@ from es_service.protocol.messages import (
     chunk_name,
 )
 from es_service.protocol.noise import NORMAL_STD, Domain, Keys, evaluation_reset_keys, stream_keys
-from es_service.protocol.policies import slots
+from es_service.protocol.policies import POLICIES_TOGETHER, slots
 from workers.compilable import Compilable
 from workers.results import evaluation_result, policies_result, training_result
 from workers.rollouts import BACKENDS
 from workers.rollouts.backend import Episodes, RolloutBackend, lane_of
 
 AnyChunk = TypeVar("AnyChunk", TrainingChunk, EvaluationChunk, GradientChunk)
-POLICY_CHUNKS_TOGETHER = 8
-"""Most policy chunks in one call of the kernel: a call costs little then, and the copies of the weights stay small."""
 
 
 class Kind(NamedTuple):
@@ -234,13 +232,18 @@ def _groups(work: Sequence[Work], *, together: bool) -> list[list[Work]]:
     last = None
     for subject, chunk in work:
         key = (_shared_by(subject), type(chunk), chunk.generation, chunk.ask)
-        full = isinstance(subject, Policies) and groups and len(groups[-1]) == POLICY_CHUNKS_TOGETHER
+        full = isinstance(chunk, PolicyChunk) and groups and _slots(groups[-1]) + chunk.count > POLICIES_TOGETHER
         if together and key == last and not full:
             groups[-1].append((subject, chunk))
         else:
             groups.append([(subject, chunk)])
         last = key
     return groups
+
+
+def _slots(work: Sequence[Work]) -> int:
+    """Slots of policy chunks together."""
+    return sum(chunk.count for _, chunk in work if isinstance(chunk, PolicyChunk))
 
 
 def _shared_by(subject: Subject) -> tuple[str, int, int]:

@@ -32,7 +32,8 @@ from es_service.errors import EvaluationError, Interrupted
 from es_service.logs import logger
 from es_service.protocol.evaluator import DispatchCounts
 from es_service.protocol.messages import ChunkResult, Work, WorkItemId
-from es_service.protocol.pieces import pieces_of, whole
+from es_service.protocol.pieces import pieces_of, separated, together, whole
+from es_service.protocol.policies import POLICY_SLOTS
 
 _LOG = logger(__name__)
 _RARE = (events.WorkerUp, events.WorkerLost, events.Compiled, events.Failure, events.StopWorker)
@@ -229,13 +230,14 @@ class Engine(Generic[AnyTransport]):
         pieces = [[one] if most is None else pieces_of(one, most) for one in work]
         parts = self._parts([piece for of_chunk in pieces for piece in of_chunk])
         self._waits.begin((item_id.kind for item_id, _ in parts), time.monotonic())
-        self._work, self._results = dict(parts), {}
+        most = POLICY_SLOTS if self._state.limits.cores > 1 else self._state.limits.policies_together
+        self._work, self._results = {item_id: together(part, most) for item_id, part in parts}, {}
         self._step(events.Submit(tuple(events.WorkItem(item_id, item_id.kind, item_id.chunks) for item_id, _ in parts)))
 
         def wait() -> list[ChunkResult]:
             while pending(self._state):
                 self._serve()
-            results = (result for item_id, _ in parts for result in self._results.pop(item_id))
+            results = (result for item_id, part in parts for result in separated(part, self._results.pop(item_id)))
             return [whole(one, list(islice(results, len(own)))) for one, own in zip(work, pieces, strict=True)]
 
         return wait

@@ -6,6 +6,8 @@ import math
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 
+from es_service.protocol.policies import POLICY_SLOTS
+
 
 @dataclass(frozen=True)
 class WorkItem:
@@ -57,6 +59,8 @@ class Limits:
     """Longest time for a chunk of episodes, in the place of the limits for first and later items; None: these."""
     episodes_together: int | None = None
     """Most episodes of an evaluation or policy chunk that are sent together; None: whole chunks."""
+    policies_together: int = POLICY_SLOTS
+    """Most policies with one episode each that a worker with one core is sent as one chunk."""
     max_failures_in_a_row: int = 3
     """Number of consecutive exceptions after which a worker is killed and replaced."""
     restart_backoff_s: float = 1.0

@@ -79,7 +79,7 @@ def policy_work(
     has_none = not (mean_N_O.any() or np.signbit(mean_N_O).any()) and bool((std_N_O == 1.0).all())
     for first in range(0, len(parameters_N_D), POLICY_SLOTS):
         of = slice(first, first + POLICY_SLOTS)
-        given = parameters_N_D.part(of) if isinstance(parameters_N_D, Recipes) else _own(parameters_N_D[of])
+        given = parameters_N_D.some(of) if isinstance(parameters_N_D, Recipes) else _own(parameters_N_D[of])
         of_each = () if has_none else (_own(array[of]) for array in statistics)
         policies = Policies(first, episodes, seed, traces, given, *of_each, domain=domain)
         parts = range(chunks_of(len(policies.parameters_N_D), episodes))

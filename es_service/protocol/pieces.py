@@ -1,4 +1,5 @@
 """Evaluation and policy chunks in pieces, for tasks whose episodes may take long: each piece can go to another worker.
+And policy chunks that are several in one, for tasks whose episodes take less than a message.
 
 The numbers of episodes and slots stay those of the whole chunk, and so do the results, as far as the bits of an episode
 do not depend on the others that are computed with it.
@@ -8,12 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
-from es_service.protocol.episodes import joined
-from es_service.protocol.messages import ChunkResult, EpisodesResult, EvaluationChunk, Policies, PolicyChunk, Work
+from es_service.protocol.episodes import each, joined
+from es_service.protocol.messages import (
+    ChunkResult,
+    EpisodesResult,
+    EvaluationChunk,
+    Policies,
+    PolicyChunk,
+    Subject,
+    Work,
+)
 from es_service.protocol.policies import slots
+from es_service.protocol.recipes import Recipes
 
 
 def pieces_of(work: Work, most: int) -> list[Work]:
@@ -44,3 +55,85 @@ def whole(work: Work, results: Sequence[ChunkResult]) -> ChunkResult:
     if not traces:
         return found
     return replace(found, trace_T_B=np.concatenate(traces) if isinstance(work[1], PolicyChunk) else traces[0])
+
+
+def together(work: Sequence[Work], most: int) -> list[Work]:
+    """A work item as it is sent: neighbouring policies of one ask that are made of recipes and have one episode each
+    are one chunk, as far as they are at most `most`, and all recipes have the parents that they need.
+
+    The slots of policies with more episodes, or with observation statistics, stay as they are.
+    """
+    groups: list[list[Work]] = []
+    for one in work:
+        if groups and _goes_on(groups[-1], one, most):
+            groups[-1].append(one)
+        else:
+            groups.append([one])
+    sent: dict[int, Subject] = {}  # by `id`, since chunks with the same policies share them
+    found = []
+    for group in groups:
+        (subject, chunk), recipes = group[0], [_recipes(one) for one, _ in group]
+        if id(subject) not in sent:
+            sent[id(subject)] = subject
+            if isinstance(subject, Policies) and (first := recipes[0]) is not None:
+                parent_N_2 = np.concatenate([one.parent_N_2 for one in recipes if one is not None])
+                key_N_4 = np.concatenate([one.key_N_4 for one in recipes if one is not None])
+                whole = replace(first, parent_N_2=parent_N_2, key_N_4=key_N_4).part(slice(None))
+                sent[id(subject)] = replace(subject, parameters_N_D=whole)
+        if isinstance(chunk, PolicyChunk) and len(group) > 1:
+            chunk = replace(chunk, count=sum(len(one) for one in recipes if one is not None))
+        found.append((sent[id(subject)], chunk))
+    return found
+
+
+def _goes_on(group: Sequence[Work], work: Work, most: int) -> bool:
+    """Whether the policies of a chunk are the next ones after those of a group."""
+    (subject, chunk), (before, last) = work, group[-1]
+    recipes, earlier = _recipes(subject), _recipes(before)
+    return (
+        recipes is not None
+        and earlier is not None
+        and recipes.names is earlier.names  # those of one ask
+        and isinstance(subject, Policies)
+        and isinstance(before, Policies)
+        and subject.episodes == 1
+        and subject.observation_mean_N_O is before.observation_mean_N_O is None
+        and subject == replace(before, first=before.first + len(earlier), parameters_N_D=recipes)
+        and chunk == replace(last, chunk_id=last.chunk_id + 1)
+        and chunk == PolicyChunk(chunk.generation, chunk.chunk_id, chunk.ask)
+        and subject.first + len(recipes) - _first(group[0][0]) <= most
+    )
+
+
+def _recipes(subject: Subject) -> Recipes | None:
+    given = subject.parameters_N_D if isinstance(subject, Policies) else None
+    return given if isinstance(given, Recipes) else None
+
+
+def _first(subject: Subject) -> int:
+    return subject.first if isinstance(subject, Policies) else 0
+
+
+def separated(work: Sequence[Work], results: Sequence[ChunkResult]) -> list[ChunkResult]:
+    """The results of each chunk from those of a work item as it was sent."""
+    if len(results) == len(work):
+        return list(results)
+    found: list[ChunkResult] = []
+    for result in results:
+        ends = [0]
+        while isinstance(result, EpisodesResult) and ends[-1] < len(result.fitness):
+            subject, chunk = work[len(found) + len(ends) - 1]
+            assert isinstance(subject, Policies)
+            assert isinstance(chunk, PolicyChunk)
+            ends.append(ends[-1] + len(slots(subject, chunk)[0]))
+        found += [_rows(result, *place) for place in pairwise(ends)] if isinstance(result, EpisodesResult) else [result]
+    return found
+
+
+def _rows(result: EpisodesResult, first: int, end: int) -> EpisodesResult:
+    """The results of some slots; the first have the failures of all."""
+    found = replace(each(lambda array: array[first:end], result), failures=() if first else result.failures)
+    if not result.of_steps:
+        return found
+    start, stop = (int(result.steps[:at].sum(dtype=np.int64)) for at in (first, end))
+    return replace(found, of_steps={name: array[start:stop] for name, array in result.of_steps.items()})

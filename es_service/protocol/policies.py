@@ -17,11 +17,14 @@ from es_service.protocol.recipes import Recipes
 POLICY_SLOTS = 16
 """Slots of a policy chunk, each of which is one episode of one policy. This is a constant so that the shape that is
 compiled never changes."""
+POLICIES_TOGETHER = 8 * POLICY_SLOTS
+"""Most slots in one call of a kernel: a call costs little then, and the memory of the weights stays small."""
 
 
 @dataclass(frozen=True)
 class Policies:
-    """Up to POLICY_SLOTS policies that travel together, once to each worker that runs chunks of them."""
+    """Policies that travel together, once to each worker that runs chunks of them: up to POLICY_SLOTS, or with chunks
+    that are several in one those of these."""
 
     first: int
     """Number of the first of them among the policies of their ask."""
@@ -63,7 +66,8 @@ class PolicyChunk:
     """Number of the chunk among those of the policies that it is sent with."""
     first: int = 0
     count: int = POLICY_SLOTS
-    """The first of its slots that is wanted, and how many are, if the chunk is a piece of one (`protocol.pieces`)."""
+    """The first of its slots that is wanted, and how many are, if the chunk is a piece of one, or several in one
+    (`protocol.pieces`)."""
 
 
 def chunks_of(policies: int, episodes: int) -> int:
@@ -74,5 +78,5 @@ def chunks_of(policies: int, episodes: int) -> int:
 def slots(policies: Policies, chunk: PolicyChunk) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """(index of the policy [L], number of the episode [L]) of each slot of a chunk."""
     count, first = len(policies.parameters_N_D), chunk.part * POLICY_SLOTS + chunk.first
-    slot_L = np.arange(first, min(first + min(chunk.count, POLICY_SLOTS - chunk.first), count * policies.episodes))
+    slot_L = np.arange(first, min(first + chunk.count, count * policies.episodes))
     return slot_L % count, slot_L // count

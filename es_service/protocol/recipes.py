@@ -90,6 +90,10 @@ class Recipes:
         names, parents = (tuple(all_[index] for index in used.tolist()) for all_ in (self.names, self.parents))
         return Recipes(self.rule, names, parents, parent_M_2.reshape(-1, 2), self.key_N_4[of])
 
+    def some(self, of: slice) -> Recipes:
+        """The recipes of some of the policies, still with the parents of all."""
+        return replace(self, parent_N_2=self.parent_N_2[of], key_N_4=self.key_N_4[of])
+
     def as_sent(self) -> Recipes:
         """The recipes without the parents' parameters."""
         return replace(self, parents=())

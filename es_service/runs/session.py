@@ -27,6 +27,7 @@ from es_service.loop import driver
 from es_service.loop.parts import moments_from_arrays
 from es_service.protocol.machine import platform_info
 from es_service.protocol.messages import FloatArray, Moments, TaskSpec, WorkerSpec
+from es_service.protocol.policies import POLICIES_TOGETHER, POLICY_SLOTS
 from es_service.runs.compiling import compiling_sentence, noting
 from es_service.runs.identity import Recorder, code_of, tell_of_other_code
 from es_service.runs.signals import stop_on_signals
@@ -229,6 +230,7 @@ def dispatch_limits(config: RunConfig, most: int | None = None) -> Limits:
         late_factor=Limits.late_factor if rollout.copies_late_items else math.inf,
         time_limit_s=chunk_limit_s(config, task),
         episodes_together=rollout.episodes_together(task),
+        policies_together=POLICIES_TOGETHER if rollout.takes_chunks_together else POLICY_SLOTS,
     )
 
 

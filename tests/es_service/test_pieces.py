@@ -9,9 +9,12 @@ import pytest
 
 from es_service.dispatch.events import Limits
 from es_service.dispatch.inline_engine import inline_engine
-from es_service.loop.policies import policy_episodes, policy_work
+from es_service.loop.policies import no_statistics, policy_episodes, policy_work
 from es_service.protocol.messages import GradientChunk, PolicySpec, TrainingChunk, around, evaluation_chunks
-from es_service.protocol.pieces import pieces_of, whole
+from es_service.protocol.noise import Domain, stream_keys
+from es_service.protocol.pieces import pieces_of, separated, together, whole
+from es_service.protocol.policies import POLICY_SLOTS
+from es_service.protocol.recipes import IsoLine, recipes_of
 from tests.helpers import centre, random_parameters, spec
 from workers.worker import make_worker
 
@@ -61,3 +64,68 @@ def test_an_engine_puts_together_what_it_has_sent_in_pieces():
     for one, other in zip((*found[0][0], found[0][1]), (*found[1][0], found[1][1]), strict=True):
         np.testing.assert_array_equal(one.fitness, other.fitness)
         np.testing.assert_array_equal(one.trace_T_B, other.trace_T_B)
+
+
+MAZE = spec(policy=PolicySpec((2, 8, 2)), rollout="simd", outputs=("last_reward", "observation"))
+PARENTS = [random_parameters(seed, MAZE.policy.parameters) for seed in range(6)]
+
+
+def recipes(policies: int):
+    parent_N_2 = np.random.default_rng(policies).integers(len(PARENTS), size=(policies, 2))
+    keys = stream_keys(0, Domain.VARIATION, 1, np.arange(policies))
+    return recipes_of(IsoLine(0.1, 0.2), PARENTS, parent_N_2, keys)
+
+
+def asked_for(policies: int, episodes: int = 1, ask: int = 0):
+    return policy_work(
+        recipes(policies), no_statistics(policies, 2), episodes, seed=3, generation=2, ask=ask, traces=True
+    )
+
+
+@pytest.mark.parametrize(("policies", "most", "sizes"), [(16, 128, [16]), (70, 128, [70]), (70, 40, [32, 38])])
+def test_policies_with_one_episode_are_sent_as_one_chunk_and_have_the_results_of_their_own(policies, most, sizes):
+    run, asked = make_worker(MAZE), asked_for(policies)
+    sent = together(asked.work, most)
+    assert [len(subject.parameters_N_D) for subject, _ in sent] == sizes
+    results, expected = run(sent), [result for one in asked.work for result in run([one])]
+    assert [len(result.fitness) for result in results] == sizes
+    for found, wanted in zip(separated(asked.work, results), expected, strict=True):
+        for name in ("fitness", "returns", "descriptor", "steps", "trace_T_B"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name), err_msg=name)
+        for name in ("outputs", "of_steps"):
+            for key, array in getattr(wanted, name).items():
+                np.testing.assert_array_equal(getattr(found, name)[key], array, err_msg=key)
+
+
+def test_what_is_sent_has_the_parents_that_it_needs_and_no_others():
+    for subject, chunk in together(asked_for(40).work, 16):
+        used = subject.parameters_N_D
+        assert len(used) == min(POLICY_SLOTS, 40 - subject.first)
+        assert sorted(set(used.parent_N_2.ravel().tolist())) == list(range(len(used.names)))
+        assert chunk.count == POLICY_SLOTS
+        expected = recipes(40).made()[subject.first : subject.first + len(used)]
+        np.testing.assert_array_equal(used.made(), expected)
+
+
+def test_only_neighbours_of_one_ask_are_one_chunk():
+    several, first, second = asked_for(40, episodes=2).work, asked_for(33).work, asked_for(33, ask=1).work
+    of_policies = np.ones((40, MAZE.policy.parameters), np.float32)
+    explicit = policy_work(of_policies, no_statistics(40, 2), 1, seed=3, generation=2).work
+    work = [*several, *first, *second, second[0], *explicit]
+    counts = [chunk.count for _, chunk in together(work, 128)]
+    assert counts == [16] * len(several) + [33, 33, 16] + [16] * len(explicit)
+    subjects = {id(subject) for subject, _ in together(several, 128)}
+    assert len(subjects) == 3, "chunks of the same policies share them"
+    training = around(centre(random_parameters(0, 10), observation_size=2), [TrainingChunk(1, 0), TrainingChunk(1, 1)])
+    assert together(training, 128) == training
+
+
+@pytest.mark.slow
+def test_an_engine_sends_policies_together():
+    asked = asked_for(70)
+    expected = policy_episodes(asked, make_worker(MAZE)(asked.work))
+    with inline_engine(MAZE, Limits(1, policies_together=128)) as engine:
+        for _ in range(2):
+            found = policy_episodes(asked, engine.evaluate(asked.work))
+            np.testing.assert_array_equal(found.fitness, expected.fitness)
+            np.testing.assert_array_equal(found.trace_T_B, expected.trace_T_B)

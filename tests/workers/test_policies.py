@@ -13,7 +13,7 @@ import pytest
 from es_service.loop.policies import no_statistics, policy_episodes, policy_work
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicySpec, WorkerSpec
 from es_service.protocol.noise import Domain, stream_keys
-from es_service.protocol.policies import POLICY_SLOTS
+from es_service.protocol.policies import POLICIES_TOGETHER, POLICY_SLOTS
 from tests.helpers import PARAMETERS, SPEC, DirectEvaluator, centre, random_parameters, spec
 from tests.workers.simd.rollouts import targets, task_spec
 from workers.environments import make_environment
@@ -21,7 +21,7 @@ from workers.policies.policy import initial_parameters
 from workers.simd.backend.words import aligned
 from workers.simd.episodes import rollout
 from workers.simd.episodes.compiled import compile_episodes
-from workers.worker import POLICY_CHUNKS_TOGETHER, make_worker
+from workers.worker import make_worker
 
 N, E = 37, 3
 POLICIES = np.stack([random_parameters(seed) for seed in range(N)])
@@ -122,7 +122,7 @@ def test_an_episode_depends_on_neither_chunk_nor_slot_nor_number_of_policies_and
 def test_policies_of_one_kind_in_any_order_of_chunks_give_the_same_bits(evaluator):
     """Chunks in several groups, and each alone."""
     asked = policy_work(POLICIES, STATISTICS, 9, seed=5, generation=9, traces=True)
-    assert len(asked.work) == -(-N * 9 // POLICY_SLOTS) > 2 * POLICY_CHUNKS_TOGETHER
+    assert len(asked.work) == -(-N * 9 // POLICY_SLOTS) > 2 * POLICIES_TOGETHER // POLICY_SLOTS
     together = evaluator.evaluate(asked.work)
     alone = [evaluator.evaluate([one])[0] for one in asked.work]
     order = np.random.default_rng(0).permutation(len(asked.work))
