@@ -149,15 +149,15 @@ run(load_config({config!r}), {str(tmp_path / "run")!r})
 
 def test_a_chunk_that_fails_everywhere_ends_the_run_with_its_error(tmp_path, monkeypatch):
     """A poison chunk: the message begins with the worker's own traceback and names it; what is committed stays."""
-    evaluate = Engine.evaluate
+    begin = Engine.begin
 
     def poisoned(self, work):
         if work[0][0].generation == 3 and isinstance(work[0][1], TrainingChunk):
             poison = TrainingChunk(3, "two")
             work = [(centre, poison if chunk.chunk_id == 2 else chunk) for centre, chunk in work]
-        return evaluate(self, work)
+        return begin(self, work)
 
-    monkeypatch.setattr(Engine, "evaluate", poisoned)
+    monkeypatch.setattr(Engine, "begin", poisoned)
     with pytest.raises(
         EvaluationError, match=r"(?s)ufunc.*in TrainingChunk two of.*TrainingChunk .*3 failed in 4 attempts"
     ):
