@@ -19,6 +19,7 @@ from workers.simd.backend import machine_code, target
 from workers.simd.backend.target import Target, host_target
 from workers.simd.backend.words import aligned, pack
 from workers.simd.episodes.kernel import Kernel, compile_kernel
+from workers.simd.episodes.noise import gradient_module
 from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.operations import OPERATIONS
@@ -192,6 +193,21 @@ def test_a_narrow_processor_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert host_target().isa == "avx2"
     with pytest.raises(target.NoVectorsError, match="has no AVX-512"):
         host_target("avx512")
+
+
+def test_the_host_may_be_a_mac_or_something_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """LLVM does not say what features the processor of a Mac has; all have NEON."""
+    monkeypatch.setattr(target, "_host", lambda: ("arm64-apple-darwin24.0.0", "apple-m1", {}))
+    mac = host_target()
+    assert (mac.isa, mac.width, mac.features) == ("neon", 4, "")
+    assert mac.describe() == "apple-m1, NEON, 4 lanes"
+    code = machine_code.compile_object(gradient_module(mac), mac)
+    assert code.startswith(b"\xcf\xfa\xed\xfe"), "an object file of macOS"
+    with pytest.raises(target.NoVectorsError, match="AVX2 was requested, which arm64 does not have"):
+        host_target("avx2")
+    monkeypatch.setattr(target, "_host", lambda: ("riscv64-unknown-linux-gnu", "generic", {}))
+    with pytest.raises(target.NoVectorsError, match="no code for the architecture riscv64, only for x86_64, aarch64"):
+        host_target()
 
 
 def test_digests_tell_functions_apart_and_know_them_again() -> None:
