@@ -1,5 +1,5 @@
 """The run store: one SQLite file per run with one transaction per generation, verified when it is opened for writing.
 
-`writer.py` has the only writer, and all readers use `reader.py`. `create`, `beginning`, `repair` and `upkeep` are parts
-of the writer; `verify`, `schema`, `codec`, `folder` and `lock` are shared. `digest.py` computes the digest of a run.
+`writer.py` has the only writer; `create`, `beginning`, `kept`, `repair` and `upkeep` are parts of it. Whoever reads
+stored rows does so by `rows.py`: `reader`, `sound` (for reports, also of damaged runs), `verify` and `digest`.
 """
