@@ -1,45 +1,57 @@
-"""What does a generation of policies cost the driver? MAP-Elites on PointMaze with made-up episodes, by item.
+"""What does a generation of policies cost the driver and its workers? MAP-Elites on PointMaze, by item.
 
-    python -m tests.benchmarks.policies_time                # a minute, one core
+    python -m tests.benchmarks.policies_time                # the driver, with made-up episodes: a minute, one core
+    python -m tests.benchmarks.policies_time --workers      # messages and workers, with real episodes
     python -m tests.benchmarks.policies_time --bytes --task ant_trap --hidden 256 256 --batch 256
 
-Milliseconds of the processor in the driver's process, all its threads together, so other programs disturb them little;
-medians over the generations after the first 50, in which the map fills. Messages to workers and rollouts are left out.
-The digest at the end of a line shows whether two versions have computed the same. With `--bytes`, the numbers are
-instead the kilobytes that two workers, which take turns, are sent in a generation: the median after the first 50.
+Milliseconds of the processor in this process, all its threads together, so other programs disturb them little; medians
+over the generations after the first 50, in which the map fills. The digest at the end of a line shows whether two
+versions have computed the same. With `--workers`, two workers in this process take turns, and the items are of both
+together: messages are made and read as the engine inline does. With `--bytes`, the numbers are instead the kilobytes
+that two workers are sent in a generation.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import pickle
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from es_service import api
-from es_service.config.model import policy_spec
+from es_service.config.model import policy_spec, worker_spec
 from es_service.config.tasks import task_of
 from es_service.loop import driver
 from es_service.loop.history import evaluated_columns, history_columns
 from es_service.protocol.evaluator import DispatchCounts
-from es_service.protocol.kept_parents import KeptParents, as_sent, parents_to_send
-from es_service.protocol.messages import EpisodesResult, Work
-from es_service.protocol.policies import PolicyChunk, slots
+from es_service.protocol.kept_parents import KeptParents, apart, as_sent, parents_to_send
+from es_service.protocol.messages import EpisodesResult, Work, WorkerSpec
+from es_service.protocol.pieces import separated, together
+from es_service.protocol.policies import POLICIES_TOGETHER, PolicyChunk, slots
 from es_service.protocol.wire import framed
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
 from es_service.store.digest import checked_parts, digest_of
 from es_service.store.schema import RunMeta
 from es_service.store.writer import RunStore
+from workers import worker
+from workers.compilable import Compilable
+from workers.parents import Parents
+from workers.rollouts import BACKENDS
 
 FILLING = 50
 ITEMS = ("propose", "evaluate", "update", "finish", "rows", "commit")
+MESSAGES = ("send", "read", "arguments", "function", "results", "rest", "answer", "hear")
+"""The driver makes messages; workers read them and make new parents, prepare their kernel, make policies and roll them
+out, prepare the results, and do the rest; they answer, and the driver reads that."""
 
 
 class Inventing:
@@ -54,8 +66,8 @@ class Inventing:
 
     def evaluate(self, work):
         if self._workers and work:
-            parts = [work[number :: len(self._workers)] for number in range(len(self._workers))]
-            self.sent_bytes.append(sum(map(_bytes_of, parts, self._workers)))
+            frames = map(_frames, _halves(work), self._workers)
+            self.sent_bytes.append(sum(len(frame) for of_worker in frames for frame in of_worker))
         return [self._answer(*one) for one in work]
 
     def _answer(self, subject, chunk):
@@ -66,12 +78,62 @@ class Inventing:
         return EpisodesResult(fitness, fitness, place, np.full(slots_L, 200, np.int32), place, None, trace)
 
 
-def _bytes_of(work: Sequence[Work], kept: KeptParents[int]) -> int:
-    """Bytes of a work item's messages to a worker, as the engine inline sends them."""
-    parents = [framed(("parents", {name: given})) for name, given in parents_to_send(work, kept).items()]
-    subjects = {id(subject): framed(("subject", 0, as_sent(subject))) for subject, _ in work}
-    chunks = framed(("chunks", 0, 1, [(number, chunk) for number, (_, chunk) in enumerate(work)]))
-    return sum(map(len, [*parents, *subjects.values(), chunks]))
+class Working:
+    """Has every chunk run by two workers in this process."""
+
+    counts = DispatchCounts()
+
+    def __init__(self, spec: WorkerSpec, spent: dict[str, float]) -> None:
+        self._spent, kinds_of, made = spent, worker.kinds_of, BACKENDS[spec.rollout].made
+
+        def timed_kinds(*given: Any) -> Any:
+            kinds = kinds_of(*given)
+            function, *others = kinds[PolicyChunk]
+            inside = Compilable(timed(function, spent, "function"), function.compile)
+            return kinds | {
+                PolicyChunk: worker.Kind(inside, *map(timed, others, [spent] * 2, ["arguments", "results"]))
+            }
+
+        with patch.object(worker, "kinds_of", timed_kinds):
+            self._run = timed(worker.make_worker(spec), spent, "rest")
+        self._workers = [(KeptParents(2**28, int), Parents(2**28, made)) for _ in range(2)]
+
+    def evaluate(self, work):
+        parts = zip(_halves(work), self._workers, strict=True)
+        return [result for part, sides in parts if part for result in self._half(part, *sides)]
+
+    def _half(self, work: Sequence[Work], theirs: KeptParents[int], own: Parents) -> list[Any]:
+        frames = timed(_frames, self._spent, "send")(work, theirs)
+        results = self._run(timed(_read, self._spent, "read")(frames, own))
+        answer = timed(framed, self._spent, "answer")(results)
+        return timed(lambda frame: separated(work, pickle.loads(frame[8:])), self._spent, "hear")(answer)
+
+
+def _halves(work: Sequence[Work]) -> list[Sequence[Work]]:
+    middle = -(-len(work) // 2)
+    return [work[:middle], work[middle:]]
+
+
+def _frames(work: Sequence[Work], kept: KeptParents[int]) -> list[bytes]:
+    """A work item's messages to a worker, as the engine inline sends them."""
+    work = together(work, POLICIES_TOGETHER)
+    parents = [framed(("parents", some)) for some in apart(parents_to_send(work, kept))]
+    subjects = {id(subject): framed(("subject", id(subject), as_sent(subject))) for subject, _ in work}
+    return [*subjects.values(), *parents, framed(("chunks", [(id(subject), chunk) for subject, chunk in work]))]
+
+
+def _read(frames: Sequence[bytes], parents: Parents) -> list[Work]:
+    """The work item of messages, with the parents of its policies."""
+    subjects, work = {}, []
+    for frame in frames:
+        match pickle.loads(frame[8:]):
+            case ("subject", number, subject):
+                subjects[number] = subject
+            case ("parents", given):
+                parents.receive(given)
+            case ("chunks", chunks):
+                work = [(subjects[number], chunk) for number, chunk in chunks]
+    return parents.complete(work)
 
 
 def timed(function: Callable[..., Any], spent: dict[str, float], name: str) -> Callable[..., Any]:
@@ -111,7 +173,10 @@ def measure(batch: int, generations: int, place: Path, given: argparse.Namespace
     def note(row: Any) -> None:
         rows.append(dict(spent))
 
+    items = MESSAGES if given.workers else ITEMS
     evaluator = Inventing(counting=given.bytes)
+    if given.workers:
+        evaluator = Working(replace(worker_spec(config, task), rollout="simd"), spent)
     kept = {name: getattr(driver, name) for name in ITEMS[:-1]}
     try:
         for name, function in kept.items():
@@ -125,7 +190,7 @@ def measure(batch: int, generations: int, place: Path, given: argparse.Namespace
     if given.bytes:
         sent = round(float(np.median(evaluator.sent_bytes[1 + FILLING :])) / 1e3, 1)
         return {"batch": batch, "kB": sent, "digest": digest_of(checked_parts(place)[0])[:12]}
-    ms = {name: 1e3 * np.diff([row.get(name, 0.0) for row in rows])[FILLING - 1 :] for name in ITEMS}
+    ms = {name: 1e3 * np.diff([row.get(name, 0.0) for row in rows])[FILLING - 1 :] for name in items}
     found = {name: round(float(np.median(values)), 2) for name, values in ms.items()}
     whole = round(float(np.median(np.sum(list(ms.values()), axis=0))), 2)
     return {"batch": batch, **found, "whole": whole, "digest": digest_of(checked_parts(place)[0])[:12]}
@@ -135,6 +200,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--batch", nargs="+", type=int, default=[64, 256, 1024])
     parser.add_argument("--generations", type=int, default=150)
+    parser.add_argument("--workers", action="store_true")
     parser.add_argument("--bytes", action="store_true")
     parser.add_argument("--task", default="point_maze")
     parser.add_argument("--hidden", nargs="*", type=int, default=[64, 64])
