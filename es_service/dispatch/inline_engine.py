@@ -27,7 +27,7 @@ from es_service.dispatch.engine import Answer, Engine, Message
 from es_service.dispatch.events import Compiled, Failure, Limits, Placed, WorkerLost, WorkerUp, with_last_words
 from es_service.errors import Interrupted
 from es_service.protocol.kept import Kept
-from es_service.protocol.kept_parents import KeptParents, apart, as_sent, parents_to_send
+from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents, apart, as_sent, parents_to_send
 from es_service.protocol.kept_subjects import MadeOnce, forget_old_subjects
 from es_service.protocol.messages import Subject, Work, WorkerSpec
 from es_service.protocol.parent import start_child
@@ -85,6 +85,8 @@ class _Worker:
     """Bytes of the subjects that it has, by their numbers."""
     unanswered: dict[tuple[Hashable, int], Sequence[Work]] = field(default_factory=dict)
     """Work items that it was sent and has not answered, by id and attempt."""
+    lacking: set[tuple[Hashable, int]] = field(default_factory=set)
+    """Those of them for which it has lacked parents once."""
 
 
 class ChildProcesses:
@@ -221,11 +223,16 @@ class ChildProcesses:
                         self._ready.append(Compiled(number, kind, seconds))
                     case ("results", item_id, attempt, results):
                         worker.unanswered.pop((item_id, attempt), None)
+                        worker.lacking.discard((item_id, attempt))
                         self._ready.append(Answer(number, item_id, attempt, results))
                     case ("failure", item_id, attempt, error):
                         worker.unanswered.pop((item_id, attempt), None)
                         self._ready.append(Failure(number, item_id, attempt, error.message, error.traceback))
+                    case ("lacks", item_id, attempt) if (item_id, attempt) in worker.lacking:
+                        worker.unanswered.pop((item_id, attempt), None)
+                        self._ready.append(Failure(number, item_id, attempt, LACKS_AGAIN, ""))
                     case ("lacks", item_id, attempt):
+                        worker.lacking.add((item_id, attempt))
                         worker.parents.clear()
                         self.send(number, item_id, attempt, worker.unanswered[item_id, attempt])
                     case ("broken", error):

@@ -27,7 +27,7 @@ from es_service.dispatch.ray_cluster import Watch, connect, disconnect
 from es_service.dispatch.ray_faults import fault_reason, raised_in_actor
 from es_service.dispatch.ray_nodes import Claim, Growth, Membership, emptiest, layout, shortage, with_work
 from es_service.dispatch.ray_refusals import Refusals
-from es_service.protocol.kept_parents import KeptParents
+from es_service.protocol.kept_parents import LACKS_AGAIN, KeptParents
 from es_service.protocol.messages import Work, WorkerPlace, WorkerSpec
 from es_service.protocol.sources import OtherCodeError
 
@@ -130,6 +130,8 @@ class Actors:
         self._parent_cache_bytes = spec.parent_cache_bytes
         self._parents: dict[int, KeptParents[int]] = {}
         """Worker id -> sizes of the parents of policies that it keeps."""
+        self._lacking: set[tuple[int, Hashable, int]] = set()
+        """Worker, work item and attempt for which the worker has lacked parents once."""
         self._refusals = Refusals(on_refusal)
 
     def places(self) -> dict[int, WorkerPlace]:
@@ -249,10 +251,15 @@ class Actors:
             return self._lost(call.worker, f"{where or 'before it had a place'}: {fault_reason(error)}")
         del self._calls[ref]
         if call.what == "run":
+            item = call.worker, call.item_id, call.attempt
             if (results := pickle.loads(value)) is None:  # it lacks parents of policies
+                if item in self._lacking:
+                    return Failure(*item, LACKS_AGAIN, "")
+                self._lacking.add(item)
                 self._parents[call.worker].clear()
-                self.send(call.worker, call.item_id, call.attempt, call.work)
+                self.send(*item, call.work)
                 return None
+            self._lacking.discard(item)
             return Answer(call.worker, call.item_id, call.attempt, results)
         if call.what == "compile":
             return Compiled(call.worker, call.kind, value)

@@ -4,7 +4,8 @@ For each work item, the sender sends the parents of recipes that the worker lack
 made of others by a recipe is made again by the worker, if it has those, and only its origin travels. The worker keeps
 their parameters in a `KeptParents`, and the sender their sizes in another one. Both make the same changes, and so the
 sender knows what the worker has, without asking. Should a worker lack something all the same, it says so, the sender
-takes it to have nothing (`KeptParents.clear`) and sends the item again: that is no failed attempt.
+takes it to have nothing (`KeptParents.clear`) and sends the item again: that is no failed attempt, unless it lacks
+something again.
 """
 
 from __future__ import annotations
@@ -23,6 +24,10 @@ from es_service.protocol.recipes import Origin, Recipes, origin_of
 
 Value = TypeVar("Value")
 FloatArray = NDArray[np.float32]
+
+
+LACKS_AGAIN = "it lacks parents of policies, though it was sent all of them"
+"""Message of the failure of a worker that says twice of a work item that it lacks something."""
 
 
 class LackingError(Exception):

@@ -24,6 +24,7 @@ from es_service.dispatch.events import Compiled, Failure, Limits, Placed, Worker
 from es_service.dispatch.ray_calls import IN_CALL_BYTES
 from es_service.dispatch.ray_engine import Actors
 from es_service.dispatch.ray_nodes import ONE_CORE
+from es_service.errors import EvaluationError
 from es_service.loop.policies import no_statistics, policy_work
 from es_service.protocol.messages import Work
 from es_service.protocol.noise import Domain, stream_keys
@@ -198,6 +199,16 @@ def test_a_worker_that_lacks_parents_is_sent_them_and_no_attempt_is_charged(engi
         assert evaluator.counts.retries == evaluator.counts.lost_workers == 0
         names = sent()
     assert len(names) > 3 * len(set(names)), "most of them again and again"
+
+
+@pytest.mark.parametrize("engine", [inline, ray])
+def test_a_worker_that_lacks_what_it_was_just_sent_has_failed(engine, monkeypatch):
+    generations = Generations(10)
+    with engine(2**40, 2**40) as (evaluator, _):
+        evaluator.evaluate(generations.next())
+        monkeypatch.setattr(Parents, "receive", lambda self, parents: None)
+        with pytest.raises(EvaluationError, match="though it was sent all of them"):
+            evaluator.evaluate(generations.next(new=PARENTS))
 
 
 def test_what_was_sent_with_an_item_that_failed_is_not_sent_again():
