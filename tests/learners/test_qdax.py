@@ -21,8 +21,6 @@ from tests.benchmarks.baselines.rows import COLUMNS
 from tests.benchmarks.baselines.run import Run, relu_config
 from workers.policies.policy import act, split_layers
 
-pytestmark = pytest.mark.timeout(1800)  # XLA compiles for minutes on a busy machine
-
 
 def arrays(run: Run) -> list[np.ndarray]:
     """All that a run keeps, as arrays."""
