@@ -21,7 +21,7 @@ from es_service.config.changes import START_KEYS, start_afresh
 from es_service.errors import ConfigError, NotInRunError
 from es_service.loop.parts import CELL_PREFIX
 from es_service.protocol.options import choice
-from es_service.runs import checked_config, evaluation, lineage
+from es_service.runs import checked_config, evaluation, lineage, sessions
 from es_service.runs.session import dispatch_limits
 from es_service.runs.standing import more, read_standing
 from es_service.store import reader
@@ -126,7 +126,7 @@ def test_another_descriptor_is_refused(tmp_path, monkeypatch):
     for module in (checked_config, tasks):
         monkeypatch.setattr(module, "TASKS", Told(told))
     monkeypatch.setattr(
-        api, "work", lambda *_, **__: api.Outcome(api.open_run(tmp_path / "run"), "")
+        sessions, "work", lambda *_, **__: api.Outcome(api.open_run(tmp_path / "run"), "")
     )  # as workers know of no such option
     api.run(SMALL, tmp_path / "run")
     assert (
