@@ -232,7 +232,7 @@ CASES = [
     ),
     *cases(
         "an Adam moment",
-        f"{OF_RULES} tests/laws/test_es.py::test_twenty_generations_equal_the_twin",
+        f"{OF_RULES} tests/laws/test_es.py::test_twenty_generations_equal_the_reference",
         (
             "the first decays at the rate of the second",
             ADAM,
@@ -515,7 +515,7 @@ CASES = [
     ),
     *cases(
         "an elite's fitness",
-        f"{OF_MAPS} {OF_MAP_ELITES} {OF_ME_ES}::test_thirty_generations_equal_the_twin",
+        f"{OF_MAPS} {OF_MAP_ELITES} {OF_ME_ES}::test_thirty_generations_equal_the_reference",
         (
             "is replaced by an equal one",
             BEHAVIOUR_MAP,

@@ -1,7 +1,7 @@
 """One episode of one member as step functions, which `xla` maps over lanes and `simd` compiles.
 
-`look` and `move` together are one control step; the policy acts between them. A finished episode continues to be
-computed but is masked, so steps after `done` never count.
+`normalised_observation` and `advance` together are one control step; the policy acts between them. A finished episode
+continues to be computed but is masked, so steps after `done` never count.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class EpisodeSteps(NamedTuple):
 
     begin: Callable[[Any], Carry]
     """Function from the stream key of the reset to a carry."""
-    look: Callable[[Carry, Any, Any], Any]
+    normalised_observation: Callable[[Carry, Any, Any], Any]
     """Function (carry, mean_O, std_O) -> normalised observation [O]."""
-    move: Callable[[Carry, Any, Any, Any], Carry]
+    advance: Callable[[Carry, Any, Any, Any], Carry]
     """Function (carry, mean_O, outputs of the policy's last layer, stream key of the action noise) -> carry; only
     training uses the key. The memory stays."""
 
@@ -85,7 +85,7 @@ def episode_steps(
         )
         return Carry(state, jnp.array(True), initial_memory(jnp, spec.policy), nothing)
 
-    def look(carry: Carry, mean_O: Any, std_O: Any) -> Any:
+    def normalised_observation(carry: Carry, mean_O: Any, std_O: Any) -> Any:
         return normalise(jnp, observe(carry.state), mean_O, std_O, spec.observation_clip)
 
     def training_action(outputs: Any, key: Any, step: Any) -> Any:
@@ -100,7 +100,7 @@ def episode_steps(
         reached_T = steps + 1 <= last_steps_T
         return jnp.where(reached_T[:, None], descriptor_B, trace_T_B)
 
-    def move(carry: Carry, mean_O: Any, outputs: Any, action_key: Any) -> Carry:
+    def advance(carry: Carry, mean_O: Any, outputs: Any, action_key: Any) -> Carry:
         alive, before = carry.alive, carry.episode
         if training:
             action_A = training_action(outputs, action_key, before.steps)  # a living episode has done as many steps
@@ -127,4 +127,4 @@ def episode_steps(
         masked = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)
         return Carry(state, alive & ~done, carry.memory_H, masked)
 
-    return EpisodeSteps(begin, look, move)
+    return EpisodeSteps(begin, normalised_observation, advance)

@@ -164,8 +164,8 @@ def _make_episodes(
     steps = episode_steps(environment, spec, training=training)
     by_lane, of_statistics = 0 if training or own_weights else None, 0 if own_weights else None
     policies = jax.vmap(lambda *given: act(jnp, spec.policy, *given), in_axes=(by_lane, 0, 0))
-    looks = jax.vmap(steps.look, in_axes=(0, of_statistics, of_statistics))
-    moves = jax.vmap(steps.move, in_axes=(0, of_statistics, 0, 0))
+    observe = jax.vmap(steps.normalised_observation, in_axes=(0, of_statistics, of_statistics))
+    advance = jax.vmap(steps.advance, in_axes=(0, of_statistics, 0, 0))
 
     def split(parameters_D):
         return split_layers(spec.policy, parameters_D)
@@ -181,8 +181,8 @@ def _make_episodes(
 
         def body(at: tuple[Any, Carry, Any, Carry | None]) -> tuple[Any, Carry, Any, Carry | None]:
             step, carry, of_steps_T_L, seen_T = at
-            outputs_L, memory_L_H = policies(layers, carry.memory_H, looks(carry, mean_O, std_O))
-            moved = moves(carry, mean_O, outputs_L, keys_L)._replace(memory_H=memory_L_H)
+            outputs_L, memory_L_H = policies(layers, carry.memory_H, observe(carry, mean_O, std_O))
+            moved = advance(carry, mean_O, outputs_L, keys_L)._replace(memory_H=memory_L_H)
             of_steps_T_L = {name: kept.at[step].set(moved.episode.outputs[name]) for name, kept in of_steps_T_L.items()}
             return step + 1, moved, of_steps_T_L, keep(seen_T, step, carry)
 

@@ -12,7 +12,7 @@ from es_service.config.presets import preset_table
 from es_service.config.shipped import shipped_configs
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.recent import Recent, read_recent
-from es_service.runs.standing import Standing, state
+from es_service.runs.run_status import RunStatus, state
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store.digest import digest_of
 
@@ -22,10 +22,10 @@ def print_json(value: object) -> None:
     print(json.dumps(_finite(value), indent=1, allow_nan=False))
 
 
-def standing_data(standing: Standing) -> dict[str, Any]:
+def status_data(status: RunStatus) -> dict[str, Any]:
     """What `status` shows of a run: `newest` is the newest row of its history, `objectives` says what the centres of
     that generation climb, and those of recent ones, or in `problem` why that is not known."""
-    run, row = standing.run, standing.row
+    run, row = status.run, status.row
     recent = read_recent(run, row["generation"]) if row else Recent()
     return {
         "run": str(run.folder),
@@ -33,10 +33,10 @@ def standing_data(standing: Standing) -> dict[str, Any]:
         "task": run.constants["task.environment"],
         "algorithm": run.constants["search.algorithm"],
         "seed": run.constants["seed"],
-        "state": state(standing),
-        "driver": standing.driver,
-        "last_end": standing.end,
-        "limits": standing.limits,
+        "state": state(status),
+        "driver": status.driver,
+        "last_end": status.end,
+        "limits": status.limits,
         "newest": row,
         "objectives": {
             "newest": recent.newest and recent.newest._asdict(),

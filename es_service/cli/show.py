@@ -10,7 +10,7 @@ import typer
 
 from es_service import api
 from es_service.cli.console import console
-from es_service.cli.data import catalogue_data, digest_data, print_json, standing_data
+from es_service.cli.data import catalogue_data, digest_data, print_json, status_data
 from es_service.cli.options import JsonOption, print_note
 from es_service.cli.several import RunsArgument, is_single, of_each, problem_data, readable
 from es_service.cli.tables.catalogue import print_catalogue
@@ -20,7 +20,7 @@ from es_service.config.shipped import shipped_text
 from es_service.config.tasks import TASKS
 from es_service.errors import ConfigError, ServiceError
 from es_service.runs.folders import runs_of
-from es_service.runs.standing import newest_runs, read_standing
+from es_service.runs.run_status import newest_runs, read_status
 from es_service.store import digest
 
 
@@ -60,7 +60,7 @@ def status(
 def _print_standings(folders: list[Path]) -> bool:
     """Print a list with an object for each run; return whether all runs could be read."""
     found: list[dict[str, Any]] = []
-    for folder, data in of_each(folders, lambda run: standing_data(read_standing(api.open_run(run)))):
+    for folder, data in of_each(folders, lambda run: status_data(read_status(api.open_run(run)))):
         if isinstance(data, ServiceError):
             found.append(problem_data(folder, data))
         else:

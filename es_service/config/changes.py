@@ -47,7 +47,7 @@ START_KEYS = ("search.preset", "search.init_from", "policy.init", "search.fitnes
 """Keys that are used only when a run starts."""
 _SHAPES = ("compute.chunk_pairs", "compute.rollout_block_pairs", "compute.gradient_block_pairs")
 _MAP = ("map.kind", "map.bounds", "map.cells")
-_FOLLOWERS = {
+DERIVED_KEYS = {
     "task.environment": ("task.episode_steps", *_MAP, "map.qd_offset"),
     "task.episode_steps": ("map.qd_offset",),
     "task.fitness": ("map.qd_offset",),
@@ -67,7 +67,7 @@ ABSENT = "(absent)"
 """Stands for the value of a constant that only the other run has."""
 
 
-def without_followers(values: Mapping[str, Any], wanted: Mapping[str, Any], algorithms: Methods) -> dict[str, Any]:
+def without_derived(values: Mapping[str, Any], wanted: Mapping[str, Any], algorithms: Methods) -> dict[str, Any]:
     """Resolved values without those that are derived from a key which is about to change.
 
     Args:
@@ -77,13 +77,13 @@ def without_followers(values: Mapping[str, Any], wanted: Mapping[str, Any], algo
     """
     changed = [
         key
-        for key in _FOLLOWERS
+        for key in DERIVED_KEYS
         if key in wanted
         and wanted[key] != values.get(key)
         and not (key == "search.algorithm" and are_alike(values.get(key), wanted[key], algorithms))
     ]
-    followers = tuple(name for key in changed for name in _FOLLOWERS[key])
-    return {key: value for key, value in values.items() if not key.startswith(followers)}
+    derived = tuple(name for key in changed for name in DERIVED_KEYS[key])
+    return {key: value for key, value in values.items() if not key.startswith(derived)}
 
 
 def does_not_fit(name: str, old: Any, new: Any, algorithms: Methods) -> bool:

@@ -20,7 +20,7 @@ from es_service.config.methods import (
     search_fields,
 )
 from es_service.config.model import RunConfig
-from es_service.config.problems import nearest, one_of, unfit
+from es_service.config.problems import nearest, one_of, problem_of
 from es_service.config.search import SearchConfig
 from es_service.config.yaml_text import in_line, parse_value, show
 from es_service.errors import Problem
@@ -84,7 +84,7 @@ def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, An
         name = f"{group}{key}"
         if "." in str(key):
             section, leaf = name.rsplit(".", 1)
-            problems.append(unfit(name, value, f"a key in a file has no dots; write {leaf} inside {section}:"))
+            problems.append(problem_of(name, value, f"a key in a file has no dots; write {leaf} inside {section}:"))
         elif isinstance(value, Mapping) and (name in GROUPS or group == "search."):
             below = sort_keys(value, f"{name}.")
             values |= below[0]
@@ -92,7 +92,7 @@ def sort_keys(mapping: Mapping[Any, Any], group: str = "") -> tuple[dict[str, An
             problems += below[2]
         elif name in GROUPS:
             unusable.add(name)
-            problems.append(unfit(name, value, _not_a_mapping(name, value)))
+            problems.append(problem_of(name, value, _not_a_mapping(name, value)))
         else:
             values[name] = value
     return values, unusable, problems
@@ -121,18 +121,18 @@ def key_problems(
             part = key.rpartition(".")[0]
             if settings and (kinds := kinds_without(key, kind := values.get(f"{part}.{KIND}"), settings)):
                 what = f"{show(value)} has no effect with {part}.{KIND} = {kind}; leave it out"
-                found[key] = unfit(key, value, f"{what} (a key of kind {one_of(kinds)})")
+                found[key] = problem_of(key, value, f"{what} (a key of kind {one_of(kinds)})")
         elif not (key.startswith(TASK_OPTIONS) and _leaf(key) and key.count(".") == 2):
             group = key in (*GROUPS, *parts)
             if key in RENAMED or key.startswith(SEARCH_OPTIONS):
                 now = RENAMED.get(key, key.replace(SEARCH_OPTIONS, "search."))
-                found[key] = unfit(key, value, f"this key is now {now}", suggestion=now)
+                found[key] = problem_of(key, value, f"this key is now {now}", suggestion=now)
             elif group and key in wanted:
                 first = next((one for one in known if one.startswith(f"{key}.")), f"{key}.NAME")
                 what = f"this is a section; set its keys one by one, such as {first}=..."
-                found[key] = unfit(key, value, what, suggestion=first)
+                found[key] = problem_of(key, value, what, suggestion=first)
             elif group:
-                found[key] = unfit(key, value, _not_a_mapping(key, value))
+                found[key] = problem_of(key, value, _not_a_mapping(key, value))
             elif methods_with(key, algorithms) and key.startswith("search."):
                 found[key] = no_effect(key, value, values["search.algorithm"], algorithms)
             else:
@@ -186,12 +186,12 @@ def _unknown_key(name: str, candidates: Iterable[str], value: Any) -> Problem:
     exactly = everywhere | ALIASES
     for keys in ({leaf: exactly[leaf]} if leaf in exactly else {}, near_by, everywhere):
         if near := nearest(leaf, keys):
-            return unfit(name, value, f"unknown key; did you mean {keys[near]}?", suggestion=keys[near])
+            return problem_of(name, value, f"unknown key; did you mean {keys[near]}?", suggestion=keys[near])
     if siblings := [_leaf(key) for key in (*GROUPS, *candidates) if key.rpartition(".")[0] == section]:
         named, others = siblings[:MOST_NAMED], len(siblings) - MOST_NAMED
         more = f" and {others} others" if others > 0 else ""
-        return unfit(name, value, f"unknown key; {section or 'the top level'} has {', '.join(named)}{more}")
-    return unfit(name, value, f"unknown key; the sections are {', '.join(SECTIONS)}")
+        return problem_of(name, value, f"unknown key; {section or 'the top level'} has {', '.join(named)}{more}")
+    return problem_of(name, value, f"unknown key; the sections are {', '.join(SECTIONS)}")
 
 
 def _leaf(name: str) -> str:

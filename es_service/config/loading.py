@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from es_service.config.changes import foreign_keys, without_followers
+from es_service.config.changes import foreign_keys, without_derived
 from es_service.config.fields import TASK_OPTIONS, as_tuple
 from es_service.config.keys import BUDGET, FIELDS, SECTIONS, Overrides, key_problems, parse_overrides, sort_keys
 from es_service.config.map_rules import map_problems
@@ -32,7 +32,7 @@ from es_service.config.methods import (
 from es_service.config.model import RunConfig
 from es_service.config.objective_rules import objective_problems
 from es_service.config.options import TaskTable, options_of, read_options, settings_of_task
-from es_service.config.problems import nearest, not_allowed, one_of, unfit, wrong_value
+from es_service.config.problems import nearest, not_allowed, one_of, problem_of, wrong_value
 from es_service.config.resolution import (
     LEFT_OPEN,
     engine_problems,
@@ -152,7 +152,7 @@ def _load(
     ):
         given = chosen.get(key)
         if key not in chosen and key.split(".")[0] not in unusable:
-            unknown.append(unfit(key, None, f"missing; must be {one_of(known)}", allowed=one_of(known)))
+            unknown.append(problem_of(key, None, f"missing; must be {one_of(known)}", allowed=one_of(known)))
         try:
             if not isinstance(given, str) or not given:
                 found[key] = None
@@ -173,7 +173,7 @@ def _load(
 
     foreign = foreign_keys(values, wanted, settings, algorithms)
     if resolved:
-        values = without_followers(values, wanted, algorithms)
+        values = without_derived(values, wanted, algorithms)
     values = {**defaults, **{key: value for key, value in values.items() if key not in foreign}} | wanted
     by_task = {} if task is None else values_of_task(task)
     filled = {} if settings is None or "search" in unusable else by_task | filled_in(by_task | values, settings)
@@ -202,7 +202,7 @@ def _load(
     problems += rollout_problems(values, task, rollouts) + shape_problems(values) + engine_problems(values, rollouts)
     problems += folder_problems(values) if new else []
     if "budget" not in unusable and not bad.keys() & BUDGET and all(values.get(key) is None for key in BUDGET):
-        problems.append(unfit("budget", None, f"this run has no limit; set at least one of {one_of(BUDGET)}"))
+        problems.append(problem_of("budget", None, f"this run has no limit; set at least one of {one_of(BUDGET)}"))
     if problems or settings is None:
         count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
         raise ConfigError.listing(f"{name}: {count}", problems)
@@ -227,7 +227,7 @@ def _idle_problems(
     """
     known = {key: field.default for key, field in FIELDS.items() if not field.is_required()} | dict(values)
     return [
-        unfit(key, value, f"{show(value)} has no effect with {task.name}, which has no policy; leave it out")
+        problem_of(key, value, f"{show(value)} has no effect with {task.name}, which has no policy; leave it out")
         if task is not None and is_idle(key, task)
         else no_effect(key, value, values["search.algorithm"], algorithms, known[key])
         for key, value in idle.items()
@@ -273,7 +273,7 @@ def _value_problems(
                 if ".".join(place[:2]) in parts:  # a kind follows, or was wrong
                     place[2:3] = [] if len(place) > 2 else ["kind"]
                 if not item["loc"]:  # a rule that the class of a user's search has
-                    problems["search"] = unfit("search", None, item["msg"])
+                    problems["search"] = problem_of("search", None, item["msg"])
                 # Where a value has parts, a location is longer than our key: ("policy", "hidden", 1).
                 found |= {".".join(place[: k + 1]) for k in range(len(place))}
     return problems | {key: _bad_value(key, value, fields[key]) for key, value in values.items() if key in found}

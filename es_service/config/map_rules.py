@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from es_service.config.options import options_of
-from es_service.config.problems import not_allowed, unfit
+from es_service.config.problems import not_allowed, problem_of
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
 from es_service.protocol.messages import UNBOUNDED, Bounds, TaskSpec, with_options
@@ -63,7 +63,7 @@ def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     qd_offset = values.get("map.qd_offset", 0.0)
     if bounds is None and "map.bounds" in values:
         what = f"missing, since the descriptor of {task.name} has no bounds; give [low, high] for each of"
-        problems.append(unfit("map.bounds", None, f"{what} {', '.join(names)}, or set map.enabled = false"))
+        problems.append(problem_of("map.bounds", None, f"{what} {', '.join(names)}, or set map.enabled = false"))
     for key, numbers in (("map.bounds", [x for pair in bounds or () for x in pair]), ("map.qd_offset", [qd_offset])):
         if any(abs(number) > LARGEST for number in numbers):
             problems.append(not_allowed(key, values[key], f"within {LARGEST:g} of 0"))
@@ -72,7 +72,7 @@ def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
             allowed = f"a list of {len(names)} pairs [low, high], or auto"
             what = f"{show(bounds)} has {len(bounds)} pairs, but the descriptor has {len(names)} dimensions"
             problem = f"{what} ({', '.join(names)}); must be {allowed}"
-            problems.append(unfit("map.bounds", bounds, problem, allowed=allowed))
+            problems.append(problem_of("map.bounds", bounds, problem, allowed=allowed))
         else:
             problems += [
                 Problem(
@@ -92,10 +92,10 @@ def map_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
             what = "one number for a cvt" if kind == "cvt" else f"{wanted} numbers, one for each of {', '.join(names)}"
             allowed = f"{what}, or auto"
             problem = f"{show(cells)} has {len(cells)} numbers; must be {allowed}"
-            problems.append(unfit("map.cells", cells, problem, allowed=allowed))
+            problems.append(problem_of("map.cells", cells, problem, allowed=allowed))
         elif math.prod(cells) > (most := MOST_CVT_CELLS if kind == "cvt" else MOST_CELLS):
             allowed = f"at most {most:,}"
             hint = " for a cvt" if kind == "cvt" else "; with many dimensions use map.kind = cvt"
             problem = f"{show(cells)} makes {math.prod(cells):,} cells; must be {allowed}{hint}"
-            problems.append(unfit("map.cells", cells, problem, allowed=allowed))
+            problems.append(problem_of("map.cells", cells, problem, allowed=allowed))
     return problems

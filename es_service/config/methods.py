@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 
 from es_service.config.fields import Section
 from es_service.config.presets import PRESETS, preset_values
-from es_service.config.problems import not_allowed, one_of, unfit
+from es_service.config.problems import not_allowed, one_of, problem_of
 from es_service.config.search import SearchConfig
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
@@ -120,7 +120,7 @@ def no_effect(key: str, value: Any, method: str, algorithms: Methods, default: A
     """
     others = one_of(methods_with(key, algorithms), "and")
     what = f"{show(value)} has no effect with {method}; leave it out (a key of {others})"
-    return unfit(key, value, what, suggestion=default)
+    return problem_of(key, value, what, suggestion=default)
 
 
 def default_centres(values: Mapping[str, Any], settings: type[SearchConfig]) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from es_service.config.problems import unfit
+from es_service.config.problems import problem_of
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
 from es_service.protocol.messages import TaskSpec
@@ -31,17 +31,17 @@ def objective_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Proble
                 f"{show(middle)} has {len(middle)} numbers, but the descriptor of {task.name} has {len(names)}, "
                 f"{', '.join(names)}; give descriptor one number for each"
             )
-            problems.append(unfit(key, middle, what))
+            problems.append(problem_of(key, middle, what))
         if kind == "final" and not task.final_fitness:
             what = f"final says little about an episode of {task.name}; choose return or another objective"
-            problems.append(unfit(key, kind, what, suggestion="return"))
+            problems.append(problem_of(key, kind, what, suggestion="return"))
         if kind == "goal_distance" and not task.has_goal:
             what = f"goal_distance is not known in {task.name}, which has no goal; choose another objective"
-            problems.append(unfit(key, kind, what))
+            problems.append(problem_of(key, kind, what))
     chosen = values.get("search.candidate_choice")
     if chosen == "place" and values.get(f"{OBJECTIVE}.kind") != "target":
         what = f"place needs {OBJECTIVE}.kind = target, whose middle is the place; choose fitness or novelty"
-        problems.append(unfit("search.candidate_choice", chosen, what, suggestion="fitness"))
+        problems.append(problem_of("search.candidate_choice", chosen, what, suggestion="fitness"))
     return problems
 
 

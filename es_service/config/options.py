@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from es_service.config.fields import TASK_OPTIONS
-from es_service.config.problems import nearest, one_of, unfit, wrong_value
+from es_service.config.problems import nearest, one_of, problem_of, wrong_value
 from es_service.config.yaml_text import in_line, show
 from es_service.errors import Problem
 from es_service.protocol.messages import DescriptorChoice, TaskSpec
@@ -62,7 +62,7 @@ def read_options(values: Mapping[str, Any], task: TaskSpec) -> tuple[dict[str, O
             known = f"{task.name} has {one_of(declared) if declared else 'none'}"
             meant = nearest(name, declared)
             hint = f"; did you mean {meant}?" if meant else ""
-            problems.append(unfit(key, value, f"unknown option; {known}{hint}", suggestion=meant))
+            problems.append(problem_of(key, value, f"unknown option; {known}{hint}", suggestion=meant))
         elif (read := _read(declared[name], value)) is None:
             problems.append(wrong_value(key, value, allowed_text(declared[name]), declared[name].choices))
         else:

@@ -71,7 +71,7 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def unfit(field: str, value: Any, what: str, *, suggestion: Any = None, allowed: str | None = None) -> Problem:
+def problem_of(field: str, value: Any, what: str, *, suggestion: Any = None, allowed: str | None = None) -> Problem:
     """The problem of a value that does not fit another one; `what` is the whole text after "field: "."""
     return Problem(f"{field}: {what}", field, value, allowed, suggestion)
 

@@ -18,7 +18,7 @@ from es_service.config.map_rules import default_bounds, default_cells, default_k
 from es_service.config.methods import default_centres
 from es_service.config.model import RunConfig, policy_spec
 from es_service.config.options import options_of
-from es_service.config.problems import not_allowed, one_of, unfit, wrong_value
+from es_service.config.problems import not_allowed, one_of, problem_of, wrong_value
 from es_service.config.search import PopulationConfig, SearchConfig
 from es_service.config.yaml_text import show
 from es_service.errors import Problem
@@ -206,7 +206,7 @@ def policy_problems(values: Mapping[str, Any], task: TaskSpec) -> list[Problem]:
     hidden = list(spec.widths[1:-1])
     what = f"{show(hidden)} makes more than {MOST_PARAMETERS:,} parameters for {task.name}"
     problem = f"{what}, which is the most that the run store can keep; the layers must be narrower"
-    return [*problems, unfit("policy.hidden", hidden, problem, allowed="narrower")]
+    return [*problems, problem_of("policy.hidden", hidden, problem, allowed="narrower")]
 
 
 def _policy_spec(values: Mapping[str, Any], task: TaskSpec) -> PolicySpec:
@@ -223,19 +223,19 @@ def shape_problems(values: Mapping[str, Any]) -> list[Problem]:
         fits = f"{below + chunk} (or {below})" if below else f"{chunk}"
         hint = f"try pairs = {fits}, or compute.chunk_pairs = auto"
         what = f"{pairs} is not a multiple of compute.chunk_pairs ({chunk}); {hint}"
-        problems.append(unfit("search.pairs", pairs, what, suggestion=below + chunk))
+        problems.append(problem_of("search.pairs", pairs, what, suggestion=below + chunk))
     if chunk is not None and rollout is not None and chunk % rollout:
         divisors = [size for size in range(1, MOST_CHUNK_PAIRS + 1) if chunk % size == 0]
         near = sorted(sorted(divisors, key=lambda size: abs(size - rollout))[:2])
         what = f"{rollout} does not divide compute.chunk_pairs ({chunk}); try {' or '.join(map(str, near))}, or auto"
-        problems.append(unfit("compute.rollout_block_pairs", rollout, what, suggestion=near[0]))
+        problems.append(problem_of("compute.rollout_block_pairs", rollout, what, suggestion=near[0]))
     top = values.get("search.shaping.count")
     if pairs is not None and top is not None and top > pairs:
         what = f"{top} is more than search.pairs ({pairs}); try {pairs}, or null for all"
-        problems.append(unfit("search.shaping.count", top, what, suggestion=pairs))
+        problems.append(problem_of("search.shaping.count", top, what, suggestion=pairs))
     if pairs is not None and gradient is not None and gradient > pairs:
         what = f"{gradient} is more than search.pairs ({pairs}); try {pairs}, or auto"
-        problems.append(unfit("compute.gradient_block_pairs", gradient, what, suggestion=pairs))
+        problems.append(problem_of("compute.gradient_block_pairs", gradient, what, suggestion=pairs))
     return problems
 
 
@@ -245,7 +245,7 @@ def engine_problems(values: Mapping[str, Any], rollouts: Rollouts) -> list[Probl
     problems = []
     if _value(values, "compute.engine") != "ray":
         problems = [
-            unfit(
+            problem_of(
                 name,
                 values[name],
                 f"{show(values[name])} needs compute.engine = ray, but the engine is {values['compute.engine']}",
@@ -262,11 +262,11 @@ def engine_problems(values: Mapping[str, Any], rollouts: Rollouts) -> list[Probl
             f"threads needs compute.engine = inline and compute.rollout = {able}, because only its code runs in "
             "several threads at once; must be processes"
         )
-        problems.append(unfit("compute.inline_workers", "threads", what, allowed="processes"))
+        problems.append(problem_of("compute.inline_workers", "threads", what, allowed="processes"))
     workers, cpus = values.get("compute.workers", "auto"), _value(values, f"{RESOURCES}cpu")
     if "auto" not in (workers, cpus) and workers % cpus:
         what = f"{workers} is not a multiple of {RESOURCES}cpu ({cpus}), the cores of each actor"
-        problems.append(unfit("compute.workers", workers, what, suggestion=-(-workers // cpus) * cpus))
+        problems.append(problem_of("compute.workers", workers, what, suggestion=-(-workers // cpus) * cpus))
     gpus = _value(values, f"{RESOURCES}gpu")
     if gpus > 1 and gpus != int(gpus):
         problems.append(not_allowed(f"{RESOURCES}gpu", gpus, "a whole number or a fraction below 1"))
@@ -302,7 +302,7 @@ def rollout_problems(values: Mapping[str, Any], task: TaskSpec | None, rollouts:
         return []
     others = [other for other in fit if other != name]
     allowed = f"auto or {one_of(others)}" if others else "auto"
-    return [unfit("compute.rollout", name, f"{why}; must be {allowed}", allowed=allowed)]
+    return [problem_of("compute.rollout", name, f"{why}; must be {allowed}", allowed=allowed)]
 
 
 def config_warnings(config: RunConfig, task: TaskSpec, rollouts: Rollouts) -> list[str]:

@@ -8,7 +8,7 @@ import stat
 from collections.abc import Mapping
 from typing import Any
 
-from es_service.config.problems import unfit
+from es_service.config.problems import problem_of
 from es_service.errors import Problem
 
 
@@ -38,4 +38,6 @@ def folder_problems(values: Mapping[str, Any]) -> list[Problem]:
     else:
         what = "" if stat.S_ISDIR(found.st_mode) else "is a file"
     allowed = "the folder of another run, or null"
-    return [unfit("search.init_from", start, f"{folder} {what}; must be {allowed}", allowed=allowed)] if what else []
+    return (
+        [problem_of("search.init_from", start, f"{folder} {what}; must be {allowed}", allowed=allowed)] if what else []
+    )

@@ -125,9 +125,9 @@ class WorkerLost:
 
     worker: int
     reason: str
-    bystander: bool = False
-    """Whether it was lost together with another worker, or before it received its work item; the item is then not
-    charged with the loss."""
+    charge_item: bool = True
+    """Whether its work item is charged with the loss. It is not if the worker was lost together with another one, or
+    before it received the item."""
     refused: bool = False
     """Whether its host must not work for this run, and gets no other worker. This is no fault."""
     traceback: str = field(default="", repr=False)

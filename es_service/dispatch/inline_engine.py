@@ -129,7 +129,7 @@ class ChildProcesses:
         if worker not in self._workers:
             return ""
         child = self._forget(worker)
-        return self._lose(child, f"worker {worker}, a thread of the same process, was killed", bystanders=True)
+        return self._lose(child, f"worker {worker}, a thread of the same process, was killed", charge_items=False)
 
     def send(self, worker: int, item_id: Hashable, attempt: int, work: Sequence[Work]) -> None:
         """Send the chunks, after those of their subjects and of the parents of policies that the worker lacks."""
@@ -252,11 +252,11 @@ class ChildProcesses:
         worker.channel.close()
         return worker.child
 
-    def _lose(self, child: _Child, reason: str = "", traceback: str = "", *, bystanders: bool = False) -> str:
+    def _lose(self, child: _Child, reason: str = "", traceback: str = "", *, charge_items: bool = True) -> str:
         """Kill a child and report the loss of its remaining workers, after their messages; returns its last output.
 
-        A worker that had no work item is a bystander: before the scheduler learns of its loss, it may send it a work
-        item of another worker of this child.
+        The item of a worker that had none is not charged with the loss: before the scheduler learns of the loss, it may
+        send that worker an item of another worker of this child.
         """
         lost = {number: worker for number, worker in self._workers.items() if worker.child is child}
         for number in lost:
@@ -266,11 +266,12 @@ class ChildProcesses:
         if not reason:
             reason = f"worker {', '.join(map(str, lost))} (pid {child.process.pid}) ended with {how}"
             reason += f":\n{last_words}" if last_words else ""
-        elif bystanders:
+        elif not charge_items:
             reason = with_last_words(reason, last_words)
         for number, worker in lost.items():
-            idle = not worker.unanswered
-            self._ready.append(WorkerLost(number, reason, bystander=bystanders or idle, traceback=traceback))
+            self._ready.append(
+                WorkerLost(number, reason, charge_item=bool(worker.unanswered) and charge_items, traceback=traceback)
+            )
         return last_words
 
 

@@ -319,4 +319,4 @@ class Actors:
     def _lost(self, worker: int, reason: str, *, refused: bool = False, traceback: str = "") -> WorkerLost:
         has_begun = self._calls.owed_first().get(worker) in ("compile", "run")
         self.kill(worker)
-        return WorkerLost(worker, reason, bystander=not has_begun, refused=refused, traceback=traceback)
+        return WorkerLost(worker, reason, charge_item=has_begun, refused=refused, traceback=traceback)

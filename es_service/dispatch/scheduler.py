@@ -101,9 +101,9 @@ def handle(s: SchedulerState, event: Event, now: float) -> list[Command]:
                 put_worker(s, s.up, worker, Worker(s.next_rank))
                 s.start_failures = 0
                 s.next_rank += 1
-        case WorkerLost(worker, reason, bystander, refused):
+        case WorkerLost(worker, reason, charge_item, refused):
             fault = not refused and worker not in s.draining
-            _lose(s, out, worker, reason, now, fault=fault, charge=not bystander)
+            _lose(s, out, worker, reason, now, fault=fault, charge=charge_item)
         case Compiled():
             note_compiled(s, event, now)
         case Failure():

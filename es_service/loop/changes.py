@@ -67,7 +67,7 @@ def changed_parts(state: RunState, before: RunState | None, stored: Stored | Non
     parts |= dict.fromkeys(map(centre_part, range(len(search.centres), len(earlier_centres))))
     if earlier is None or search.weight is not earlier.weight:
         _compare(parts, WEIGHT, weight_to_arrays(search.weight), earlier and weight_to_arrays(earlier.weight))
-    parts |= state_parts.changes(search.own, earlier.own if earlier is not None else {})
+    parts |= state_parts.changes(search.extra, earlier.extra if earlier is not None else {})
     parts |= archive_changes(search.archive, earlier.archive if earlier is not None else None)
     map_before = earlier.map if earlier is not None else None
     if search.map is not None and (search.map is not map_before or state.elites):
@@ -154,8 +154,8 @@ def _malformed(search: SearchState, earlier: SearchState | None) -> str:
         return wrong
     if earlier is not None and (search.map is None) != (earlier.map is None):
         return "the behaviour map was added or removed, which only `map.enabled` decides"
-    if (earlier is None or search.own is not earlier.own) and (
-        wrong := state_parts.problem(search.own, earlier.own if earlier is not None else {})
+    if (earlier is None or search.extra is not earlier.extra) and (
+        wrong := state_parts.problem(search.extra, earlier.extra if earlier is not None else {})
     ):
         return wrong
     map_before = earlier.map if earlier is not None else None

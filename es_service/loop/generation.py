@@ -61,7 +61,7 @@ def initial_state(search: Search) -> RunState:
     if search.config.map.enabled:
         map_ = empty_map(make_geometry(search.config.map), counts_samples=algorithm.counts_samples)
     dimensions, settings = len(search.task.descriptor_names), search.config.search
-    learned = first_state(centres, dimensions, algorithm.fitness_weight, map_, algorithm.own, settings)
+    learned = first_state(centres, dimensions, algorithm.fitness_weight, map_, algorithm.extra, settings)
     for index, (mean_O, std_O) in enumerate(search.statistics()):
         centre = replace(learned.centres[index], own_mean_O=mean_O, own_std_O=std_O)
         learned = with_centre(learned, index, centre)

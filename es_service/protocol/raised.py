@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from es_service.protocol.sources import OURS, SHARED_FOLDERS, own_path
+from es_service.protocol.sources import OURS, SHARED_FOLDERS, user_path
 
 _PROJECT = Path(__file__).parents[2]
 _HIDDEN = (*(f"{_PROJECT / package}/" for package in OURS), f"{sysconfig.get_path('stdlib')}/", "<")
@@ -67,7 +67,7 @@ def why_not_imported(module: str, error: Exception) -> str:
 
 def users_error(error: BaseException, *names: str) -> str:
     """What the user's code raised, with its frames in the user's files; empty if it was not the user's code."""
-    packages = {path.partition(":")[0].partition(".")[0] for path in map(own_path, names) if path}
+    packages = {path.partition(":")[0].partition(".")[0] for path in map(user_path, names) if path}
     texts, is_users, one = [], False, error
     while one is not None:
         frames = _frames(one, packages)

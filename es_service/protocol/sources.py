@@ -62,7 +62,7 @@ def driver_sources(algorithm: str) -> dict[str, str]:
 
 def user_sources(path: str) -> dict[str, str]:
     """Sources of a task or an algorithm of a user, as they are now; empty if the name is none of a user."""
-    own = own_path(path)
+    own = user_path(path)
     found = {one.source: one.sha256 for one in modules_of(own).user.values()} if own else {}
     return found | _version(LIBRARY) if path.startswith(f"{LIBRARY}:") else found
 
@@ -112,7 +112,7 @@ def why_refused(expected: Sources, environment: str, platform: str = "any") -> s
     )
 
 
-def own_path(name: str) -> str:
+def user_path(name: str) -> str:
     """The user's code that a task or an algorithm names, as `package.module:name`; empty if it names none.
 
     `brax:NAME` is none. What is simulated by Python has the kind of the task before the path, as in
@@ -128,9 +128,9 @@ def own_path(name: str) -> str:
     return rest if kind in PATH_FOLLOWS and ":" in rest else name if colon else ""
 
 
-def is_own(name: str) -> bool:
+def is_user_code(name: str) -> bool:
     """Whether a task or an algorithm is the user's."""
-    return bool(own_path(name))
+    return bool(user_path(name))
 
 
 @cache

@@ -18,7 +18,7 @@ from es_service.report.facts import number
 from es_service.report.markup import Markup, joined, table, tag
 from es_service.report.page import axis_choice, document, section
 from es_service.report.series import X_AXES
-from es_service.runs.standing import state
+from es_service.runs.run_status import state
 
 UNITS = {"coverage": (100.0, " %"), "env_steps": (1e-6, "")}
 """History column -> factor and unit in which it is shown."""
@@ -208,7 +208,7 @@ def _runs(groups: Sequence[Group]) -> Markup:
             f"{run.constants['seed']}",
             f"{run.last('generation'):,.0f}",
             number(run.last("best_fitness")),
-            state(run.standing),
+            state(run.status),
         )
         for group in groups
         for run in group.runs

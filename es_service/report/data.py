@@ -25,7 +25,7 @@ from es_service.loop.parts import (
 from es_service.protocol.machine import is_mixed
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.certified import Certified, newest_certified
-from es_service.runs.standing import Standing, standing_at
+from es_service.runs.run_status import RunStatus, status_at
 from es_service.runs.view import Run, is_light
 from es_service.search.maps.behaviour_map import BehaviourMap
 from es_service.store.columns import as_floats
@@ -61,7 +61,7 @@ class RunData:
     """Generation and fitness of the best centre; None before the first generation."""
     certified: Certified | None
     """The policy that the newest certification has put first; None if there is none, or if it cannot be read."""
-    standing: Standing
+    status: RunStatus
     platforms: list[tuple[int, dict[str, Any]]]
     """(first generation, platform); each applies until the next one."""
     digest: str
@@ -143,7 +143,7 @@ def run_data(folder: Path, found: SoundRun, driver: Mapping[str, Any] | None) ->
         paths=_paths(found),
         best=None if best is None else (int(best["generation"]), float(best["fitness"])),
         certified=_certified(folder, problems),
-        standing=standing_at(run, driver, found.newest),
+        status=status_at(run, driver, found.newest),
         platforms=found.platforms,
         digest="",
         problems=tuple(problems),

@@ -13,7 +13,7 @@ from es_service.report.data import RunData
 from es_service.report.series import phase_seconds
 from es_service.runs.identity import code_changes
 from es_service.runs.objectives import objectives, weights
-from es_service.runs.standing import population_size, state
+from es_service.runs.run_status import population_size, state
 
 
 class Fault(NamedTuple):
@@ -35,7 +35,7 @@ def verdict(data: RunData) -> str:
     episodes = data.constants["search.evaluation_episodes"]
     found = f"The best centre, found {where}, has a mean fitness of {number(fitness)}"
     sentence = f"{alone}{found} over {count(episodes, 'evaluation episode')} (selected, not certified)"
-    target = data.standing.limits.get("target_fitness")
+    target = data.status.limits.get("target_fitness")
     if target is not None:
         reached = "reaches" if fitness >= target else "does not reach"
         sentence += f", which {reached} the target of {number(target)}"
@@ -63,11 +63,11 @@ def _certified(data: RunData) -> str:
 
 def what_was_run(data: RunData) -> list[tuple[str, str]]:
     """Task, search, state and budget, as (label, text)."""
-    constants, limits = data.constants, data.standing.limits
+    constants, limits = data.constants, data.status.limits
     fields = [
         ("task", f"{constants['task.environment']}, {constants['task.episode_steps']:,} steps an episode"),
         ("search", f"{constants['search.algorithm']}, {population_size(constants)}, seed {constants['seed']}"),
-        ("state", state(data.standing)),
+        ("state", state(data.status)),
     ]
     if data.history["generation"].size:
         of = {key: f" of {limit:,.0f}" for key, limit in limits.items()}
@@ -113,7 +113,7 @@ def provenance(data: RunData) -> list[tuple[str, str]]:
                 (f"code{since}", code_text(platform[CODE]) + (f"; {in_words(changed)} changed" if changed else ""))
             )
         before = platform
-    digest = data.digest or ("not computed while a driver is writing" if data.standing.driver else "not available")
+    digest = data.digest or ("not computed while a driver is writing" if data.status.driver else "not available")
     return [
         *fields,
         ("digest", f"{digest}{', mixed: computed on several platforms' if data.mixed else ''}"),

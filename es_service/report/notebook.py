@@ -9,7 +9,7 @@ from es_service.report.data import RunData, read_run
 from es_service.report.facts import verdict
 from es_service.report.markup import tag
 from es_service.report.page import document, run_title
-from es_service.runs.standing import state
+from es_service.runs.run_status import state
 from es_service.runs.view import Run
 
 SHOWN = ("Fitness", "Coverage of the behaviour map")
@@ -29,7 +29,7 @@ def run_html(run: Run) -> str:
 
 
 def _page(data: RunData) -> str:
-    how = f"{state(data.standing)}; {data.folder}"
+    how = f"{state(data.status)}; {data.folder}"
     said = [tag("p", verdict(data), class_="verdict"), tag("p", how, class_="note")]
     problems = [tag("p", tag("b", "Damaged: "), problem, class_="problem") for problem in data.problems]
     sections, points = [tag("section", *said, *problems, id="what")], []

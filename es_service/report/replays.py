@@ -14,7 +14,7 @@ import numpy as np
 
 from es_service.errors import ServiceError
 from es_service.protocol.recordings import Recordings
-from es_service.protocol.sources import is_own
+from es_service.protocol.sources import is_user_code
 from es_service.report import floor
 from es_service.report.data import RunData
 from es_service.report.facts import number
@@ -40,13 +40,13 @@ def replay_section(
     Args:
         trusted: whether code that the config of the run names may be executed, without which such a run has no replay.
     """
-    run = data.standing.run
+    run = data.status.run
     for place in cells:
         run.cell(place)
     if certified:
         run.policy("certified")
     names = (run.present_config["task"]["environment"], run.present_config["search"]["algorithm"])
-    if not trusted and (code := [name for name in names if is_own(name)]):
+    if not trusted and (code := [name for name in names if is_user_code(name)]):
         return _no_replay(
             f"A replay would execute {' and '.join(code)}, which the config of this run names. If you trust its "
             "author, ask for the replay by its name: best, certified, or a cell."

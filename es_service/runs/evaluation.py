@@ -27,9 +27,9 @@ from es_service.protocol.evaluator import Evaluator
 from es_service.protocol.messages import EVALUATION_EPISODES_PER_CHUNK, Centre, Moments, WorkerSpec
 from es_service.runs.checked_config import changed_config
 from es_service.runs.compiling import compiling_sentence, noting
-from es_service.runs.moment import Policy, make_policy
 from es_service.runs.session import dispatch_limits, require_cores
 from es_service.runs.signals import stop_on_signals
+from es_service.runs.snapshot import Policy, make_policy
 from es_service.runs.view import Run, is_light, is_no_elite
 from es_service.search.observation_statistics import merge_moments, moments_of
 
@@ -127,20 +127,20 @@ def candidates(
         raise NotInRunError(f"{run.folder} has no finished generation yet", run=run.folder, ways_out=[way_out])
     found = []
     if best:
-        moment = run.at(generation, lambda part: part == BEST)
-        found.append(Candidate("best", moment.policy("best"), moment.best.generation, moment.best.fitness))
+        snapshot = run.at(generation, lambda part: part == BEST)
+        found.append(Candidate("best", snapshot.policy("best"), snapshot.best.generation, snapshot.best.fitness))
     if centre:
-        moment = run.at(generation, is_no_elite)
-        _, fitness = moment.require_newest_centre()
-        found.append(Candidate("centre", moment.policy("centre"), moment.generation, fitness))
+        snapshot = run.at(generation, is_no_elite)
+        _, fitness = snapshot.require_newest_centre()
+        found.append(Candidate("centre", snapshot.policy("centre"), snapshot.generation, fitness))
     if not cells and not every and not top:
         return found
     wanted = None
     if not every:
-        moment = run.at(generation, is_light)
-        fittest = np.argsort(-moment.behaviour_map.fitness_N, kind="stable")[:top]
-        best_cells = moment.behaviour_map.cell_N[fittest].tolist()
-        wanted = list(dict.fromkeys([*map(moment.cell, cells), *best_cells]))
+        snapshot = run.at(generation, is_light)
+        fittest = np.argsort(-snapshot.behaviour_map.fitness_N, kind="stable")[:top]
+        best_cells = snapshot.behaviour_map.cell_N[fittest].tolist()
+        wanted = list(dict.fromkeys([*map(snapshot.cell, cells), *best_cells]))
     map_, elites = run.elites(wanted, generation)
     if not elites and (cells or every):
         raise NotInRunError(f"the map of {run.folder} is empty", run=run.folder)

@@ -14,7 +14,7 @@ import numpy as np
 from es_service.config.problems import unknown_name
 from es_service.errors import ConfigError, NotInRunError, StoreError, WayOut
 from es_service.protocol.parameters import ParameterSpec
-from es_service.runs.moment import Moment, map_places
+from es_service.runs.snapshot import Snapshot, map_places
 from es_service.runs.trackers import TensorBoard, check_trackers, fill
 from es_service.runs.view import Run, is_no_elite
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
@@ -64,14 +64,14 @@ def tables(run: Run) -> Iterator[tuple[str, pd.DataFrame]]:
 
     The parameters are those of the best centre, of the newest one (if the generation evaluated one) and of the elites:
     `which` is best, centre or the place of a cell, such as 3,17; then each parameter in the units of the function."""
-    moment = run.at(wanted=is_no_elite) if run.parameter_spec is None else run.at()
-    yield "history", run.history_until(moment.generation).reset_index()
-    yield "evaluations", run.evaluations_until(moment.generation)
-    yield "novelty", moment.novelty
+    snapshot = run.at(wanted=is_no_elite) if run.parameter_spec is None else run.at()
+    yield "history", run.history_until(snapshot.generation).reset_index()
+    yield "evaluations", run.evaluations_until(snapshot.generation)
+    yield "novelty", snapshot.novelty
     if run.constants["map.enabled"]:
-        yield "map", moment.map
+        yield "map", snapshot.map
     if run.parameter_spec is not None:
-        yield "parameters", _parameters(moment, run.parameter_spec, has_map=run.constants["map.enabled"])
+        yield "parameters", _parameters(snapshot, run.parameter_spec, has_map=run.constants["map.enabled"])
     if not (certified := run.certified).empty:
         yield "certified", certified
 
@@ -88,7 +88,7 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
     after layer; those of a memory are of its gates and its candidate (`workers/policies/recurrent.py`). If the task is
     a function, `parameter_names` [D], and in its units `best_values` [D], `centre_values` [D] and `values` [N, D].
     """
-    moment = run.at()
+    snapshot = run.at()
     clip, spec = run.constants["policy.observation_clip"], run.policy_spec
     found: dict[str, Any] = {
         "widths": np.array(spec.widths),
@@ -98,16 +98,16 @@ def arrays(run: Run) -> dict[str, np.ndarray]:
         "memory": np.array(spec.memory),
         "observation_clip": np.array(math.nan if clip is None else clip),
     }
-    stored: list[Literal["best", "centre"]] = ["best"] if moment.newest_centre is None else ["best", "centre"]
+    stored: list[Literal["best", "centre"]] = ["best"] if snapshot.newest_centre is None else ["best", "centre"]
     for which in stored:
-        policy = moment.policy(which)
+        policy = snapshot.policy(which)
         found |= {
             f"{which}_parameters": policy.parameters_D,
             f"{which}_mean": policy.observation_mean_O,
             f"{which}_std": policy.observation_std_O,
         }
     if run.constants["map.enabled"]:
-        map_, elites = moment.elites()
+        map_, elites = snapshot.elites()
         found |= _map_arrays(run, map_, elites)
     if (named := run.parameter_spec) is not None:
         found["parameter_names"] = np.array(named.names)
@@ -192,15 +192,15 @@ def _map_arrays(run: Run, map_: BehaviourMap, elites: dict[int, Elite]) -> dict[
     }
 
 
-def _parameters(moment: Moment, spec: ParameterSpec, *, has_map: bool) -> pd.DataFrame:
+def _parameters(snapshot: Snapshot, spec: ParameterSpec, *, has_map: bool) -> pd.DataFrame:
     """The table of parameters; see `tables`."""
     import pandas as pd
 
-    rows = {"best": moment.policy("best").parameters_D}
-    if moment.newest_centre is not None:
-        rows["centre"] = moment.policy("centre").parameters_D
+    rows = {"best": snapshot.policy("best").parameters_D}
+    if snapshot.newest_centre is not None:
+        rows["centre"] = snapshot.policy("centre").parameters_D
     if has_map:
-        map_, elites = moment.elites()
+        map_, elites = snapshot.elites()
         places = [",".join(map(str, place)) for place in map_places(map_).reshape(map_.size, -1).tolist()]
         rows |= zip(places, (elite.centre_D for elite in elites.values()), strict=True)
     table = pd.DataFrame(spec.values(np.stack(list(rows.values()))), columns=pd.Index(spec.names))

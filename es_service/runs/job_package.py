@@ -16,7 +16,7 @@ from es_service.config.model import RunConfig
 from es_service.config.shipped import config_file
 from es_service.errors import ConfigError
 from es_service.protocol.machine import PACKAGES
-from es_service.protocol.sources import modules_of, own_path
+from es_service.protocol.sources import modules_of, user_path
 from es_service.runs.sweep_plan import PlannedRun
 
 CONFIG = "config.yaml"
@@ -87,7 +87,7 @@ def _package(command: Sequence[str], out: str, text: str, configs: Sequence[RunC
     files: dict[str, Path] = {}
     expected: set[str] = set()
     named = {path for config in configs for path in (config.task.environment, config.search.algorithm)}
-    for path in filter(None, map(own_path, named)):
+    for path in filter(None, map(user_path, named)):
         found = modules_of(path)
         if found.is_installed:
             expected.add(path.partition(":")[0].partition(".")[0])

@@ -35,7 +35,7 @@ from es_service.loop.parts import (
 )
 from es_service.protocol.messages import Moments
 from es_service.runs.checked_config import changed_config, changes_from
-from es_service.runs.moment import Moment, Policy, make_policy
+from es_service.runs.snapshot import Policy, Snapshot, make_policy
 from es_service.runs.view import Run, is_no_elite, open_run
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import NO_CELL, FitnessWeight
@@ -52,7 +52,7 @@ from es_service.store.digest import digest_at
 NORMALISED = "policy.observation_normalization"
 OBSERVED = ("policy.observation_clip", NORMALISED)
 """Keys that determine how a policy processes its observations."""
-LUCK = ("task.episodes_per_member", "search.pairs", "search.sigma", "policy.action_noise")
+SCORE_KEYS = ("task.episodes_per_member", "search.pairs", "search.sigma", "policy.action_noise")
 """Keys that change the highest fitness of a population, but not the meaning of an evaluation."""
 ROWS_AT_ONCE = 4096
 """History rows that are held in memory together."""
@@ -81,20 +81,22 @@ def fork_config(parent: str | os.PathLike[str], overrides: Overrides = ()) -> Ru
     mapping = present | {"search": present["search"] | {"init_from": None}}  # a fork has the parent's state instead
     config = changed_config(mapping, overrides)
     changes = changes_from(origin.constants, config)
-    unfit = [_unfit(name, old, new, name) for name, old, new in changes if does_not_fit(name, old, new, ALGORITHMS)]
+    problems = [
+        _problem_of(name, old, new, name) for name, old, new in changes if does_not_fit(name, old, new, ALGORITHMS)
+    ]
     names = task_of(config).descriptor_names
-    if not unfit and list(names) != origin.descriptor_names:  # a task of the user that was edited
+    if not problems and list(names) != origin.descriptor_names:  # a task of the user that was edited
         what = f"the descriptor of {config.task.environment}"
-        unfit = [_unfit(what, origin.descriptor_names, list(names), "task.environment")]
-    if not unfit and origin.policy_spec != (spec := policy_spec(config, task_of(config))):
+        problems = [_problem_of(what, origin.descriptor_names, list(names), "task.environment")]
+    if not problems and origin.policy_spec != (spec := policy_spec(config, task_of(config))):
         old, new = list(origin.policy_spec.widths), list(spec.widths)
-        unfit = [_unfit("the network's layers", old, new, "policy.hidden")]
-    if unfit:
-        raise _refused(origin, "its state does not fit these changes", unfit)
+        problems = [_problem_of("the network's layers", old, new, "policy.hidden")]
+    if problems:
+        raise _refused(origin, "its state does not fit these changes", problems)
     return config
 
 
-def _unfit(what: str, old: Any, new: Any, field: str) -> Problem:
+def _problem_of(what: str, old: Any, new: Any, field: str) -> Problem:
     return Problem(f"{what}: {show(old)} -> {show(new)}", field, new, show(old), old)
 
 
@@ -112,9 +114,9 @@ def forked(origin: Run, config: RunConfig, generation: int | None) -> tuple[dict
     """
     at, parts = origin.parts(generation)
     changed = {name for name, _, _ in changes_from(origin.constants, config)}
-    if any(name in OBSERVED or name.startswith("task.") for name in changed.difference(LUCK)):
+    if any(name in OBSERVED or name.startswith("task.") for name in changed.difference(SCORE_KEYS)):
         parts = _without_fitness(parts)
-    elif changed.intersection(LUCK):
+    elif changed.intersection(SCORE_KEYS):
         parts = _without_scores(parts)
     if "search.algorithm" in changed:
         weight = FitnessWeight(ALGORITHMS[config.search.algorithm](config).fitness_weight)
@@ -200,15 +202,15 @@ def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> t
         )
     if isinstance(config.search, CandidatesConfig):
         return _several(origin, config, config.search, which, tell)
-    moment = origin.at(wanted=is_no_elite)
-    moments, own = moments_from_arrays(moment.parts[OBSERVATIONS]), None
+    snapshot = origin.at(wanted=is_no_elite)
+    moments, own = moments_from_arrays(snapshot.parts[OBSERVATIONS]), None
     if which == "centre":
-        centre, _ = moment.require_newest_centre()
+        centre, _ = snapshot.require_newest_centre()
         centre_D = centre.centre_D
         if centre.own_mean_O is not None and centre.own_std_O is not None:
             own = centre.own_mean_O, centre.own_std_O
     else:
-        kept = moment.best if isinstance(which, str) else origin.elite(which)
+        kept = snapshot.best if isinstance(which, str) else origin.elite(which)
         centre_D, own = kept.centre_D, (kept.observation_mean_O, kept.observation_std_O)
     if not origin.constants[NORMALISED]:
         moments = no_observations(spec.widths[0])  # they were gathered, but its policy did not use them
@@ -218,7 +220,7 @@ def started(config: RunConfig, init_from: str, tell: Callable[[str], None]) -> t
         moments = Moments(moments.count, mean_O, moments.count * np.square(std_O))
     _tell_otherwise(origin, config, tell)
     start = {"centre_D": centre_D, **moments_to_arrays(moments)}
-    return _lineage(origin, moment.generation), Beginning(start=start)
+    return _lineage(origin, snapshot.generation), Beginning(start=start)
 
 
 def _several(
@@ -234,11 +236,11 @@ def _several(
             suggestion=str(origin.folder),
             run=origin.folder,
         )
-    moment = origin.at()
-    policies = [moment.policy("best")]
+    snapshot = origin.at()
+    policies = [snapshot.policy("best")]
     if origin.constants["map.enabled"]:
-        map_, elites = moment.elites()
-        for row in _by_choice(moment, map_, config, search):
+        map_, elites = snapshot.elites()
+        for row in _by_choice(snapshot, map_, config, search):
             elite = elites[int(map_.cell_N[row])]
             policies.append(make_policy(origin.meta, elite.centre_D, elite.observation_mean_O, elite.observation_std_O))
     different: dict[bytes, Policy] = {}
@@ -252,13 +254,13 @@ def _several(
         "std_K_O": np.stack([one.observation_std_O for one in chosen]),
         **moments_to_arrays(no_observations(origin.policy_spec.widths[0])),
     }
-    return _lineage(origin, moment.generation), Beginning(start=start)
+    return _lineage(origin, snapshot.generation), Beginning(start=start)
 
 
-def _by_choice(moment: Moment, map_: BehaviourMap, config: RunConfig, search: CandidatesConfig) -> list[int]:
+def _by_choice(snapshot: Snapshot, map_: BehaviourMap, config: RunConfig, search: CandidatesConfig) -> list[int]:
     """Rows of the map in the order of `search.candidate_choice`, the older one of equal ones first."""
     if search.candidate_choice == "novelty":
-        archive = archive_from_parts(moment.parts, map_.descriptor_N_B.shape[1])
+        archive = archive_from_parts(snapshot.parts, map_.descriptor_N_B.shape[1])
         key_N = -elite_novelty(map_, archive, config.novelty)
     elif search.candidate_choice == "place":
         middle = search.objective.descriptor if isinstance(search.objective, TargetObjective) else ()

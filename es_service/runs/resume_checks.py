@@ -17,8 +17,8 @@ from es_service.loop.history import Column, evaluated_columns, history_columns
 from es_service.protocol.messages import TaskSpec
 from es_service.runs.checked_config import changes_from
 from es_service.runs.identity import require_unchanged
+from es_service.runs.run_status import RunStatus, read_status
 from es_service.runs.session import require_cores
-from es_service.runs.standing import Standing, read_standing
 from es_service.runs.view import open_run
 from es_service.search.algorithms import ALGORITHMS
 from es_service.store.schema import RunMeta
@@ -43,7 +43,7 @@ def require_resumable(store: RunStore, config: RunConfig, asked: Mapping[str, An
     folder = store.folder
     require_cores(config, WayOut("resume", "", str(folder), asked))
     if changes := changes_from(store.meta.constants, config):
-        raise refused_changes(folder, changes, ALGORITHMS, _budget_of_a_fork(config, read_standing(open_run(folder))))
+        raise refused_changes(folder, changes, ALGORITHMS, _budget_of_a_fork(config, read_status(open_run(folder))))
     task = task_of(config)
     if other := _other_task(store.meta.task, task):
         raise ConfigError(
@@ -70,12 +70,12 @@ def columns(config: RunConfig, task: TaskSpec) -> tuple[tuple[Column, ...], tupl
     return history_columns(task, config.map.enabled, corrects), evaluated_columns(task, config.map.enabled)
 
 
-def _budget_of_a_fork(config: RunConfig, standing: Standing) -> dict[str, Any]:
+def _budget_of_a_fork(config: RunConfig, status: RunStatus) -> dict[str, Any]:
     """Budget settings that a fork needs besides the changed keys: the limits in `config` that differ from those of the
     run, and larger limits where they are already spent."""
     limits = limits_of(config.budget)
-    wanted = {key: limits.get(key) for key in REACHED if limits.get(key) != standing.limits.get(key)}
-    wanted |= raised(limits, standing.row) if standing.row else {}
+    wanted = {key: limits.get(key) for key in REACHED if limits.get(key) != status.limits.get(key)}
+    wanted |= raised(limits, status.row) if status.row else {}
     return {f"budget.{key}": value for key, value in wanted.items()}
 
 

@@ -26,7 +26,7 @@ Parameters = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
-class Standing:
+class SelectionRecord:
     """A candidate with its selection episodes so far."""
 
     index: int
@@ -64,14 +64,14 @@ def halved(
     number: int,
     keep: int,
     by: Measure,
-) -> tuple[list[Standing], int]:
+) -> tuple[list[SelectionRecord], int]:
     """The `keep` best candidates by successive halving, best first, and the environment steps that it took.
 
     In each round, every candidate that is left has the same new episodes as the others, twice as many as in the round
     before; then the worse half leaves. Means are over the episodes of all rounds. Source: Karnin, Koren and Somekh 2013
     (sequential halving), with doubled instead of equal budgets.
     """
-    left, episodes, steps, ask = [Standing(index) for index in range(len(given))], FIRST_EPISODES, 0, 0
+    left, episodes, steps, ask = [SelectionRecord(index) for index in range(len(given))], FIRST_EPISODES, 0, 0
     while len(left) > 1:
         policies = [given[one.index] for one in left]
         results = new_episodes(engine, policies, episodes, seed, number, ask, Domain.CANDIDATE_RESET)

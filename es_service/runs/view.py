@@ -18,7 +18,7 @@ from es_service.loop.parts import BEST, BLOCK_PREFIX, CELL_PREFIX, ELITE_PREFIX,
 from es_service.protocol.messages import PolicySpec
 from es_service.protocol.parameters import ParameterSpec
 from es_service.runs.certified import certified_policies, newest_certified
-from es_service.runs.moment import Moment, Policy, descriptor_names, make_policy, policy_spec
+from es_service.runs.snapshot import Policy, Snapshot, descriptor_names, make_policy, policy_spec
 from es_service.search.maps.behaviour_map import BehaviourMap, Elite
 from es_service.store import reader
 from es_service.store.columns import Columns
@@ -115,10 +115,10 @@ class Run:
         """
         return reader.read_parts(self.folder, generation, wanted)
 
-    def at(self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True) -> Moment:
+    def at(self, generation: int | None = None, wanted: Callable[[str], bool] = lambda part: True) -> Snapshot:
         """The state after a generation, with the arguments of `parts`. All parts together take as much memory as all of
         the map's policies."""
-        return Moment(self.folder, self.meta, *self.parts(generation, wanted))
+        return Snapshot(self.folder, self.meta, *self.parts(generation, wanted))
 
     @property
     def novelty(self) -> pd.DataFrame:

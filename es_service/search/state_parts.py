@@ -1,6 +1,7 @@
 """What a search of the user's own remembers besides centres, novelty archive and map, and how it is stored.
 
-`Algorithm.own` declares it, by name, with its initial values, and `SearchState.own` has the present ones. A value is
+`Algorithm.extra` declares it, by name, with its initial values, and `SearchState.extra` has the present ones. A
+value is
 
 * a NumPy array: all of these are stored together, whenever one of them differs;
 * `Whole`: arrays that are stored together, apart from those of other names;
@@ -68,12 +69,12 @@ def freeze(values: Iterable[Any]) -> None:
             value = value.base
 
 
-def read_only(own: Mapping[str, Any]) -> Mapping[str, Any]:
+def read_only(extra: Mapping[str, Any]) -> Mapping[str, Any]:
     """The same values, with arrays made read-only, in a read-only mapping; itself if it is such a mapping."""
-    if isinstance(own, ReadOnly):
-        return own
+    if isinstance(extra, ReadOnly):
+        return extra
     # A resumed run has arrays in C order; in another one, sums of the same values may have other bits.
-    ordered = {name: np.array(one, order="C") if _is_disordered(one) else one for name, one in own.items()}
+    ordered = {name: np.array(one, order="C") if _is_disordered(one) else one for name, one in extra.items()}
     freeze(ordered.values())
     return ReadOnly(ordered)
 
@@ -114,13 +115,13 @@ class ByCell:
 Named = Whole | Appended | ByCell
 
 
-def problem(own: Mapping[str, Any], before: Mapping[str, Any] = MappingProxyType({})) -> str:
+def problem(extra: Mapping[str, Any], before: Mapping[str, Any] = MappingProxyType({})) -> str:
     """Why values cannot be stored; empty if they can.
 
     Args:
         before: values that can be; entries of `ByCell` that are the same objects are not looked at again.
     """
-    for name, value in own.items():
+    for name, value in extra.items():
         what = f"its own value {name!r}"
         if not isinstance(value, Named):
             if not _is_array(value):
@@ -145,13 +146,13 @@ def problem(own: Mapping[str, Any], before: Mapping[str, Any] = MappingProxyType
     return ""
 
 
-def changes(own: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Arrays | None]:
+def changes(extra: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Arrays | None]:
     """The pieces in which values differ from earlier ones, by their names in the store; None for those that are gone.
 
     With an empty `before`, all pieces.
     """
     found: dict[str, Arrays | None] = {}
-    now_by_name, then_by_name = ({}, {}) if own is before else (_stored(own), _stored(before))
+    now_by_name, then_by_name = ({}, {}) if extra is before else (_stored(extra), _stored(before))
     for name in [*now_by_name, *(then_by_name.keys() - now_by_name.keys())]:
         now, then = now_by_name.get(name), then_by_name.get(name)
         if now is then:
@@ -212,11 +213,11 @@ def _bits(values: np.ndarray) -> np.ndarray:
     return values.view(unsigned) if unsigned else np.frombuffer(values.tobytes(), np.uint8)
 
 
-def _stored(own: Mapping[str, Any]) -> dict[str, Named]:
+def _stored(extra: Mapping[str, Any]) -> dict[str, Named]:
     """Values by their names in the store."""
     prefixes = {Whole: WHOLE_PREFIX, Appended: APPENDED_PREFIX, ByCell: BY_CELL_PREFIX}
-    named = {prefixes[type(value)] + name: value for name, value in own.items() if isinstance(value, Named)}
-    plain = {name: value for name, value in own.items() if not isinstance(value, Named)}
+    named = {prefixes[type(value)] + name: value for name, value in extra.items() if isinstance(value, Named)}
+    plain = {name: value for name, value in extra.items() if not isinstance(value, Named)}
     return {OWN: Whole(plain), **named} if plain else named
 
 

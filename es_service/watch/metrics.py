@@ -35,8 +35,8 @@ def metrics(summaries: Iterable[Summary]) -> str:
         labels = {"run": one.found.name}
         try:
             found = _values(one)
-            if one.standing is not None:
-                constants = one.standing.run.constants
+            if one.status is not None:
+                constants = one.status.run.constants
                 labels |= {"task": constants["task.environment"], "search": constants["search.algorithm"]}
         except FORGED:
             found = {"readable": 0.0}
@@ -53,17 +53,17 @@ def metrics(summaries: Iterable[Summary]) -> str:
 
 
 def _values(one: Summary) -> Mapping[str, float]:
-    found: dict[str, float] = {"readable": float(one.standing is not None)}
-    if one.standing is None:
+    found: dict[str, float] = {"readable": float(one.status is not None)}
+    if one.status is None:
         return found
-    row = one.standing.row
-    found["running"] = float(one.standing.driver is not None)
+    row = one.status.row
+    found["running"] = float(one.status.driver is not None)
     if one.certified is not None:
         found["certified_fitness"] = float(one.certified.row()["return_mean"])
     if row is not None:
         found |= {name: float(row[column]) for name, (column, _) in GAUGES.items() if column in row}
         try:
-            recent = read_recent(one.standing.run, int(row["generation"]))
+            recent = read_recent(one.status.run, int(row["generation"]))
         except ServiceError:  # it was deleted meanwhile
             return found
         if recent.problem is None:

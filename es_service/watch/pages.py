@@ -16,7 +16,7 @@ from es_service.report.markup import Markup, tag
 from es_service.report.page import REPLAY, run_sections, run_title, section
 from es_service.report.progress import short
 from es_service.runs.replay import CERTIFIED
-from es_service.runs.standing import state
+from es_service.runs.run_status import state
 from es_service.watch.channels import Picture
 from es_service.watch.runs import FORGED, Found, Reading, Runs, Summary
 
@@ -69,7 +69,7 @@ def draw_list(runs: Runs) -> Callable[[], Picture]:
 
     def draw() -> Picture:
         found = runs.summaries()
-        running = sum(one.standing is not None and one.standing.driver is not None for one in found)
+        running = sum(one.status is not None and one.status.driver is not None for one in found)
         said = f"{len(found):,} runs, of which {running:,} are running." if found else "There is no run yet."
         rows = [tag("tr", *_row(one)) for one in found]
         heads = tag("thead", tag("tr", *(tag("th", head, scope="col") for head in HEADS)))
@@ -91,20 +91,20 @@ def _row(one: Summary) -> list[Markup]:
 
 def _cells(one: Summary) -> list[Markup]:
     """The cells of a row, each with the name of its column for narrow windows."""
-    found, standing = one.found, one.standing
+    found, status = one.found, one.status
     box = tag("input", type="checkbox", name="run", value=found.key, aria_label=f"compare {found.name}")
     link = tag("a", found.name, href=f"/run/{found.key}")
-    if standing is None:
+    if status is None:
         values = [None, link, tag("span", one.problem, class_="problem"), *[None] * (len(HEADS) - 3)]
     else:
-        constants, row, limits = standing.run.constants, standing.row or {}, standing.limits
+        constants, row, limits = status.run.constants, status.row or {}, status.limits
         of = {key: f" of {short(limit)}" for key, limit in limits.items()}
         best = number(row["best_fitness"]) if row else ""
         certified = "" if one.certified is None else number(one.certified.row()["return_mean"])
         share = row.get("coverage")
         coverage = "" if share is None else f"{100 * share:.1f} %"
         values = [
-            box, link, state(standing),
+            box, link, state(status),
             f"{row['generation']:,}{of.get('generations', '')}" if row else "",
             f"{short(row['env_steps'])}{of.get('env_steps', '')}" if row else "",
             _short(row.get("steps_per_second")), best, certified, coverage,

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from es_service.errors import ServiceError, StoreError
 from es_service.report.data import RunData, followed, run_data
 from es_service.runs.certified import Certified, newest_certified
-from es_service.runs.standing import Standing, read_standing
+from es_service.runs.run_status import RunStatus, read_status
 from es_service.runs.view import open_run
 from es_service.store.folder import CONFIG, COPY, DATABASE, LOCK, holds_run
 from es_service.store.lock import lock_holder
@@ -50,7 +50,7 @@ class Summary(NamedTuple):
     """What a list shows of a run."""
 
     found: Found
-    standing: Standing | None
+    status: RunStatus | None
     certified: Certified | None
     problem: str
     """Why it cannot be read; empty if it can."""
@@ -89,7 +89,7 @@ class Runs:
     def moved(self, run_id: str, but: Found) -> Found | None:
         """A run of this id in another folder."""
         for one in self.summaries():
-            if one.found.key != but.key and one.standing is not None and one.standing.run.run_id == run_id:
+            if one.found.key != but.key and one.status is not None and one.status.run.run_id == run_id:
                 return one.found
         return None
 
@@ -142,13 +142,13 @@ def require_inside(found: Found) -> None:
 def _summary(found: Found) -> Summary:
     try:
         require_inside(found)
-        standing = read_standing(open_run(found.folder))
+        status = read_status(open_run(found.folder))
         certified = newest_certified(found.folder)
     except ServiceError as error:
         return Summary(found, None, None, " ".join(error.sentence.split()))
     except FORGED as error:
         return Summary(found, None, None, f"its data are not those of a run: {error!r}")
-    return Summary(found, standing, certified, "")
+    return Summary(found, status, certified, "")
 
 
 def _below(root: Path) -> Iterator[Found]:

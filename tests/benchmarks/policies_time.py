@@ -102,9 +102,9 @@ class Working:
         parts = zip(_halves(work), self._workers, strict=True)
         return [result for part, sides in parts if part for result in self._half(part, *sides)]
 
-    def _half(self, work: Sequence[Work], theirs: KeptParents[int], own: Parents) -> list[Any]:
+    def _half(self, work: Sequence[Work], theirs: KeptParents[int], extra: Parents) -> list[Any]:
         frames = timed(_frames, self._spent, "send")(work, theirs)
-        results = self._run(timed(_read, self._spent, "read")(frames, own))
+        results = self._run(timed(_read, self._spent, "read")(frames, extra))
         answer = timed(framed, self._spent, "answer")(results)
         return timed(lambda frame: separated(work, pickle.loads(frame[8:])), self._spent, "hear")(answer)
 

@@ -13,8 +13,8 @@ from es_service.report import maps
 from es_service.report.data import read_run
 from es_service.report.detours import crosses, detours
 from es_service.report.floor import plan_frame
-from es_service.runs.moment import make_policy
-from tests.twins import point_maze
+from es_service.runs.snapshot import make_policy
+from tests.references import point_maze
 from workers.environments import SHIPPED
 
 pytestmark = pytest.mark.usefixtures("workers_here")

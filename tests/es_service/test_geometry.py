@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from es_service.loop.parts import geometry_from_arrays, geometry_to_arrays
 from es_service.search.maps.geometry import Cvt, Grid, make_geometry
 from tests.es_service.map_examples import OBLONG, PLANE, SQUARE, map_config
-from tests.twins import behaviour_map as twin
+from tests.references import behaviour_map as reference
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ from tests.twins import behaviour_map as twin
 )
 def test_cells_of_a_grid_by_hand(descriptor, index):
     assert PLANE.index_of(int(PLANE.cells_of([descriptor])[0])) == index
-    assert twin.grid_index(PLANE.bounds, PLANE.shape, descriptor) == index
+    assert reference.grid_index(PLANE.bounds, PLANE.shape, descriptor) == index
 
 
 def test_edges_by_hand():
@@ -44,21 +44,25 @@ bounds_and_cells = st.lists(
 
 
 @given(bounds_and_cells, st.data())
-def test_grids_equal_the_twin_on_any_descriptor_and_on_every_edge(sides, data):
+def test_grids_equal_the_reference_on_any_descriptor_and_on_every_edge(sides, data):
     bounds, shape = zip(*sides, strict=True)
     grid = Grid(bounds, shape)
     descriptors = [
         [data.draw(st.sampled_from(edges.tolist()) | st.floats(-400.0, 400.0)) for edges in grid.edges]
         for _ in range(5)
     ]
-    expected = [twin.cell_number(shape, twin.grid_index(bounds, shape, descriptor)) for descriptor in descriptors]
+    expected = [
+        reference.cell_number(shape, reference.grid_index(bounds, shape, descriptor)) for descriptor in descriptors
+    ]
     assert grid.cells_of(descriptors).tolist() == expected
 
 
-def test_five_thousand_descriptors_equal_the_twin():
+def test_five_thousand_descriptors_equal_the_reference():
     grid = Grid(((-35.0, 40.0), (-1.0, 0.1)), (20, 7))
     descriptors = np.random.default_rng(0).uniform([-40, -1.2], [45, 0.3], (5000, 2))
-    expected = [twin.cell_number(grid.shape, twin.grid_index(grid.bounds, grid.shape, d)) for d in descriptors]
+    expected = [
+        reference.cell_number(grid.shape, reference.grid_index(grid.bounds, grid.shape, d)) for d in descriptors
+    ]
     assert grid.cells_of(descriptors).tolist() == expected
     assert len(set(expected)) == grid.size
 
@@ -66,7 +70,7 @@ def test_five_thousand_descriptors_equal_the_twin():
 def test_cells_are_numbered_with_the_last_dimension_fastest():
     assert [PLANE.index_of(cell) for cell in (0, 1, 3, 4, 11)] == [(0, 0), (0, 1), (0, 3), (1, 0), (2, 3)]
     assert all(PLANE.cell_at(PLANE.index_of(cell)) == cell for cell in range(PLANE.size))
-    assert all(twin.cell_number(PLANE.shape, PLANE.index_of(cell)) == cell for cell in range(PLANE.size))
+    assert all(reference.cell_number(PLANE.shape, PLANE.index_of(cell)) == cell for cell in range(PLANE.size))
 
 
 @pytest.mark.parametrize("index", [(3, 0), (0, 4), (-1, 0), (0,), (0, 0, 0), ()])
@@ -105,11 +109,11 @@ def test_the_nearest_centroid_and_of_equally_near_ones_the_first():
     assert cvt.cells_of([[0.4, 0.1], [0.5, 0.0], [1.0, 0.0], [0.5, 0.5], [-9.0, 9.0]]).tolist() == [0, 0, 1, 0, 3]
 
 
-def test_many_descriptors_equal_the_twin():
+def test_many_descriptors_equal_the_reference():
     rng = np.random.default_rng(0)
     cvt = Cvt(((0.0, 1.0),) * 3, rng.integers(0, 5, (40, 3)) / 4)  # many are equally near
     descriptors = rng.integers(-1, 10, (500, 3)) / 8
-    assert cvt.cells_of(descriptors).tolist() == [twin.nearest_centroid(cvt.centroid_C_B, d) for d in descriptors]
+    assert cvt.cells_of(descriptors).tolist() == [reference.nearest_centroid(cvt.centroid_C_B, d) for d in descriptors]
 
 
 def test_descriptors_do_not_depend_on_how_many_are_asked_together():

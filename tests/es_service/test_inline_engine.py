@@ -203,7 +203,7 @@ def test_a_thread_that_has_answered_everything_is_a_bystander_of_its_child_s_end
     ends[1].close()
     heard = [transport.receive(1.0) for _ in range(3)]
     assert heard[0] == Answer(0, 0, 1, ["its own"])
-    assert {message.worker: message.bystander for message in heard[1:]} == {0: True, 1: False}
+    assert {message.worker: message.charge_item for message in heard[1:]} == {0: False, 1: True}
 
 
 class Unreadable:

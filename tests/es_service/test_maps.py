@@ -33,7 +33,7 @@ from es_service.search.maps.behaviour_map import (
     unchanged_entries,
 )
 from tests.es_service.map_examples import PLANE
-from tests.twins import behaviour_map as twin
+from tests.references import behaviour_map as reference
 
 # Insertion
 
@@ -104,12 +104,12 @@ def test_a_score_is_changed_where_the_centre_has_an_elite():
         max_size=30,
     )
 )
-def test_any_offers_give_the_twin_s_map_and_never_a_worse_one(offers):
-    map_, other = empty_map(PLANE), twin.GridMap(PLANE.bounds, PLANE.shape)
+def test_any_offers_give_the_reference_s_map_and_never_a_worse_one(offers):
+    map_, other = empty_map(PLANE), reference.GridMap(PLANE.bounds, PLANE.shape)
     worst = np.full(PLANE.size, -np.inf)
     for generation, (x, y, fitness) in enumerate(offers):
         map_, cell, entered = insert(map_, np.array([x, y]), float(fitness), generation, 0, math.nan)
-        index = other.insert(twin.Elite(float(fitness), (x, y), generation, math.nan))
+        index = other.insert(reference.Elite(float(fitness), (x, y), generation, math.nan))
         assert entered == (index is not None)
         assert not entered or PLANE.index_of(cell) == index
         fitness_C = np.full(PLANE.size, -np.inf)
@@ -120,8 +120,8 @@ def test_any_offers_give_the_twin_s_map_and_never_a_worse_one(offers):
     assert map_.fitness_N.tolist() == [elite.fitness for elite in other.elites.values()]
     assert map_.generation_N.tolist() == [elite.generation for elite in other.elites.values()]
     columns = map_statistics(map_, -2.0, None)
-    assert columns["coverage"] == twin.coverage(other.elites, 12)
-    assert columns["qd_score"] == twin.qd_score(other.elites, -2.0)
+    assert columns["coverage"] == reference.coverage(other.elites, 12)
+    assert columns["qd_score"] == reference.qd_score(other.elites, -2.0)
 
 
 @given(

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from es_service.protocol.noise import NORMAL_STD, TEST_VECTORS, Domain, normal_integers, normals, stream_keys, uniforms
-from tests.twins import noise as twin
+from tests.references import noise as reference
 
 COORDINATES = np.arange(4482, dtype=np.uint32)
 words = st.integers(0, 2**32 - 1)
@@ -35,9 +35,9 @@ def test_published_vectors():
 @given(
     seed=st.integers(0, 2**63 - 1), generation=st.integers(0, 2**40), ids=st.lists(st.integers(0, 2**40), max_size=3)
 )
-def test_stream_keys_equal_the_twin(seed, generation, ids):
+def test_stream_keys_equal_the_reference(seed, generation, ids):
     key = stream_keys(seed, Domain.ACTION_NOISE, generation, *ids)
-    assert key.tolist() == twin.stream_key(seed, int(Domain.ACTION_NOISE), generation, *ids)
+    assert key.tolist() == reference.stream_key(seed, int(Domain.ACTION_NOISE), generation, *ids)
 
 
 def test_stream_keys_broadcast_over_ids():
@@ -52,10 +52,10 @@ def test_stream_keys_broadcast_over_ids():
 
 
 @given(key=st.lists(words, min_size=4, max_size=4), coordinate=words)
-def test_numpy_equals_the_twin(key, coordinate):
+def test_numpy_equals_the_reference(key, coordinate):
     key_words, at = np.array(key, np.uint32), np.array([coordinate], np.uint32)
-    assert normal_integers(np, key_words, at)[0] == twin.normal_integer(key, coordinate)
-    assert uniforms(key_words, at)[0] == np.float32(twin.uniform(key, coordinate))
+    assert normal_integers(np, key_words, at)[0] == reference.normal_integer(key, coordinate)
+    assert uniforms(key_words, at)[0] == np.float32(reference.uniform(key, coordinate))
 
 
 def test_xla_equals_numpy_bit_for_bit():

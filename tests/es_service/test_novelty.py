@@ -1,4 +1,4 @@
-"""The novelty archive against a brute-force twin and by hand; the tree changes no bit, nor does the store."""
+"""The novelty archive against a slow reference implementation and by hand; tree and store change no bit."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ from es_service.search.novelty import (
     same_entries,
     sound_archive,
 )
-from tests.twins import novelty_search as twin
+from tests.references import novelty_search as reference
 
 coordinates = st.integers(-3, 3).map(float) | st.floats(-1e3, 1e3, allow_subnormal=False)
 points = st.tuples(coordinates, coordinates)
@@ -130,10 +130,10 @@ def test_archives_that_share_room_do_not_see_each_others_entries():
 
 
 @given(st.lists(points, max_size=40), st.lists(points, min_size=1, max_size=5), st.integers(1, 12))
-def test_equals_the_twin_bit_by_bit(entries, queries, neighbours):
+def test_equals_the_reference_bit_by_bit(entries, queries, neighbours):
     archive = archive_of(entries)
     for distance in ("euclidean", "squared_euclidean"):
-        expected = [twin.novelty(entries, query, neighbours, distance != "euclidean") for query in queries]
+        expected = [reference.novelty(entries, query, neighbours, distance != "euclidean") for query in queries]
         assert of(archive, queries, neighbours, distance) == expected
 
 
@@ -164,7 +164,9 @@ def test_the_tree_changes_no_bit(dimensions, scatter, neighbours):
     with_tree = of(archive, queries, neighbours, exclude=exclude)
     brute = NoveltyArchive(archive.descriptor_N_B, archive.generation_N, archive.centre_N)
     assert with_tree == of(brute, queries, neighbours, exclude=exclude)
-    some = [twin.novelty(archive.descriptor_N_B, queries[i], neighbours, without=int(exclude[i])) for i in (0, 41, 59)]
+    some = [
+        reference.novelty(archive.descriptor_N_B, queries[i], neighbours, without=int(exclude[i])) for i in (0, 41, 59)
+    ]
     assert [with_tree[i] for i in (0, 41, 59)] == some
 
 

@@ -12,7 +12,7 @@ from es_service.errors import ConfigError, EvaluationError, StoreError
 from es_service.protocol.messages import EpisodesResult
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Ask, CentreEvaluation
-from es_service.search.algorithms.common import archived, first_state
+from es_service.search.algorithms.common import add_to_archive, first_state
 from es_service.search.maps.behaviour_map import COLUMNS, insert
 from es_service.search.novelty import NoveltyArchive
 from es_service.search.observation_statistics import no_observations
@@ -34,7 +34,7 @@ def test_the_example_weighs_novelty_of_the_better_half_alone():
     assert config.search.centres == 1
     search = ALGORITHMS[EXAMPLE](config)
     state = first_state([np.zeros(3, np.float32)], 2, search.fitness_weight)
-    state = archived(state, CentreEvaluation(0, 0, True, 0.0, np.zeros(2)))
+    state = add_to_archive(state, CentreEvaluation(0, 0, True, 0.0, np.zeros(2)))
     # Two pairs: the first's + is far and good, its - farther and bad; the other's + near and good, its - invalid.
     fitness = np.array([[4.0, 1.0], [3.0, np.nan]], np.float32)
     descriptor = np.array([[(2.0, 0.0), (9.0, 0.0)], [(1.0, 0.0), (5.0, 0.0)]], np.float32)
@@ -280,15 +280,15 @@ def test_sigma_rises_with_success_and_falls_without(tmp_path):
     sigma = 0.1
     for success in is_success:
         sigma = min(1.0, max(0.01, sigma * (1.5 if success else 1.5**-0.25)))
-    own = whole.parts()[1]["own"]
-    assert own["sigma"] == pytest.approx(sigma, rel=1e-12)
-    assert own["sigma"] != pytest.approx(0.1, rel=0.01)
-    assert own["record"] == fitness.max()
+    extra = whole.parts()[1]["own"]
+    assert extra["sigma"] == pytest.approx(sigma, rel=1e-12)
+    assert extra["sigma"] != pytest.approx(0.1, rel=0.01)
+    assert extra["record"] == fitness.max()
 
 
 def test_an_adapted_sigma_is_the_one_that_is_asked_for():
     search = ALGORITHMS[ADAPTIVE](api.load_config(CONFIG, {"search.algorithm": ADAPTIVE}))
-    state = first_state([np.zeros(3, np.float32)], 2, 1.0, own=search.own)
+    state = first_state([np.zeros(3, np.float32)], 2, 1.0, extra=search.extra)
     sigmas = []
     for generation, (fitness, valid) in enumerate([(1, True), (2, True), (2, True), (9, False), (-9, True), (3, True)]):
         told = CentreEvaluation(generation, 0, valid, fitness, np.zeros(2))

@@ -31,30 +31,30 @@ def begin(folder, name="counting", generations=6):
     return api.run(api.load_config(CONFIG, settings), folder).run
 
 
-def telling(config, own, change):
+def telling(config, extra, change):
     """ES that has arrays of its own and changes them when it is told: `change(own, evaluation) -> own`."""
     ours = ALGORITHMS["es"](config)
 
     def tell(state, evaluations):
-        return replace(ours.tell(state, evaluations), own=change(state.own, evaluations[0]))
+        return replace(ours.tell(state, evaluations), extra=change(state.extra, evaluations[0]))
 
-    return replace(ours, tell=tell, own=own)
+    return replace(ours, tell=tell, extra=extra)
 
 
 def counting(config, extra=0.0):
     """Sigma depends on what it remembers: a count, a list that grows, and a scalar that NumPy makes of a sum."""
 
-    def change(own, evaluation):
-        heard = np.append(own["heard"], evaluation.fitness)
-        return {"count": own["count"] + 1, "heard": heard, "sum": own["sum"] + evaluation.fitness, "x": own["x"]}
+    def change(extra, evaluation):
+        heard = np.append(extra["heard"], evaluation.fitness)
+        return {"count": extra["count"] + 1, "heard": heard, "sum": extra["sum"] + evaluation.fitness, "x": extra["x"]}
 
-    own = {"count": np.array(0), "heard": np.zeros(0), "sum": np.array(0.0, np.float32), "x": np.array(extra)}
-    search = telling(config, own, change)
+    extra = {"count": np.array(0), "heard": np.zeros(0), "sum": np.array(0.0, np.float32), "x": np.array(extra)}
+    search = telling(config, extra, change)
 
     def ask(state, generation):
-        assert state.own["count"] == generation == state.own["heard"].size
+        assert state.extra["count"] == generation == state.extra["heard"].size
         (asked,) = ALGORITHMS["es"](config).ask(state, generation)
-        return (replace(asked, sigma=0.2 / (1 + float(state.own["sum"]) ** 2)),)
+        return (replace(asked, sigma=0.2 / (1 + float(state.extra["sum"]) ** 2)),)
 
     return replace(search, ask=ask)
 
@@ -72,10 +72,10 @@ def test_they_outlive_a_stop_and_a_fork_to_the_bit(tmp_path):
     forked = api.fork(tmp_path / "parent", ["budget.generations=6"], out=tmp_path / "fork", generation=3).run
     assert forked.digest() == whole.digest()
     for run in (whole, forked, api.open_run(tmp_path / "parts")):
-        own = run.parts()[1]["own"]
-        assert (own["count"], own["heard"].size, own["sum"].dtype) == (7, 7, np.float32)
-        np.testing.assert_array_equal(own["heard"], run.history["centre_fitness_mean"])
-        assert own["sum"] == pytest.approx(own["heard"].sum(), rel=1e-5)
+        extra = run.parts()[1]["own"]
+        assert (extra["count"], extra["heard"].size, extra["sum"].dtype) == (7, 7, np.float32)
+        np.testing.assert_array_equal(extra["heard"], run.history["centre_fitness_mean"])
+        assert extra["sum"] == pytest.approx(extra["heard"].sum(), rel=1e-5)
 
 
 def test_they_are_in_the_digest(tmp_path):
@@ -114,9 +114,9 @@ def test_they_cannot_be_changed_in_place_also_after_a_resume(tmp_path):
     assert len(SEEN) == 7
     for state in SEEN:
         with pytest.raises(ValueError, match="read-only"):
-            state.own["x"][...] = 1.0
+            state.extra["x"][...] = 1.0
         with pytest.raises(TypeError, match="does not support item assignment"):
-            state.own["x"] = np.array(1.0)
+            state.extra["x"] = np.array(1.0)
 
 
 def test_a_part_that_nothing_changes_is_written_once(tmp_path):
@@ -128,21 +128,21 @@ def test_a_part_that_nothing_changes_is_written_once(tmp_path):
 
 
 def idle(config):
-    return telling(config, {"x": np.arange(3)}, lambda own, evaluation: own)
+    return telling(config, {"x": np.arange(3)}, lambda extra, evaluation: extra)
 
 
-def from_generation_2(own, evaluation, **changes):
-    return {**own, **changes} if evaluation.generation == 2 else own
+def from_generation_2(extra, evaluation, **changes):
+    return {**extra, **changes} if evaluation.generation == 2 else extra
 
 
 OWN = {"x": np.zeros(2), "n": np.array(1)}
 CHANGES = {
-    "other_type": lambda own, told: from_generation_2(own, told, x=np.zeros(2, np.float32)),
-    "another": lambda own, told: from_generation_2(own, told, y=np.zeros(2)),
-    "fewer": lambda own, told: {"x": own["x"]} if told.generation == 2 else own,
-    "no_array": lambda own, told: from_generation_2(own, told, x=[0.0, 0.0]),
-    "later_objects": lambda own, told: from_generation_2(own, told, x=np.array([None, 0.0])),
-    "longer": lambda own, told: from_generation_2(own, told, x=np.zeros((3, 4))),
+    "other_type": lambda extra, told: from_generation_2(extra, told, x=np.zeros(2, np.float32)),
+    "another": lambda extra, told: from_generation_2(extra, told, y=np.zeros(2)),
+    "fewer": lambda extra, told: {"x": extra["x"]} if told.generation == 2 else extra,
+    "no_array": lambda extra, told: from_generation_2(extra, told, x=[0.0, 0.0]),
+    "later_objects": lambda extra, told: from_generation_2(extra, told, x=np.array([None, 0.0])),
+    "longer": lambda extra, told: from_generation_2(extra, told, x=np.zeros((3, 4))),
 }
 
 
@@ -176,8 +176,8 @@ def test_other_names_types_and_shapes_are_stored(tmp_path, name):
     begin(tmp_path / "parts", name, generations=2)
     resumed = api.resume(tmp_path / "parts", ["budget.generations=6"]).run
     assert resumed.digest() == whole.digest()
-    own = resumed.parts()[1]["own"]
-    kinds = {name: (str(array.dtype), array.shape) for name, array in own.items()}
+    extra = resumed.parts()[1]["own"]
+    kinds = {name: (str(array.dtype), array.shape) for name, array in extra.items()}
     n, x = {"n": ("int64", ())}, {"x": ("float64", (2,))}
     assert (
         kinds
@@ -200,15 +200,15 @@ def test_what_is_no_array_of_numbers_ends_the_run(tmp_path, name, kind):
 
 
 def objects(config):
-    return telling(config, {"x": np.array([None, 1.0]), "n": np.array(1)}, lambda own, told: own)
+    return telling(config, {"x": np.array([None, 1.0]), "n": np.array(1)}, lambda extra, told: extra)
 
 
 def lists(config):
-    return telling(config, {"x": [0.0, 1.0]}, lambda own, told: own)
+    return telling(config, {"x": [0.0, 1.0]}, lambda extra, told: extra)
 
 
 def words(config):
-    return telling(config, {"x": np.array(["a", "b"])}, lambda own, told: own)
+    return telling(config, {"x": np.array(["a", "b"])}, lambda extra, told: extra)
 
 
 @pytest.mark.parametrize("name", ["objects", "lists", "words"])

@@ -472,7 +472,7 @@ def test_what_changed_in_a_cluster_is_told_in_the_order_that_keeps_workers():
     told = [actors.receive(0.0) for _ in range(4)]
     assert told[0] == Drain(1)
     assert isinstance(told[1], WorkerLost)
-    assert (told[1].worker, told[1].bystander) == (0, False)
+    assert (told[1].worker, told[1].charge_item) == (0, True)
     assert told[2:] == [SetWorkers(1), None]
     watch.now = Membership({"2": 7}, {}, frozenset("1"), frozenset("12"))
     assert [actors.receive(0.0) for _ in range(2)] == [SetWorkers(3), None], "no more than there is work for"

@@ -59,7 +59,7 @@ def test_what_a_bystander_was_computing_is_not_to_blame():
     state, _ = play(state, (1.0, items("a")))
     for worker in range(5):
         now = 100.0 * worker + 2.0
-        lost = WorkerLost(worker, "its process was killed", bystander=True)
+        lost = WorkerLost(worker, "its process was killed", charge_item=False)
         state, _ = play(state, (now, lost), (now + 20.0, Tick()))  # after its wait, the next is started
         state, commands = step(state, WorkerUp(worker + 1), now + 21.0)
         assert commands == [Assign(worker + 1, "a", 1)]

@@ -17,7 +17,7 @@ from es_service.cli.tables.evaluations import csv_file
 from es_service.errors import ConfigError, Interrupted, NotInRunError, StoreError
 from es_service.runs import evaluation
 from es_service.runs.folders import holds_runs, runs_of
-from es_service.runs.standing import newest_runs
+from es_service.runs.run_status import newest_runs
 from es_service.runs.sweep import INSIDE
 from es_service.store.lock import acquire_lock
 from tests.run_examples import write_run

@@ -25,7 +25,7 @@ from es_service.cli.tables.status import follow_status, print_status, print_summ
 from es_service.errors import ConfigError, Interrupted
 from es_service.loop.interfaces import Stop
 from es_service.runs import recent
-from es_service.runs.standing import Standing, more, read_standing, state
+from es_service.runs.run_status import RunStatus, more, read_status, state
 from es_service.store import reader
 from es_service.store.lock import acquire_lock
 from tests.run_examples import write_run
@@ -138,7 +138,7 @@ def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, cap
     print_summary(console, run, "")
     print_status(console, run)
     printed = capsys.readouterr().out
-    suggested = settings(more(read_standing(run)))
+    suggested = settings(more(read_status(run)))
     assert f"state              finished: the {'target' if 'reached' in spent else 'budget'}" in printed
     assert spent in printed
     assert printed.count(f"resume {run.folder} {' '.join(suggested)}") == 2
@@ -150,10 +150,10 @@ def test_what_it_suggests_goes_on(budget, spent, options, console, tmp_path, cap
     way = refused.value.way_out
     assert way is not None
     assert (way.action, way.run) == ("fork", str(run.folder))
-    assert way.settings == {"search.sigma": 0.05, **more(read_standing(run))}
+    assert way.settings == {"search.sigma": 0.05, **more(read_status(run))}
     with pytest.warns(RuntimeWarning, match="no generation was run"):
         empty = api.fork(run.folder, ["search.sigma=0.05"], out=tmp_path / "empty").run
-    assert more(read_standing(empty)) == more(read_standing(run))
+    assert more(read_status(empty)) == more(read_status(run))
     for going_on in (
         api.fork(way.run, way.settings, out=tmp_path / "fork"),
         api.resume(empty.folder, suggested[1::2]),
@@ -230,12 +230,12 @@ def test_why_a_run_has_stopped_is_told_until_it_is_finished(end, told, tmp_path)
     folder = tmp_path / "run"
     with contextlib.suppress(ValueError, Interrupted, KeyboardInterrupt):
         api.run(SMALL | {"budget": {"generations": 2}}, folder, on_generation=ends)
-    assert state(read_standing(api.open_run(folder))) == f"stopped before its budget was spent: {told}"
-    assert state(read_standing(api.resume(folder).run)) == "finished: the budget of 2 generations is spent"
+    assert state(read_status(api.open_run(folder))) == f"stopped before its budget was spent: {told}"
+    assert state(read_status(api.resume(folder).run)) == "finished: the budget of 2 generations is spent"
     (folder / "config.yaml").write_text(
         (folder / "config.yaml").read_text().replace("generations: 2", "generations: 3")
     )
-    assert state(read_standing(api.open_run(folder))) == "stopped before its budget was spent"
+    assert state(read_status(api.open_run(folder))) == "stopped before its budget was spent"
 
 
 def test_who_follows_a_run_is_told_once_that_it_waits_or_compiles(run, console, monkeypatch, capsys):
@@ -257,7 +257,7 @@ def test_time_to_go_is_that_of_the_budget_that_is_spent_first(run):
     row = {"generation": 100, "env_steps": 10**6, "wall_clock_s": 3600.0, "best_fitness": 0.0}
 
     def running(limits):
-        return state(Standing(run, {"host": "a", "pid": 1, "waiting_since": None, "doing": ""}, row, limits))
+        return state(RunStatus(run, {"host": "a", "pid": 1, "waiting_since": None, "doing": ""}, row, limits))
 
     assert running({}) == running({"target_fitness": 1.0}) == "running on a, pid 1"
     assert running({"generations": 500}) == "running on a, pid 1; about 4 h left"

@@ -211,11 +211,11 @@ def json_without_recent(answer: str) -> tuple[object, bool]:
 def compared(example: Example, folder: Path, digest: bool) -> str:
     """Whether a report shows what it should; of a damaged run, whether all that it shows was so at some generation."""
     found = read_run(folder, digest=digest)
-    if digest and (found.problems or found.standing.problem):
+    if digest and (found.problems or found.status.problem):
         run_page(found, lambda name: name)
     if found.problems:
         return PARTLY if shown(found) <= example.shown else OTHER
-    same = repr(found.standing.row) == repr(example.report.standing.row) and shown(found) == shown(example.report)
+    same = repr(found.status.row) == repr(example.report.status.row) and shown(found) == shown(example.report)
     return RIGHT if same and found.digest in ("", example.report.digest) else OTHER
 
 
@@ -227,8 +227,8 @@ def shown(report: RunData) -> set[Any]:
     map_.pop("order_N", None)  # with gaps where an entry cannot be read
     single = {"best": report.best, "geometry": geometry, "description": report.meta}
     found = {(name, repr(value)) for name, value in single.items() if value is not None}
-    if report.standing.row:
-        found.add(("history", tuple(np.float64(value).tobytes() for value in report.standing.row.values())))
+    if report.status.row:
+        found.add(("history", tuple(np.float64(value).tobytes() for value in report.status.row.values())))
     found |= {("map", row) for row in rows(map_)}
     found |= {("history", row) for row in rows(report.history)} | {("centre", row) for row in rows(report.centres)}
     found |= {("path", cell, path.tobytes()) for cell, path in report.paths.items()}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from es_service import api
-from es_service.runs import standing
+from es_service.runs import run_status
 from es_service.runs.certified import certified_policies
 
 pytestmark = pytest.mark.usefixtures("workers_here")
@@ -39,10 +39,10 @@ def test_it_ends_at_the_first_best_centre_that_new_episodes_confirm_and_its_bits
     assert [one.stored_fitness for one in tested] == sorted({one.stored_fitness for one in tested})
     until = run.generation
     assert run.history["centre_fitness_mean"].tolist() == whole.history["centre_fitness_mean"].tolist()[: until + 1]
-    assert standing.state(standing.read_standing(run)) == f"finished: {outcome.reason}"
+    assert run_status.state(run_status.read_status(run)) == f"finished: {outcome.reason}"
     again = api.resume(run.folder)
     assert (again.reason, again.run.generation) == (outcome.reason, until)
-    further = api.resume(run.folder, standing.more(standing.read_standing(run)))
+    further = api.resume(run.folder, run_status.more(run_status.read_status(run)))
     assert further.run.generation == 40
     assert further.run.digest() == whole.digest()
 

@@ -15,7 +15,7 @@ from es_service.dispatch.waits import NOTICE_S, SILENCE_S, Waits
 from es_service.protocol.messages import Chunk
 from es_service.runs import compiling, evaluation
 from es_service.runs.compiling import compiling_sentence, note_compiled, was_compiled
-from es_service.runs.standing import doing, read_standing
+from es_service.runs.run_status import doing, read_status
 from tests.helpers import spec
 from tests.system.session import SMALL
 
@@ -92,7 +92,7 @@ def test_a_run_says_that_its_workers_compile(tmp_path, monkeypatch, caplog):
 
     def hear(sentence: str) -> None:
         said.append(sentence)
-        states.append(doing(read_standing(api.open_run(tmp_path / "run"))))
+        states.append(doing(read_status(api.open_run(tmp_path / "run"))))
 
     api.run(config, tmp_path / "run", on_compile=hear)
     assert said[0] == "compiling for point_maze (evaluation episodes, first time, about 10 s)"

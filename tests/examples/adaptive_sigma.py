@@ -23,16 +23,16 @@ def adaptive_sigma(config: RunConfig) -> Algorithm:
     shared, first = novelty_search(config, fitness_weight=1.0), config.search.sigma
 
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
-        return tuple(replace(asked, sigma=float(state.own["sigma"])) for asked in shared.ask(state, generation))
+        return tuple(replace(asked, sigma=float(state.extra["sigma"])) for asked in shared.ask(state, generation))
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         state = shared.tell(state, evaluations)
-        sigma, record = float(state.own["sigma"]), float(state.own["record"])
+        sigma, record = float(state.extra["sigma"]), float(state.extra["record"])
         highest = max((one.fitness for one in evaluations if one.valid), default=-np.inf)
         if evaluations[0].generation > 0:  # the initial centre is no success
             sigma = float(np.clip(sigma * (RISE if highest > record else FALL), first / RANGE, first * RANGE))
-        own = {"sigma": np.array(sigma), "record": np.array(max(record, highest))}
-        return replace(state, own=own)  # arrays of a state are never changed in place
+        extra = {"sigma": np.array(sigma), "record": np.array(max(record, highest))}
+        return replace(state, extra=extra)  # arrays of a state are never changed in place
 
-    own = {"sigma": np.array(first), "record": np.array(-np.inf)}
-    return replace(shared, ask=ask, tell=tell, own=own)
+    extra = {"sigma": np.array(first), "record": np.array(-np.inf)}
+    return replace(shared, ask=ask, tell=tell, extra=extra)

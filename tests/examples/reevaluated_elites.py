@@ -53,7 +53,7 @@ def reevaluated_elites(config: RunConfig) -> Algorithm:
         return (*shared.ask(state, generation), *policies)
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
-        count, before, map_, left = len(state.centres), state.map, state.map, dict(state.own["left"].entries)
+        count, before, map_, left = len(state.centres), state.map, state.map, dict(state.extra["left"].entries)
         samples = [one for one in evaluations if one.centre >= count]
         for cell, one in zip(drawn(state, evaluations[0].generation), samples, strict=bool(samples)):
             row = before.row_of(cell)
@@ -62,7 +62,7 @@ def reevaluated_elites(config: RunConfig) -> Algorithm:
             map_, at, is_there = resampled(map_, cell, one.descriptor_B, one.fitness, one.episodes)
             if at != cell or not is_there:
                 left[cell] = {"count": left.get(cell, {"count": np.array(0)})["count"] + 1}
-        state = replace(state, map=map_, own={"left": ByCell(left)})
+        state = replace(state, map=map_, extra={"left": ByCell(left)})
         return shared.tell(state, tuple(one for one in evaluations if one.centre < count))
 
-    return replace(shared, ask=ask, parents=drawn, tell=tell, counts_samples=True, own={"left": ByCell()})
+    return replace(shared, ask=ask, parents=drawn, tell=tell, counts_samples=True, extra={"left": ByCell()})

@@ -12,7 +12,7 @@ from es_service.protocol.noise import Domain, normals, stream_keys, uniforms
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore, rows_of
-from tests.twins.behaviour_map import cell_number
+from tests.references.behaviour_map import cell_number
 from workers.environments import SHIPPED
 from workers.policies.policy import initial_parameters
 

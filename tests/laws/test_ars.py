@@ -1,4 +1,4 @@
-"""ARS against its twin, its weights by hand, and invalid members; its policy is linear."""
+"""ARS against its reference implementation, its weights by hand, and invalid members; its policy is linear."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from es_service.protocol.noise import Domain, normals, stream_keys
 from es_service.search.shaping import pair_weights, shaped
 from es_service.search.steps import STEPS
 from tests.laws.es_runs import Tampering, run_in_memory, small_config
-from tests.twins import ars as twin
+from tests.references import ars as reference
 from workers.environments import SHIPPED
 from workers.policies.policy import initial_parameters
 
@@ -47,7 +47,7 @@ def spoil(chunk, result):
     ],
     ids=["V2-t", "V1-t", "V2, all pairs, l2", "two layers, invalid members"],
 )
-def test_twenty_generations_equal_the_twin(policy, search, tampered):
+def test_twenty_generations_equal_the_reference(policy, search, tampered):
     config = config_of(policy, **search)
     task = SHIPPED["point_maze"]
     state, store, evaluator, _ = run_in_memory(
@@ -55,7 +55,7 @@ def test_twenty_generations_equal_the_twin(policy, search, tampered):
     )
     shape, search = policy_spec(config, task), config.search
     first = initial_parameters(shape, config.policy.init, 0)
-    other = twin.ARS(first, search.step.learning_rate, search.step.l2, search.shaping.count or search.pairs)
+    other = reference.ARS(first, search.step.learning_rate, search.step.l2, search.shaping.count or search.pairs)
     for generation in range(1, 21):
         results = {
             chunk.chunk_id: np.where(np.isfinite(result.descriptor).all(axis=-1), result.fitness, np.nan)

@@ -12,7 +12,7 @@ from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Ask
 from tests.helpers import DirectEvaluator, centre, random_parameters, spec
 from tests.laws.me_es_runs import SHAPE, assert_near, config_of, first_centres, noise_of, points, run_in_memory
-from tests.twins import es as twin
+from tests.references import es as reference
 
 # Random streams
 
@@ -70,7 +70,7 @@ def test_sigma_and_pairs_are_those_of_the_ask():
         point, fitness, _ = points(evaluator, TrainingChunk, 1, ask)
         assert (point.sigma, len(fitness)) == (sigma, pairs)
         np.testing.assert_array_equal(point.parameters_D, first[index])
-        other = twin.ES(first[index], 0.05, config.search.step.l2)
+        other = reference.ES(first[index], 0.05, config.search.step.l2)
         other.generation(noise_of(1, ask, pairs), fitness)
         assert_near(state.search.centres[index].centre_D, other.centre)
     np.testing.assert_array_equal(state.search.centres[1].centre_D, first[1])

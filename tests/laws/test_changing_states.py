@@ -120,37 +120,37 @@ def samples_are_counted_or_not(state, generation, rng):
 
 
 def own_values_change(state, generation, rng):
-    own = dict(state.own)
+    extra = dict(state.extra)
     name = str(rng.choice(["a", "b", "c"]))
-    way, then = rng.integers(7), own.get(name)
+    way, then = rng.integers(7), extra.get(name)
     if way == 0:
-        own.pop(name, None)
+        extra.pop(name, None)
     elif way == 1:
-        own[name] = some(rng, *rng.integers(0, 3, int(rng.integers(3)))).astype(rng.choice(["f4", "f8"]))
+        extra[name] = some(rng, *rng.integers(0, 3, int(rng.integers(3)))).astype(rng.choice(["f4", "f8"]))
     elif way == 2:
-        own[name] = Whole({str(key): some(rng, 2) for key in range(rng.integers(3))})
+        extra[name] = Whole({str(key): some(rng, 2) for key in range(rng.integers(3))})
     elif way == 3 or not isinstance(then, Appended | ByCell):
         rows = int(rng.integers(0, 600))
-        own[name] = Appended({"x": some(rng, rows, 2), "n": rng.integers(0, 2, rows)}) if way % 2 else ByCell()
+        extra[name] = Appended({"x": some(rng, rows, 2), "n": rng.integers(0, 2, rows)}) if way % 2 else ByCell()
     elif isinstance(then, Appended):
         kept = then.arrays["x"].shape[0] - int(rng.integers(2)) * int(rng.integers(300))
         more = int(rng.integers(0, 300))
         x, n = then.arrays["x"][: max(0, kept)], then.arrays["n"][: max(0, kept)]
-        own[name] = Appended({"x": np.concatenate([x, some(rng, more, 2)]), "n": np.append(n, np.arange(more))})
+        extra[name] = Appended({"x": np.concatenate([x, some(rng, more, 2)]), "n": np.append(n, np.arange(more))})
     else:
         entries = {cell: entry for cell, entry in then.entries.items() if rng.random() < 0.8}
         for cell in rng.integers(0, 5, 2):
             entries[cell] = {"x": some(rng, int(rng.integers(3)))}
-        own[name] = ByCell(entries)
-    return replace(state, own=own)
+        extra[name] = ByCell(entries)
+    return replace(state, extra=extra)
 
 
 def nothing_changes(state, generation, rng):
     """Everything is made anew and has the same content."""
-    own = {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in state.own.items()}
+    extra = {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in state.extra.items()}
     columns = {name: getattr(state.map, name).copy() for name in ("cell_N", *COLUMNS)}
     centres = tuple(replace(centre, centre_D=centre.centre_D.copy()) for centre in state.centres)
-    return replace(state, centres=centres, own=own, map=replace(state.map, **columns))
+    return replace(state, centres=centres, extra=extra, map=replace(state.map, **columns))
 
 
 CHANGES = [

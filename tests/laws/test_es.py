@@ -1,4 +1,4 @@
-"""ES against its twin; budgets, invalid members, and what the driver holds."""
+"""ES against its reference implementation; budgets, invalid members, and what the driver holds."""
 
 import dataclasses
 import tracemalloc
@@ -24,7 +24,7 @@ from es_service.search.algorithms import ALGORITHMS
 from es_service.search.observation_statistics import merge_moments, no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
 from tests.laws.es_runs import SHAPE, Tampering, run_in_memory, small_config
-from tests.twins import es as twin
+from tests.references import es as reference
 from workers.environments import SHIPPED
 from workers.policies.policy import initial_parameters
 from workers.simd.backend import target
@@ -38,23 +38,23 @@ def finished():
     return config, *run_in_memory(config)
 
 
-def test_twenty_generations_equal_the_twin(finished):
+def test_twenty_generations_equal_the_reference(finished):
     config, state, _, evaluator, _ = finished
-    assert_equals_the_twin(config, state, evaluator)
+    assert_equals_the_reference(config, state, evaluator)
 
 
 @pytest.mark.parametrize("shaping", ["signs", "returns"])
-def test_other_shapings_equal_the_twin(finished, shaping):
+def test_other_shapings_equal_the_reference(finished, shaping):
     config = small_config(shaping={"kind": shaping})
     state, _, evaluator, _ = run_in_memory(config)
-    assert_equals_the_twin(config, state, evaluator)
+    assert_equals_the_reference(config, state, evaluator)
     assert not np.allclose(state.search.centres[0].centre_D, finished[1].search.centres[0].centre_D)
 
 
-def assert_equals_the_twin(config, state, evaluator):
+def assert_equals_the_reference(config, state, evaluator):
     search = config.search
     first, step = initial_parameters(SHAPE, config.policy.init, 0), search.step
-    es = twin.ES(first, step.learning_rate, step.l2, search.shaping.kind)
+    es = reference.ES(first, step.learning_rate, step.l2, search.shaping.kind)
     for generation in range(1, 21):
         results = [
             (chunk.chunk_id, result.fitness)

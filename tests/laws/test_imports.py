@@ -47,7 +47,7 @@ JOINERS = {
     "es_service.environments.spaces",
     "es_service.environments.vector",
     "es_service.runs.compiling",
-    "es_service.runs.moment",
+    "es_service.runs.snapshot",
     "es_service.runs.repeating",
     "es_service.runs.scaling",
     "es_service.runs.session",
@@ -60,7 +60,7 @@ RAY_USERS = {"es_service.dispatch.ray_cluster", "es_service.runs.jobs"}
 OTHER_MEANINGS = {
     "workers.xla_cache": {"xla"},
     "es_service.store.lock": {"host"},
-    "es_service.runs.standing": {"host"},
+    "es_service.runs.run_status": {"host"},
     "es_service.watch.guard": {"host"},
 }
 """Module -> words that mean a folder or a machine there, and not the rollouts of these names."""

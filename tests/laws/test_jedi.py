@@ -33,7 +33,7 @@ def jedi(**search):
     )
     method = ALGORITHMS["jedi"](config)
     map_ = empty_map(make_geometry(config.map))
-    return config, method, first_state([np.zeros(6, np.float32)] * 2, 2, 1.0, map_, method.own, config.search)
+    return config, method, first_state([np.zeros(6, np.float32)] * 2, 2, 1.0, map_, method.extra, config.search)
 
 
 def test_nearness_and_fitness_are_scaled_to_the_range_of_the_population():
@@ -120,10 +120,10 @@ def test_targets_change_after_their_generations_and_emitters_start_from_the_near
     assert [one.objective.kind for one in method.ask(state, 1)] == ["fitness", "fitness"]
     assert method.start_cells(state, 1) == {}
     state = told(method, state, 0, (1.5, 5.5))
-    targets = [state.own[TARGET]]
+    targets = [state.extra[TARGET]]
     for generation in range(1, 7):
         starts = method.start_cells(state, generation)
-        nearest = [1 if abs(x - 1.5) <= abs(x - 5.5) else 5 for x, _ in state.own[TARGET]]
+        nearest = [1 if abs(x - 1.5) <= abs(x - 5.5) else 5 for x, _ in state.extra[TARGET]]
         assert starts == (dict(enumerate(nearest)) if generation in (1, 4) else {})
         for emitter, cell in starts.items():
             state = method.restart(state, emitter, cell, Elite(np.ones(6, np.float32), NOTHING, NOTHING, NOTHING))
@@ -132,10 +132,10 @@ def test_targets_change_after_their_generations_and_emitters_start_from_the_near
         assert [one.objective.weight for one in asked] == pytest.approx([[1.0, 0.65, 0.3][(generation - 1) % 3]] * 2)
         state = told(method, state, generation, (1.5, None))
         if generation % 3 == 0:
-            targets.append(state.own[TARGET])
-        assert (state.own[TARGET] == targets[-1]).all()
+            targets.append(state.extra[TARGET])
+        assert (state.extra[TARGET] == targets[-1]).all()
     assert len(targets) == 3
-    assert state.own[VISITS].tolist() == [0, 7, 0, 0, 0, 1, 0, 0, 0]
+    assert state.extra[VISITS].tolist() == [0, 7, 0, 0, 0, 1, 0, 0, 0]
 
 
 @pytest.mark.parametrize(("generations", "expected"), [(1, [0.3, 0.3]), (2, [1.0, 0.3, 1.0])])

@@ -1,4 +1,7 @@
-"""MAP-Elites against its twin; parents, variation, invalid policies, interruption, and what a config may say."""
+"""MAP-Elites against its reference implementation.
+
+Also parents, variation, invalid policies, interruption, and what a config may say.
+"""
 
 from dataclasses import replace
 
@@ -21,8 +24,8 @@ from es_service.search.maps.behaviour_map import Elite, empty_map, insert
 from es_service.search.maps.geometry import Grid
 from es_service.store.codec import decode_part, encode_part
 from tests.laws.me_es_runs import CELLS, SHAPE, Remembering, Sharing, first_centres, number, run_in_memory
-from tests.twins import map_elites as twin
-from tests.twins.behaviour_map import GridMap
+from tests.references import map_elites as reference
+from tests.references.behaviour_map import GridMap
 from workers.environments import SHIPPED
 
 BATCH, CENTRES, ISO, LINE = 20, 3, 0.3, 0.6
@@ -63,10 +66,10 @@ def evaluated(evaluator, generation):
     return found
 
 
-def test_twelve_generations_equal_the_twin():
+def test_twelve_generations_equal_the_reference():
     config = config_of()
     state, store, evaluator = run_in_memory(config)
-    other = twin.MapElites(GridMap(((-1.0, 1.0), (-1.0, 1.0)), CELLS), ISO, LINE)
+    other = reference.MapElites(GridMap(((-1.0, 1.0), (-1.0, 1.0)), CELLS), ISO, LINE)
     elites = other.map.elites
     for index, (centre_D, row) in enumerate(zip(first_centres(config), store.evaluated[0], strict=True)):
         other.evaluated(0, index, centre_D.astype(float), row["fitness_mean"], (row["x"], row["y"]))

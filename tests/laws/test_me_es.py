@@ -1,4 +1,4 @@
-"""ME-ES against its twin; modes of its blocks, invalid centres, statistics, interruption."""
+"""ME-ES against its reference implementation; modes of its blocks, invalid centres, statistics, interruption."""
 
 import numpy as np
 import pytest
@@ -24,18 +24,18 @@ from tests.laws.me_es_runs import (
     points,
     run_in_memory,
 )
-from tests.twins import me_es as twin
-from tests.twins.behaviour_map import GridMap, coverage, qd_score
+from tests.references import me_es as reference
+from tests.references.behaviour_map import GridMap, coverage, qd_score
 from workers.environments import SHIPPED
 from workers.policies.policy import initial_parameters
 
 
 @pytest.mark.parametrize("mode", ["explore", "exploit", "explore_exploit"])
 @pytest.mark.parametrize("preset", ["literature", "uber"])
-def test_thirty_generations_equal_the_twin(preset, mode):
+def test_thirty_generations_equal_the_reference(preset, mode):
     config = config_of(preset, mode=mode)
     state, store, evaluator = run_in_memory(config)
-    other = twin.MapElitesES(
+    other = reference.MapElitesES(
         initial_parameters(SHAPE, config.policy.init, 0, 0),
         GridMap(((-1.0, 1.0), (-1.0, 1.0)), CELLS),
         config.search.step.learning_rate,

@@ -7,7 +7,7 @@ import pytest
 
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import NO_CELL, CentreEvaluation
-from es_service.search.algorithms.common import archived, first_state, mapped
+from es_service.search.algorithms.common import add_to_archive, first_state, insert_into_map
 from es_service.search.algorithms.me_es import cell_shares
 from es_service.search.algorithms.starts import elite_novelty
 from es_service.search.maps.behaviour_map import BehaviourMap
@@ -190,7 +190,7 @@ def test_scores_by_hand():
         ]
     ):
         evaluation = CentreEvaluation(generation, 0, place is not None, fitness, np.array([place or np.nan]), best)
-        state = mapped(archived(state, evaluation), evaluation)
+        state = insert_into_map(add_to_archive(state, evaluation), evaluation)
         assert state.map is not None
         known = dict(zip(state.map.cell_N.tolist(), state.map.score_N.tolist(), strict=True))
         assert {cell: None if np.isnan(score) else score for cell, score in known.items()} == scores

@@ -28,7 +28,7 @@ from es_service.search.state_parts import ByCell, Whole
 from tests.laws.me_es_runs import CELLS, SHAPE, Sharing, first_centres, run_in_memory
 from tests.laws.me_es_runs import config_of as config_of_centres
 from tests.laws.test_map_elites import ISO, LINE
-from tests.twins.measured_map_elites import MeasuredMapElites, Policy
+from tests.references.measured_map_elites import MeasuredMapElites, Policy
 
 BATCH, CENTRES, GENERATIONS = 24, 6, 8
 KINDS = {
@@ -78,7 +78,7 @@ def drawn(generation, stream, count):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_map_elites_equals_the_twin(name):
+def test_map_elites_equals_the_reference(name):
     config = config_of(name)
     elites = config.search.elites
     _, store, evaluator = run_in_memory(config, Spoiling())
@@ -161,7 +161,7 @@ def centres_config(algorithm, kind="eme", **more):
 
 
 @pytest.mark.parametrize(("algorithm", "kind"), [("me_es", "eme"), ("memes", "eme"), ("memes", "archive_sampling")])
-def test_the_maps_of_emitters_equal_the_twin(algorithm, kind):
+def test_the_maps_of_emitters_equal_the_reference(algorithm, kind):
     """Each centre is a new policy with one sample, the mean of its evaluation episodes."""
     config = centres_config(algorithm, kind)
     emitters, elites = config.search.emitters, config.search.elites
@@ -241,8 +241,8 @@ def test_after_a_fork_that_emptied_the_map_nothing_is_kept():
 def test_only_what_is_measured_again_counts_samples_and_keeps_policies():
     for name, elites in {"once": {"kind": "once"}, "eme": {"kind": "eme", "estimate": "median"}}.items():
         state, _, _ = run_in_memory(config_of("eme", generations=2, elites=elites))
-        own = {KEPT: Whole, POLICIES: ByCell, SAMPLES: ByCell} if name == "eme" else {}
-        assert {key: type(value) for key, value in state.search.own.items()} == own
+        extra = {KEPT: Whole, POLICIES: ByCell, SAMPLES: ByCell} if name == "eme" else {}
+        assert {key: type(value) for key, value in state.search.extra.items()} == extra
         assert (state.search.map.samples_N is None) == (name == "once")
 
 

@@ -1,4 +1,7 @@
-"""MEMES against its twin; when an emitter is reset and from where, interruption, and what a config may say."""
+"""MEMES against its reference implementation.
+
+Also when an emitter is reset and from where, interruption, and what a config may say.
+"""
 
 from dataclasses import replace
 from typing import get_args
@@ -35,8 +38,8 @@ from tests.laws.me_es_runs import (
     points,
     run_in_memory,
 )
-from tests.twins import memes as twin
-from tests.twins.behaviour_map import GridMap
+from tests.references import memes as reference
+from tests.references.behaviour_map import GridMap
 from workers.environments import SHIPPED
 
 EMITTERS, PATIENCE, NEWEST = 4, 2, 30
@@ -51,10 +54,10 @@ def config_of(generations=24, **search):
 
 
 @pytest.mark.parametrize("mode", ["explore_exploit", "explore", "exploit"])
-def test_twenty_four_generations_equal_the_twin(mode):
+def test_twenty_four_generations_equal_the_reference(mode):
     config = config_of(mode=mode)
     state, store, evaluator = run_in_memory(config)
-    other = twin.Memes(
+    other = reference.Memes(
         first_centres(config),
         GridMap(((-1.0, 1.0), (-1.0, 1.0)), CELLS),
         config.search.step.learning_rate,
@@ -106,7 +109,7 @@ def begun(emitters=2, **search):
     """(the search, its state before any evaluation), with a map of nine cells in a row."""
     algorithm = ALGORITHMS["memes"](config_of(emitters=emitters, **search))
     map_ = empty_map(Grid(((0.0, 9.0),), (9,)))
-    return algorithm, first_state([np.zeros(3, np.float32)] * emitters, 1, 0.0, map_, algorithm.own)
+    return algorithm, first_state([np.zeros(3, np.float32)] * emitters, 1, 0.0, map_, algorithm.extra)
 
 
 def test_an_emitter_is_reset_after_generations_in_which_nothing_of_its_entered_the_map():
@@ -131,18 +134,18 @@ def test_an_emitter_is_reset_after_generations_in_which_nothing_of_its_entered_t
             for emitter, of in enumerate((first, second))
         )
         state = search.tell(state, told)
-        assert state.own[STAGNANT].tolist() == counts
+        assert state.extra[STAGNANT].tolist() == counts
         assert sorted(search.start_cells(state, generation + 1)) == reset
 
 
 def test_an_emitter_begins_again_with_a_fresh_optimiser_and_a_count_of_its_own():
     search, state = begun(emitters=3)
-    state = replace(state, own={STAGNANT: np.array([5, 7, 1])})
+    state = replace(state, extra={STAGNANT: np.array([5, 7, 1])})
     used = replace(state.centres[1], step={"adam_step": np.array(9), "adam_m_D": np.ones(3, np.float32)})
     state = replace(state, centres=(state.centres[0], used, state.centres[2]))
     nothing = np.zeros(0, np.float32)
     after = search.restart(state, 1, 4, Elite(np.full(3, 2, np.float32), nothing, nothing, nothing))
-    assert after.own[STAGNANT].tolist() == [5, 0, 1]
+    assert after.extra[STAGNANT].tolist() == [5, 0, 1]
     assert (after.centres[1].step["adam_step"], after.centres[1].cell) == (0, 4)
     assert after.centres[1].step["adam_m_D"].tolist() == [0, 0, 0]
     assert after.centres[1].centre_D.tolist() == [2, 2, 2]
@@ -153,7 +156,7 @@ def test_the_elite_is_any_of_the_map_with_equal_probability():
     search, state = begun(emitters=1000)
     places = [7.5, 0.5, 3.5, 4.5]
     told = [evaluated(0, emitter, 0.0, places[min(emitter, 3)]) for emitter in range(1000)]
-    state = replace(search.tell(state, tuple(told)), own={STAGNANT: np.full(1000, PATIENCE)})
+    state = replace(search.tell(state, tuple(told)), extra={STAGNANT: np.full(1000, PATIENCE)})
     drawn = list(search.start_cells(state, 1).values())
     assert len(drawn) == 1000
     np.testing.assert_allclose(
@@ -164,7 +167,7 @@ def test_the_elite_is_any_of_the_map_with_equal_probability():
 
 def test_while_the_map_is_empty_no_emitter_is_reset():
     search, state = begun()
-    assert search.start_cells(replace(state, own={STAGNANT: np.array([99, 99])}), 1) == {}
+    assert search.start_cells(replace(state, extra={STAGNANT: np.array([99, 99])}), 1) == {}
 
 
 # Interruption
@@ -240,7 +243,7 @@ def test_an_emitter_that_exploits_begins_again_after_its_generations_although_it
         for emitter in (reset := search.start_cells(state, generation)):
             nothing = np.zeros(0, np.float32)
             state = search.restart(state, emitter, 3, Elite(np.ones(3, np.float32), nothing, nothing, nothing))
-        ages.append((sorted(reset), state.own[AGE].tolist()))
+        ages.append((sorted(reset), state.extra[AGE].tolist()))
         state = told(search, state, generation, (1.5, 5.5))  # each generation is fitter than the one before
     assert ages == [
         ([], [0, 0]),
@@ -284,7 +287,7 @@ def test_starts_are_counted_where_the_least_tried_is_wanted():
         for emitter, cell in search.start_cells(state, generation).items():
             state = search.restart(state, emitter, cell, elite)
             drawn.append(cell)
-    counts_C = state.own[TRIED]
+    counts_C = state.extra[TRIED]
     assert len(drawn) == 8
     assert [counts_C[1], counts_C[5], counts_C.sum()] == [drawn.count(1), drawn.count(5), 8]
-    assert TRIED not in begun()[1].own
+    assert TRIED not in begun()[1].extra

@@ -1,4 +1,4 @@
-"""NS-ES, NSR-ES and NSRA-ES against their twin; choice of centres, weight rule, invalid centres."""
+"""NS-ES, NSR-ES and NSRA-ES against their reference implementation; choice of centres, weight rule, invalid centres."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import CentreEvaluation, FitnessWeight
 from es_service.search.algorithms.common import (
     CENTRE_CHOICE,
-    archived,
+    add_to_archive,
     choose_centre,
     first_state,
     novelty_of_centres,
@@ -24,7 +24,7 @@ from es_service.search.algorithms.nsra_es import adapted_weight
 from es_service.search.objectives import utilities, weighted
 from es_service.search.observation_statistics import no_observations
 from tests.helpers import DirectEvaluator, MemoryStore
-from tests.twins import novelty_search as twin
+from tests.references import novelty_search as reference
 from workers.environments import SHIPPED
 from workers.policies.policy import initial_parameters
 
@@ -91,13 +91,13 @@ def episodes(evaluator, kind, generation, centre_D=None):
         ("nsr_es", "euclidean", "signs"),
     ],
 )
-def test_twenty_generations_equal_the_twin(algorithm, distance, shaping):
+def test_twenty_generations_equal_the_reference(algorithm, distance, shaping):
     config, squared = config_of(algorithm, distance, shaping={"kind": shaping}), distance == "squared_euclidean"
     state, store, evaluator = run_in_memory(config)
     search = config.search
     rule = (search.fitness_weight_step, search.fitness_weight_patience, 0.0) if algorithm == "nsra_es" else None
     centres = [initial_parameters(SHAPE, config.policy.init, 0, index) for index in range(5)]
-    other = twin.NoveltySearch(
+    other = reference.NoveltySearch(
         centres,
         search.step.learning_rate,
         search.step.l2,
@@ -122,7 +122,7 @@ def test_twenty_generations_equal_the_twin(algorithm, distance, shaping):
         other.generation(centre, noise, *episodes(evaluator, TrainingChunk, generation))
         fitness, descriptor = (x[:20] for x in episodes(evaluator, EvaluationChunk, generation))
         mean = descriptor.astype(float).mean(axis=0)
-        assert row["centre_novelty"] == pytest.approx(twin.novelty(other.archive, mean, 3, squared), rel=1e-12)
+        assert row["centre_novelty"] == pytest.approx(reference.novelty(other.archive, mean, 3, squared), rel=1e-12)
         other.evaluated(centre, fitness.astype(float).mean(), mean)
         assert row["archive_size"] == len(other.archive) == 5 + generation
     for ours, theirs in zip(state.search.centres, other.centres, strict=True):
@@ -173,7 +173,7 @@ def state_with(descriptors, dimensions=2):
     state = first_state([np.zeros(3, np.float32)] * len(descriptors), dimensions, 0.0)
     for centre, descriptor in enumerate(descriptors):
         if descriptor is not None:
-            state = archived(state, CentreEvaluation(0, centre, True, 0.0, np.array(descriptor, float)))
+            state = add_to_archive(state, CentreEvaluation(0, centre, True, 0.0, np.array(descriptor, float)))
     return state
 
 
@@ -194,8 +194,8 @@ def test_members_are_chosen_in_proportion_to_their_novelty():
 def test_novelty_is_that_of_today_s_archive_and_of_the_centre_s_newest_entry():
     state = state_with([(0, 0), (10, 0)])
     for _ in range(3):  # others crowd around the first centre
-        state = archived(state, CentreEvaluation(1, 1, True, 0.0, np.array([0.0, 0.0])))
-    state = archived(state, CentreEvaluation(2, 1, True, 0.0, np.array([5.0, 0.0])))
+        state = add_to_archive(state, CentreEvaluation(1, 1, True, 0.0, np.array([0.0, 0.0])))
+    state = add_to_archive(state, CentreEvaluation(2, 1, True, 0.0, np.array([5.0, 0.0])))
     assert novelty_of_centres(state, config_of("ns_es").novelty).tolist() == [0.0, 5.0]
     share, _ = choices(state, 200)
     assert share.tolist() == [0.0, 1.0]
@@ -289,7 +289,9 @@ def test_invalid_members_are_last_whatever_is_climbed(weight, shaping):
     population = EpisodesResult(fitness, fitness, descriptor, np.ones((2, 2), np.int32), fitness, no_observations(2))
     (population,) = invalidate([population], 0.5, 1)
     assert np.isnan(population.fitness).sum() == 2
-    state = archived(first_state([np.zeros(1, np.float32)], 2, weight), CentreEvaluation(0, 0, True, 0.0, np.zeros(2)))
+    state = add_to_archive(
+        first_state([np.zeros(1, np.float32)], 2, weight), CentreEvaluation(0, 0, True, 0.0, np.zeros(2))
+    )
     novelty = config_of("nsr_es").novelty
     utility = utilities(weighted(weight), population, state.archive, novelty, KINDS[shaping])
     assert utility[0, 1] == utility[1, 0] == utility.min() <= utility[0, 0] < utility[1, 1] == utility.max()

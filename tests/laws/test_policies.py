@@ -14,7 +14,7 @@ from es_service.loop.policies import no_statistics, policy_episodes, policy_work
 from es_service.protocol.messages import PolicyChunk
 from es_service.search.algorithms import ALGORITHMS
 from es_service.search.algorithms.base import Ask, PolicyAsk
-from es_service.search.algorithms.common import archived, mapped
+from es_service.search.algorithms.common import add_to_archive, insert_into_map
 from es_service.search.maps.behaviour_map import insert
 from tests.helpers import workers_in_this_process
 from tests.laws.me_es_runs import SHAPE, Sharing, config_of, run_in_memory
@@ -145,7 +145,7 @@ def only(policies):
 
     def tell(state, told):
         for one in told:
-            state = mapped(archived(state, one), one) if one.centre == 0 else state
+            state = insert_into_map(add_to_archive(state, one), one) if one.centre == 0 else state
         return state
 
     return replace(shipped, ask=lambda state, generation: (PolicyAsk(policies),), tell=tell)

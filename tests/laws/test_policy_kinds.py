@@ -13,8 +13,8 @@ from es_service.config.tasks import TASKS
 from es_service.runs.certification import certify_run
 from es_service.runs.certified import Certified
 from es_service.runs.export import export
-from es_service.runs.moment import Policy
 from es_service.runs.replay import record
+from es_service.runs.snapshot import Policy
 from es_service.runs.verification import verify
 from es_service.store.digest import digest_parts
 

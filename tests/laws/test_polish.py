@@ -87,7 +87,7 @@ def evaluations(generation, fitness):
 def test_candidates_leave_by_mean_ranks_after_the_first_evaluation_and_after_each_round(parent):
     config = config_of(parent)
     method = ALGORITHMS["polish"](config)
-    state = first_state([np.zeros(3, np.float32)] * 5, 2, 1.0, own=method.own, search=config.search)
+    state = first_state([np.zeros(3, np.float32)] * 5, 2, 1.0, extra=method.extra, search=config.search)
 
     def left(state, generation):
         return [one.centre for one in method.ask(state, generation)]

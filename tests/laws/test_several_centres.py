@@ -1,4 +1,4 @@
-"""Generations that ask for several populations: equal to the twins; what their history says and counts."""
+"""Generations that ask for several populations equal the reference implementations; what their history says."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from es_service.loop.generation import fittest
 from es_service.loop.parts import elite_part, map_from_parts
 from es_service.protocol.messages import EvaluationChunk, TrainingChunk
 from es_service.search.algorithms.base import NO_CELL, CentreEvaluation, in_columns
-from es_service.search.algorithms.common import archived, first_state, mapped, novelty_of_centres
+from es_service.search.algorithms.common import add_to_archive, first_state, insert_into_map, novelty_of_centres
 from es_service.search.algorithms.me_es import CELL_CHOICE, block_mode
 from es_service.search.algorithms.nsra_es import adapted_weight
 from es_service.search.maps.behaviour_map import empty_map
@@ -28,19 +28,19 @@ from tests.laws.me_es_runs import (
     points,
     run_in_memory,
 )
-from tests.twins import me_es as me_es_twin
-from tests.twins import novelty_search as novelty_twin
-from tests.twins.behaviour_map import GridMap
+from tests.references import me_es as me_es_reference
+from tests.references import novelty_search as novelty_reference
+from tests.references.behaviour_map import GridMap
 
 EMITTERS, CELLS = 3, (8, 8)
 NSRA = {"fitness_weight_start": 0.5, "fitness_weight_step": 0.125, "fitness_weight_patience": 2}
 
 
 @pytest.mark.parametrize("preset", ["literature", "uber"])
-def test_blocks_side_by_side_equal_the_twin(preset):
+def test_blocks_side_by_side_equal_the_reference(preset):
     config = config_of(preset, generations=18, cells=CELLS, emitters=EMITTERS)
     state, store, evaluator = run_in_memory(config)
-    emitters = me_es_twin.side_by_side(
+    emitters = me_es_reference.side_by_side(
         first_centres(config),
         GridMap(((-1.0, 1.0), (-1.0, 1.0)), CELLS),
         config.search.step.learning_rate,
@@ -72,7 +72,7 @@ def test_blocks_side_by_side_equal_the_twin(preset):
             mean, place = evaluation(evaluator, generation, ask)
             robbed += emitter.elite is not None and emitter.elite not in elites.values()
             emitter.evaluated(generation, mean, place, highest[ask])
-            found = novelty_twin.novelty(before, place, 3, PRESETS[preset]["squared"])
+            found = novelty_reference.novelty(before, place, 3, PRESETS[preset]["squared"])
             assert rows[ask]["novelty"] == pytest.approx(found, rel=1e-12)
         mine = [[cell for cell, elite in elites.items() if elite is one.elite] for one in emitters]
         assert [row["cell"] for row in rows] == [number(cells[0], CELLS) if cells else None for cells in mine]
@@ -109,7 +109,7 @@ def test_scores_of_centres_side_by_side_by_hand():
         (1, 40, 0, 2.5, {2: 40, 4: 30}, [4, NO_CELL]),
     ):
         told = CentreEvaluation(1, centre_, True, fitness, np.array([place]), best)
-        state = mapped(state, told)
+        state = insert_into_map(state, told)
         assert state.map is not None
         assert dict(zip(state.map.cell_N.tolist(), state.map.score_N.tolist(), strict=True)) == scores
         assert [one.cell for one in state.centres] == cells
@@ -118,7 +118,7 @@ def test_scores_of_centres_side_by_side_by_hand():
 def test_the_novelty_of_a_centre_is_measured_against_the_newest_entries_by_hand():
     state = first_state([np.zeros(3, np.float32)] * 2, 1, 0.0)
     for generation, (index, place) in enumerate([(0, 1.0), (0, 5.0), (1, 9.0), (0, 20.0)]):
-        state = archived(state, CentreEvaluation(generation, index, True, 0.0, np.array([place]), 0.0))
+        state = add_to_archive(state, CentreEvaluation(generation, index, True, 0.0, np.array([place]), 0.0))
     settings = config_of(neighbours=2).novelty
     assert novelty_of_centres(state, settings).tolist() == [13.0, 6.0]  # (11 + 15) / 2, (4 + 8) / 2
     newest = settings.model_copy(update={"newest": 2})
@@ -128,13 +128,13 @@ def test_the_novelty_of_a_centre_is_measured_against_the_newest_entries_by_hand(
 
 
 @pytest.mark.parametrize(("algorithm", "weight"), [("ns_es", 0.0), ("nsr_es", 0.5), ("nsra_es", 0.5)])
-def test_every_centre_at_once_equals_the_twin(algorithm, weight):
+def test_every_centre_at_once_equals_the_reference(algorithm, weight):
     rule = NSRA if algorithm == "nsra_es" else {}
     config = config_of(
         generations=14, algorithm=algorithm, centres=3, update="all", step={"learning_rate": 0.05}, **rule
     )
     state, store, evaluator = run_in_memory(config)
-    other = novelty_twin.NoveltySearch(
+    other = novelty_reference.NoveltySearch(
         first_centres(config),
         config.search.step.learning_rate,
         config.search.step.l2,
@@ -153,7 +153,7 @@ def test_every_centre_at_once_equals_the_twin(algorithm, weight):
             assert_near(start.parameters_D, other.centres[ask].centre)
             other.generation(ask, noise_of(generation, ask), *found)
         told = [(ask, *evaluation(evaluator, generation, ask)) for ask in range(3)]
-        expected = [novelty_twin.novelty(other.archive, place, 3) for *_, place in told]
+        expected = [novelty_reference.novelty(other.archive, place, 3) for *_, place in told]
         assert [row["novelty"] for row in rows] == pytest.approx(expected, rel=1e-12)
         other.told(told)
         assert store.rows[generation]["archive_size"] == len(other.archive) == 3 + 3 * generation

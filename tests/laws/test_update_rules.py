@@ -1,4 +1,4 @@
-"""Ranks, the gradient estimate, the tree sum and Adam, worked by hand and against their twins."""
+"""Ranks, the gradient estimate, the tree sum and Adam, worked by hand and against their reference implementations."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from es_service.search.steps.adam import adam_step, adamw_step, fresh_adam
 from es_service.search.steps.clipup import clipup_step, fresh_clipup
 from tests.helpers import DirectEvaluator
 from tests.laws.es_runs import SHAPE, small_config
-from tests.twins import es as twin
+from tests.references import es as reference
 from workers.environments import SHIPPED
 
 KINDS = {"ranks": Ranks(), "signs": Signs(), "returns": Returns(), "top_pairs": TopPairs(count=5)}
@@ -51,17 +51,17 @@ def test_standardised_returns_by_hand():
 
 
 @given(fitness_arrays, st.sampled_from(["signs", "returns"]), st.randoms(use_true_random=False))
-def test_other_shapings_equal_the_twin_and_no_order_of_pairs_matters(fitness, shaping, random):
+def test_other_shapings_equal_the_reference_and_no_order_of_pairs_matters(fitness, shaping, random):
     utilities = shaped(KINDS[shaping], fitness)
-    np.testing.assert_allclose(utilities.ravel(), twin.SHAPINGS[shaping](fitness.ravel()), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(utilities.ravel(), reference.SHAPINGS[shaping](fitness.ravel()), rtol=1e-6, atol=1e-9)
     order = random.sample(range(len(fitness)), len(fitness))
     np.testing.assert_array_equal(shaped(KINDS[shaping], fitness[order]), utilities[order])
 
 
 @given(fitness_arrays)
-def test_ranks_equal_the_twin_and_sum_to_zero(fitness):
+def test_ranks_equal_the_reference_and_sum_to_zero(fitness):
     ranks = centred_ranks(fitness)
-    np.testing.assert_allclose(ranks.ravel(), twin.averaged_centred_ranks(fitness.ravel()), atol=1e-12)
+    np.testing.assert_allclose(ranks.ravel(), reference.averaged_centred_ranks(fitness.ravel()), atol=1e-12)
     assert abs(ranks.sum()) < 1e-9
 
 

@@ -23,6 +23,7 @@ REPLACED = {
     r"\bjudge?ments?\b": "evaluation of a centre",
     r"\babsorb": "tell",
     r"\btruth\b": "bool",
+    r"\btwins?\b": "reference implementation",
     r"\brepertoire\b": "behaviour map",
     r"\bsolutions?\b": "policy or centre",
 }

@@ -56,7 +56,7 @@ def search(config):
 
 
 @pytest.fixture
-def own(tmp_path, monkeypatch):
+def extra(tmp_path, monkeypatch):
     """The folder of a user with a task and a search, and a function that runs and then continues a run with them."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
@@ -80,8 +80,8 @@ def own(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
-def test_a_task_and_a_search_that_are_edited_between_stop_and_resume(own):
-    folder, go_on = own
+def test_a_task_and_a_search_that_are_edited_between_stop_and_resume(extra):
+    folder, go_on = extra
     assert go_on(1) == []
     (folder / "my_notes.py").write_text("not imported")
     assert go_on(2, strict=True) == []
@@ -123,9 +123,9 @@ def hashes(run):
     return read_platforms(run.folder)[-1][1][CODE]
 
 
-def test_a_task_that_is_edited_between_two_runs_of_one_process_is_new_in_the_second(own):
+def test_a_task_that_is_edited_between_two_runs_of_one_process_is_new_in_the_second(extra):
     """With its helper, in all its parts: what the driver knows of it, what workers compute, what is recorded."""
-    folder, _ = own
+    folder, _ = extra
     config = SMALL | {
         "task": {"environment": "my_task:Point"},
         "search": {"algorithm": "es", "pairs": 16, "evaluation_episodes": 4},
@@ -165,9 +165,9 @@ def test_a_task_that_is_edited_between_two_runs_of_one_process_is_new_in_the_sec
 
 
 @pytest.mark.long
-def test_a_search_that_is_edited_between_two_runs_of_one_process_is_new_in_the_second(own):
+def test_a_search_that_is_edited_between_two_runs_of_one_process_is_new_in_the_second(extra):
     """It, or a module that it imports."""
-    folder, _ = own
+    folder, _ = extra
     files = {"my_search.py": LENGTH, "my_version.py": "VERSION = 1\n"}
     for name, text in files.items():
         (folder / name).write_text(text)

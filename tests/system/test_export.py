@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from es_service.runs.export import ribs_archive
-from es_service.runs.moment import map_places
+from es_service.runs.snapshot import map_places
 from es_service.search.maps.geometry import Grid
 from tests.system.command_line import command
 

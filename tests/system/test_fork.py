@@ -22,8 +22,8 @@ from es_service.errors import ConfigError, NotInRunError
 from es_service.loop.parts import CELL_PREFIX
 from es_service.protocol.options import choice
 from es_service.runs import checked_config, evaluation, lineage, sessions
+from es_service.runs.run_status import more, read_status
 from es_service.runs.session import dispatch_limits
-from es_service.runs.standing import more, read_standing
 from es_service.store import reader
 from es_service.store.digest import digest_at
 from es_service.store.reader import read_generation
@@ -172,7 +172,7 @@ def test_a_fork_whose_budget_is_spent_says_so(parent, tmp_path):
     assert forked.generation == 6
     (notice,) = told
     assert notice.startswith("no generation was run: the budget of 6 generations is spent already at generation 6")
-    assert more(read_standing(forked)) == {"budget.generations": 12}
+    assert more(read_status(forked)) == {"budget.generations": 12}
     api.resume(forked.folder, ["budget.generations=7"], on_notice=told.append)
     assert (forked.generation, len(told)) == (7, 1)
 

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from es_service.dispatch.waits import NOTICE_S
-from es_service.runs.standing import is_waiting, read_standing
+from es_service.runs.run_status import is_waiting, read_status
 from es_service.runs.view import open_run
 from es_service.store.digest import digest_parts
 from es_service.store.folder import holds_run
@@ -28,7 +28,7 @@ GENERATIONS = 20
 
 def waits(run: Path) -> bool:
     """Whether a run waits, as a reader of its folder sees it."""
-    return holds_run(run) and is_waiting(read_standing(open_run(run)))
+    return holds_run(run) and is_waiting(read_status(open_run(run)))
 
 
 def end(hosts: cluster.Hosts, driver: subprocess.Popen[str], run: Path, number: int) -> str:
@@ -87,7 +87,7 @@ def test_a_run_that_finds_the_cluster_full_waits_and_then_ends_with_the_digest_t
         assert driver.returncode == 0, printed
         took = time.monotonic() - began
     assert "a worker has a place in the cluster; the run begins" in printed
-    row = read_standing(open_run(run)).row
+    row = read_status(open_run(run)).row
     assert row is not None
     assert row["wall_clock_s"] < took - waited
     assert digest_parts(run) == inline_digest(tmp_path / "inline", CONFIG, GENERATIONS)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from es_service.protocol.options import Option
-from tests.twins import point_maze
+from tests.references import point_maze
 
 
 class CornerMaze:

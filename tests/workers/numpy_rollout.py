@@ -15,7 +15,7 @@ from es_service.protocol.noise import NORMAL_STD, evaluation_reset_keys, normal_
 from es_service.protocol.outputs import OF_STEPS
 from es_service.protocol.recipes import explicit
 from es_service.protocol.recordings import Recording, Recordings, RecordRequest
-from tests.twins import point_maze
+from tests.references import point_maze
 from workers.compilable import Compilable
 from workers.policies.outputs import action, drawn_action
 from workers.policies.policy import act, normalise, split_layers

@@ -12,9 +12,9 @@ from es_service.config.tasks import TASKS, task_of
 from es_service.errors import ConfigError
 from es_service.protocol.messages import EvaluationChunk
 from es_service.protocol.noise import evaluation_reset_keys
-from es_service.protocol.sources import own_path, user_sources
-from es_service.runs.moment import Policy
+from es_service.protocol.sources import user_path, user_sources
 from es_service.runs.replay import record
+from es_service.runs.snapshot import Policy
 from tests.helpers import centre, random_parameters, spec, workers_in_this_process
 from workers.environments import TaskError, describe_environment
 from workers.worker import make_worker
@@ -197,9 +197,9 @@ def test_a_descriptor_that_there_is_not_is_named(descriptor, problem):
 
 
 def test_the_code_of_an_environment_is_its_module_and_the_library_s_version():
-    assert own_path("gymnasium:Ant-v5") == ""
-    assert own_path("gymnasium:my_package/My-v0") == "my_package:My-v0"
-    assert own_path("gymnasium:my_package.inner:other/My-v0") == "my_package.inner:other/My-v0"
+    assert user_path("gymnasium:Ant-v5") == ""
+    assert user_path("gymnasium:my_package/My-v0") == "my_package:My-v0"
+    assert user_path("gymnasium:my_package.inner:other/My-v0") == "my_package.inner:other/My-v0"
     assert user_sources("gymnasium:Ant-v5") == {"gymnasium": gymnasium.__version__}
     assert "tests/workers/gymnasium_environments.py" in user_sources(REACH)
     assert TASKS[REACH].summary == "Reach of Gymnasium"

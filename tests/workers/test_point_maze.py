@@ -1,4 +1,4 @@
-"""PointMaze against a scalar twin of the published rules, and against landmarks worked out by hand."""
+"""PointMaze against a scalar reference implementation of the published rules, and landmarks worked out by hand."""
 
 import importlib
 import inspect
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from es_service.protocol.noise import Domain, stream_keys
-from tests.twins import point_maze as twin
+from tests.references import point_maze as reference
 from tests.workers.steps import resets_of
 from workers.environments import SHIPPED, make_environment
 
@@ -18,7 +18,7 @@ step = jax.jit(ENVIRONMENT.step)
 steps = jax.jit(jax.vmap(ENVIRONMENT.step))
 
 
-def test_random_moves_equal_the_twin():
+def test_random_moves_equal_the_reference():
     rng = np.random.default_rng(0)
     count = 100_000
     old = rng.uniform(-1, 1, (count, 2)).astype(np.float32)
@@ -27,7 +27,7 @@ def test_random_moves_equal_the_twin():
     new, reward, done = (np.asarray(x) for x in steps(old, action))
     differing = 0
     for i in range(count):
-        x, y, expected_reward, expected_done = twin.step(*old[i].tolist(), tuple(action[i].tolist()))
+        x, y, expected_reward, expected_done = reference.step(*old[i].tolist(), tuple(action[i].tolist()))
         same = np.allclose([*new[i], reward[i]], [x, y, expected_reward], atol=1e-5) and done[i] == expected_done
         differing += not same
     assert differing <= 3  # moves whose hit is within float32 rounding of a wall's end or the goal's edge

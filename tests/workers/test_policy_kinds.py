@@ -10,7 +10,7 @@ import pytest
 
 from es_service.protocol.messages import EpisodesResult, EvaluationChunk, PolicySpec, TrainingChunk, WorkerSpec
 from es_service.protocol.noise import Domain, evaluation_reset_keys, stream_keys
-from es_service.runs.moment import Policy
+from es_service.runs.snapshot import Policy
 from tests.examples.swing_up import SwingUp
 from tests.helpers import centre, chunk_runner, random_parameters, spec
 from tests.workers.numpy_rollout import NumPy
@@ -43,11 +43,11 @@ def kind(policy: PolicySpec, rollout: str = "xla") -> WorkerSpec:
 def test_xla_and_simd_compute_what_numpy_does(policy: PolicySpec):
     """In training with the noise of its address, and in evaluations."""
     for chunk in (TrainingChunk(1, 0), EvaluationChunk(1, 0)):
-        xla, simd, twin = (run(replace(kind(policy), rollout=name), chunk) for name in ("xla", "simd", "numpy"))
+        xla, simd, reference = (run(replace(kind(policy), rollout=name), chunk) for name in ("xla", "simd", "numpy"))
         assert len(np.unique(xla.returns)) > 4
         for found in (xla, simd):
-            np.testing.assert_allclose(found.descriptor, twin.descriptor, atol=1e-4)
-            np.testing.assert_allclose(found.returns, twin.returns, atol=1e-3)
+            np.testing.assert_allclose(found.descriptor, reference.descriptor, atol=1e-4)
+            np.testing.assert_allclose(found.returns, reference.returns, atol=1e-3)
 
 
 def run(worker_spec: WorkerSpec, chunk: TrainingChunk | EvaluationChunk) -> EpisodesResult:

@@ -19,8 +19,8 @@ from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, norma
 from es_service.runs.view import Policy
 from tests import helpers
 from tests.helpers import PARAMETERS, centre, chunk_runner, random_parameters
-from tests.twins import noise as noise_twin
-from tests.twins import point_maze as maze_twin
+from tests.references import noise as noise_reference
+from tests.references import point_maze as maze_reference
 from workers import environments
 from workers.environments import Environment, make_environment
 from workers.rollout import make_training_rollout
@@ -31,16 +31,16 @@ MEAN, STD = np.float32([0.1, -0.4]), np.float32([0.3, 0.6])
 
 
 def numpy_episode(parameters_D, reset_key, action_key, action_noise, steps=200):
-    """One PointMaze episode with the scalar twin and the NumPy policy: returns, steps, end, observations."""
+    """One PointMaze episode with the scalar reference and the NumPy policy: returns, steps, end, observations."""
     policy = Policy(SHAPE, parameters_D, MEAN, STD, 5.0)
-    x = -0.1 + 0.2 * noise_twin.uniform(reset_key, 0)
-    y = -1.0 + 0.3 * noise_twin.uniform(reset_key, 1)
+    x = -0.1 + 0.2 * noise_reference.uniform(reset_key, 0)
+    y = -1.0 + 0.3 * noise_reference.uniform(reset_key, 1)
     total, seen, distances = 0.0, [], []
     for t in range(steps):
         seen.append((x, y))
-        noise = np.array([noise_twin.normal_integer(action_key, 2 * t + i) for i in range(2)]) / NORMAL_STD
+        noise = np.array([noise_reference.normal_integer(action_key, 2 * t + i) for i in range(2)]) / NORMAL_STD
         action = policy(np.float32([x, y])) + action_noise * noise
-        x, y, reward, done = maze_twin.step(x, y, (float(action[0]), float(action[1])))
+        x, y, reward, done = maze_reference.step(x, y, (float(action[0]), float(action[1])))
         total += reward
         distances.append(-reward)
         if done:
@@ -61,8 +61,8 @@ def test_training_chunk_equals_numpy_episodes(spec):
     observed = []
     for p, pair in enumerate(range(16, 24)):
         direction = normals(stream_keys(3, Domain.PARAMETER_NOISE, 1, pair), PARAMETERS)
-        reset = noise_twin.stream_key(3, Domain.TRAINING_RESET, 1, pair, 0, 0)
-        action = noise_twin.stream_key(3, Domain.ACTION_NOISE, 1, pair, 0, 0)
+        reset = noise_reference.stream_key(3, Domain.TRAINING_RESET, 1, pair, 0, 0)
+        action = noise_reference.stream_key(3, Domain.ACTION_NOISE, 1, pair, 0, 0)
         for s, sign in enumerate((1.0, -1.0)):
             member = (parameters_D + sign * 0.1 * direction).astype(np.float32)
             total, steps, end, seen, distances = numpy_episode(member, reset, action, 0.01)
@@ -84,7 +84,7 @@ def test_evaluation_chunk_equals_numpy_episodes_and_has_no_noise(spec):
     assert isinstance(result, EpisodesResult)
     assert result.moments is None
     for e, episode in enumerate(range(16, 32)):
-        reset = noise_twin.stream_key(3, Domain.EVALUATION_RESET, 4, episode)
+        reset = noise_reference.stream_key(3, Domain.EVALUATION_RESET, 4, episode)
         total, steps, end, _, _ = numpy_episode(parameters_D, reset, [0, 0, 0, 0], 0.0)
         assert result.fitness[e] == pytest.approx(total, abs=2e-2)
         assert result.steps[e] == steps
@@ -129,8 +129,8 @@ def test_episodes_per_member_average(spec):
         pairs = [
             numpy_episode(
                 (parameters_D + 0.1 * normals(stream_keys(3, Domain.PARAMETER_NOISE, 1, p), PARAMETERS)),
-                noise_twin.stream_key(3, Domain.TRAINING_RESET, 1, p, 0, e),
-                noise_twin.stream_key(3, Domain.ACTION_NOISE, 1, p, 0, e),
+                noise_reference.stream_key(3, Domain.TRAINING_RESET, 1, p, 0, e),
+                noise_reference.stream_key(3, Domain.ACTION_NOISE, 1, p, 0, e),
                 0.01,
             )
             for p in range(2)

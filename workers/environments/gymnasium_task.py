@@ -29,7 +29,7 @@ import numpy as np
 from es_service.protocol.messages import DescriptorChoice, TaskSpec
 from es_service.protocol.options import Option, OptionValue
 from es_service.protocol.raised import users_error, why_not_imported
-from es_service.protocol.sources import LIBRARY, own_path
+from es_service.protocol.sources import LIBRARY, user_path
 from es_service.protocol.user_code import import_user_module
 from workers.environments import TaskError
 from workers.environments.host_descriptors import describe_descriptor
@@ -124,7 +124,7 @@ def _gymnasium() -> Any:
 
 def _registered(name: str) -> Any:
     """The specification under which an environment is registered, after its module has been imported."""
-    gymnasium, own = _gymnasium(), own_path(f"{LIBRARY}:{name}")
+    gymnasium, own = _gymnasium(), user_path(f"{LIBRARY}:{name}")
     module = own.partition(":")[0]
     try:
         if own and (":" in name or _exists(module)):

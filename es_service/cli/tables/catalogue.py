@@ -31,7 +31,7 @@ def print_catalogue(console: Console, known_tasks: Mapping[str, TaskSpec]) -> No
     algorithms = _table("algorithms (search.algorithm)")
     for name, method in ALGORITHMS.items():
         algorithms.add_row(name, method.summary)
-    algorithms.add_row("module:function", "A search of your own; see es_service/search/algorithms/own.py.")
+    algorithms.add_row("module:function", "A search of your own; see es_service/search/algorithms/user_method.py.")
     console.print(algorithms)
 
     presets = Table(title="presets (search.preset): the keys on which they differ", title_justify="left")

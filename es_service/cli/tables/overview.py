@@ -12,7 +12,7 @@ from es_service.cli.several import of_each
 from es_service.errors import ServiceError
 from es_service.report.progress import short
 from es_service.runs.folders import output_of
-from es_service.runs.standing import Standing, read_standing, state
+from es_service.runs.run_status import RunStatus, read_status, state
 from es_service.runs.view import open_run
 
 _COLUMNS = ("run", "algorithm", "task", "seed", "generation", "env steps", "best", "cells", "state")
@@ -27,7 +27,7 @@ def print_overview(console: Console, folders: Sequence[Path]) -> bool:
         folders: those of runs or of sweeps.
     """
     rows, problems = [], 0
-    for folder, found in of_each(folders, lambda run: _row(read_standing(open_run(run)))):
+    for folder, found in of_each(folders, lambda run: _row(read_status(open_run(run)))):
         if isinstance(found, ServiceError):
             rows.append(_without_row(folder, f"error: {' '.join(found.sentence.split())}"))
             problems += 1
@@ -47,16 +47,16 @@ def _without_row(folder: Path, state: str) -> tuple[str, ...]:
     return (str(folder), *["-"] * (len(_COLUMNS) - 2), state)
 
 
-def _row(standing: Standing) -> tuple[str, ...]:
-    constants, limits, row = standing.run.constants, standing.limits, standing.row
+def _row(status: RunStatus) -> tuple[str, ...]:
+    constants, limits, row = status.run.constants, status.limits, status.row
     who = (
-        str(standing.run.folder),
+        str(status.run.folder),
         constants["search.algorithm"],
         constants["task.environment"],
         str(constants["seed"]),
     )
     if row is None:
-        return (*who, *["-"] * (len(_COLUMNS) - len(who) - 1), state(standing))
+        return (*who, *["-"] * (len(_COLUMNS) - len(who) - 1), state(status))
     generations, steps = limits.get("generations"), limits.get("env_steps")
     return (
         *who,
@@ -64,5 +64,5 @@ def _row(standing: Standing) -> tuple[str, ...]:
         short(row["env_steps"]) + (f" of {short(steps)}" if steps else ""),
         f"{row['best_fitness']:.2f}",
         f"{row['map_cells']:,}" if "map_cells" in row else "-",
-        state(standing),
+        state(status),
     )

@@ -13,7 +13,16 @@ from es_service.errors import StoreError
 from es_service.report.progress import plain_line
 from es_service.runs.certified import newest_certified
 from es_service.runs.recent import FAULTS_OF, Recent, read_recent
-from es_service.runs.standing import Standing, doing, is_waiting, more, population_size, read_standing, state, way_on
+from es_service.runs.run_status import (
+    RunStatus,
+    doing,
+    how_to_continue,
+    is_waiting,
+    more,
+    population_size,
+    read_status,
+    state,
+)
 from es_service.runs.view import Run
 
 FOLLOW_INTERVAL_S = 1.0
@@ -23,7 +32,7 @@ SHOWN_PARAMETERS = 12
 
 def print_status(console: Console, run: Run) -> None:
     """Print the settings of a run, its state (waiting, running, stopped or finished) and its progress."""
-    standing = read_standing(run)
+    status = read_status(run)
     constants, parent = run.constants, run.meta.parent
     method = (constants["search.algorithm"], population_size(constants))
     fields = {
@@ -36,51 +45,51 @@ def print_status(console: Console, run: Run) -> None:
     if parent:
         fields["started from"] = f"{parent['folder']}, generation {parent['generation']}"
     fields["state"] = (
-        state(standing) if standing.driver else f"{state(standing)}; continue with: {way_command(way_on(standing))}"
+        state(status) if status.driver else f"{state(status)}; continue with: {way_command(how_to_continue(status))}"
     )
-    _print_fields(console, fields | _progress(standing) | _parameters(standing) | _certified(run))
+    _print_fields(console, fields | _progress(status) | _parameters(status) | _certified(run))
 
 
 def follow_status(console: Console, run: Run) -> None:
     """Print a line for the newest generation, at most one a second, until no driver is running; and one for a wait."""
     next_generation, told = 0, ""
     while True:
-        standing = read_standing(run)
-        waits_for = "a place" if is_waiting(standing) else doing(standing)
+        status = read_status(run)
+        waits_for = "a place" if is_waiting(status) else doing(status)
         if waits_for and waits_for != told:
-            print_line(console, state(standing))
+            print_line(console, state(status))
         told = waits_for
-        if standing.row and standing.row["generation"] >= next_generation:
-            next_generation = standing.row["generation"] + 1
-            print_line(console, plain_line(standing.row))
-        if not standing.driver:
-            way = way_command(way_on(standing))
-            print_line(console, f"no driver is running: {state(standing)}; continue with: {way}")
+        if status.row and status.row["generation"] >= next_generation:
+            next_generation = status.row["generation"] + 1
+            print_line(console, plain_line(status.row))
+        if not status.driver:
+            way = way_command(how_to_continue(status))
+            print_line(console, f"no driver is running: {state(status)}; continue with: {way}")
             return
         time.sleep(FOLLOW_INTERVAL_S)
 
 
 def print_summary(console: Console, run: Run, reason: str) -> None:
     """Print the summary of a session at its end: the result, the folder and the next commands."""
-    standing, folder = read_standing(run), run.folder
+    status, folder = read_status(run), run.folder
     sigma = next((key for key in ("search.sigma", "search.iso_sigma") if key in run.constants), None)
     doubled = {sigma: float(f"{run.constants[sigma] * 2:g}")} if sigma else {}
     print_line(console, f"\nDone: {reason}.")
-    _print_fields(console, _progress(standing) | _parameters(standing) | _certified(run))
+    _print_fields(console, _progress(status) | _parameters(status) | _certified(run))
     print_line(console, f"\nThe run is in {folder}. Next:")
     for words in (
         ("status", folder),
         ("report", folder),
         ("evaluate", folder, "--certify"),
         ("digest", folder),
-        ("resume", folder, *settings(more(standing))),
-        ("fork", folder, *settings(doubled | more(standing))),
+        ("resume", folder, *settings(more(status))),
+        ("fork", folder, *settings(doubled | more(status))),
     ):
         print_line(console, f"  {command(*words)}")
 
 
-def _progress(standing: Standing) -> dict[str, str]:
-    last, limits = standing.row, standing.limits
+def _progress(status: RunStatus) -> dict[str, str]:
+    last, limits = status.row, status.limits
     if last is None:
         return {"generation": "no generation is finished yet"}
     goal = {}
@@ -90,7 +99,7 @@ def _progress(standing: Standing) -> dict[str, str]:
     if "map_cells" in last:
         filled["map"] = f"{last['map_cells']:,} cells, {100 * last['coverage']:.1f} %; QD-score {last['qd_score']:,.0f}"
     rate = last["env_steps"] / last["wall_clock_s"] if last["wall_clock_s"] else 0.0
-    recent = read_recent(standing.run, last["generation"])
+    recent = read_recent(status.run, last["generation"])
     of = {key: f" of {limit:,}" for key, limit in limits.items()}
     target = f" (target: {limits['target_fitness']:g})" if "target_fitness" in limits else ""
     return {
@@ -107,10 +116,10 @@ def _progress(standing: Standing) -> dict[str, str]:
     }
 
 
-def _parameters(standing: Standing) -> dict[str, str]:
+def _parameters(status: RunStatus) -> dict[str, str]:
     """The parameters of the best centre by name, if the task is a function."""
-    run = standing.run
-    if standing.row is None or run.parameter_spec is None:
+    run = status.run
+    if status.row is None or run.parameter_spec is None:
         return {}
     try:
         named = run.parameters("best")

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 
 from es_service.config.search import PopulationConfig
 from es_service.search.algorithms.method import Method
-from es_service.search.algorithms.own import own_method
+from es_service.search.algorithms.user_method import user_method
 
 
 def _shipped() -> Iterator[Method]:
@@ -29,8 +29,8 @@ def _by_simplicity(method: Method) -> tuple[int, str]:
     """Number of keys that other gradient methods lack, or have with another default; and the name."""
     common, settings = PopulationConfig.model_fields, method.settings
     fields = settings.model_fields.items()
-    own = [name for name, key in fields if name not in common or key.default != common[name].default]
-    return len(own) + len(settings.presets), method.name
+    extra = [name for name, key in fields if name not in common or key.default != common[name].default]
+    return len(extra) + len(settings.presets), method.name
 
 
 OURS: dict[str, Method] = {one.name: one for one in sorted(_shipped(), key=_by_simplicity)}
@@ -42,7 +42,7 @@ class Algorithms(Mapping[str, Method]):
 
     def __getitem__(self, name: str) -> Method:
         """Raises KeyError for a plain name that is not shipped, ConfigError for a function that cannot be used."""
-        return own_method(name) if ":" in name else OURS[name]
+        return user_method(name) if ":" in name else OURS[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(OURS)

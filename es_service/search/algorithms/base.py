@@ -75,7 +75,7 @@ class SearchState:
     weight: FitnessWeight
     map: BehaviourMap | None = None
     """The behaviour map; None if `map.enabled` is false."""
-    own: Mapping[str, Any] = field(default_factory=dict)
+    extra: Mapping[str, Any] = field(default_factory=dict)
     """What else the search remembers, by name: arrays and what `search.state_parts` describes."""
     elites: Mapping[int, Elite] = field(default_factory=dict)
     """Policies of elites by cell, which are not part of the state, since the store keeps them. `ask` sees those of the
@@ -92,7 +92,7 @@ def frozen(state: SearchState) -> SearchState:
         values.flags.writeable = False  # but not the arrays of which they are the first part
     if state.map is not None:
         freeze([*vars(state.map).values(), *vars(state.map.geometry).values()])
-    return replace(state, archive=archive, own=read_only(state.own))
+    return replace(state, archive=archive, extra=read_only(state.extra))
 
 
 def from_elite(state: SearchState, index: int, cell: int, elite: Elite, *, own_statistics: bool = False) -> SearchState:
@@ -255,7 +255,7 @@ class Algorithm:
     """(state, generation) -> cells whose elites `ask` needs; they are then in `SearchState.elites`."""
     restart: Callable[[SearchState, int, int, Elite], SearchState] = from_elite
     """(state, index of a centre, start cell, its elite) -> state in which that centre has restarted."""
-    own: Mapping[str, Any] = field(default_factory=dict)
+    extra: Mapping[str, Any] = field(default_factory=dict)
     """What else the search remembers, by name, with its first values: arrays, and what `search.state_parts` describes.
     """
     counts_samples: bool = False

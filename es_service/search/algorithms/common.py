@@ -55,7 +55,7 @@ def novelty_search(
     Args:
         fitness_weight: initial value of w.
         adapt: (weight, evaluations of a generation after 0) -> new weight; None for a constant w.
-        offer: what becomes of evaluated centres; None: `archived_and_mapped`.
+        offer: what becomes of evaluated centres; None: `add_to_archive_and_map`.
     """
     search = settings_of(config, PopulationConfig)
     updates_all = isinstance(search, CentresSettings) and search.update == "all"
@@ -70,13 +70,13 @@ def novelty_search(
         return pair_weights(utilities(objective, population, state.archive, config.novelty, search.shaping))
 
     def step(state: SearchState, asked: Ask, gradient_D: FloatArray) -> SearchState:
-        return moved(state, asked, gradient_D, search)
+        return step_centre(state, asked, gradient_D, search)
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         weight = state.weight
         if adapt is not None and evaluations[0].generation > 0:
             weight = adapt(weight, evaluations)
-        return replace((offer or archived_and_mapped)(state, evaluations), weight=weight)
+        return replace((offer or add_to_archive_and_map)(state, evaluations), weight=weight)
 
     return Algorithm(ask, tell, weights, step, fitness_weight)
 
@@ -108,7 +108,7 @@ def first_state(
     dimensions: int,
     fitness_weight: float,
     map_: BehaviourMap | None = None,
-    own: Mapping[str, Any] | None = None,
+    extra: Mapping[str, Any] | None = None,
     search: SearchConfig | None = None,
 ) -> SearchState:
     """The state before any evaluation: initial centres, none of which has made a step, and an empty novelty archive.
@@ -118,11 +118,11 @@ def first_state(
         dimensions: number of descriptor dimensions.
         fitness_weight: initial weight of fitness.
         map_: the empty behaviour map; None for a run without one.
-        own: `Algorithm.own`.
+        own: `Algorithm.extra`.
         search: settings with the kind of the steps; None for a search without steps.
     """
     states = tuple(CentreState(centre_D, fresh_state(search, centre_D.size)) for centre_D in centres)
-    return SearchState(states, empty_archive(dimensions), FitnessWeight(fitness_weight), map_, read_only(own or {}))
+    return SearchState(states, empty_archive(dimensions), FitnessWeight(fitness_weight), map_, read_only(extra or {}))
 
 
 def choose_centre(state: SearchState, generation: int, config: RunConfig) -> int:
@@ -166,7 +166,7 @@ def novelty_of_centres(state: SearchState, settings: NoveltyConfig) -> NDArray[n
     return novelty_M
 
 
-def moved(state: SearchState, asked: Ask, gradient_D: FloatArray, search: PopulationConfig) -> SearchState:
+def step_centre(state: SearchState, asked: Ask, gradient_D: FloatArray, search: PopulationConfig) -> SearchState:
     """The state after one step of the asked centre up the gradient estimate [D], by its own `search.step`."""
     centre = state.centres[asked.centre]
     settings = search.step
@@ -176,14 +176,14 @@ def moved(state: SearchState, asked: Ask, gradient_D: FloatArray, search: Popula
     return with_centre(state, asked.centre, replace(centre, centre_D=centre_D, step=step))
 
 
-def archived_and_mapped(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
+def add_to_archive_and_map(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
     """The state with the evaluated centres in the novelty archive and in the behaviour map, one after another."""
     for evaluation in evaluations:
-        state = mapped(archived(state, evaluation), evaluation)
+        state = insert_into_map(add_to_archive(state, evaluation), evaluation)
     return state
 
 
-def archived(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
+def add_to_archive(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
     """The state with a valid centre appended to the novelty archive; unchanged for an invalid centre."""
     if not evaluation.valid:
         return state
@@ -192,7 +192,7 @@ def archived(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
     return replace(with_centre(state, evaluation.centre, centre), archive=archive)
 
 
-def mapped(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
+def insert_into_map(state: SearchState, evaluation: CentreEvaluation) -> SearchState:
     """The state with a valid centre inserted into the behaviour map, if it is better than the elite of its cell.
 
     `CentreState.cell` is then the cell whose elite the centre is, or NO_CELL. If the centre was an elite before this

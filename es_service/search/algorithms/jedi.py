@@ -95,7 +95,7 @@ def jedi(config: RunConfig) -> Algorithm:
     shared, geometry = novelty_search(config, fitness_weight=1.0), make_geometry(config.map)
 
     def start_cells(state: SearchState, generation: int) -> dict[int, int]:
-        target_M_B = state.own[TARGET]
+        target_M_B = state.extra[TARGET]
         if (generation - 1) % search.target_generations or state.map is None or np.isnan(target_M_B).any():
             return {}
         distance_M_N = np.linalg.norm(target_M_B[:, None] - state.map.descriptor_N_B, axis=-1)
@@ -107,25 +107,25 @@ def jedi(config: RunConfig) -> Algorithm:
             FitnessObjective()
             if np.isnan(target_B).any()
             else NearnessObjective(descriptor=tuple(target_B.tolist()), weight=weight)
-            for target_B in state.own[TARGET]
+            for target_B in state.extra[TARGET]
         ]
         return tuple(population(state, one, search, objective, generation) for one, objective in enumerate(objectives))
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
-        state, generation, own = shared.tell(state, evaluations), evaluations[0].generation, dict(state.own)
+        state, generation, extra = shared.tell(state, evaluations), evaluations[0].generation, dict(state.extra)
         valid = [one.descriptor_B for one in evaluations if one.valid]
         if valid:
-            own[VISITS] = own[VISITS] + np.bincount(geometry.cells_of(np.array(valid)), minlength=geometry.size)
+            extra[VISITS] = extra[VISITS] + np.bincount(geometry.cells_of(np.array(valid)), minlength=geometry.size)
         if generation % search.target_generations == 0 and state.map is not None and state.map.size:
-            candidate_C_B = promising(state.map, own[VISITS], search.model_noise)
+            candidate_C_B = promising(state.map, extra[VISITS], search.model_noise)
             key = stream_keys(config.seed, Domain.SELECTION, generation, TARGET_CHOICE)
             drawn_M = uniforms(key, np.arange(search.emitters, dtype=np.uint32)).astype(np.float64)
-            own[TARGET] = candidate_C_B[(drawn_M * len(candidate_C_B)).astype(np.int64)]
-        return replace(state, own=read_only(own))
+            extra[TARGET] = candidate_C_B[(drawn_M * len(candidate_C_B)).astype(np.int64)]
+        return replace(state, extra=read_only(extra))
 
     dimensions = len(config.map.bounds)
-    own = {TARGET: np.full((search.emitters, dimensions), np.nan), VISITS: np.zeros(geometry.size, np.int64)}
-    return replace(shared, start_cells=start_cells, ask=ask, tell=tell, own=own)
+    extra = {TARGET: np.full((search.emitters, dimensions), np.nan), VISITS: np.zeros(geometry.size, np.int64)}
+    return replace(shared, start_cells=start_cells, ask=ask, tell=tell, extra=extra)
 
 
 def target_weight(search: JediSettings, generation: int) -> float:

@@ -32,13 +32,13 @@ from es_service.config.search import SearchConfig
 from es_service.protocol.noise import Domain, stream_keys, uniforms
 from es_service.protocol.recipes import IsoLine, recipes_of
 from es_service.search.algorithms.base import Algorithm, CentreEvaluation, PolicyAsk, SearchState, in_columns
-from es_service.search.algorithms.common import archived, archived_and_mapped
+from es_service.search.algorithms.common import add_to_archive, add_to_archive_and_map
 from es_service.search.algorithms.measured import (
     LAYER_CHOICE,
     asked_again,
     drawn_rows,
+    extra_of,
     kept_of,
-    own_of,
     parameters_of,
     shares,
     told_of_samples,
@@ -111,7 +111,7 @@ def map_elites(config: RunConfig) -> Algorithm:
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         if evaluations[0].generation == 0:
-            return archived_and_mapped(state, evaluations)
+            return add_to_archive_and_map(state, evaluations)
         told, map_ = in_columns(evaluations), state.map
         valid, generation = told.valid_N, told.generation
         if map_ is None or not valid.any():
@@ -153,13 +153,13 @@ def _with_measured_elites(config: RunConfig, search: MapElitesSettings, elites: 
         told = in_columns(evaluations)
         if told.generation == 0:
             for evaluation in told:
-                state = archived(state, evaluation)
+                state = add_to_archive(state, evaluation)
             return told_of_samples(config, elites, state, told, np.arange(len(told))[:, None])
         _, count, rows = of_generation(state, told.generation)
         index_S_N = np.arange(elites.first_samples * count).reshape(-1, count)
         return told_of_samples(config, elites, state, told, index_S_N.T, rows, np.arange(index_S_N.size, len(told)))
 
-    return Algorithm(ask, tell, own=own_of(config, elites), counts_samples=True)
+    return Algorithm(ask, tell, extra=extra_of(config, elites), counts_samples=True)
 
 
 def parent_rows(

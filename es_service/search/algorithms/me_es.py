@@ -112,7 +112,7 @@ def me_es(config: RunConfig) -> Algorithm:
         ]
         share_N = novelty_N = np.zeros(map_.size)
         if not (how == "top" or how == "score"):
-            share_N = start_shares(how, map_, state.archive, config.novelty, state.own.get(TRIED))
+            share_N = start_shares(how, map_, state.archive, config.novelty, state.extra.get(TRIED))
         elif "explore" in modes:
             novelty_N = elite_novelty(map_, state.archive, config.novelty)
         for emitter, mode in enumerate(modes):
@@ -130,8 +130,8 @@ def me_es(config: RunConfig) -> Algorithm:
         )
 
     restart = counting(partial(from_elite, own_statistics=search.parent_statistics == "elite"))
-    own = counted_starts(config) if search.cell_sampling == "least_tried" else {}
-    return measuring(config, replace(shared, ask=ask, start_cells=start_cells, restart=restart, own=own))
+    extra = counted_starts(config) if search.cell_sampling == "least_tried" else {}
+    return measuring(config, replace(shared, ask=ask, start_cells=start_cells, restart=restart, extra=extra))
 
 
 def block_objective(search: MeEsSettings, seed: int, generation: int, emitter: int = 0) -> Objective:

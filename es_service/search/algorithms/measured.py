@@ -34,7 +34,7 @@ from es_service.search.algorithms.base import (
     SearchState,
     in_columns,
 )
-from es_service.search.algorithms.common import archived, archived_and_mapped
+from es_service.search.algorithms.common import add_to_archive, add_to_archive_and_map
 from es_service.search.algorithms.settings import EmittersSettings, settings_of
 from es_service.search.maps.behaviour_map import EMPTY, BehaviourMap, Elite, make_elite, rows_in
 from es_service.search.maps.kept import (
@@ -63,21 +63,21 @@ MOST_SAMPLES = 500
 NONE = np.zeros(0, np.int64)
 
 
-def own_of(config: RunConfig, settings: Measured) -> dict[str, Any]:
-    """`Algorithm.own` of a search that keeps policies."""
-    own: dict[str, Any] = {KEPT: Whole(kept_to_arrays(empty_kept(len(config.map.bounds)))), POLICIES: ByCell()}
-    return own | ({SAMPLES: ByCell()} if settings.estimate == "median" else {})
+def extra_of(config: RunConfig, settings: Measured) -> dict[str, Any]:
+    """`Algorithm.extra` of a search that keeps policies."""
+    extra: dict[str, Any] = {KEPT: Whole(kept_to_arrays(empty_kept(len(config.map.bounds)))), POLICIES: ByCell()}
+    return extra | ({SAMPLES: ByCell()} if settings.estimate == "median" else {})
 
 
 def kept_of(state: SearchState) -> KeptPolicies:
     """The values of the policies that a search keeps."""
-    kept = kept_from_arrays(state.own[KEPT].arrays)
+    kept = kept_from_arrays(state.extra[KEPT].arrays)
     return kept if state.map is not None and state.map.size else at_rows(kept, NONE)
 
 
 def parameters_of(state: SearchState, serials: Sequence[int]) -> list[NDArray[np.float32]]:
     """Parameters of kept policies, by their numbers."""
-    entries = state.own[POLICIES].entries
+    entries = state.extra[POLICIES].entries
     return [entries[serial]["centre_D"] for serial in serials]
 
 
@@ -99,7 +99,7 @@ def asked_again(state: SearchState, kept: KeptPolicies, rows: NDArray[np.int64])
     """
     if not rows.size:
         return ()
-    entries = state.own[POLICIES].entries
+    entries = state.extra[POLICIES].entries
     policies = [entries[serial] for serial in kept.serial_K[rows].tolist()]
 
     statistics = (np.stack([one[name] for one in policies]) for name in ("observation_mean_O", "observation_std_O"))
@@ -124,11 +124,11 @@ def told_of_samples(
         again_R: indices in `told` of their samples.
     """
     assert state.map is not None, "a search that keeps policies has a map"
-    kept, own = kept_of(state), dict(state.own)
+    kept, extra = kept_of(state), dict(state.extra)
     known = set(kept.serial_K.tolist())
     samples: dict[int, Arrays] | None = None
-    if SAMPLES in own:
-        samples = {serial: one for serial, one in own[SAMPLES].entries.items() if serial in known}
+    if SAMPLES in extra:
+        samples = {serial: one for serial, one in extra[SAMPLES].entries.items() if serial in known}
     is_valid_R = told.valid_N[again_R]
     kept = _with_new_samples(kept, told, rows_R[is_valid_R], again_R[is_valid_R], samples)
     comes_K = np.zeros(kept.size, bool)
@@ -146,16 +146,16 @@ def told_of_samples(
     uniform_K = uniforms(key, np.arange(resident.size, dtype=np.uint32)) if how == "any" else None
     kept = put(resident, coming, state.map.geometry, settings.depth, how, uniform_K)
     entered = np.flatnonzero(np.isin(new.serial_K, kept.serial_K))
-    own[KEPT] = Whole(kept_to_arrays(kept))
-    own[POLICIES] = _policies(own[POLICIES].entries, known, kept, new.serial_K[entered], told, new_N_S[entered, 0])
+    extra[KEPT] = Whole(kept_to_arrays(kept))
+    extra[POLICIES] = _policies(extra[POLICIES].entries, known, kept, new.serial_K[entered], told, new_N_S[entered, 0])
     if samples is not None:
         for n in entered.tolist():
             rows_S = new_N_S[n]
             samples[int(new.serial_K[n])] = _samples(told.fitness_N[rows_S], told.descriptor_N_B[rows_S])
-        own[SAMPLES] = ByCell({serial: samples[serial] for serial in kept.serial_K.tolist()})
+        extra[SAMPLES] = ByCell({serial: samples[serial] for serial in kept.serial_K.tolist()})
     map_ = top_layer(kept, state.map)
-    elites = _elites(map_, state.map, kept, own[POLICIES], told.generation)
-    return replace(state, map=map_, own=read_only(own), elites=elites)
+    elites = _elites(map_, state.map, kept, extra[POLICIES], told.generation)
+    return replace(state, map=map_, extra=read_only(extra), elites=elites)
 
 
 def _with_new_samples(
@@ -250,7 +250,7 @@ def offering(config: RunConfig) -> Callable[[SearchState, Sequence[CentreEvaluat
     """What becomes of evaluated centres: they enter the novelty archive, and the map as `search.elites` says."""
     settings = settings_of(config, EmittersSettings).elites
     if not isinstance(settings, Measured):
-        return archived_and_mapped
+        return add_to_archive_and_map
     elites: Measured = settings
 
     def offered(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
@@ -261,7 +261,7 @@ def offering(config: RunConfig) -> Callable[[SearchState, Sequence[CentreEvaluat
             rows = drawn_rows(config, elites, kept_of(state), told.generation, _again(config, elites))
         new, again = np.flatnonzero(is_centre), np.flatnonzero(~is_centre)
         for row in new.tolist():
-            state = archived(state, told[row])
+            state = add_to_archive(state, told[row])
         state = _scored(state, told, new)
         before = state.map
         state = told_of_samples(config, elites, state, told, new[:, None], rows, again)
@@ -294,7 +294,7 @@ def measuring(config: RunConfig, algorithm: Algorithm) -> Algorithm:
         rows = drawn_rows(config, elites, kept, generation, _again(config, elites))
         return (*algorithm.ask(state, generation), *asked_again(state, kept, rows))
 
-    return replace(algorithm, ask=ask, own={**algorithm.own, **own_of(config, elites)}, counts_samples=True)
+    return replace(algorithm, ask=ask, extra={**algorithm.extra, **extra_of(config, elites)}, counts_samples=True)
 
 
 def _again(config: RunConfig, settings: Measured) -> int:
@@ -317,7 +317,7 @@ def _scored(state: SearchState, told: CentreEvaluations, rows: NDArray[np.int64]
         if cell != NO_CELL and np.isfinite(score) and at.size:
             score_K[at] = score
     arrays = {**kept_to_arrays(kept), "score_K": score_K}
-    return replace(state, own=read_only({**state.own, KEPT: Whole(arrays)}))
+    return replace(state, extra=read_only({**state.extra, KEPT: Whole(arrays)}))
 
 
 # Searches whose newcomers are measured several times

@@ -96,20 +96,20 @@ def memes(config: RunConfig) -> Algorithm:
             return {}
         key = stream_keys(config.seed, Domain.SELECTION, generation, RESET_CHOICE)
         drawn_M = uniforms(key, np.arange(len(state.centres), dtype=np.uint32)).astype(np.float64)
-        is_reset_M = state.own[STAGNANT] >= search.stagnation_generations
+        is_reset_M = state.extra[STAGNANT] >= search.stagnation_generations
         if search.exploit_generations is not None:
-            is_reset_M = is_reset_M | (exploits_M & (state.own[AGE] >= search.exploit_generations))
+            is_reset_M = is_reset_M | (exploits_M & (state.extra[AGE] >= search.exploit_generations))
         if not is_reset_M.any():
             return {}
-        share_N = start_shares(search.starts, state.map, state.archive, config.novelty, state.own.get(TRIED))
+        share_N = start_shares(search.starts, state.map, state.archive, config.novelty, state.extra.get(TRIED))
         return {
             int(emitter): drawn_cell(state.map, share_N, drawn_M[emitter]) for emitter in np.flatnonzero(is_reset_M)
         }
 
     def restart(state: SearchState, index: int, cell: int, elite: Elite) -> SearchState:
-        counts = {name: counts_M for name, counts_M in state.own.items() if name in (STAGNANT, AGE)}
+        counts = {name: counts_M for name, counts_M in state.extra.items() if name in (STAGNANT, AGE)}
         zeroed = {name: np.where(np.arange(counts_M.size) == index, 0, counts_M) for name, counts_M in counts.items()}
-        return elite_restart(replace(state, own=read_only({**state.own, **zeroed})), index, cell, elite)
+        return elite_restart(replace(state, extra=read_only({**state.extra, **zeroed})), index, cell, elite)
 
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
         return tuple(
@@ -120,19 +120,19 @@ def memes(config: RunConfig) -> Algorithm:
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
         state = shared.tell(state, evaluations)
         entered_M = np.array([centre.cell != NO_CELL for centre in state.centres])
-        counts = {STAGNANT: np.where(entered_M, 0, state.own[STAGNANT] + 1)}
-        if AGE in state.own:
-            counts[AGE] = state.own[AGE] + 1
-        return replace(state, own=read_only({**state.own, **counts}))
+        counts = {STAGNANT: np.where(entered_M, 0, state.extra[STAGNANT] + 1)}
+        if AGE in state.extra:
+            counts[AGE] = state.extra[AGE] + 1
+        return replace(state, extra=read_only({**state.extra, **counts}))
 
     exploits_M = np.array([weight_of_fitness(emitter_objective(search, one)) > 0.0 for one in range(search.emitters)])
     elite_restart = counting(partial(from_elite, own_statistics=search.parent_statistics == "elite"))
-    own = {STAGNANT: np.zeros(search.emitters, np.int64)}
+    extra = {STAGNANT: np.zeros(search.emitters, np.int64)}
     if search.exploit_generations is not None:
-        own[AGE] = np.zeros(search.emitters, np.int64)
+        extra[AGE] = np.zeros(search.emitters, np.int64)
     if search.starts == "least_tried":
-        own |= counted_starts(config)
-    return measuring(config, replace(shared, start_cells=start_cells, restart=restart, ask=ask, tell=tell, own=own))
+        extra |= counted_starts(config)
+    return measuring(config, replace(shared, start_cells=start_cells, restart=restart, ask=ask, tell=tell, extra=extra))
 
 
 def emitter_objective(search: MemesSettings, emitter: int) -> Objective:

@@ -68,26 +68,26 @@ def polish(config: RunConfig) -> Algorithm:
     shared = novelty_search(config, fitness_weight=weight_of_fitness(search.objective))
 
     def ask(state: SearchState, generation: int) -> tuple[Ask, ...]:
-        left = np.flatnonzero(state.own[LEFT][: len(state.centres)])
+        left = np.flatnonzero(state.extra[LEFT][: len(state.centres)])
         return tuple(population(state, int(index), search, search.objective, generation) for index in left)
 
     def tell(state: SearchState, evaluations: Sequence[CentreEvaluation]) -> SearchState:
-        own, generation = state.own, evaluations[0].generation
+        extra, generation = state.extra, evaluations[0].generation
         in_round = (generation - 1) % search.round_generations + 1
         remain = search.candidates if generation == 0 else -(-len(evaluations) // 2)
         if len(evaluations) > remain and (generation == 0 or in_round > search.round_generations // 2):
             index = np.array([one.centre for one in evaluations])
-            score = own[SCORE].copy()
+            score = extra[SCORE].copy()
             score[index] += mean_ranks([one.results for one in evaluations if one.results is not None], search)
             if generation == 0 or in_round == search.round_generations:
                 best = index[np.argsort(-score[index], kind="stable")[:remain]]
-                own = {**own, LEFT: np.isin(np.arange(score.size), best), SCORE: np.zeros_like(score)}
+                extra = {**extra, LEFT: np.isin(np.arange(score.size), best), SCORE: np.zeros_like(score)}
             else:
-                own = {**own, SCORE: score}
-        return replace(shared.tell(state, evaluations), own=read_only(own))
+                extra = {**extra, SCORE: score}
+        return replace(shared.tell(state, evaluations), extra=read_only(extra))
 
-    own = {LEFT: np.ones(search.screened, bool), SCORE: np.zeros(search.screened)}
-    return replace(shared, ask=ask, tell=tell, own=own)
+    extra = {LEFT: np.ones(search.screened, bool), SCORE: np.zeros(search.screened)}
+    return replace(shared, ask=ask, tell=tell, extra=extra)
 
 
 def mean_ranks(results: list[EpisodesResult], search: CandidatesConfig) -> NDArray[np.float64]:

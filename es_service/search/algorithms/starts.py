@@ -34,9 +34,9 @@ def counting(restart: Restart) -> Restart:
     """The same function, which also counts the start if the search counts them."""
 
     def counted(state: SearchState, index: int, cell: int, elite: Elite) -> SearchState:
-        if (tried_C := state.own.get(TRIED)) is not None:
+        if (tried_C := state.extra.get(TRIED)) is not None:
             tried_C = tried_C + (np.arange(tried_C.size) == cell)
-            state = replace(state, own=read_only({**state.own, TRIED: tried_C}))
+            state = replace(state, extra=read_only({**state.extra, TRIED: tried_C}))
         return restart(state, index, cell, elite)
 
     return counted

@@ -30,7 +30,7 @@ from workers.simd.episodes.check import require_same
 from workers.simd.episodes.compiled import compile_episodes
 from workers.simd.episodes.kernel import compile_kernel
 from workers.simd.frontend.trace import trace_jaxpr
-from workers.simd.graph.twin import evaluate
+from workers.simd.graph.reference import evaluate
 from workers.worker import make_worker
 
 GENTLE = settings(
@@ -64,8 +64,8 @@ def every_primitive(draw: Any, target: Target) -> None:
     for name, one, other in zip(CASES, found, wanted, strict=True):
         same_words(one, other, name)
     graph, _, outputs = trace_jaxpr(jax.make_jaxpr(function)(of))
-    twin = evaluate(graph, outputs, as_words(given_))
-    require_same(as_words(found), as_words([value[:, None] for value in twin]), "the twin")
+    reference = evaluate(graph, outputs, as_words(given_))
+    require_same(as_words(found), as_words([value[:, None] for value in reference]), "the reference implementation")
 
 
 def as_words(tree: Any) -> np.ndarray:
@@ -77,7 +77,7 @@ def as_words(tree: Any) -> np.ndarray:
 @ON_ARM
 @settings(GENTLE, max_examples=2)
 @given(data=st.data())
-def test_every_primitive_has_the_bits_of_x86_and_of_its_twin(data: st.DataObject, target: Target) -> None:
+def test_every_primitive_has_the_bits_of_x86_and_of_its_reference(data: st.DataObject, target: Target) -> None:
     every_primitive(data.draw, target)
 
 

@@ -1,4 +1,7 @@
-"""New machine code is compared with its twin before it is used: right code passes, wrong code is found and not kept."""
+"""New machine code is compared with its reference implementation before it is used.
+
+Right code passes; wrong code is found and not kept.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ KINDS = [{"training": True}, {"training": False}, {"training": False, "own_weigh
 @pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
 @pytest.mark.parametrize("kind", KINDS, ids=["training", "evaluation", "policies"])
 @pytest.mark.parametrize("hidden", [(), (16,), (33, 48), (144,)], ids=str)
-def test_policies_of_all_shapes_have_the_bits_of_their_twin(hidden, kind, target, tmp_path: Path) -> None:
+def test_policies_of_all_shapes_have_the_bits_of_their_reference(hidden, kind, target, tmp_path: Path) -> None:
     shape = spec(policy=PolicySpec((2, *hidden, 2)))
     checked = []
     compile_episodes(

@@ -1,4 +1,4 @@
-"""Machine code: the bits of its NumPy twin at every width, whatever lanes, blocks and threads there are."""
+"""Machine code has the bits of its NumPy reference at every width, whatever lanes, blocks and threads there are."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from workers.simd.episodes.noise import gradient_module
 from workers.simd.frontend.digest import jaxpr_digest
 from workers.simd.frontend.trace import trace_jaxpr
 from workers.simd.graph.operations import OPERATIONS
-from workers.simd.graph.twin import evaluate
+from workers.simd.graph.reference import evaluate
 
 LANES = 100
 
@@ -51,7 +51,7 @@ def words_of(tree) -> list[np.ndarray]:
 
 
 @functools.cache
-def twin_of(name: str) -> list[np.ndarray]:
+def reference_of(name: str) -> list[np.ndarray]:
     """The words of `step_of` in NumPy; of the ants they take seconds."""
     step, states, actions = step_of(name)
     graph, _, outputs = trace_jaxpr(jax.make_jaxpr(step)(one_of(states), one_of(actions)))
@@ -68,16 +68,16 @@ def twin_of(name: str) -> list[np.ndarray]:
         pytest.param("ant_maze", marks=pytest.mark.long),
     ],
 )
-def test_bits_are_the_twins_on_every_target(name: str, target: Target) -> None:
+def test_bits_are_the_references_on_every_target(name: str, target: Target) -> None:
     step, states, actions = step_of(name)
     kernel = compile_kernel(step, one_of(states), one_of(actions), target=target)
     found = np.concatenate([leaf.reshape(LANES, -1) for leaf in words_of(kernel(states, actions))], axis=1).T
-    for number, (one, other) in enumerate(zip(found, twin_of(name), strict=True)):
+    for number, (one, other) in enumerate(zip(found, reference_of(name), strict=True)):
         np.testing.assert_array_equal(one, other.astype(one.dtype), err_msg=f"word {number}")
 
 
 @pytest.mark.parametrize("target", every_target(), ids=lambda target: target.isa)
-def test_operations_are_the_twins_for_special_values_too(target: Target) -> None:
+def test_operations_are_the_references_for_special_values_too(target: Target) -> None:
     rng = np.random.default_rng(0)
     pool = np.array([0.0, -0.0, 1.0, -1.0, 0.3, np.inf, -np.inf, np.nan, 1e-30, 3e38, 2.5, 8388609.0], np.float32)
     a, b, c = (rng.choice(pool, 64) for _ in range(3))
@@ -98,9 +98,9 @@ def test_operations_are_the_twins_for_special_values_too(target: Target) -> None
     graph, _, outputs = trace_jaxpr(jax.make_jaxpr(function)(*(x[0] for x in arguments)))
     used = {graph.keys[node][0] for node in range(len(graph.keys))}
     assert set(OPERATIONS) - used <= {"fma", "bits", "int_of_float", "int_of_bool", "ult", "unbits"}
-    twin = evaluate(graph, outputs, np.array([np.asarray(x).view(np.uint32) for x in arguments]))
+    reference = evaluate(graph, outputs, np.array([np.asarray(x).view(np.uint32) for x in arguments]))
     found = compile_kernel(function, *(one_of(x) for x in arguments), target=target)(*arguments)
-    for one, other in zip(found, twin, strict=True):
+    for one, other in zip(found, reference, strict=True):
         np.testing.assert_array_equal(one, np.asarray(other).astype(one.dtype))
 
 

@@ -61,7 +61,7 @@ def run(
 
 
 def actions_of(shape: PolicySpec, parameters_D: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The twin, in float64."""
+    """The reference implementation, in float64."""
     values, start = x.astype(float), 0
     for inputs, outputs in shape.layers:
         weights = parameters_D[start : start + inputs * outputs].reshape(inputs, outputs)

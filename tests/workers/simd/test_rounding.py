@@ -34,8 +34,8 @@ from workers.simd.graph import loops
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.loops import build_loop
 from workers.simd.graph.operations import compute
+from workers.simd.graph.reference import evaluate
 from workers.simd.graph.schedule import Region, schedule
-from workers.simd.graph.twin import evaluate
 
 PAIRS, STEPS = 24, 25
 COMPARED = ("fitness", "returns", "descriptor", "steps", "goal_distance")
@@ -132,7 +132,7 @@ def inputs_and_product() -> tuple[FoldingGraph, list[int], int]:
 
 
 def computed(graph: FoldingGraph, outputs: list[int]) -> list[np.ndarray]:
-    """Outputs by machine code, which are the twin's."""
+    """Outputs by machine code, which are the reference implementation's."""
     target = host_target()
     text = emit(graph, outputs, len(X), target)
     native = load_compiled(text, lambda: text, target)
@@ -141,8 +141,8 @@ def computed(graph: FoldingGraph, outputs: list[int]) -> list[np.ndarray]:
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(native.address)
     call(words.ctypes.data, out.ctypes.data, len(words))
     found = list(out.transpose(1, 0, 2).reshape(len(outputs), -1)[:, : X.shape[1]].view(np.float32))
-    for one, twin in zip(found, evaluate(graph, outputs, X.view(np.uint32)), strict=True):
-        np.testing.assert_array_equal(one, twin)
+    for one, reference in zip(found, evaluate(graph, outputs, X.view(np.uint32)), strict=True):
+        np.testing.assert_array_equal(one, reference)
     return found
 
 

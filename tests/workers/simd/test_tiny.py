@@ -70,11 +70,11 @@ def test_what_counts_as_zero_is_what_the_architecture_says(target: Target) -> No
         assert zeros.any()
         np.testing.assert_array_equal(result == 0, zeros)
         differ = [LEAST - HALF_UNIT <= abs(one) < LEAST for one in exact[name]]
-        twin = compute(name, arguments[name])
+        reference = compute(name, arguments[name])
         assert any(differ) or name == "div", "a quotient of floats is never so near"
-        np.testing.assert_array_equal(result[~np.array(differ)], twin[~np.array(differ)])
+        np.testing.assert_array_equal(result[~np.array(differ)], reference[~np.array(differ)])
         if architecture == "x86_64":
-            np.testing.assert_array_equal(result, twin)
+            np.testing.assert_array_equal(result, reference)
         else:
             np.testing.assert_array_equal(result[differ], 0)
-            np.testing.assert_array_equal(np.abs(twin[differ]), np.float32(2.0**-126))
+            np.testing.assert_array_equal(np.abs(reference[differ]), np.float32(2.0**-126))

@@ -1,7 +1,8 @@
-"""A comparison of new machine code with its twin in NumPy, which a worker makes before it uses the code.
+"""A comparison of new machine code with its reference in NumPy, which a worker makes before it uses the code.
 
-Tests compare the code of our machines with the twins. A worker may run on a processor, or with a version of LLVM, that
-we have never seen: there the reset and one step of a few episodes must have the bits that NumPy gives them.
+Tests compare the code of our machines with the reference implementations. A worker may run on a processor, or with a
+version of LLVM, that we have never seen: there the reset and one step of a few episodes must have the bits that NumPy
+gives them.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ import numpy as np
 from es_service.protocol.messages import WorkerSpec
 from es_service.protocol.noise import NORMAL_STD, Domain, normal_integers, stream_keys
 from workers.simd.backend.words import Words, aligned, pack
-from workers.simd.episodes import twin
+from workers.simd.episodes import reference
 from workers.simd.episodes.compiled import EpisodeKernel
 from workers.simd.episodes.kernel import Kernel
 from workers.simd.episodes.program import EpisodeProgram
 from workers.simd.graph.graph import Graph
 from workers.simd.graph.operations import compute
-from workers.simd.graph.twin import evaluate
+from workers.simd.graph.reference import evaluate
 
 LANES = 16
 UNIT = float(np.float32(0.1 / NORMAL_STD))
@@ -57,22 +58,22 @@ def check_episodes(kernel: EpisodeKernel, program: EpisodeProgram) -> None:
     if kernel.own_weights:
         memory, weights = kernel.network.room_for_own(LANES, spec.policy.parameters)
         memory[...] = parameters_L_D
-        weights_of = twin.own(memory)
+        weights_of = reference.own(memory)
     elif noise_keys_P is not None:
-        weights_of = twin.perturbed(parameters_L_D[0], np.float32(UNIT), noise_keys_P)
+        weights_of = reference.perturbed(parameters_L_D[0], np.float32(UNIT), noise_keys_P)
         weights = kernel.network.pack(parameters_L_D[0])
     else:
-        weights, weights_of = kernel.network.pack(parameters_L_D[0]), twin.shared(parameters_L_D[0], LANES)
+        weights, weights_of = kernel.network.pack(parameters_L_D[0]), reference.shared(parameters_L_D[0], LANES)
 
     carries, go = kernel.started(weights, UNIT, mean_O, std_O, noise_keys_P, keys_L, keys_L)
     carry_L = _by_lane(carries)
     go(1)
-    (look, _, seen), (move, _, after) = program.graphs()
+    (normalised_observation, _, seen), (advance, _, after) = program.graphs()
     statistics = [np.broadcast_to(x[:, inputs_O], (LANES, len(inputs_O))).T.view(np.uint32) for x in (mean_O, std_O)]
-    x_I_L = np.stack(evaluate(look, seen, np.concatenate([carry_L, *statistics])))
-    action_A_L = twin.policy(spec.policy, inputs_O, x_I_L, weights_of)
+    x_I_L = np.stack(evaluate(normalised_observation, seen, np.concatenate([carry_L, *statistics])))
+    action_A_L = reference.policy(spec.policy, inputs_O, x_I_L, weights_of)
     words = np.concatenate([carry_L, statistics[0], action_A_L.view(np.uint32), keys_L.T])
-    require_same(_by_lane(carries), _words(evaluate(move, after, words)), f"a step of {spec.environment}")
+    require_same(_by_lane(carries), _words(evaluate(advance, after, words)), f"a step of {spec.environment}")
 
 
 def check_gradient(gradient_sum: Callable[..., np.ndarray], parameters: int) -> None:

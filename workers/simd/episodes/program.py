@@ -76,14 +76,15 @@ def write_episodes(
     key, inputs = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32), jax.ShapeDtypeStruct((len(inputs_O),), jnp.float32)
     outputs = jax.ShapeDtypeStruct((spec.policy.outputs,), jnp.float32)
     carry = jax.eval_shape(steps.begin, key)
-    look, move = (
-        jax.make_jaxpr(steps.look)(carry, inputs, inputs),
-        jax.make_jaxpr(steps.move)(carry, inputs, outputs, key),
+    normalised_observation, advance = (
+        jax.make_jaxpr(steps.normalised_observation)(carry, inputs, inputs),
+        jax.make_jaxpr(steps.advance)(carry, inputs, outputs, key),
     )
     leaves = jax.tree.leaves(carry)
-    if [(aval.shape, aval.dtype) for aval in move.out_avals] != [(aval.shape, aval.dtype) for aval in leaves]:
+    if [(aval.shape, aval.dtype) for aval in advance.out_avals] != [(aval.shape, aval.dtype) for aval in leaves]:
         raise TypeError(
-            f"step returns a state of arrays {move.out_avals}, but reset one of {leaves}; shapes and dtypes must agree"
+            f"step returns a state of arrays {advance.out_avals}, but reset one of {leaves}; shapes and dtypes must "
+            "agree"
         )
     alive_word = sum(words_of(aval) for aval in jax.tree.leaves(carry.state))
     words = sum(map(words_of, leaves))
@@ -91,13 +92,13 @@ def write_episodes(
 
     @functools.cache
     def graphs() -> tuple[Traced, Traced]:
-        return trace_jaxpr(look), trace_jaxpr(move)
+        return trace_jaxpr(normalised_observation), trace_jaxpr(advance)
 
     def text() -> str:
         kept = [word for place in of_steps.values() for word in place]
         return _module(*graphs(), network, len(inputs_O), words, alive_word, weights, kept)
 
-    digests = f"{definition()} {jaxpr_digest(look)} {jaxpr_digest(move)}"
+    digests = f"{definition()} {jaxpr_digest(normalised_observation)} {jaxpr_digest(advance)}"
     name = f"episodes {digests} {spec.policy} {inputs_O.tolist()} {training}{' own' * own_weights}"
     return EpisodeProgram(steps, carry, alive_word, network, of_steps, name, text, graphs)
 
@@ -110,8 +111,8 @@ def _places(carry: Carry) -> Any:
 
 
 def _module(
-    look: Traced,
-    move: Traced,
+    normalised_observation: Traced,
+    advance: Traced,
     network: Network,
     inputs: int,
     words: int,
@@ -132,12 +133,12 @@ def _module(
     """
     width, target = network.width, network.target
     actions = network.outputs
-    graph, _, outputs = look
+    graph, _, outputs = normalised_observation
     sources = [("carry", words), ("constants", inputs), ("constants", inputs)]
-    look_code = graph_function("look", graph, outputs, sources, "seen", target)
-    graph, _, outputs = move
+    observation_code = graph_function("look", graph, outputs, sources, "seen", target)
+    graph, _, outputs = advance
     sources = [("carry", words), ("constants", inputs), ("action", actions), ("action_key", KEY_WORDS)]
-    move_code = graph_function("move", graph, outputs, sources, "carry", target)
+    advance_code = graph_function("move", graph, outputs, sources, "carry", target)
     policy_code = policy_function(network, weights)
     fill_code = fill_function(network.vectors, len(network.places) - network.vectors, target)
     keep_code = [keep_function(network)] * network.keeps_weights
@@ -188,4 +189,4 @@ def _module(
         return []
 
     builder.loop("%blocks", block)
-    return module([look_code, move_code, policy_code, *before, builder])
+    return module([observation_code, advance_code, policy_code, *before, builder])

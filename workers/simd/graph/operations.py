@@ -121,7 +121,8 @@ NUMPY_DTYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtyp
 BIT_MOVES = {"unbits", "bits", "neg", "abs", "select"}
 """Operations that pass floats through unchanged. All others replace denormal arguments and results by zeros."""
 ROUNDED = {"mul", "div", "fma"}
-"""Operations whose results may be both inexact and tiny. The twin computes them in float64 and rounds once."""
+"""Operations whose results may be both inexact and tiny. The reference implementation computes them in
+float64 and rounds once."""
 SMALLEST_NORMAL = 2.0**-126
 LEAST_KEPT = 2.0**-126 - 2.0**-151
 """Least absolute value that is not a zero after rounding: what 24 bits round to 2^-126, as on x86-64. Processors of Arm

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from tests.twins.es import ES, SHAPINGS
+from tests.references.es import ES, SHAPINGS
 
 
 def novelty(archive, descriptor, neighbours, squared=False, without=None):

@@ -93,7 +93,7 @@ class Policy:
 
 
 @dataclass(frozen=True)
-class Moment:
+class Snapshot:
     """The state of a run after one generation, read at once and checked; `parts` may be only some of its parts."""
 
     folder: Path

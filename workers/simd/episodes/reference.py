@@ -16,7 +16,7 @@ from es_service.protocol.policy_spec import Activation, PolicySpec
 from workers.simd.episodes.hidden import activated_node
 from workers.simd.graph.folding import FoldingGraph
 from workers.simd.graph.operations import compute
-from workers.simd.graph.twin import evaluate
+from workers.simd.graph.reference import evaluate
 
 Floats = NDArray[np.float32]
 WeightsOf = Callable[[NDArray[np.intp], bool], Floats]

@@ -37,12 +37,12 @@ def import_factory(path: str) -> Callable[[RunConfig], object]:
     except Exception as error:  # the user's code can raise anything
         raise ConfigError(why_not_imported(module, error)) from error
     if not callable(found):
-        needed = "es_service/search/algorithms/own.py describes the function that is needed"
+        needed = "es_service/search/algorithms/user_method.py describes the function that is needed"
         raise ConfigError(f"{module} has no function {name!r}; {needed}")
     return found
 
 
-def own_method(path: str) -> Method:
+def user_method(path: str) -> Method:
     """The user's search with the settings that it declares, or with those of one that declares none.
 
     Raises:

@@ -1,10 +1,10 @@
-"""MEMES once more, slowly and in float64, on top of the other twins: one emitter at a time."""
+"""MEMES once more, slowly and in float64, on top of the other reference implementations: one emitter at a time."""
 
 import math
 
-from tests.twins.behaviour_map import Elite
-from tests.twins.es import ES, averaged_centred_ranks
-from tests.twins.novelty_search import novelty
+from tests.references.behaviour_map import Elite
+from tests.references.es import ES, averaged_centred_ranks
+from tests.references.novelty_search import novelty
 
 
 class Memes:

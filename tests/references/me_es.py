@@ -1,10 +1,10 @@
-"""ME-ES once more, slowly and in float64, on top of the other twins: one elite, one number at a time."""
+"""ME-ES once more, slowly and in float64, on top of the other references: one elite, one number at a time."""
 
 import math
 
-from tests.twins.behaviour_map import Elite
-from tests.twins.es import ES, averaged_centred_ranks
-from tests.twins.novelty_search import novelty
+from tests.references.behaviour_map import Elite
+from tests.references.es import ES, averaged_centred_ranks
+from tests.references.novelty_search import novelty
 
 
 def best(cells, values, count):
@@ -124,7 +124,7 @@ def other(climbs):
 
 
 def side_by_side(centres, map_, *settings, **more):
-    """Emitters that share a map and an archive: one twin for each centre."""
+    """Emitters that share a map and an archive: one reference implementation for each centre."""
     emitters = [MapElitesES(centre, map_, *settings, emitter=i, **more) for i, centre in enumerate(centres)]
     for emitter in emitters:
         emitter.archive, emitter.evaluated_in = emitters[0].archive, emitters[0].evaluated_in

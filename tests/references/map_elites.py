@@ -1,6 +1,6 @@
 """MAP-Elites once more, slowly and in float64: one policy, one parameter at a time."""
 
-from tests.twins.behaviour_map import Elite
+from tests.references.behaviour_map import Elite
 
 
 class MapElites:

@@ -1,4 +1,4 @@
-"""The standing of a run: its newest generation, its budget, and whether it waits, is running, finished or stopped."""
+"""The status of a run: its newest generation, its budget, and whether it waits, is running, finished or stopped."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TARGET = "target_certified"
 
 
 @dataclass(frozen=True)
-class Standing:
+class RunStatus:
     """A run at the moment when it was read."""
 
     run: Run
@@ -61,76 +61,76 @@ def newest_runs(folder: Path, most: int = 10) -> list[Path]:
     return sorted(written, key=lambda run: written[run], reverse=True)[:most]
 
 
-def read_standing(run: Run) -> Standing:
-    """The present standing of a run. Raises StoreError if the run cannot be read."""
+def read_status(run: Run) -> RunStatus:
+    """The present status of a run. Raises StoreError if the run cannot be read."""
     driver = lock_holder(run.folder)  # read before the history, so that the last row is not missed
-    return standing_at(run, driver, read_newest(run.folder))
+    return status_at(run, driver, read_newest(run.folder))
 
 
-def standing_at(run: Run, driver: Mapping[str, Any] | None, row: Row | None) -> Standing:
-    """The standing of a run whose driver and newest history row were read before; see `Standing`."""
+def status_at(run: Run, driver: Mapping[str, Any] | None, row: Row | None) -> RunStatus:
+    """The status of a run whose driver and newest history row were read before; see `RunStatus`."""
     try:
         budget = BudgetConfig.model_validate(run.present_config["budget"])
     except ConfigError as error:
-        return Standing(run, driver, row, {}, " ".join(error.sentence.split()))
+        return RunStatus(run, driver, row, {}, " ".join(error.sentence.split()))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, ("budget", *first["loc"])))
-        return Standing(run, driver, row, {}, f"{run.folder / CONFIG}: {key}: {first['msg']}")
+        return RunStatus(run, driver, row, {}, f"{run.folder / CONFIG}: {key}: {first['msg']}")
     try:
         certified = target_reached(run.folder, budget.target_certified)
     except StoreError:
         certified = ""  # damage of a certification, which `verify` names
     end = "" if driver else last_end(run.folder)
-    return Standing(run, driver, row, limits_of(budget), certified=certified, end=end)
+    return RunStatus(run, driver, row, limits_of(budget), certified=certified, end=end)
 
 
-def is_waiting(standing: Standing) -> bool:
+def is_waiting(status: RunStatus) -> bool:
     """Whether the driver runs and waits for a first place in the cluster."""
-    return standing.driver is not None and standing.driver["waiting_since"] is not None
+    return status.driver is not None and status.driver["waiting_since"] is not None
 
 
-def doing(standing: Standing) -> str:
+def doing(status: RunStatus) -> str:
     """What the driver is doing, in words, if that takes long and no generation shows it; else empty."""
-    return (standing.driver["doing"] or "") if standing.driver else ""
+    return (status.driver["doing"] or "") if status.driver else ""
 
 
-def state(standing: Standing) -> str:
+def state(status: RunStatus) -> str:
     """The state of a run in words: waiting, running, finished or stopped, with details."""
-    if standing.driver:
-        where = f"on {standing.driver['host']}, pid {standing.driver['pid']}"
-        if is_waiting(standing):
-            return f"waiting for a first place in the cluster since {standing.driver['waiting_since']}; driver {where}"
-        left = to_go(standing)
-        return "; ".join([f"running {where}", *([f"{left} left"] if left else []), *filter(None, [doing(standing)])])
-    if standing.problem:
-        return f"stopped, and its budget cannot be read: {standing.problem}"
-    if standing.reasons:
-        return f"finished: {next(iter(standing.reasons.values()))}"
-    return "stopped before its budget was spent" + (f": {standing.end}" if standing.end else "")
+    if status.driver:
+        where = f"on {status.driver['host']}, pid {status.driver['pid']}"
+        if is_waiting(status):
+            return f"waiting for a first place in the cluster since {status.driver['waiting_since']}; driver {where}"
+        left = to_go(status)
+        return "; ".join([f"running {where}", *([f"{left} left"] if left else []), *filter(None, [doing(status)])])
+    if status.problem:
+        return f"stopped, and its budget cannot be read: {status.problem}"
+    if status.reasons:
+        return f"finished: {next(iter(status.reasons.values()))}"
+    return "stopped before its budget was spent" + (f": {status.end}" if status.end else "")
 
 
-def way_on(standing: Standing) -> WayOut:
+def how_to_continue(status: RunStatus) -> WayOut:
     """The way to continue a run that is not running."""
-    return WayOut("resume", "continue it", str(standing.run.folder), more(standing))
+    return WayOut("resume", "continue it", str(status.run.folder), more(status))
 
 
-def more(standing: Standing) -> dict[str, float | None]:
+def more(status: RunStatus) -> dict[str, float | None]:
     """Settings with which a finished run can continue; empty if it is not finished."""
-    if standing.row is None:
+    if status.row is None:
         return {}
-    reached = {TARGET: None} if standing.certified else {}
-    return {f"budget.{key}": value for key, value in (reached | raised(standing.limits, standing.row)).items()}
+    reached = {TARGET: None} if status.certified else {}
+    return {f"budget.{key}": value for key, value in (reached | raised(status.limits, status.row)).items()}
 
 
-def to_go(standing: Standing) -> str:
+def to_go(status: RunStatus) -> str:
     """Estimate of the remaining time at the run's average speed, such as "about 4 h"; empty if there is none."""
-    row = standing.row
+    row = status.row
     if row is None:
         return ""
     fractions = [
         limit / row[REACHED[key]]
-        for key, limit in standing.limits.items()
+        for key, limit in status.limits.items()
         if key != "target_fitness" and row[REACHED[key]] > 0
     ]
     if not fractions:

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 from statistics import fmean, median
 
-from tests.twins.behaviour_map import cell_number, grid_index
+from tests.references.behaviour_map import cell_number, grid_index
 
 WEIGHTS = {
     "exponential": lambda rank, deepest: math.exp(-rank),
