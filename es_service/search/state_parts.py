@@ -11,7 +11,7 @@ value is
 The store compares contents, so every change is kept: values, types and shapes, rows and entries that come, change and
 leave, and names that come and go. Values are read-only; to change one, return a state with another mapping:
 
-    replace(state, own={**state.own, "tries": ByCell({**state.own["tries"].entries, cell: {"count": count}})})
+    replace(state, extra={**state.extra, "tries": ByCell({**state.extra["tries"].entries, cell: {"count": count}})})
 """
 
 from __future__ import annotations

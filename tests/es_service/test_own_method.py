@@ -44,9 +44,9 @@ def restless(config):
         return {} if generation % patience else {0: int(state.map.cell_N[state.map.fitness_N.argmax()])}
 
     def restart(state, index, cell, elite):
-        return replace(from_elite(state, index, cell, elite), own={"restarts": state.own["restarts"] + 1})
+        return replace(from_elite(state, index, cell, elite), extra={"restarts": state.extra["restarts"] + 1})
 
-    return replace(shared, start_cells=start_cells, restart=restart, own={"restarts": np.zeros(1, np.int64)})
+    return replace(shared, start_cells=start_cells, restart=restart, extra={"restarts": np.zeros(1, np.int64)})
 '''
 CONFIG = {
     "task": {"environment": "point_maze", "episode_steps": 30},

@@ -114,7 +114,7 @@ from my_version import VERSION
 
 def search(config):
     Path("said").write_text(str(VERSION))
-    return replace(ns_es(config), own={"version": np.asarray(VERSION)})
+    return replace(ns_es(config), extra={"version": np.asarray(VERSION)})
 """
 
 
